@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The order of signal messages in a bag: by log time, then topic, then index, whoever arrived first."""
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from lathe_rc.errors import LatheError
+
+
+@dataclass(frozen=True, order=True)
+class Entry:
+    """A message to be written; sorts as bags are sorted."""
+
+    log_ns: int
+    topic: str
+    sequence: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block message and what its info says."""
+
+    entry: Entry
+    first: int
+    companions: int
+    last: bool
+
+
+class Merger:
+    """Collects the messages of all signal topics and gives them back in the order of a bag.
+
+    A block leaves when every dense topic has brought the block with the same first sample and every source the
+    sparse messages that its block counts: then nothing with an earlier time can still come.
+
+    Args:
+        dense: source by fully qualified dense topic.
+        sparse: source by fully qualified sparse topic.
+    """
+
+    def __init__(self, dense: Mapping[str, str], sparse: Mapping[str, str]) -> None:
+        self._dense, self._sparse = dense, sparse
+        self._blocks: dict[str, deque[Block]] = {topic: deque() for topic in dense}
+        self._waiting: list[Entry] = []
+        self._sequence = dict.fromkeys([*dense, *sparse], 0)
+        self._received = dict.fromkeys(sparse.values(), 0)
+        self.blocks = 0  #: complete blocks given back, over all topics
+        self.complete = False  #: True when the last block of every topic has been given back
+
+    def _entry(self, topic: str, log_ns: int, data: bytes) -> Entry:
+        self._sequence[topic] += 1
+        return Entry(log_ns, topic, self._sequence[topic], data)
+
+    def add_block(
+        self, topic: str, log_ns: int, data: bytes, *, first: int, companions: int, last: bool
+    ) -> None:
+        """Take a block message."""
+        self._blocks[topic].append(Block(self._entry(topic, log_ns, data), first, companions, last))
+
+    def add_sparse(self, topic: str, log_ns: int, data: bytes) -> None:
+        """Take a sparse message."""
+        self._waiting.append(self._entry(topic, log_ns, data))
+        self._received[self._sparse[topic]] += 1
+
+    def release(self) -> Iterator[list[Entry]]:
+        """Give back what is complete, one sorted list for each block.
+
+        Raises:
+            LatheError: topics are cut into different blocks.
+        """
+        while all(self._blocks.values()):
+            heads = {topic: queue[0] for topic, queue in self._blocks.items()}
+            if len({(block.first, block.entry.log_ns, block.last) for block in heads.values()}) > 1:
+                spans = ", ".join(f"{topic} from {block.first}" for topic, block in heads.items())
+                raise LatheError(f"topics are not cut into the same blocks: {spans}")
+            if any(self._received.get(self._dense[t], 0) < block.companions for t, block in heads.items()):
+                return
+            for queue in self._blocks.values():
+                queue.popleft()
+            end = next(iter(heads.values()))
+            due = [entry for entry in self._waiting if entry.log_ns <= end.entry.log_ns]
+            self._waiting = [entry for entry in self._waiting if entry.log_ns > end.entry.log_ns]
+            self.blocks += 1
+            self.complete = end.last
+            yield sorted(due + [block.entry for block in heads.values()])

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recording an offline run: the messages that a cell of ROS nodes would have sent, in the same order."""
+
+import json
+from collections.abc import Mapping
+
+from lathe_rc.bag.order import Merger
+from lathe_rc.bag.writer import BagWriter, offered_qos
+from lathe_rc.cell import messages
+from lathe_rc.cell.framing import Framer
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.parameters import SharedParameters
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wiring import Cell
+
+SIGNAL_DEPTH = 64  #: queue length of signal topics beyond the window
+
+
+def about(scenario: str, shared: SharedParameters, host_topics: list[str]) -> dict[str, str]:
+    """What a bag says of itself in its metadata."""
+    return {
+        "lathe_rc.scenario": scenario,
+        "lathe_rc.run_id": shared.run_id,
+        "lathe_rc.host_topics": json.dumps(host_topics),
+    }
+
+
+class OfflineRecorder:
+    """Cuts the chunks of the engine into blocks and writes them; a sink of the engine.
+
+    Args:
+        cell: the cell that runs.
+        samples: length of the run.
+        writer: the bag.
+    """
+
+    def __init__(self, cell: Cell, samples: int, writer: BagWriter) -> None:
+        shared = cell.master.shared
+        self._cell, self._samples, self._writer = cell, samples, writer
+        self._block, self._step_ns = shared.block_size, shared.step_ns
+        self._framers = {name: Framer(shared.run_id, f"/{name}", shared.step_ns) for name in cell.stages}
+        self._merger = Merger(
+            {f"/{topic}": source.node for topic, source in cell.dense.items()},
+            {f"/{topic}": source.node for topic, source in cell.sparse.items()},
+        )
+        qos = offered_qos(cell.master.parameters.window + SIGNAL_DEPTH, "transient_local")
+        for topic, source in sorted({**cell.dense, **cell.sparse}.items()):
+            writer.add_topic(f"/{topic}", source.type, qos)
+
+    def chunk(
+        self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]
+    ) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        pending = {topic: list(found) for topic, found in sparse.items()}
+        for start in range(0, samples, self._block):
+            stop = min(start + self._block, samples)
+            for topic, found in pending.items():
+                while found and found[0].index < first + stop:
+                    self._add_sparse(topic, found.pop(0))
+            for topic, signals in dense.items():
+                part = {name: array[start:stop] for name, array in signals.items()}
+                self._add_block(topic, first + start, part, last=first + stop == self._samples)
+            for entries in self._merger.release():
+                for entry in entries:
+                    self._writer.write(entry.topic, entry.log_ns, entry.data)
+
+    def _add_sparse(self, topic: str, message: Sparse) -> None:
+        framed = self._framers[self._cell.sparse[topic].node].sparse(message)
+        self._merger.add_sparse(f"/{topic}", messages.stamp_ns(framed), messages.encode(message.type, framed))
+
+    def _add_block(self, topic: str, first: int, signals: Signals, *, last: bool) -> None:
+        source = self._cell.dense[topic]
+        framed = self._framers[source.node].block(source.type, first, signals, last=last)
+        self._merger.add_block(
+            f"/{topic}",
+            messages.stamp_ns(framed),
+            messages.encode(source.type, framed),
+            first=first,
+            companions=framed.block.companions,
+            last=last,
+        )

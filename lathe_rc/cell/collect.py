@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keeping the signals of an offline run in memory."""
+
+from collections.abc import Mapping
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.framing import Framer
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.recording import Recording, SparseTopic
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wiring import Cell
+
+
+class Collector:
+    """Collects whole arrays; a sink of the engine."""
+
+    def __init__(self, cell: Cell, samples: int) -> None:
+        self._cell = cell
+        self._framer = Framer("", "", cell.master.shared.step_ns)
+        self._dense = {topic: messages.allocate(source.type, samples) for topic, source in cell.dense.items()}
+        self._sparse: dict[str, list[Sparse]] = {topic: [] for topic in cell.sparse}
+
+    def chunk(
+        self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]
+    ) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        for topic, signals in dense.items():
+            whole = self._dense[topic]
+            for name, array in signals.items():
+                whole[name][first : first + samples] = array
+        for topic, found in sparse.items():
+            self._sparse[topic] += found
+
+    def recording(self) -> Recording:
+        """What was collected, by fully qualified topic."""
+        sparse = {}
+        for topic, found in self._sparse.items():
+            part = sparse[f"/{topic}"] = SparseTopic(self._cell.sparse[topic].type)
+            for message in found:
+                framed = self._framer.sparse(message)
+                part.add(messages.stamp_ns(framed), framed)
+        return Recording({f"/{topic}": signals for topic, signals in self._dense.items()}, sparse)

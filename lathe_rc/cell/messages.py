@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The message types of the cell, read from their .msg files; CDR without ROS."""
+
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+import numpy.typing as npt
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+PACKAGE = "lathe_rc_msgs"
+
+ENCODER = f"{PACKAGE}/msg/EncoderBlock"
+COMMAND = f"{PACKAGE}/msg/ActuatorCommand"
+STATE = f"{PACKAGE}/msg/ActuatorState"
+TOOL = f"{PACKAGE}/msg/ToolBlock"
+LEARNING = f"{PACKAGE}/msg/LearningStatus"
+EVENT = f"{PACKAGE}/msg/Event"
+MEMBER = f"{PACKAGE}/msg/Member"
+JOINTS = "sensor_msgs/msg/JointState"
+
+START_NS = 1_000_000_000  #: simulated time of sample 0 [ns]; a stamp of 0 means "not set" in ROS
+MAX_BLOCK = 8192  #: bound of the arrays of a block [sample]; the .msg files say the same
+
+Samples = npt.NDArray[Any]
+Signals = dict[str, Samples]  #: the arrays of a block by field name
+
+
+class BlockInfo(Protocol):
+    """What a block says about itself; see BlockInfo.msg."""
+
+    run_id: str
+    source: str
+    first_index: int
+    step_ns: int
+    last: bool
+    companions: int
+
+
+class Block(Protocol):
+    """A message that is a block of samples."""
+
+    block: BlockInfo
+
+
+@cache
+def store() -> Typestore:
+    """ROS 2's own types and those of lathe_rc."""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    # In a wheel the .msg files lie inside the package, in a checkout beside it.
+    package = Path(__file__).parents[1]
+    folder = next(path for path in (package / "msg_defs", package.parent / "msg_defs") if path.is_dir())
+    own = {}
+    for path in sorted((folder / "msg").glob("*.msg")):
+        own.update(get_types_from_msg(path.read_text(encoding="utf-8"), f"{PACKAGE}/msg/{path.stem}"))
+    types.register(own)
+    return types
+
+
+@cache
+def sample_fields(msgtype: str) -> dict[str, np.dtype[Any]]:
+    """The array fields of a block type, in order, with their element types."""
+    fields = {}
+    for name, (kind, detail) in store().fielddefs[msgtype][1]:
+        if kind == Nodetype.SEQUENCE:
+            ((_, (element, _)), _) = cast("tuple[tuple[Any, tuple[str, int]], int]", detail)
+            fields[name] = np.dtype(element)
+    return fields
+
+
+def allocate(msgtype: str, samples: int) -> Signals:
+    """Zeroed arrays for ``samples`` samples of a block type."""
+    return {name: np.zeros(samples, dtype) for name, dtype in sample_fields(msgtype).items()}
+
+
+def header(index: int, step_ns: int) -> Any:
+    """std_msgs/Header with the simulated time of sample ``index``."""
+    seconds, nanoseconds = divmod(START_NS + index * step_ns, 1_000_000_000)
+    types = store().types
+    stamp = types["builtin_interfaces/msg/Time"](seconds, nanoseconds)
+    return types["std_msgs/msg/Header"](stamp, "")
+
+
+def stamp_ns(message: Any) -> int:
+    """Simulated time [ns] in a message's header."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def block_message(msgtype: str, info: BlockInfo, signals: Signals) -> Any:
+    """A block message; its stamp is the time of its last sample."""
+    samples = next(iter(signals.values())).size
+    return store().types[msgtype](
+        header(info.first_index + samples - 1, info.step_ns), info, *(signals[f] for f in sample_fields(msgtype))
+    )
+
+
+def block_info(
+    run_id: str, source: str, first_index: int, step_ns: int, *, last: bool, companions: int
+) -> BlockInfo:
+    """What a block says about itself."""
+    info = store().types[f"{PACKAGE}/msg/BlockInfo"](run_id, source, first_index, step_ns, last, companions)
+    return cast("BlockInfo", info)
+
+
+def encode(msgtype: str, message: Any) -> bytes:
+    """CDR bytes of a message."""
+    return bytes(store().serialize_cdr(message, msgtype))
+
+
+def decode(msgtype: str, data: bytes) -> Any:
+    """A message from CDR bytes; arrays are views of the bytes."""
+    return store().deserialize_cdr(data, msgtype)

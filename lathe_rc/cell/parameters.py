@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameter tables: each parameter once, with type, default, range, unit and description.
+
+ROS descriptors, validation, help and the documentation are made from these tables.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
+
+from annotated_types import Ge, Gt, Le, Lt, MinLen
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
+
+from lathe_rc.cell.messages import MAX_BLOCK
+from lathe_rc.errors import InputError
+
+Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
+
+T = TypeVar("T", bound="Table")
+
+_NAMES = {bool: "true or false", int: "an integer", float: "a finite number", str: "a text"}
+
+
+def parameter(default: Any, doc: str, unit: str = "1", *, path: bool = False) -> Any:
+    """A field of a table, with its unit; ``path`` marks a file, taken relative to the scenario's folder.
+
+    Ranges stand in the annotation, e.g. ``Annotated[float, Gt(0)]``.
+    """
+    return Field(default=default, description=doc, json_schema_extra={"unit": unit, "path": path})
+
+
+class Row:
+    """One parameter as people and ROS see it.
+
+    Attributes:
+        name: of the parameter.
+        type: of the value, or of its elements.
+        is_list: whether it is an array.
+        choices: allowed texts; empty where any will do.
+        low, high: range of a number, ends allowed or not as ``limits`` says; infinite where there is none.
+        limits: the range in words, empty where there is none.
+    """
+
+    def __init__(self, name: str, info: FieldInfo) -> None:
+        extra = cast("dict[str, Any]", info.json_schema_extra)
+        self.name, self.doc = name, info.description or ""
+        self.default: Value = info.get_default(call_default_factory=True)
+        self.unit, self.is_path = str(extra["unit"]), bool(extra["path"])
+        annotation: Any = info.annotation
+        metadata = list(info.metadata)
+        self.is_list = get_origin(annotation) is list
+        if self.is_list:
+            (annotation,) = get_args(annotation)
+        if get_origin(annotation) is Annotated:
+            annotation, *inner = get_args(annotation)
+            metadata += inner
+        self.choices: tuple[str, ...] = get_args(annotation) if get_origin(annotation) is Literal else ()
+        self.type: type = str if self.choices else annotation
+        self.low, self.high, words = -math.inf, math.inf, []
+        for limit in metadata:
+            if isinstance(limit, Ge | Gt):
+                self.low = float(cast("float", limit.ge if isinstance(limit, Ge) else limit.gt))
+                words.append(f"{'from' if isinstance(limit, Ge) else 'above'} {self.low:g}")
+            elif isinstance(limit, Le | Lt):
+                self.high = float(cast("float", limit.le if isinstance(limit, Le) else limit.lt))
+                words.append(f"{'up to' if isinstance(limit, Le) else 'below'} {self.high:g}")
+            elif isinstance(limit, MinLen):
+                words.append("not empty")
+        self.limits = " ".join(words)
+
+    def allowed(self) -> str:
+        """What the parameter accepts, in words."""
+        what = f"one of {', '.join(self.choices)}" if self.choices else _NAMES[self.type]
+        text = " ".join(filter(None, (what, self.limits)))
+        if self.is_list:
+            text = f"a list, each {text}"
+        return text if self.unit == "1" else f"{text} [{self.unit}]"
+
+
+class Table(BaseModel):
+    """A set of parameters; immutable, refuses unknown names, wrong types and values out of range."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True)
+
+    @classmethod
+    def rows(cls) -> dict[str, Row]:
+        """The parameters by name."""
+        return {name: Row(name, info) for name, info in cls.model_fields.items()}
+
+    @classmethod
+    def read(cls: type[T], node: str, values: Mapping[str, object]) -> T:
+        """Make the table from values by parameter name; those that are missing take their defaults.
+
+        Raises:
+            InputError: one line for the first value that is refused; ``node`` is who it is for.
+        """
+        try:
+            return cls(**values)
+        except ValidationError as error:
+            first = error.errors()[0]
+            name = str(first["loc"][0])
+            if first["type"] == "extra_forbidden":
+                known = ", ".join(sorted(cls.model_fields))
+                raise InputError(f"{node}.{name}: unknown parameter; allowed: {known}") from None
+            raise InputError(f"{node}.{name} = {values[name]!r}; allowed: {cls.rows()[name].allowed()}") from None
+
+
+class SharedParameters(Table):
+    """What all nodes of a cell must agree on; may stand under ``/**`` in a parameter file."""
+
+    sample_rate: Annotated[int, Ge(1000), Le(1_000_000)] = parameter(
+        64_000, "sampling rate of the cell; the step must be a whole number of nanoseconds", "Hz"
+    )
+    block_size: Annotated[int, Ge(1), Le(MAX_BLOCK)] = parameter(64, "samples in a block", "sample")
+    nominal_rpm: Annotated[float, Gt(0), Le(60_000)] = parameter(1000.0, "nominal spindle speed", "1/min")
+    seed: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(0, "seed of everything random in the cell")
+    joint_state_period: Annotated[int, Ge(1)] = parameter(
+        640, "a JointState message every so many samples", "sample"
+    )
+    run_id: str = parameter("", "identity of the run; every block carries it")
+
+    def model_post_init(self, context: Any, /) -> None:
+        """Refuse a sampling rate whose step is not a whole number of nanoseconds."""
+        if 1_000_000_000 % self.sample_rate:
+            low = next(r for r in range(self.sample_rate, 0, -1) if 1_000_000_000 % r == 0)
+            high = next(r for r in range(self.sample_rate, 1_000_000_001) if 1_000_000_000 % r == 0)
+            raise InputError(
+                f"sample_rate = {self.sample_rate} Hz: its step is not a whole number of ns; "
+                f"allowed nearby: {low} or {high} Hz"
+            )
+        if len(self.run_id) > 64:
+            raise InputError(f"run_id = {self.run_id!r}; allowed: at most 64 characters")
+
+    @property
+    def step_ns(self) -> int:
+        """Sampling step [ns]."""
+        return 1_000_000_000 // self.sample_rate
+
+    @property
+    def step(self) -> float:
+        """Sampling step [s]."""
+        return 1.0 / self.sample_rate
+
+    @property
+    def nominal_speed(self) -> float:
+        """Nominal spindle speed Ω0 [rad/s]."""
+        return self.nominal_rpm * math.pi / 30.0
+
+
+class NodeParameters(SharedParameters):
+    """What every node has."""
+
+    stage: str = parameter("", "what the node is; empty: its name says it")
+    remap: list[str] = parameter([], "topic names to replace, as old:=new")
+    events: list[str] = parameter(
+        [], "scheduled events, as 'revolution 60: freeze', 'second 3.5: freeze' or 'sample 7000: clear'"
+    )
+    autostart: bool = parameter(True, "configure and activate by itself")
+

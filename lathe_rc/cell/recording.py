@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The signals of a whole run, from whatever host, and their digests."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lathe_rc.cell.messages import Samples, Signals
+
+_NOT_SIGNALS = {"header", "run_id", "source"}
+
+
+@dataclass(frozen=True)
+class SparseTopic:
+    """Messages at chosen samples: time stamps [ns] and, by field, one value a message."""
+
+    type: str
+    stamps: list[int] = field(default_factory=list)
+    values: dict[str, list[Any]] = field(default_factory=dict)
+
+    def add(self, stamp: int, message: Any) -> None:
+        """Append a message."""
+        self.stamps.append(stamp)
+        for name, value in vars(message).items():
+            if name not in _NOT_SIGNALS:
+                self.values.setdefault(name, []).append(value)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """All signal topics of a run.
+
+    Attributes:
+        dense: by fully qualified topic, the arrays of each field, shape (samples,).
+        sparse: by fully qualified topic.
+    """
+
+    dense: Mapping[str, Signals]
+    sparse: Mapping[str, SparseTopic]
+
+    def digests(self) -> dict[str, str]:
+        """One digest a signal topic, by topic: SHA-256 of the SHA-256 of each field's samples in the order of the
+        fields, little-endian; of sparse topics the time stamps come first. Blocks leave no trace in it.
+        """
+        found = {topic: _combine(list(signals.values())) for topic, signals in self.dense.items()}
+        for topic, part in self.sparse.items():
+            found[topic] = _combine([np.array(part.stamps, dtype=np.int64), *map(_flat, part.values.values())])
+        return dict(sorted(found.items()))
+
+
+def _flat(values: Sequence[Any]) -> Samples:
+    """One array of a field's values: numbers end to end, texts as their bytes with an end mark."""
+    parts = []
+    for value in values:
+        for item in value if isinstance(value, list) else [value]:
+            text = isinstance(item, str)
+            parts.append(np.frombuffer(f"{item}\0".encode(), np.uint8) if text else np.atleast_1d(item))
+    return np.concatenate(parts) if parts else np.empty(0)
+
+
+def _combine(fields: Sequence[Samples]) -> str:
+    whole = hashlib.sha256()
+    for samples in fields:
+        little = samples.astype(samples.dtype.newbyteorder("<"), copy=False)
+        whole.update(hashlib.sha256(np.ascontiguousarray(little)).digest())
+    return whole.hexdigest()

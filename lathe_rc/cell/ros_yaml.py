@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS 2 parameter files without ROS, read as rcl reads them.
+
+YAML leaves the meaning of a scalar to its reader, and rcl's differs from that of every Python library: ``1e-3``
+is a double, ``0x10`` and ``010`` are integers, ``yes`` is true. So the text is parsed by PyYAML and the scalars
+by the C library's own strtol and strtod, as rcl_yaml_param_parser does it.
+"""
+
+import ctypes
+import math
+import re
+from pathlib import Path
+
+import yaml
+
+from lathe_rc.cell.parameters import Value
+from lathe_rc.errors import InputError
+
+_MAX_BYTES = 1 << 20
+_MAX_DEPTH = 32
+_TRUE = {"Y", "y", "yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON"}
+_FALSE = {"N", "n", "no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF"}
+_SPECIAL = re.compile(r"[+-]?\.(nan|NaN|NAN|inf|Inf|INF)")
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_libc.strtol.restype = ctypes.c_long
+_libc.strtol.argtypes = (ctypes.c_char_p, ctypes.POINTER(ctypes.c_char_p), ctypes.c_int)
+_libc.strtod.restype = ctypes.c_double
+_libc.strtod.argtypes = (ctypes.c_char_p, ctypes.POINTER(ctypes.c_char_p))
+
+
+def _number(text: str) -> int | float | None:
+    """What strtol or strtod make of the whole text; None if neither takes all of it."""
+    data = ctypes.create_string_buffer(text.encode())
+    start = ctypes.cast(data, ctypes.c_char_p)
+    end = ctypes.c_char_p()
+
+    def whole() -> bool:
+        used = (ctypes.cast(end, ctypes.c_void_p).value or 0) - ctypes.addressof(data)
+        return ctypes.get_errno() == 0 and used == len(data) - 1 and used > 0
+
+    ctypes.set_errno(0)
+    integer = int(_libc.strtol(start, ctypes.byref(end), 0))
+    if whole():
+        return integer
+    if _SPECIAL.fullmatch(text):
+        # rcl skips everything before the letters, the sign included.
+        return math.nan if "n" == text.lstrip("+-.")[0].lower() else math.inf
+    ctypes.set_errno(0)
+    real = float(_libc.strtod(start, ctypes.byref(end)))
+    return real if whole() else None
+
+
+def scalar(text: str, *, quoted: bool = False) -> bool | int | float | str:
+    """The value that rcl gives a scalar."""
+    if quoted:
+        return text
+    if text in _TRUE:
+        return True
+    if text in _FALSE:
+        return False
+    number = None if "\0" in text else _number(text)
+    return text if number is None else number
+
+
+def _value(node: yaml.Node, where: str) -> Value:
+    if isinstance(node, yaml.ScalarNode):
+        return scalar(node.value, quoted=node.style in ("'", '"', "|", ">"))
+    if isinstance(node, yaml.SequenceNode):
+        items = [_value(item, where) for item in node.value]
+        kinds = {type(item) for item in items}
+        if len(kinds) > 1 or list in kinds:
+            raise InputError(f"{where}: a list of mixed types; allowed: all bool, integer, double or string")
+        return items  # type: ignore[return-value]  # the check above makes it one of the list types
+    raise InputError(f"{where}: neither a value nor a list")
+
+
+def _flatten(node: yaml.Node, where: str, prefix: str, depth: int, into: dict[str, Value]) -> None:
+    """Collect parameters; nested maps make dotted names."""
+    if not isinstance(node, yaml.MappingNode) or depth > _MAX_DEPTH:
+        raise InputError(f"{where}: not a map of parameters")
+    for key, item in node.value:
+        name = f"{prefix}{key.value}"
+        if isinstance(item, yaml.MappingNode):
+            _flatten(item, f"{where}.{name}", f"{name}.", depth + 1, into)
+        elif name in into:
+            raise InputError(f"{where}: {name} appears twice; keep one")
+        else:
+            into[name] = _value(item, f"{where}.{name}")
+
+
+def _compose(text: str, source: str) -> yaml.Node | None:
+    try:
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
+            raise InputError(f"{source}: YAML aliases; ROS 2 does not read them: write the value out")
+        return yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f":{mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "unreadable"
+        raise InputError(f"{source}{place}: not YAML ({problem})") from None
+    except RecursionError:
+        raise InputError(f"{source}: nested too deeply") from None
+
+
+def parse_value(text: str, source: str) -> Value:
+    """A value as it would stand in a parameter file, e.g. ``1e-3`` or ``[1, 2]``."""
+    node = _compose(text, source)
+    return "" if node is None else _value(node, source)
+
+
+def read(path: Path) -> dict[str, dict[str, Value]]:
+    """Parameters by node and name, in the order of the file.
+
+    Node names lose their leading ``/`` or ``/**/``; the wildcard for all nodes is ``/**``.
+
+    Raises:
+        InputError: the file is missing, larger than 1 MiB, or not a ROS 2 parameter file.
+    """
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise InputError(f"{path}: larger than {_MAX_BYTES >> 20} MiB; not a parameter file")
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; allowed: YAML in UTF-8") from None
+    root = _compose(text, str(path))
+    if not isinstance(root, yaml.MappingNode):
+        raise InputError(f"{path}: no nodes; allowed: 'NODE: {{ros__parameters: ...}}'")
+    nodes: dict[str, dict[str, Value]] = {}
+    for key, item in root.value:
+        name = "/**" if key.value == "/**" else key.value.removeprefix("/**/").removeprefix("/")
+        entries = item.value if isinstance(item, yaml.MappingNode) else []
+        if [entry[0].value for entry in entries] != ["ros__parameters"]:
+            raise InputError(f"{path}:{key.start_mark.line + 1}: {key.value} does not hold ros__parameters alone")
+        _flatten(entries[0][1], f"{path}: {name}", "", 0, nodes.setdefault(name, {}))
+    return nodes

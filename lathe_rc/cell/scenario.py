@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenarios: ROS 2 parameter files that describe a whole cell."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from lathe_rc.cell import ros_yaml
+from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Value
+from lathe_rc.cell.recorder import KIND as RECORDER
+from lathe_rc.cell.recorder import RecorderParameters
+from lathe_rc.cell.stages import STAGES
+from lathe_rc.errors import InputError
+
+TABLES: dict[str, type[NodeParameters]] = {kind: stage.Parameters for kind, stage in STAGES.items()}
+TABLES[RECORDER] = RecorderParameters
+
+_EVERYONE = "/**"
+# What changes neither a sample nor a message of a run, and so not its identity.
+_HOST_PARAMETERS = {"run_id", "speed_factor", "window", "members", "autostart"}
+
+
+def kind_of(node: str, values: Mapping[str, object]) -> str:
+    """What a node is: its ``stage`` parameter, or its name.
+
+    Raises:
+        InputError: there is no such stage.
+    """
+    kind = str(values.get("stage") or node)
+    if kind not in TABLES:
+        raise InputError(f"{node}: no stage {kind!r}; allowed: {', '.join(TABLES)} (set {node}.stage)")
+    return kind
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A cell, described.
+
+    Attributes:
+        name: the file's name without its ending.
+        nodes: the table of each node by its name, in the order of the file.
+    """
+
+    name: str
+    nodes: dict[str, NodeParameters]
+
+    @property
+    def shared(self) -> SharedParameters:
+        """What all nodes agree on."""
+        return next(iter(self.nodes.values()))
+
+    def of_kind(self, kind: str) -> list[str]:
+        """Names of the nodes of a kind."""
+        return [name for name, table in self.nodes.items() if kind_of(name, {"stage": table.stage}) == kind]
+
+    def to_yaml(self) -> str:
+        """The complete parameter file; empty lists are left out, since rcl cannot read them."""
+        tree = {}
+        for name, table in self.nodes.items():
+            values = {key: value for key, value in table.model_dump().items() if value != []}
+            tree[f"/**/{name}"] = {"ros__parameters": values}
+        return yaml.safe_dump(tree, sort_keys=False, default_flow_style=None)
+
+
+def _override(text: str, nodes: dict[str, dict[str, Value]]) -> None:
+    """Apply ``NODE.PARAM=VALUE`` or, for a shared parameter, ``PARAM=VALUE``."""
+    target, equals, value = text.partition("=")
+    node, dot, name = target.strip().partition(".")
+    if not equals:
+        raise InputError(f"--set {text!r}; allowed: NODE.PARAM=VALUE, or PARAM=VALUE for a shared parameter")
+    if not dot:
+        node, name = _EVERYONE, node
+        if name not in SharedParameters.model_fields:
+            shared = ", ".join(SharedParameters.model_fields)
+            raise InputError(f"--set {text!r}: {name} is not shared; allowed: {shared}, or NODE.{name}=VALUE")
+    elif node not in nodes:
+        present = ", ".join(name for name in nodes if name != _EVERYONE)
+        raise InputError(f"--set {text!r}: no node {node!r} in the scenario; allowed: {present}")
+    parsed = ros_yaml.parse_value(value, f"--set {target}")
+    if node == _EVERYONE:
+        for values in nodes.values():
+            values.pop(name, None)
+    nodes.setdefault(node, {})[name] = _absolute(kind_of(node, nodes[node]), name, parsed, Path()) if dot else parsed
+
+
+def _absolute(kind: str, name: str, value: Value, folder: Path) -> Value:
+    """A path relative to ``folder`` made absolute; anything else as it is."""
+    row = TABLES[kind].rows().get(name)
+    if row is None or not row.is_path or not isinstance(value, str) or not value:
+        return value
+    return str((folder / value).resolve())
+
+
+def _identity(nodes: Mapping[str, NodeParameters]) -> str:
+    """A run id that names the scenario's content: two runs of it give the same messages."""
+    content = {}
+    for name, table in nodes.items():
+        if isinstance(table, RecorderParameters):
+            continue
+        values = table.model_dump(exclude=_HOST_PARAMETERS)
+        for row in type(table).rows().values():
+            if row.is_path and values[row.name]:
+                path = Path(values[row.name])
+                values[row.name] = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else path.name
+        content[name] = values
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
+    """Read a scenario.
+
+    Args:
+        path: ROS 2 parameter file.
+        overrides: ``NODE.PARAM=VALUE``, or ``PARAM=VALUE`` for shared parameters, applied in order.
+
+    Raises:
+        InputError: one line for the first thing that is wrong.
+    """
+    nodes = ros_yaml.read(path)
+    for name, values in nodes.items():
+        if name != _EVERYONE:
+            kind = kind_of(name, values)
+            for key, value in values.items():
+                values[key] = _absolute(kind, key, value, path.parent)
+    for text in overrides:
+        _override(text, nodes)
+    shared = nodes.pop(_EVERYONE, {})
+    SharedParameters.read(_EVERYONE, shared)
+    if not nodes:
+        raise InputError(f"{path}: no nodes beside {_EVERYONE}")
+    tables: dict[str, NodeParameters] = {}
+    for name, values in nodes.items():
+        for key in SharedParameters.model_fields:
+            if key in values and key in shared and values[key] != shared[key]:
+                raise InputError(f"{name}.{key} = {values[key]}: {_EVERYONE} says {shared[key]}; keep one")
+        tables[name] = TABLES[kind_of(name, values)].read(name, {**shared, **values})
+    agreed = next(iter(tables.values()))
+    for name, table in tables.items():
+        for key in SharedParameters.model_fields:
+            if getattr(table, key) != getattr(agreed, key):
+                raise InputError(
+                    f"{name}.{key} = {getattr(table, key)}: other nodes have {getattr(agreed, key)}; "
+                    f"set it under {_EVERYONE}"
+                )
+    identity = agreed.run_id or _identity(tables)
+    named = {name: table.model_copy(update={"run_id": identity}) for name, table in tables.items()}
+    return Scenario(path.stem, named)

@@ -1,0 +1,12 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stages of the cell: physics and control laws with their parameters and ports."""
+
+from lathe_rc.cell.stage import Stage
+from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_rc.cell.stages.learning_controller import LearningController
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.stages.tool import Tool
+
+STAGES: dict[str, type[Stage]] = {
+    stage.kind: stage for stage in (SpindleEncoder, LearningController, ElectrodynamicActuator, Tool)
+}

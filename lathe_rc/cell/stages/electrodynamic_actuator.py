@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coarse electrodynamic tool drive."""
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from annotated_types import Ge, Gt, Le
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
+from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
+from lathe_rc.plants.linear import Discretisation
+from lathe_rc.signals.noise import Sensor
+
+
+class ElectrodynamicActuatorParameters(NodeParameters):
+    """The drive closed by its own loops, e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), its limits and its sensor."""
+
+    natural_frequency: Annotated[float, Gt(0)] = parameter(1038.0, "ωn", "rad/s")
+    damping: Annotated[float, Gt(0)] = parameter(0.804, "ζ", "1")
+    delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "τ", "s")
+    discretisation: Discretisation = parameter("foh", "foh: exact for a command linear between samples; or tustin")
+    stroke: Annotated[float, Gt(0)] = parameter(1e-3, "end stops at plus and minus this displacement", "m")
+    max_velocity: Annotated[float, Gt(0)] = parameter(1.0, "a profile that asks for more is refused", "m/s")
+    max_acceleration: Annotated[float, Gt(0)] = parameter(200.0, "a profile that asks for more is refused", "m/s^2")
+    moving_mass: Annotated[float, Gt(0)] = parameter(1.2, "carriage, coil and tool", "kg")
+    force_constant: Annotated[float, Gt(0)] = parameter(30.0, "force of the coil per current", "N/A")
+    noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
+    resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
+
+
+class ElectrodynamicActuator(Stage):
+    """See `lathe_rc.plants.electrodynamic`.
+
+    Attributes:
+        parameters: its table.
+        drive: the machine.
+    """
+
+    kind = "electrodynamic_actuator"
+    Parameters = ElectrodynamicActuatorParameters
+
+    def __init__(self, name: str, parameters: ElectrodynamicActuatorParameters) -> None:
+        super().__init__(name, parameters)
+        self.parameters = parameters
+        self.drive = ElectrodynamicDrive(
+            natural_frequency=parameters.natural_frequency,
+            damping=parameters.damping,
+            delay=parameters.delay,
+            stroke=parameters.stroke,
+            moving_mass=parameters.moving_mass,
+            force_constant=parameters.force_constant,
+            step=parameters.step,
+            method=parameters.discretisation,
+        )
+        self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
+        self.declare(
+            inputs=[Input("coarse/command", messages.COMMAND, ("position",))],
+            outputs=[Output("coarse/state", messages.STATE, Joint("position", "velocity", "effort"))],
+        )
+
+    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+        """See `Stage`."""
+        (command,), (state,) = inputs, outputs
+        self.drive.block(first, command["position"], state["position"], state["velocity"], state["effort"])
+        self._sensor.measure(state["position"], state["measured_position"])
+        return []

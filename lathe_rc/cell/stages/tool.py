@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tool against the part: desired form, displacement, form error."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
+from lathe_rc.errors import InputError
+from lathe_rc.plants.tool import form
+from lathe_rc.signals.profile import Harmonics, Piston, Polygon, Profile, ProfileTable, read_csv
+
+
+class ToolParameters(NodeParameters):
+    """The desired form of the part and the feed along it."""
+
+    profile: Literal["harmonics", "piston", "polygon", "csv"] = parameter("harmonics", "kind of profile")
+    profile_file: str = parameter("", "csv: file with angle_deg, (height_mm,) radius_um", path=True)
+    harmonic_order: list[Annotated[int, Ge(0), Le(2000)]] = parameter(
+        [], "harmonics: waves per revolution; none at all: an oval of 225 µm (paper 000, Fig. 6)"
+    )
+    harmonic_amplitude: list[float] = parameter([], "harmonics: amplitudes", "m")
+    harmonic_phase: list[float] = parameter([], "harmonics: phases at angle 0; empty: all 0", "rad")
+    piston_ovality: Annotated[float, Ge(0)] = parameter(
+        0.5e-3, "piston: difference of the diameters at the ends of the skirt", "m"
+    )
+    piston_ovality_middle: Annotated[float, Ge(0)] = parameter(0.4e-3, "piston: the same at the widest place", "m")
+    piston_barrel: Annotated[float, Ge(0)] = parameter(30e-6, "piston: radius lost towards the ends", "m")
+    piston_length: Annotated[float, Gt(0)] = parameter(0.06, "piston: length of the skirt", "m")
+    piston_widest: Annotated[float, Ge(0)] = parameter(0.02, "piston: widest place from the start", "m")
+    polygon_sides: Annotated[int, Ge(3), Le(64)] = parameter(3, "polygon: number of sides")
+    polygon_inscribed_radius: Annotated[float, Gt(0)] = parameter(1e-3, "polygon: radius of the inscribed circle", "m")
+    polygon_corner_radius: Annotated[float, Gt(0)] = parameter(0.8e-3, "polygon: radius of the corners", "m")
+    feed: Annotated[float, Ge(0)] = parameter(0.0, "advance along the part", "m/rev")
+    start_height: Annotated[float, Ge(0)] = parameter(0.0, "where along the part the run begins", "m")
+
+    def form(self) -> Profile:
+        """The profile.
+
+        Raises:
+            InputError: lists of different lengths, sizes that do not fit, or a file that cannot be used.
+        """
+        if self.profile == "csv":
+            if not self.profile_file:
+                raise InputError("tool.profile_file is empty; name the CSV file of the profile")
+            return read_csv(Path(self.profile_file))
+        if self.profile == "piston":
+            return Piston(
+                self.piston_ovality,
+                self.piston_ovality_middle,
+                self.piston_barrel,
+                self.piston_length,
+                self.piston_widest,
+            )
+        if self.profile == "polygon":
+            return Polygon(self.polygon_sides, self.polygon_inscribed_radius, self.polygon_corner_radius)
+        order, amplitude = self.harmonic_order, self.harmonic_amplitude
+        if not order and not amplitude:
+            order, amplitude = [2], [225e-6]
+        phase = self.harmonic_phase or [0.0] * len(order)
+        return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
+
+
+class Tool(Stage):
+    """Sums the drives and compares with the desired form.
+
+    Attributes:
+        parameters: its table.
+        profile: the form as it is run.
+    """
+
+    kind = "tool"
+    Parameters = ToolParameters
+
+    def __init__(self, name: str, parameters: ToolParameters) -> None:
+        super().__init__(name, parameters)
+        self.parameters = parameters
+        self.profile = ProfileTable(parameters.form())
+        self.declare(
+            inputs=[
+                Input("encoder", messages.ENCODER, ("angle", "angle_true")),
+                Input("coarse/state", messages.STATE, ("position", "measured_position")),
+            ],
+            outputs=[Output("tool", messages.TOOL, Joint("displacement"))],
+        )
+
+    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+        """See `Stage`."""
+        (encoder, drive), (tool,) = inputs, outputs
+        form(
+            self.profile.heights,
+            self.profile.table,
+            self.parameters.feed,
+            self.parameters.start_height,
+            encoder["angle"],
+            encoder["angle_true"],
+            drive["position"],
+            drive["measured_position"],
+            tool["reference"],
+            tool["displacement"],
+            tool["error"],
+            tool["measured_error"],
+            tool["height"],
+        )
+        return []

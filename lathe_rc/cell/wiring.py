@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The wired cell: stages in the order in which they compute, topics by name, and the checks before a start."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
+
+from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.scenario import kind_of
+from lathe_rc.cell.stage import Input, Stage
+from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_rc.cell.stages.learning_controller import LearningController
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.stages.tool import Tool
+from lathe_rc.errors import InputError
+
+
+def remapped(table: NodeParameters, topic: str) -> str:
+    """The relative name of a topic after the node's ``remap`` rules.
+
+    Raises:
+        InputError: a rule is not of the form old:=new.
+    """
+    for rule in table.remap:
+        old, arrow, new = rule.partition(":=")
+        if not arrow or not old or not new:
+            raise InputError(f"remap = {rule!r}; allowed: old:=new")
+        if old == topic:
+            return new
+    return topic
+
+
+@dataclass(frozen=True)
+class Source:
+    """Who publishes a topic."""
+
+    node: str
+    type: str
+
+
+class Cell:
+    """All stages of a scenario, wired.
+
+    Args:
+        nodes: table of each node by name; nodes that are no stages are left out.
+
+    Attributes:
+        stages: by node name, in the order of the forward edges.
+        dense: publisher of each topic that carries a block a block, by relative topic.
+        sparse: the same for topics that carry messages at chosen samples.
+
+    Raises:
+        InputError: a topic without or with two publishers, types that do not match, a loop without a delay.
+    """
+
+    def __init__(self, nodes: Mapping[str, NodeParameters]) -> None:
+        made: dict[str, Stage] = {}
+        for name, table in nodes.items():
+            kind = kind_of(name, {"stage": table.stage})
+            if kind in STAGES:
+                made[name] = STAGES[kind](name, table)
+        self.dense: dict[str, Source] = {}
+        self.sparse: dict[str, Source] = {}
+        for name, stage in made.items():
+            for output in stage.outputs:
+                self._add(self.dense, remapped(stage.shared, output.topic), Source(name, output.type))
+            for topic, msgtype in stage.sparse_topics.items():
+                self._add(self.sparse, remapped(stage.shared, topic), Source(name, msgtype))
+        order: TopologicalSorter[str] = TopologicalSorter({name: () for name in made})
+        for name, stage in made.items():
+            for port in stage.inputs:
+                source = self._source(stage, port)
+                if port.delay == 0:
+                    order.add(name, source.node)
+        try:
+            self.stages = {name: made[name] for name in order.static_order()}
+        except CycleError as error:
+            raise InputError(
+                f"{' -> '.join(error.args[1])}: a loop without a feedback delay cannot start"
+            ) from None
+
+    def _add(self, topics: dict[str, Source], topic: str, source: Source) -> None:
+        other = self.dense.get(topic) or self.sparse.get(topic)
+        if other:
+            raise InputError(f"{topic} is published by {other.node} and {source.node}; remap one of them")
+        topics[topic] = source
+
+    def _source(self, stage: Stage, port: Input) -> Source:
+        topic = remapped(stage.shared, port.topic)
+        source = self.dense.get(topic)
+        if source is None:
+            raise InputError(f"{stage.name} reads {topic}, which no node of the scenario publishes")
+        if source.type != port.type:
+            raise InputError(f"{stage.name} reads {topic} as {port.type}, but {source.node} publishes {source.type}")
+        return source
+
+    @property
+    def master(self) -> SpindleEncoder:
+        """The time master.
+
+        Raises:
+            InputError: there is none, or more than one.
+        """
+        found = [stage for stage in self.stages.values() if isinstance(stage, SpindleEncoder)]
+        if len(found) != 1:
+            raise InputError(f"{len(found)} spindle_encoder nodes in the scenario; allowed: 1")
+        return found[0]
+
+    def readers(self, topic: str) -> list[Stage]:
+        """Stages that read a relative topic."""
+        return [
+            stage
+            for stage in self.stages.values()
+            if any(remapped(stage.shared, port.topic) == topic for port in stage.inputs)
+        ]
+
+    def longest_delay(self, topic: str) -> int:
+        """Longest feedback delay [sample] at which a topic is read."""
+        return max(
+            (
+                port.delay
+                for stage in self.stages.values()
+                for port in stage.inputs
+                if remapped(stage.shared, port.topic) == topic
+            ),
+            default=0,
+        )
+
+    @property
+    def shortest_feedback(self) -> int | None:
+        """Shortest feedback delay in the cell [sample]; None without feedback."""
+        delays = [port.delay for stage in self.stages.values() for port in stage.inputs if port.delay]
+        return min(delays, default=None)
+
+    def check(self) -> None:
+        """Refuse what cannot work, with the figures, before anything moves.
+
+        Raises:
+            InputError: a block longer than a feedback delay, a profile that a drive cannot follow, a memory that
+                would be read before it is learned, a learning loop that does not converge.
+        """
+        low, high = self.master.speed_range()
+        if low <= 0.0:
+            raise InputError(f"{self.master.name}: speed falls to {low:.4g} rad/s; allowed: above 0")
+        drives = [stage for stage in self.stages.values() if isinstance(stage, ElectrodynamicActuator)]
+        for stage in self.stages.values():
+            for port in stage.inputs:
+                if 0 < port.delay < stage.shared.block_size:
+                    raise InputError(
+                        f"{stage.name}: feedback of {port.topic} is delayed by {port.delay} samples, block_size = "
+                        f"{stage.shared.block_size}; allowed: a block no longer than the delay"
+                    )
+            if isinstance(stage, Tool):
+                for drive in drives:
+                    self._check_profile(stage, drive, high)
+            if isinstance(stage, LearningController):
+                _check_delay(stage, high)
+                for output in stage.outputs:
+                    for reader in self.readers(remapped(stage.shared, output.topic)):
+                        if isinstance(reader, ElectrodynamicActuator):
+                            _check_convergence(stage, reader, low, high)
+
+    def _check_profile(self, tool: Tool, drive: ElectrodynamicActuator, speed: float) -> None:
+        acceleration = self.master.law.largest_acceleration()
+        demand = tool.profile.demand(speed, acceleration, tool.parameters.feed)
+        limits = drive.parameters
+        for what, asked, allowed, unit in (
+            ("stroke", demand.stroke * 1e6, limits.stroke * 1e6, "µm"),
+            ("velocity", demand.velocity, limits.max_velocity, "m/s"),
+            ("acceleration", demand.acceleration, limits.max_acceleration, "m/s^2"),
+        ):
+            if asked > allowed:
+                raise InputError(
+                    f"{tool.name}.profile: {drive.name} cannot follow it at {speed:.4g} rad/s: {what} "
+                    f"{asked:.4g} {unit}; allowed: {allowed:.4g} {unit} (turn slower or change the form)"
+                )
+
+
+def _check_delay(stage: LearningController, speed: float) -> None:
+    largest = stage.largest_delay(speed)
+    delay = stage.parameters.feedback_delay
+    if delay > largest:
+        raise InputError(
+            f"{stage.name}.feedback_delay = {delay} samples: at {speed:.4g} rad/s the cycle leaves {largest}; "
+            f"allowed: {stage.shared.block_size} up to {largest}"
+        )
+
+
+def _check_convergence(stage: LearningController, drive: ElectrodynamicActuator, low: float, high: float) -> None:
+    loop = stage.loop(drive.drive.plant.response)
+    supremum, speed = max((loop.supremum(s), s) for s in (low, (low + high) / 2, high))
+    if supremum >= 1.0 and not stage.parameters.allow_unstable:
+        parameters = stage.parameters
+        raise InputError(
+            f"{stage.name}: learning diverges: sup|Q - Z| = {supremum:.4g} at {speed:.4g} rad/s with lead_time = "
+            f"{parameters.lead_time * 1e3:.4g} ms, q_time = {parameters.q_time * 1e6:.4g} µs; allowed: below 1 "
+            "(widen Q, change the lead, or set allow_unstable)"
+        )

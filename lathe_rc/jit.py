@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compilation of inner loops: one decorator, one place for its settings, one cache."""
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import ParamSpec, TypeVar, cast
+
+import numba
+import platformdirs
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_PACKAGE = Path(__file__).parent
+_KERNEL_FOLDERS = ("signals", "plants", "control")
+
+
+def _source_hash() -> str:
+    """Hash of every file that may hold a kernel."""
+    digest = hashlib.sha256(Path(__file__).read_bytes())
+    for folder in _KERNEL_FOLDERS:
+        for path in sorted((_PACKAGE / folder).glob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+if "NUMBA_CACHE_DIR" not in os.environ:
+    # Numba looks for changes in the file of a kernel, not in those of the kernels that it calls: a cache
+    # shared between versions of the source would go on using old arithmetic. So each version has its own.
+    numba.config.CACHE_DIR = str(platformdirs.user_cache_path("lathe_rc") / _source_hash())
+
+
+def kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a function of scalars and arrays; compiled code is kept between runs.
+
+    Neither reassociation nor contraction is allowed (``fastmath`` off), so the same arithmetic gives the
+    same bits whatever the length of the block. Division by zero gives inf or NaN as in NumPy.
+    """
+    compiled = numba.njit(cache=True, error_model="numpy")(function)
+    return cast("Callable[P, R]", compiled)

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Linear drives behind a delay, discretised so that nothing of the delay is rounded away."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import expm
+from scipy.signal import ss2tf
+
+Array = npt.NDArray[np.float64]
+Discretisation = Literal["foh", "tustin"]
+
+
+@dataclass(frozen=True)
+class DiscretePlant:
+    """x[n] = Φ·x[n-1] + w0·u[n-k] + w1·u[n-k-1] + w2·u[n-k-2], with the position as first state.
+
+    Attributes:
+        transition: Φ, shape (m, m).
+        weights: columns w0, w1, w2, shape (m, 3).
+        delay: whole samples k of the delay.
+        fraction: the rest of the delay in samples, 0 up to 1; the weights contain it.
+        step: sampling step [s].
+    """
+
+    transition: Array
+    weights: Array
+    delay: int
+    fraction: float
+    step: float
+
+    def response(self, frequency: npt.ArrayLike) -> npt.NDArray[np.complex128]:
+        """Response of the position to the command at ``frequency`` [rad/s], of the difference equation itself."""
+        z = np.exp(1j * np.asarray(frequency, dtype=np.float64) * self.step)
+        order = self.transition.shape[0]
+        # x[n] = Φ·x[n-1] + w·u[n] is z·(z·I - Φ)⁻¹·w; ss2tf gives the rational function after the z.
+        terms = []
+        for lag in range(3):
+            top, bottom = ss2tf(self.transition, self.weights[:, lag : lag + 1], np.eye(1, order), np.zeros((1, 1)))
+            terms.append(np.polyval(top[0], z) / np.polyval(bottom, z) * z ** (1.0 - lag - self.delay))
+        return np.asarray(sum(terms))
+
+
+def _foh(a: Array, b: Array, step: float) -> tuple[Array, Array, Array]:
+    """Φ and the weights of the input at the start and at the end of a step, exact for an input linear in it."""
+    order = a.shape[0]
+    block = np.zeros((order + 2, order + 2))
+    block[:order, :order], block[:order, order], block[order, order + 1] = a, b, 1.0 / step if step else 0.0
+    whole = expm(block * step)
+    end = whole[:order, order + 1]
+    return whole[:order, :order], whole[:order, order] - end, end
+
+
+def discretise(a: Array, b: Array, delay: float, step: float, method: Discretisation) -> DiscretePlant:
+    """Discretise x' = a·x + b·u(t - delay).
+
+    Args:
+        a: shape (m, m) [1/s].
+        b: shape (m,) [1/s].
+        delay: [s]; need not be a whole number of steps.
+        step: sampling step [s].
+        method: ``foh`` is exact for a command that is linear between its samples, also within the fraction of
+            a step that the delay leaves; ``tustin`` is the bilinear rule with that fraction interpolated.
+    """
+    samples = delay / step
+    whole = math.floor(samples + 1e-9)
+    part = max(samples - whole, 0.0)
+    weights = np.zeros((a.shape[0], 3))
+    if method == "foh":
+        # The delayed input has its kink `part` of a step after each sample: integrate up to it, then on.
+        first, start_1, end_1 = _foh(a, b, part * step)
+        second, start_2, end_2 = _foh(a, b, (1.0 - part) * step)
+        transition = second @ first
+        weights[:, 0] = (1.0 - part) * end_2
+        weights[:, 1] = second @ ((1.0 - part) * start_1 + end_1) + start_2 + part * end_2
+        weights[:, 2] = second @ (part * start_1)
+    else:
+        left = np.linalg.inv(np.eye(a.shape[0]) - a * step / 2.0)
+        transition = left @ (np.eye(a.shape[0]) + a * step / 2.0)
+        gain = left @ b * (step / 2.0)
+        weights[:] = np.outer(gain, [1.0 - part, 1.0, part])
+    return DiscretePlant(transition, weights, whole, part, step)
+
+
+def second_order(natural_frequency: float, damping: float) -> tuple[Array, Array]:
+    """Matrices a, b of 1/(1 + 2ζp/ωn + p²/ωn²) with states position and velocity; ``natural_frequency`` in rad/s."""
+    square = natural_frequency**2
+    return np.array([[0.0, 1.0], [-square, -2.0 * damping * natural_frequency]]), np.array([0.0, square])

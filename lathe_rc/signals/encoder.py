@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Spindle encoder: true and measured angle, measured speed, index pulse."""
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.jit import kernel
+from lathe_rc.signals.speed import SpeedLaw, evaluate
+
+Array = npt.NDArray[np.float64]
+
+_TURN = 2.0 * np.pi
+
+
+@kernel
+def _encode(
+    first: int,
+    step: float,
+    nominal: float,
+    lines: Array,
+    tachogram: Array,
+    counts: int,
+    history: Array,
+    angle: Array,
+    speed: Array,
+    index_pulse: npt.NDArray[np.uint8],
+    angle_true: Array,
+    speed_true: Array,
+) -> None:
+    window = history.size
+    for k in range(angle.size):
+        n = first + k
+        true, rate, _ = evaluate(n * step, nominal, lines, tachogram)
+        angle_true[k], speed_true[k] = true, rate
+        before = history[(n - 1) % window]
+        if counts == 0:
+            angle[k], speed[k] = true, rate
+        else:
+            angle[k] = np.floor(true * counts / _TURN) * _TURN / counts
+            # The oldest angle of the ring stands where the new one goes.
+            speed[k] = (angle[k] - history[n % window]) / (window * step)
+        index_pulse[k] = np.floor(angle[k] / _TURN) > np.floor(before / _TURN)
+        history[n % window] = angle[k]
+
+
+class Encoder:
+    """An incremental encoder on a spindle that follows a speed law.
+
+    Args:
+        law: spindle speed law.
+        step: sampling step [s].
+        counts: counts per revolution after quadrature; 0 for an ideal encoder, whose angle and speed are true.
+        speed_window: samples over which the measured speed is a difference of the measured angle; it lags
+            by half of them. Before sample 0 the spindle is taken to have turned at its nominal speed.
+    """
+
+    def __init__(self, law: SpeedLaw, step: float, counts: int, speed_window: int) -> None:
+        self._law, self._step, self._counts = law, step, counts
+        before = np.arange(speed_window) - speed_window
+        # history[n % window] holds the angle of sample n; these are the samples before the first.
+        self._history = before * law.nominal * step
+
+    def block(
+        self,
+        first: int,
+        angle: Array,
+        speed: Array,
+        index_pulse: npt.NDArray[np.uint8],
+        angle_true: Array,
+        speed_true: Array,
+    ) -> None:
+        """Fill the samples from index ``first`` on; arrays of shape (n,) [rad, rad/s, 1, rad, rad/s]."""
+        law = self._law
+        _encode(
+            first, self._step, law.nominal, law.lines, law.tachogram, self._counts, self._history,
+            angle, speed, index_pulse, angle_true, speed_true,
+        )  # fmt: skip

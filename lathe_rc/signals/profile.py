@@ -1,0 +1,311 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Part profiles: radius deviation against spindle angle and position along the part.
+
+A profile is a formula; what the cell runs is its table, a periodic cubic spline in the angle with linear
+interpolation along the part, which also gives the derivatives for the feasibility check.
+"""
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+
+Array = npt.NDArray[np.float64]
+
+_TURN = 2.0 * np.pi
+
+
+class Profile(Protocol):
+    """A desired form."""
+
+    @property
+    def heights(self) -> Array:
+        """Positions along the part [m], increasing, between which linear interpolation is good; shape (m,)."""
+
+    def deviation(self, angle: Array, height: float) -> Array:
+        """Radius deviation [m] at ``angle`` [rad] (shape (n,)) and ``height`` [m]; 2π-periodic."""
+
+
+@dataclass(frozen=True)
+class Harmonics:
+    """Sum of harmonics, Σ A_i·sin(i·φ + φ_i) (paper 000, eq. 5)."""
+
+    order: Array
+    amplitude: Array
+    phase: Array
+
+    def __post_init__(self) -> None:
+        if not self.order.size == self.amplitude.size == self.phase.size:
+            raise InputError(
+                f"harmonic profile: {self.order.size} orders, {self.amplitude.size} amplitudes and "
+                f"{self.phase.size} phases; give as many of each"
+            )
+
+    @property
+    def heights(self) -> Array:
+        """One height: the form is the same all along the part."""
+        return np.zeros(1)
+
+    def deviation(self, angle: Array, height: float) -> Array:
+        """See `Profile`."""
+        waves = self.amplitude[:, None] * np.sin(np.outer(self.order, angle) + self.phase[:, None])
+        return np.asarray(waves.sum(axis=0))
+
+
+@dataclass(frozen=True)
+class Piston:
+    """Oval-barrel piston skirt.
+
+    Args:
+        ovality: difference of the two diameters at the ends of the skirt [m].
+        ovality_middle: the same at the widest place [m].
+        barrel: radius lost at the ends of the skirt against the widest place [m].
+        length: length of the skirt [m].
+        widest: widest place from the start of the skirt [m].
+    """
+
+    ovality: float
+    ovality_middle: float
+    barrel: float
+    length: float
+    widest: float
+
+    @property
+    def heights(self) -> Array:
+        """65 places along the skirt: linear interpolation between them errs by at most 1e-4 of the barrel."""
+        return np.linspace(0.0, self.length, 65)
+
+    def deviation(self, angle: Array, height: float) -> Array:
+        """-barrel·z² - (ovality(z)/4)·(1 - cos 2φ), z = 0 at the widest place and 1 at the farther end."""
+        z = (height - self.widest) / max(self.widest, self.length - self.widest)
+        ovality = self.ovality_middle + (self.ovality - self.ovality_middle) * z * z
+        return np.asarray(-self.barrel * z * z - ovality / 4.0 * (1.0 - np.cos(2.0 * angle)))
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """Regular polygon with rounded corners, as the deviation from the middle between its circles.
+
+    Args:
+        sides: number of sides, 3 or more.
+        inscribed_radius: radius of the inscribed circle [m].
+        corner_radius: radius of the corners [m], above 0 and at most the inscribed radius.
+    """
+
+    sides: int
+    inscribed_radius: float
+    corner_radius: float
+
+    def __post_init__(self) -> None:
+        if self.sides < 3:
+            raise InputError(f"polygon: {self.sides} sides; allowed: 3 or more")
+        if not 0.0 < self.corner_radius <= self.inscribed_radius:
+            raise InputError(
+                f"polygon: corner radius {self.corner_radius:g} m; allowed: above 0 and at most the inscribed "
+                f"radius {self.inscribed_radius:g} m"
+            )
+
+    @property
+    def heights(self) -> Array:
+        """One height: a prism."""
+        return np.zeros(1)
+
+    def deviation(self, angle: Array, height: float) -> Array:
+        """Distance of the outline from the axis less the mean of its extremes; a side faces angle 0."""
+        half = math.pi / self.sides
+        from_side = np.abs(np.mod(angle + half, 2 * half) - half)
+        # The corner's circle touches the side where the normal through its centre meets it.
+        centre = (self.inscribed_radius - self.corner_radius) / math.cos(half)
+        touch = math.atan2((self.inscribed_radius - self.corner_radius) * math.tan(half), self.inscribed_radius)
+        from_corner = half - from_side
+        across = np.sqrt(np.maximum(self.corner_radius**2 - (centre * np.sin(from_corner)) ** 2, 0.0))
+        corner = centre * np.cos(from_corner) + across
+        side = self.inscribed_radius / np.cos(np.minimum(from_side, touch))
+        radius = np.where(from_side <= touch, side, corner)
+        return np.asarray(radius - (self.inscribed_radius + centre + self.corner_radius) / 2.0)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A profile from points: a periodic cubic spline through each row, linear between rows.
+
+    Args:
+        angle: increasing angles [rad] in [0, 2π), shape (n,).
+        heights: increasing positions [m], shape (m,).
+        radius: deviations [m], shape (m, n).
+    """
+
+    angle: Array
+    heights: Array
+    radius: Array
+
+    def deviation(self, angle: Array, height: float) -> Array:
+        """See `Profile`."""
+        rows = [np.interp(height, self.heights, column) for column in self.radius.T]
+        closed = np.append(rows, rows[0])
+        spline = CubicSpline(np.append(self.angle, self.angle[0] + _TURN), closed, bc_type="periodic")
+        return np.asarray(spline(self.angle[0] + np.mod(angle - self.angle[0], _TURN)))
+
+
+_MAX_FILE = 64 * 2**20
+_COLUMNS = {"angle_deg": 1, "height_mm": 2, "radius_um": 3}
+
+
+def _numbers(row: list[str], path: Path, line: int) -> list[float]:
+    numbers = []
+    for text in row:
+        try:
+            number = float(text)
+        except ValueError:
+            raise InputError(f"{path}:{line}: {text.strip()!r} is not a number") from None
+        if not math.isfinite(number):
+            raise InputError(f"{path}:{line}: {text.strip()!r}; allowed: finite numbers")
+        numbers.append(number)
+    return numbers
+
+
+def _table(path: Path) -> tuple[list[str], Array]:
+    """Header and rows of a CSV file of numbers; lines that start with # are comments."""
+    try:
+        if path.stat().st_size > _MAX_FILE:
+            raise InputError(f"{path}: larger than {_MAX_FILE // 2**20} MiB; thin the points out")
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the profile's path") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; allowed: CSV in UTF-8") from None
+    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and line.lstrip()[0] != "#"]
+    try:
+        rows = list(csv.reader(line for _, line in lines))
+    except csv.Error as error:
+        raise InputError(f"{path}: not a CSV file ({error})") from None
+    header = [name.strip() for name in rows[0]] if rows else []
+    if header not in (["angle_deg", "radius_um"], ["angle_deg", "height_mm", "radius_um"]):
+        raise InputError(
+            f"{path}: header {','.join(header)!r}; allowed: angle_deg,radius_um or angle_deg,height_mm,radius_um"
+        )
+    numbers = []
+    for (n, _), row in zip(lines[1:], rows[1:], strict=True):
+        if len(row) != len(header):
+            raise InputError(f"{path}:{n}: {len(row)} values; allowed: {len(header)}, as in the header")
+        numbers.append(_numbers(row, path, n))
+    if not numbers:
+        raise InputError(f"{path}: no points; give at least three angles")
+    return header, np.array(numbers)
+
+
+def read_csv(path: Path) -> Measured:
+    """Read a profile from a CSV file.
+
+    Columns ``angle_deg`` [°], optionally ``height_mm`` [mm], ``radius_um`` (radius deviation) [µm], in any
+    order of rows. Every height must have the same angles.
+
+    Raises:
+        InputError: the file is missing, malformed, holds a number that is not finite, or repeats an angle.
+    """
+    header, rows = _table(path)
+    if len(header) == 2:
+        rows = np.insert(rows, 1, 0.0, axis=1)
+    angle_deg, heights_mm = np.unique(rows[:, 0]), np.unique(rows[:, 1])
+    if angle_deg[0] < 0.0 or angle_deg[-1] >= 360.0:
+        wrong = angle_deg[0] if angle_deg[0] < 0.0 else angle_deg[-1]
+        raise InputError(f"{path}: angle {wrong:g}°; allowed: 0 up to but not including 360")
+    if angle_deg.size < 3:
+        raise InputError(f"{path}: {angle_deg.size} different angles; allowed: 3 or more")
+    radius = np.full((heights_mm.size, angle_deg.size), np.nan)
+    at = np.searchsorted(heights_mm, rows[:, 1]), np.searchsorted(angle_deg, rows[:, 0])
+    cells, counts = np.unique(np.stack(at), axis=1, return_counts=True)
+    if np.any(counts > 1):
+        height, angle = cells[:, np.argmax(counts > 1)]
+        raise InputError(
+            f"{path}: angle {angle_deg[angle]:g}° at height {heights_mm[height]:g} mm appears more than once; "
+            "keep one"
+        )
+    radius[at] = rows[:, 2] * 1e-6
+    if np.any(np.isnan(radius)):
+        height, angle = np.argwhere(np.isnan(radius))[0]
+        raise InputError(
+            f"{path}: no point at angle {angle_deg[angle]:g}°, height {heights_mm[height]:g} mm; "
+            "every height needs the same angles"
+        )
+    return Measured(np.deg2rad(angle_deg), heights_mm * 1e-3, radius)
+
+
+@kernel
+def evaluate(angle: float, height: float, heights: Array, table: Array) -> float:
+    """Radius deviation [m] from a profile's table, shape (m, n, 4): cubic in the angle, linear in the height."""
+    points = table.shape[1]
+    place = angle * (points / _TURN)
+    whole = np.floor(place)
+    u = place - whole
+    j = int(whole) % points
+    rows = heights.size
+    i = 0
+    v = 0.0
+    if rows > 1 and height > heights[0]:
+        if height >= heights[rows - 1]:
+            i = rows - 1
+        else:
+            i = np.searchsorted(heights, height, side="right") - 1
+            v = (height - heights[i]) / (heights[i + 1] - heights[i])
+    value = ((table[i, j, 0] * u + table[i, j, 1]) * u + table[i, j, 2]) * u + table[i, j, 3]
+    if v > 0.0:
+        above = table[i + 1, j]
+        value += v * (((above[0] * u + above[1]) * u + above[2]) * u + above[3] - value)
+    return value
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What a profile asks of a drive at its worst place."""
+
+    stroke: float  #: largest displacement from the middle [m]
+    velocity: float  #: [m/s]
+    acceleration: float  #: [m/s²]
+
+
+class ProfileTable:
+    """A profile as the cell runs it.
+
+    Args:
+        profile: the form.
+        points: intervals of the periodic cubic spline per revolution.
+
+    Attributes:
+        heights: [m], shape (m,).
+        table: polynomial coefficients of each interval, highest power first, shape (m, points, 4).
+    """
+
+    def __init__(self, profile: Profile, points: int = 4096) -> None:
+        angle = np.linspace(0.0, _TURN, points + 1)
+        self.heights = np.ascontiguousarray(profile.heights)
+        self.table = np.empty((self.heights.size, points, 4))
+        for row, height in zip(self.table, self.heights, strict=True):
+            values = profile.deviation(angle, float(height))
+            values[-1] = values[0]
+            spline = CubicSpline(np.arange(points + 1.0), values, bc_type="periodic")
+            row[:] = spline.c.T
+
+    def demand(self, speed: float, acceleration: float, feed: float) -> Demand:
+        """What the profile asks at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], ``feed`` in m/rev."""
+        per_radian = self.table.shape[1] / _TURN
+        value, slope = self.table[..., 3], self.table[..., 2] * per_radian
+        curvature = 2.0 * self.table[..., 1] * per_radian**2
+        along = np.zeros_like(value)
+        if self.heights.size > 1:
+            steepest = np.abs(np.diff(value, axis=0) / np.diff(self.heights)[:, None])
+            along[:-1] = steepest
+            along[1:] = np.maximum(along[1:], steepest)
+        return Demand(
+            stroke=float(np.abs(value).max()),
+            velocity=float(speed * (np.abs(slope) + along * feed / _TURN).max()),
+            acceleration=float((speed**2 * np.abs(curvature) + acceleration * np.abs(slope)).max()),
+        )

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Spindle speed laws.
+
+Every law is a closed form of time, so angle, speed and acceleration at sample n do not depend on the
+samples before it:
+
+    Ω(t) = Ω0·(1 + Σ a_i·sin(ω_i·(t − t_i) + ψ_i) + d(t)),   lines i only from t_i on,
+
+where d(t) is a piecewise-linear tachogram. A band-limited random deviation is a sum of such lines with
+seeded phases. Source: paper 000, eq. (11) and the deviation of its Fig. 6.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+
+Array = npt.NDArray[np.float64]
+
+_PACKED_LINES = 4  # rows of SpeedLaw.lines: amplitude [1], frequency [rad/s], phase [rad], start [s]
+
+
+@kernel
+def evaluate(t: float, nominal: float, lines: Array, tachogram: Array) -> tuple[float, float, float]:
+    """Angle [rad], speed [rad/s] and acceleration [rad/s²] at time ``t`` [s].
+
+    ``lines`` is (4, n): relative amplitude, frequency, phase, start. ``tachogram`` is (3, m): time,
+    relative deviation, its integral up to that time.
+    """
+    angle, speed, acceleration = t, 1.0, 0.0
+    for i in range(lines.shape[1]):
+        since = t - lines[3, i]
+        if since >= 0.0:
+            a, w, phase = lines[0, i], lines[1, i], lines[2, i]
+            sine, cosine = np.sin(w * since + phase), np.cos(w * since + phase)
+            angle += a / w * (np.cos(phase) - cosine)
+            speed += a * sine
+            acceleration += a * w * cosine
+    last = tachogram.shape[1] - 1
+    if last >= 0:
+        if t <= tachogram[0, 0]:
+            angle += tachogram[1, 0] * t
+            speed += tachogram[1, 0]
+        elif t >= tachogram[0, last]:
+            angle += tachogram[2, last] + tachogram[1, last] * (t - tachogram[0, last])
+            speed += tachogram[1, last]
+        else:
+            i = np.searchsorted(tachogram[0], t, side="right") - 1
+            since = t - tachogram[0, i]
+            slope = (tachogram[1, i + 1] - tachogram[1, i]) / (tachogram[0, i + 1] - tachogram[0, i])
+            angle += tachogram[2, i] + (tachogram[1, i] + 0.5 * slope * since) * since
+            speed += tachogram[1, i] + slope * since
+            acceleration += slope
+    return nominal * angle, nominal * speed, nominal * acceleration
+
+
+@kernel
+def _evaluate_many(t: Array, nominal: float, lines: Array, tachogram: Array) -> Array:
+    out = np.empty((3, t.size))
+    for n in range(t.size):
+        out[0, n], out[1, n], out[2, n] = evaluate(t[n], nominal, lines, tachogram)
+    return out
+
+
+@dataclass(frozen=True)
+class SpeedLaw:
+    """A spindle speed law.
+
+    Args:
+        nominal: nominal speed Ω0 [rad/s].
+        lines: (4, n) rows relative amplitude [1], frequency [rad/s], phase [rad], start [s].
+        tachogram: (3, m) rows time [s], relative deviation [1], its integral from time 0 [s].
+    """
+
+    nominal: float
+    lines: Array = field(default_factory=lambda: np.empty((_PACKED_LINES, 0)))
+    tachogram: Array = field(default_factory=lambda: np.empty((3, 0)))
+
+    def __add__(self, other: "SpeedLaw") -> "SpeedLaw":
+        """Sum of the deviations of two laws with the same nominal speed; at most one has a tachogram."""
+        if self.nominal != other.nominal:
+            raise InputError(f"speed laws of {self.nominal} and {other.nominal} rad/s cannot be added")
+        if self.tachogram.size and other.tachogram.size:
+            raise InputError("two tachograms cannot be added: merge their breakpoints into one")
+        lines = np.concatenate((self.lines, other.lines), axis=1)
+        return SpeedLaw(self.nominal, lines, self.tachogram if self.tachogram.size else other.tachogram)
+
+    def at(self, t: npt.ArrayLike) -> Array:
+        """Rows angle [rad], speed [rad/s], acceleration [rad/s²] at the times ``t`` [s], shape (3, n)."""
+        times = np.atleast_1d(np.asarray(t, dtype=np.float64))
+        return _evaluate_many(times, self.nominal, self.lines, self.tachogram)
+
+    def speed_range(self, duration: float = np.inf) -> tuple[float, float]:
+        """Lowest and highest speed [rad/s] within ``duration`` [s]; for an endless run a safe bound."""
+        lines, tachogram = self.lines, self.tachogram
+        amplitude = float(np.abs(lines[0]).sum())
+        below, above = (tachogram[1].min(), tachogram[1].max()) if tachogram.size else (0.0, 0.0)
+        bound = self.nominal * (1 + below - amplitude), self.nominal * (1 + above + amplitude)
+        fastest = float(lines[1].max(initial=0.0))
+        points = duration * fastest * 8  # about 50 points a period of the fastest line
+        if not lines.size or not points < 1e7:
+            return bound
+        times = np.linspace(0.0, duration, int(points) + 2)
+        speed = self.at(np.union1d(times, tachogram[0][tachogram[0] < duration]))[1]
+        # Between two points a sum of lines leaves their chord by at most h²/8 of its second derivative.
+        sag = self.nominal * float(np.abs(lines[0] * lines[1] ** 2).sum()) * (times[1] - times[0]) ** 2 / 8
+        return max(bound[0], speed.min() - sag), min(bound[1], speed.max() + sag)
+
+    def largest_acceleration(self) -> float:
+        """Upper bound of \\|dΩ/dt\\| [rad/s²]."""
+        bound = float(np.abs(self.lines[0] * self.lines[1]).sum())
+        if self.tachogram.shape[1] > 1:
+            bound += float(np.abs(np.diff(self.tachogram[1]) / np.diff(self.tachogram[0])).max())
+        return self.nominal * bound
+
+    def samples_until(self, angle: float, step: float) -> int:
+        """First sample index at which the true angle has reached ``angle`` [rad]; ``step`` in s.
+
+        Raises:
+            InputError: the spindle may stand still or turn back, so the angle may never be reached.
+        """
+        lowest = self.speed_range()[0]
+        if lowest <= 0.0:
+            lowest = self.speed_range(2.0 * angle / self.nominal)[0]
+        if lowest <= 0.0:
+            raise InputError(
+                f"spindle speed falls to {lowest:.4g} rad/s; allowed: above 0 (reduce the deviations)"
+            )
+        low, high = 0, int(angle / (lowest * step)) + 2
+        while low < high:
+            middle = (low + high) // 2
+            if self.at(middle * step)[0, 0] >= angle:
+                high = middle
+            else:
+                low = middle + 1
+        return low
+
+
+def constant(nominal: float) -> SpeedLaw:
+    """Constant speed ``nominal`` [rad/s]."""
+    return SpeedLaw(nominal)
+
+
+def harmonic(nominal: float, amplitude: Array, frequency: Array, phase: Array, start: float = 0.0) -> SpeedLaw:
+    """Harmonic deviations: relative ``amplitude`` [1], ``frequency`` [rad/s], ``phase`` [rad], from ``start`` [s].
+
+    All arrays have the shape (n,). Paper 000, Fig. 6: ΔΩ = 10.5·sin(ωd·t).
+    """
+    if not amplitude.size == frequency.size == phase.size:
+        raise InputError(
+            f"harmonic deviation: {amplitude.size} amplitudes, {frequency.size} frequencies and "
+            f"{phase.size} phases; give as many of each"
+        )
+    if np.any(frequency <= 0.0):
+        raise InputError(f"harmonic deviation: frequency {frequency.min():g} rad/s; allowed: above 0")
+    return SpeedLaw(nominal, np.stack((amplitude, frequency, phase, np.full(amplitude.size, start))))
+
+
+def tachogram(nominal: float, time: Array, deviation: Array) -> SpeedLaw:
+    """Piecewise-linear relative ``deviation`` [1] at increasing ``time`` [s], held before and after; shape (n,)."""
+    if time.size != deviation.size:
+        raise InputError(f"tachogram: {time.size} times and {deviation.size} deviations; give as many of each")
+    if time.size and (time[0] < 0.0 or np.any(np.diff(time) <= 0.0)):
+        raise InputError("tachogram: times must start at 0 s or later and increase; sort them and drop repeats")
+    if not time.size:
+        return SpeedLaw(nominal)
+    pieces = np.diff(time) * (deviation[1:] + deviation[:-1]) / 2
+    area = time[0] * deviation[0] + np.concatenate(([0.0], np.cumsum(pieces)))
+    return SpeedLaw(nominal, tachogram=np.stack((time, deviation, area)))
+
+
+def band_limited_random(
+    nominal: float, rms: float, low: float, high: float, lines: int, seed: int
+) -> SpeedLaw:
+    """Random relative deviation of ``rms`` [1] between ``low`` and ``high`` [rad/s].
+
+    ``lines`` equal lines, one in each of as many equal parts of the band, with frequency and phase drawn
+    from ``seed``: the sum repeats only after many periods and nears a normal distribution.
+    """
+    if rms == 0.0:
+        return SpeedLaw(nominal)
+    if not 0.0 < low < high:
+        raise InputError(f"random deviation: band {low:g}-{high:g} rad/s; allowed: 0 < low < high")
+    random = np.random.default_rng(np.random.SeedSequence([seed, 0x5BEED]))
+    frequency = low + (high - low) * (np.arange(lines) + random.random(lines)) / lines
+    phase = random.uniform(0.0, 2.0 * np.pi, lines)
+    amplitude = np.full(lines, rms * np.sqrt(2.0 / lines))
+    return SpeedLaw(nominal, np.stack((amplitude, frequency, phase, np.zeros(lines))))
