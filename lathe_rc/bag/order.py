@@ -84,3 +84,11 @@ class Merger:
             self.blocks += 1
             self.complete = end.last
             yield sorted(due + [block.entry for block in heads.values()])
+
+    def rest(self) -> list[Entry]:
+        """Give back everything that is left, sorted: what an interrupted run has of its last blocks."""
+        left = [*self._waiting, *(block.entry for queue in self._blocks.values() for block in queue)]
+        self._waiting = []
+        for queue in self._blocks.values():
+            queue.clear()
+        return sorted(left)

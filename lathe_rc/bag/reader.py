@@ -25,15 +25,17 @@ def read(path: Path) -> Recording:
     parts: dict[str, dict[str, list[Samples]]] = {}
     sparse: dict[str, SparseTopic] = {}
     expected: dict[str, int] = {}
+    types: dict[str, str] = {}
     try:
         with Reader(path) as reader:
             wanted = [connection for connection in reader.connections if connection.msgtype in DENSE | SPARSE]
             for connection in wanted:
+                types[connection.topic] = connection.msgtype
                 if connection.msgtype in DENSE:
                     parts[connection.topic] = {name: [] for name in messages.sample_fields(connection.msgtype)}
                     expected[connection.topic] = 0
                 else:
-                    sparse[connection.topic] = SparseTopic(connection.msgtype)
+                    sparse[connection.topic] = SparseTopic()
             for connection, stamp, data in reader.messages(wanted):
                 message = messages.decode(connection.msgtype, bytes(data))
                 topic = connection.topic
@@ -55,4 +57,4 @@ def read(path: Path) -> Recording:
         topic: {name: np.concatenate(arrays) if arrays else np.empty(0) for name, arrays in fields.items()}
         for topic, fields in parts.items()
     }
-    return Recording(dense, sparse)
+    return Recording(types, dense, sparse)

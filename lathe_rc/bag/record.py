@@ -13,7 +13,7 @@ from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 
-SIGNAL_DEPTH = 64  #: queue length of signal topics beyond the window
+SPARE_DEPTH = 32  #: queue length of signal topics beyond the window
 
 
 def about(scenario: str, shared: SharedParameters, host_topics: list[str]) -> dict[str, str]:
@@ -43,7 +43,7 @@ class OfflineRecorder:
             {f"/{topic}": source.node for topic, source in cell.dense.items()},
             {f"/{topic}": source.node for topic, source in cell.sparse.items()},
         )
-        qos = offered_qos(cell.master.parameters.window + SIGNAL_DEPTH, "transient_local")
+        qos = offered_qos(shared.window + SPARE_DEPTH, "transient_local")
         for topic, source in sorted({**cell.dense, **cell.sparse}.items()):
             writer.add_topic(f"/{topic}", source.type, qos)
 

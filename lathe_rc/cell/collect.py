@@ -35,8 +35,9 @@ class Collector:
         """What was collected, by fully qualified topic."""
         sparse = {}
         for topic, found in self._sparse.items():
-            part = sparse[f"/{topic}"] = SparseTopic(self._cell.sparse[topic].type)
+            part = sparse[f"/{topic}"] = SparseTopic()
             for message in found:
                 framed = self._framer.sparse(message)
                 part.add(messages.stamp_ns(framed), framed)
-        return Recording({f"/{topic}": signals for topic, signals in self._dense.items()}, sparse)
+        types = {f"/{topic}": source.type for topic, source in {**self._cell.dense, **self._cell.sparse}.items()}
+        return Recording(types, {f"/{topic}": signals for topic, signals in self._dense.items()}, sparse)

@@ -118,6 +118,9 @@ class SharedParameters(Table):
     joint_state_period: Annotated[int, Ge(1)] = parameter(
         640, "a JointState message every so many samples", "sample"
     )
+    window: Annotated[int, Ge(0), Le(4096)] = parameter(
+        32, "blocks in flight, counted from the slowest member; 0: free-running, may lose blocks", "block"
+    )
     run_id: str = parameter("", "identity of the run; every block carries it")
 
     def model_post_init(self, context: Any, /) -> None:
@@ -155,6 +158,9 @@ class NodeParameters(SharedParameters):
     remap: list[str] = parameter([], "topic names to replace, as old:=new")
     events: list[str] = parameter(
         [], "scheduled events, as 'revolution 60: freeze', 'second 3.5: freeze' or 'sample 7000: clear'"
+    )
+    volatile_inputs: list[str] = parameter(
+        [], "input topics whose publisher keeps no messages for those who come late (a device with default QoS)"
     )
     autostart: bool = parameter(True, "configure and activate by itself")
 

@@ -17,7 +17,6 @@ _NOT_SIGNALS = {"header", "run_id", "source"}
 class SparseTopic:
     """Messages at chosen samples: time stamps [ns] and, by field, one value a message."""
 
-    type: str
     stamps: list[int] = field(default_factory=list)
     values: dict[str, list[Any]] = field(default_factory=dict)
 
@@ -34,12 +33,18 @@ class Recording:
     """All signal topics of a run.
 
     Attributes:
+        types: message type by fully qualified topic.
         dense: by fully qualified topic, the arrays of each field, shape (samples,).
         sparse: by fully qualified topic.
     """
 
+    types: Mapping[str, str]
     dense: Mapping[str, Signals]
     sparse: Mapping[str, SparseTopic]
+
+    def of_type(self, msgtype: str) -> Signals:
+        """The signals of the first topic of a block type."""
+        return next(signals for topic, signals in self.dense.items() if self.types[topic] == msgtype)
 
     def digests(self) -> dict[str, str]:
         """One digest a signal topic, by topic: SHA-256 of the SHA-256 of each field's samples in the order of the

@@ -53,9 +53,13 @@ class Scenario:
         """What all nodes agree on."""
         return next(iter(self.nodes.values()))
 
+    def kind(self, node: str) -> str:
+        """What a node is."""
+        return kind_of(node, {"stage": self.nodes[node].stage})
+
     def of_kind(self, kind: str) -> list[str]:
         """Names of the nodes of a kind."""
-        return [name for name, table in self.nodes.items() if kind_of(name, {"stage": table.stage}) == kind]
+        return [name for name in self.nodes if self.kind(name) == kind]
 
     def to_yaml(self) -> str:
         """The complete parameter file; empty lists are left out, since rcl cannot read them."""

@@ -47,3 +47,9 @@ class Track:
         start = first - self._base
         assert start >= 0 and first + samples <= self.end, "samples are not there"
         return {name: array[start : start + samples] for name, array in self._arrays.items()}
+
+    def restart(self, first: int) -> None:
+        """Begin at sample ``first``, with zeros before it; drops what is there."""
+        for array in self._arrays.values():
+            array[:] = 0
+        self._base, self.end = first - self._past, first

@@ -16,7 +16,7 @@ from lathe_rc.signals.encoder import Encoder
 
 
 class SpindleEncoderParameters(NodeParameters):
-    """Speed law, encoder, and, for the time master of a cell, length, pace and window of the run."""
+    """Speed law, encoder, and, for the time master of a cell, length and pace of the run."""
 
     deviation_amplitude: list[float] = parameter(
         [], "harmonic speed deviations: amplitudes relative to the nominal speed", "1"
@@ -41,9 +41,6 @@ class SpindleEncoderParameters(NodeParameters):
     revolutions: Annotated[float, Ge(0)] = parameter(0.0, "length of the run; 0: until stopped", "rev")
     speed_factor: Annotated[float, Ge(0)] = parameter(
         1.0, "pace of the run against real time; 0: as fast as the members follow", "1"
-    )
-    window: Annotated[int, Ge(0), Le(4096)] = parameter(
-        32, "blocks in flight, counted from the slowest member; 0: free-running, may lose blocks", "block"
     )
     members: list[str] = parameter([], "nodes that must be ready before block 0; empty: start alone")
 

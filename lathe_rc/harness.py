@@ -1,0 +1,417 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Running a scenario: offline, composed in one process, grouped, or each node a process of its own.
+
+    result = run(load(Path("config/piston.yaml")), mode="processes")
+    print(result.errors.rms[-1], result.digest)
+
+Nodes report what happens over a socket each (`lathe_rc.nodes.report`), so whoever drives a cell waits for events,
+never for time. Every child is ended, whatever happens; this module does not import rclpy.
+"""
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+from lathe_rc.analysis.metrology import FormErrors, form_errors
+from lathe_rc.bag import reader, repair
+from lathe_rc.bag.record import OfflineRecorder, about
+from lathe_rc.bag.writer import BagWriter
+from lathe_rc.cell import messages
+from lathe_rc.cell.collect import Collector
+from lathe_rc.cell.engine import Engine, Sink
+from lathe_rc.cell.recorder import KIND as RECORDER
+from lathe_rc.cell.recorder import RecorderParameters
+from lathe_rc.cell.recording import Recording
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError, LatheError, LossyRunError
+
+Mode = Literal["offline", "composed", "processes"]
+Event = Mapping[str, Any]
+
+_VARIABLE = "LATHE_REPORT_FD"
+_SILENCE_LIMIT = 120.0  # [s] without any event: the first start on a machine compiles kernels
+_GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run gave.
+
+    Attributes:
+        scenario: what ran.
+        mode: the host.
+        samples: length of the run.
+        blocks: blocks that the spindle sent.
+        dropped: blocks that some member lost.
+        wall_s: from block 0 to the last block closed [s].
+        bag: where it is recorded; None if it was not to be kept.
+        recording: all signals.
+    """
+
+    scenario: Scenario
+    mode: str
+    samples: int
+    blocks: int
+    dropped: int
+    wall_s: float
+    bag: Path | None
+    recording: Recording = field(repr=False)
+
+    @property
+    def simulated_s(self) -> float:
+        """Simulated time [s]."""
+        return self.samples * self.scenario.shared.step
+
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated over wall time."""
+        return self.simulated_s / self.wall_s
+
+    @cached_property
+    def errors(self) -> FormErrors:
+        """Form error by revolution."""
+        tool, encoder = self.recording.of_type(messages.TOOL), self.recording.of_type(messages.ENCODER)
+        return form_errors(encoder["angle_true"], tool["error"])
+
+    @cached_property
+    def digest(self) -> dict[str, str]:
+        """Digest of each signal topic."""
+        return self.recording.digests()
+
+    def summary(self) -> dict[str, object]:
+        """What ``lathe run --json`` prints."""
+        errors = self.errors
+
+        def of(revolution: int) -> dict[str, float] | None:
+            if not errors.rms.size:
+                return None
+            return {"rms": errors.rms[revolution] * 1e6, "max": errors.largest[revolution] * 1e6}
+
+        return {
+            "scenario": self.scenario.name,
+            "mode": self.mode,
+            "simulated_s": self.simulated_s,
+            "wall_s": self.wall_s,
+            "real_time_factor": self.real_time_factor,
+            "revolutions": int(errors.rms.size),
+            "blocks": self.blocks,
+            "dropped": self.dropped,
+            "error_um": {
+                "first": of(0),
+                "last": of(-1),
+                "per_revolution_rms": [rms * 1e6 for rms in errors.rms],
+            },
+            "bag": str(self.bag) if self.bag else None,
+            "digest": self.digest,
+        }
+
+
+def _ignore(event: Event) -> None:
+    """Watch nothing."""
+
+
+def run(
+    scenario: Scenario,
+    *,
+    mode: Mode = "offline",
+    groups: Sequence[Sequence[str]] | None = None,
+    bag: Path | None = None,
+    watch: Callable[[Event], None] = _ignore,
+    domain: int | None = None,
+) -> Result:
+    """Run a scenario to its end.
+
+    Args:
+        scenario: what to run; its spindle must have a number of revolutions.
+        mode: ``offline``: a loop in this process; ``composed``: all nodes in one process; ``processes``: each node
+            a process.
+        groups: nodes that share a process, for ``processes``; nodes that are not named have their own.
+        bag: folder to record to; None: nothing is kept.
+        watch: called with every event, from the thread that called `run`.
+        domain: ROS domain; None: a free one.
+
+    Raises:
+        InputError: the scenario cannot work, or the bag's folder exists.
+        LatheError: a node failed or was killed; the bag, if one was asked for, is readable.
+        LossyRunError: a free-running cell lost blocks.
+    """
+    cell = Cell(scenario.nodes)
+    cell.check()
+    if cell.master.samples is None:
+        raise InputError(f"{cell.master.name}.revolutions = 0; the run needs an end: allowed above 0")
+    if bag is not None and bag.exists():
+        raise InputError(f"{bag} exists; a bag is never overwritten: name another folder or remove it")
+    if mode == "offline":
+        return _offline(scenario, cell, bag, watch)
+    with contextlib.ExitStack() as stack:
+        place = bag
+        if place is None:
+            place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-"))) / "bag"
+        complete = with_recorder(scenario, place, keep=bag is not None)
+        names = list(complete.nodes)
+        if mode == "composed":
+            split: list[list[str]] = [names]
+        else:
+            split = [list(group) for group in groups or []]
+            split += [[name] for name in names if not any(name in group for group in split)]
+        processes = stack.enter_context(Processes(complete, split, domain=domain))
+        try:
+            events = processes.wait_for_end(watch)
+        except BaseException:
+            processes.stop()
+            if bag is not None:
+                repair.mend(bag)
+            raise
+        return Result(
+            scenario=scenario,
+            mode=mode if not groups else "grouped",
+            samples=cell.master.samples,
+            blocks=-(-cell.master.samples // scenario.shared.block_size),
+            dropped=0,
+            wall_s=(events["closed"]["monotonic_ns"] - events["block0"]["monotonic_ns"]) * 1e-9,
+            bag=bag,
+            recording=reader.read(place),
+        )
+
+
+def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[Event], None]) -> Result:
+    engine = Engine(cell)
+    collector = Collector(cell, engine.samples)
+    sinks: list[Sink] = [collector]
+    writer = None
+    if bag is not None:
+        table = next((t for t in scenario.nodes.values() if isinstance(t, RecorderParameters)), RecorderParameters())
+        writer = BagWriter(
+            bag,
+            compression=table.compression,
+            chunk_size=table.chunk_size,
+            about=about(scenario.name, scenario.shared, []),
+        )
+        sinks.append(OfflineRecorder(cell, engine.samples, writer))
+    start = time.monotonic()
+    try:
+        engine.run(sinks, lambda samples: watch({"event": "progress", "node": "", "samples": samples}))
+    finally:
+        if writer:
+            writer.close()
+    wall = time.monotonic() - start
+    blocks = -(-engine.samples // scenario.shared.block_size)
+    return Result(scenario, "offline", engine.samples, blocks, 0, wall, bag, collector.recording())
+
+
+def with_recorder(scenario: Scenario, bag: Path, *, keep: bool) -> Scenario:
+    """The scenario as its processes run it: with a recorder on ``bag``, and a spindle that waits for all members."""
+    nodes = dict(scenario.nodes)
+    recorders = scenario.of_kind(RECORDER)
+    shared = {name: getattr(scenario.shared, name) for name in type(scenario.shared).model_fields}
+    name = recorders[0] if recorders else RECORDER
+    table = nodes.get(name) or RecorderParameters(
+        **{k: v for k, v in shared.items() if k in RecorderParameters.model_fields and k != "events"}
+    )
+    changes: dict[str, object] = {"bag": str(bag.resolve())}
+    if not keep:
+        changes["compression"] = "none"
+    nodes[name] = table.model_copy(update=changes)
+    for master in scenario.of_kind(SpindleEncoder.kind):
+        others = [node for node in nodes if node != master]
+        nodes[master] = nodes[master].model_copy(update={"members": others})
+    return Scenario(scenario.name, nodes)
+
+
+@contextlib.contextmanager
+def _domain(number: int | None) -> Iterator[int]:
+    """A ROS domain that nobody else on this machine uses."""
+    if number is not None:
+        yield number
+        return
+    from domain_coordinator import domain_id
+
+    with domain_id() as free:
+        yield int(free)
+
+
+class Processes:
+    """The processes of a cell, from start to end; a context manager that leaves none behind.
+
+    Args:
+        scenario: with a recorder, as `with_recorder` makes it.
+        groups: names of the nodes in each process.
+        domain: ROS domain; None: a free one.
+
+    Attributes:
+        pids: process of each node.
+        domain: the ROS domain in use.
+    """
+
+    def __init__(self, scenario: Scenario, groups: Sequence[Sequence[str]], *, domain: int | None = None) -> None:
+        self._scenario, self._groups, self._wanted_domain = scenario, groups, domain
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._stack = contextlib.ExitStack()
+        self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._threads: list[threading.Thread] = []
+        self._abandoned: set[str] = set()
+        self.pids: dict[str, int] = {}
+        self.domain = -1
+
+    def __enter__(self) -> "Processes":
+        """Start them."""
+        try:
+            self.domain = self._stack.enter_context(_domain(self._wanted_domain))
+            self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-log-")))
+            file = self._folder / "scenario.yaml"
+            file.write_text(self._scenario.to_yaml(), encoding="utf-8")
+            for group in self._groups:
+                self._start(group, file)
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End them."""
+        self.stop()
+
+    def _start(self, group: Sequence[str], file: Path) -> None:
+        members = [f"{name}:{self._scenario.kind(name)}" for name in group]
+        ours, theirs = socket.socketpair()
+        environment = os.environ | {
+            _VARIABLE: str(theirs.fileno()),
+            "ROS_DOMAIN_ID": str(self.domain),
+            "ROS_LOG_DIR": str(self._folder),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
+        }
+        name = "+".join(group)
+        with (self._folder / f"{group[0]}.log").open("wb") as log:
+            child = subprocess.Popen(
+                [sys.executable, "-m", "lathe_rc.nodes", *members, "--ros-args", "--params-file", str(file)],
+                env=environment,
+                pass_fds=(theirs.fileno(),),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        theirs.close()
+        self._children[name] = child
+        for node in group:
+            self.pids[node] = child.pid
+        thread = threading.Thread(target=self._listen, args=(name, ours, child), daemon=True)
+        thread.start()
+        self._threads.append(thread)
+
+    def _listen(self, name: str, line: socket.socket, child: subprocess.Popen[bytes]) -> None:
+        """Turn a process's reports, and its end, into events."""
+        with line, line.makefile("r", encoding="utf-8") as reports:
+            with contextlib.suppress(OSError):
+                for report in reports:
+                    self._events.put(json.loads(report))
+            code = child.wait()
+        self._events.put({"event": "exit", "node": name, "code": code, "monotonic_ns": time.monotonic_ns()})
+
+    def events(self, silence: float) -> Iterator[Event]:
+        """Events as they come.
+
+        Raises:
+            LatheError: nothing was heard for ``silence`` seconds.
+        """
+        while True:
+            try:
+                event = self._events.get(timeout=silence)
+            except queue.Empty:
+                raise LatheError(f"no node has reported anything for {silence:.0f} s{self._tails()}") from None
+            yield event
+
+    def wait_for(self, kind: str, node: str | None = None, **values: object) -> Event:
+        """Wait for an event of a kind, from a node, with certain values.
+
+        Raises:
+            LatheError: a process ended with a failure first.
+        """
+        for event in self.events(_SILENCE_LIMIT):
+            if event["event"] == kind and node in (None, event["node"]):
+                if all(event.get(key) == value for key, value in values.items()):
+                    return event
+            self._raise_failure(event)
+        raise AssertionError
+
+    def wait_for_end(self, watch: Callable[[Event], None] = _ignore) -> dict[str, Event]:
+        """Wait until every process has ended.
+
+        Returns:
+            The last event of each kind.
+
+        Raises:
+            LatheError: a node failed or was killed; says which.
+        """
+        found: dict[str, Event] = {}
+        running = set(self._children)
+        for event in self.events(_SILENCE_LIMIT):
+            if event["event"] == "exit":
+                running.discard(event["node"])
+            found[event["event"]] = event
+            watch(event)
+            self._raise_failure(event)
+            if not running:
+                break
+        if "closed" not in found or "block0" not in found:
+            raise LatheError(f"the nodes ended before the run did{self._tails()}")
+        return found
+
+    def _raise_failure(self, event: Event) -> None:
+        """Raise what went wrong first; nodes that gave up because of another ("abandoned") are no cause."""
+        node = event["node"]
+        if event["event"] == "abandoned":
+            self._abandoned.update(name for name in self._children if node in name.split("+"))
+        if event["event"] == "error":
+            kinds = {InputError.exit_code: InputError, LossyRunError.exit_code: LossyRunError}
+            raise kinds.get(event["exit_code"], LatheError)(event["message"])
+        if event["event"] == "exit" and event["code"] and node not in self._abandoned:
+            if event["code"] < 0:
+                raise LatheError(f"{node} was killed by {signal.Signals(-event['code']).name}")
+            raise LatheError(f"{node} ended with exit code {event['code']}{self._tail(node)}")
+
+    def _tail(self, name: str) -> str:
+        """The last line of a process's log."""
+        log = self._folder / f"{name.split('+')[0]}.log"
+        lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines() if log.exists() else []
+        return f": {lines[-1].strip()}" if lines else ""
+
+    def _tails(self) -> str:
+        return "".join(f"; {name}{self._tail(name)}" for name in self._children)
+
+    def stop(self) -> None:
+        """End every process: in order if it listens, by SIGKILL if it does not."""
+        for number in (signal.SIGCONT, signal.SIGTERM):
+            for child in self._children.values():
+                if child.poll() is None:
+                    with contextlib.suppress(ProcessLookupError):
+                        child.send_signal(number)
+        deadline = time.monotonic() + _GRACE
+        for child in self._children.values():
+            try:
+                child.wait(timeout=max(deadline - time.monotonic(), 0.0))
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
+        for thread in self._threads:
+            thread.join()
+        self._stack.close()
+

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A process with one node or several: start, loop, signals, exit code."""
+
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from types import FrameType
+
+import rclpy
+from rclpy.experimental import EventsExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.signals import SignalHandlerOptions
+
+from lathe_rc.cell.recorder import KIND as RECORDER
+from lathe_rc.cell.scenario import TABLES
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.nodes.recorder_node import RecorderNode
+from lathe_rc.nodes.report import Reporter
+from lathe_rc.nodes.shell import CellNode
+from lathe_rc.nodes.spindle_node import SpindleNode
+from lathe_rc.nodes.stage_node import StageNode
+
+_LONGEST_WAIT = 0.1  # [s] until signals and the harness are looked at again
+
+
+def _make(name: str, kind: str, reporter: Reporter) -> CellNode:
+    if kind not in TABLES:
+        raise InputError(f"{name}: no stage {kind!r}; allowed: {', '.join(TABLES)}")
+    classes: dict[str, type[CellNode]] = {RECORDER: RecorderNode, SpindleEncoder.kind: SpindleNode}
+    return classes.get(kind, StageNode)(name, kind, reporter)
+
+
+class _Stop:
+    """Set by SIGINT and SIGTERM."""
+
+    def __init__(self) -> None:
+        self.signal = 0
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._set)
+
+    def _set(self, number: int, frame: FrameType | None) -> None:
+        self.signal = number
+
+
+def _start(node: CellNode) -> None:
+    """Configure and activate a node that starts by itself; what it refuses is in its ``failure``."""
+    if not node.autostart:
+        return
+    if node.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+        node.trigger_activate()
+
+
+def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
+    executor = EventsExecutor()
+    for node in nodes:
+        executor.add_node(node)
+    # EventsExecutor.spin() hangs in Jazzy and Kilted; a loop of spin_once() works and sees signals.
+    while not all(node.done or node.failure for node in nodes):
+        now = time.monotonic()
+        due = min(node.next_tick for node in nodes)
+        executor.spin_once(timeout_sec=min(max(due - now, 0.0), _LONGEST_WAIT))
+        now = time.monotonic()
+        for node in nodes:
+            if now >= node.next_tick and not (node.done or node.failure):
+                node.tick(now)
+        if stop.signal or reporter.orphaned or any(node.failure for node in nodes):
+            return
+
+
+def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -> int:
+    """Run nodes in this process until they are done, fail or are told to stop.
+
+    Args:
+        members: name and kind of each node.
+        args: command line with ``--ros-args``; default: that of the process.
+
+    Returns:
+        The exit code: 0, or that of the first failure.
+    """
+    reporter = Reporter()
+    rclpy.init(args=None if args is None else ["lathe", *args], signal_handler_options=SignalHandlerOptions.NO)
+    stop = _Stop()
+    nodes: list[CellNode] = []
+    try:
+        for name, kind in members:
+            nodes.append(_make(name, kind, reporter))
+            _start(nodes[-1])
+        _loop(nodes, reporter, stop)
+        failures = [node.failure for node in nodes if node.failure]
+        return failures[0].exit_code if failures else 0
+    except LatheError as error:
+        print(f"lathe: {error}", file=sys.stderr)
+        reporter("error", members[0][0], message=str(error), exit_code=error.exit_code)
+        return error.exit_code
+    finally:
+        for node in nodes:
+            node.finish()
+        rclpy.try_shutdown()
+
+
+def main(kind: str) -> None:
+    """Entry point of the executable of one kind of node."""
+    sys.exit(run([(kind, kind)]))

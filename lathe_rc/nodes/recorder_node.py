@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The recorder: every signal topic of the cell into one bag, sorted, complete, and closed whatever happens."""
+
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from lathe_rc_msgs.msg import CellState
+from rclpy.qos import QoSProfile
+
+from lathe_rc.bag.order import Entry, Merger
+from lathe_rc.bag.record import SPARE_DEPTH, about
+from lathe_rc.bag.writer import BagWriter, offered_qos
+from lathe_rc.cell import messages
+from lathe_rc.cell.recorder import RecorderParameters
+from lathe_rc.errors import LatheError, LossyRunError
+from lathe_rc.nodes.ports import BlockQueue, latched_qos, signal_qos
+from lathe_rc.nodes.shell import CellNode
+from lathe_rc.nodes.stage_node import message_class
+
+_HOST_TOPICS = {"/diagnostics": (DiagnosticArray, QoSProfile(depth=100)), "cell_state": (CellState, latched_qos(4))}
+
+
+class RecorderNode(CellNode):
+    """See the module. It subscribes to what the members announce; alone, to what anybody announces."""
+
+    def configure_part(self) -> None:
+        """Open the bag."""
+        assert isinstance(self.table, RecorderParameters)
+        name = self.table.bag or f"bag_{self.table.run_id or 'cell'}"
+        self._path = Path(name)
+        host = [self.topic(topic) for topic in _HOST_TOPICS]
+        self._writer: BagWriter | None = BagWriter(
+            self._path,
+            compression=self.table.compression,
+            chunk_size=self.table.chunk_size,
+            about=about(self.get_namespace(), self.table, host),
+        )
+        self._depth = self.table.window + SPARE_DEPTH
+        self._queues: dict[str, BlockQueue] = {}
+        self._sparse: dict[str, str] = {}  # topic -> source
+        self._merger: Merger | None = None
+        self._blocks = self._samples = 0
+        self._log_ns = messages.START_NS
+
+    def activate_part(self) -> None:
+        """Subscribe to the host topics; the signals follow when the members have announced them."""
+        for topic, (kind, qos) in _HOST_TOPICS.items():
+            full = self.topic(topic)
+            self._open.add_topic(full, self._type_name(kind), offered_qos(qos.depth, "volatile"))
+            self.create_subscription(kind, full, self.guarded(self._host_writer(full)), qos, raw=True)
+
+    @staticmethod
+    def _type_name(kind: Any) -> str:
+        return f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
+
+    @property
+    def _open(self) -> BagWriter:
+        assert self._writer is not None, "the bag is closed"
+        return self._writer
+
+    def _host_writer(self, topic: str) -> Any:
+        return lambda data: self._open.write(topic, self._log_ns, data) if self._writer else None
+
+    def publications(self) -> list[tuple[str, str, bool]]:
+        """It publishes no signals."""
+        return []
+
+    def subscriptions_wanted(self) -> list[str]:
+        """All signal topics of the members."""
+        return [*self._queues, *self._sparse] if hasattr(self, "_queues") else []
+
+    def matched(self) -> bool:
+        """See `CellNode`; it must have subscribed first."""
+        return bool(self._queues) and super().matched()
+
+    def statistics(self) -> dict[str, object]:
+        """See `CellNode`."""
+        return {"blocks": self._blocks, "lost blocks": self._lost, "bag": str(self._path)}
+
+    @property
+    def _lost(self) -> int:
+        return sum(queue.lost for queue in self._queues.values())
+
+    # ---- topics -------------------------------------------------------------------------------------
+
+    def members_changed(self) -> None:
+        """Subscribe once all members are known; without a master, to whatever is announced."""
+        alone = self.master is None or not self.master.members
+        if not alone and (self._queues or not self.complete):
+            return
+        names = list(self.members) if alone or not self.master else list(self.master.members)
+        for name in names:
+            member = self.members[name]
+            for topic, msgtype, sparse in zip(member.publishes, member.types, member.sparse, strict=True):
+                if topic not in self._queues and topic not in self._sparse:
+                    self._subscribe(topic, msgtype, name, sparse=sparse, in_cell=not alone)
+        if not alone and self.table.window:
+            self._merger = Merger({t: q.source for t, q in self._queues.items()}, self._sparse)
+        self.announce()
+
+    def _subscribe(self, topic: str, msgtype: str, source: str, *, sparse: bool, in_cell: bool) -> None:
+        self._open.add_topic(topic, msgtype, offered_qos(self._depth, "transient_local"))
+        if sparse:
+            self._sparse[topic] = source
+            callback = self.guarded(lambda data: self._on_sparse(topic, msgtype, data))
+        else:
+            queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table)
+            if in_cell:
+                queue.expect(source)
+            callback = self.guarded(lambda data: self._on_block(queue, data))
+        self.create_subscription(
+            message_class(msgtype),
+            topic,
+            callback,
+            signal_qos(self.table, topic),
+            raw=True,
+            event_callbacks=self.subscription_events(topic),
+        )
+
+    # ---- data ---------------------------------------------------------------------------------------
+
+    def _on_sparse(self, topic: str, msgtype: str, data: bytes) -> None:
+        if self.done:
+            return
+        stamp = messages.stamp_ns(messages.decode(msgtype, data))
+        if self._merger is None:
+            self._write(Entry(stamp, topic, 0, data))
+        else:
+            self._merger.add_sparse(topic, stamp, data)
+            self._drain()
+
+    def _on_block(self, queue: BlockQueue, data: bytes) -> None:
+        if self.done:
+            return
+        message = queue.add(data)
+        queue.blocks.clear()
+        info, stamp = message.block, messages.stamp_ns(message)
+        if self._merger is None:
+            self._write(Entry(stamp, queue.topic, 0, data))
+            return
+        self._merger.add_block(
+            queue.topic, stamp, data, first=info.first_index, companions=info.companions, last=info.last
+        )
+        self._drain()
+
+    def _drain(self) -> None:
+        """Write every block that is complete."""
+        assert self._merger is not None
+        for entries in self._merger.release():
+            for entry in entries:
+                self._write(entry)
+            self._blocks += 1
+            self._samples = (self._log_ns - messages.START_NS) // self.table.step_ns + 1
+            if self._merger.complete:
+                self.finish()
+            self.progressed(self._blocks, self._samples, last=self._merger.complete)
+            if self._merger.complete:
+                self.end([])
+
+    def _write(self, entry: Entry) -> None:
+        self._open.write(entry.topic, entry.log_ns, entry.data)
+        self._log_ns = max(self._log_ns, entry.log_ns)
+
+    def finish(self) -> None:
+        """Write what is left and close the bag."""
+        if getattr(self, "_writer", None) is None:
+            return
+        complete = self._merger is not None and self._merger.complete
+        try:
+            if self._merger is not None:
+                for entry in self._merger.rest():
+                    self._write(entry)
+            self._open.close()
+        except OSError as error:
+            self.fail(LatheError(f"{self._path}: cannot be closed ({error.strerror})"))
+        finally:
+            self._writer = None
+        self.reporter("closed", self.get_name(), bag=str(self._path), blocks=self._blocks, complete=complete)
+        if self._lost:
+            self.fail(LossyRunError(f"{self.full_name}: lost {self._lost} blocks of a free-running cell"))
+

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a process tells the harness that started it: JSON lines over a socket, which also ties their lives together.
+
+The harness passes one end of a socket pair and its number in ``LATHE_REPORT_FD``. When the other end closes, the
+harness is gone, and so the process ends too.
+"""
+
+import json
+import os
+import select
+import socket
+import time
+
+VARIABLE = "LATHE_REPORT_FD"
+
+
+class Reporter:
+    """The process's line to its harness; silent when nobody listens."""
+
+    def __init__(self) -> None:
+        number = os.environ.get(VARIABLE)
+        self._socket = socket.socket(fileno=int(number)) if number else None
+
+    def __call__(self, event: str, node: str, **values: object) -> None:
+        """Report an event, with the monotonic time that all processes of the machine share."""
+        if self._socket is None:
+            return
+        line = json.dumps({"event": event, "node": node, "monotonic_ns": time.monotonic_ns(), **values})
+        try:
+            self._socket.sendall(line.encode() + b"\n")
+        except OSError:
+            # The harness is gone; orphaned() says so and the process ends in order.
+            self._socket.close()
+
+    @property
+    def orphaned(self) -> bool:
+        """True when the harness is gone."""
+        if self._socket is None:
+            return False
+        if self._socket.fileno() < 0:
+            return True
+        readable, _, _ = select.select([self._socket], [], [], 0)
+        return bool(readable) and not self._socket.recv(4096)

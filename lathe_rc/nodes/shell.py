@@ -1,0 +1,314 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The shell that all nodes share: lifecycle, membership and start handshake, progress, diagnostics, end."""
+
+import time
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from lathe_rc_msgs.msg import CellState, Member, Progress
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+
+from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.scenario import TABLES
+from lathe_rc.cell.wiring import remapped
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.nodes import declare
+from lathe_rc.nodes.ports import latched_qos
+from lathe_rc.nodes.report import Reporter
+
+_TICK = 0.02  # [s] between looks at the graph while members join
+_DIAGNOSTICS_PERIOD = 1.0  # [s]
+_LATCHED_DEPTH = 256
+
+
+class CellNode(LifecycleNode):
+    """A member of a cell, or a node alone.
+
+    Args:
+        name: default name.
+        kind: what it is.
+        reporter: line to the harness.
+
+    Attributes:
+        table: its parameters, once configured.
+        done: it has finished its part of the run.
+        failure: why it gave up.
+        next_tick: monotonic time [s] at which it wants `tick` to be called.
+    """
+
+    def __init__(self, name: str, kind: str, reporter: Reporter) -> None:
+        super().__init__(
+            name,
+            automatically_declare_parameters_from_overrides=True,
+            allow_undeclared_parameters=True,
+        )
+        given = declare.overrides(self)
+        self.kind = kind
+        self.autostart = bool(given.get("autostart", True))
+        self.table: NodeParameters = TABLES[self.kind]()
+        self.reporter = reporter
+        self.done = False
+        self.failure: LatheError | None = None
+        self.next_tick = time.monotonic()
+        self.active = False
+        self.full_name = self.get_fully_qualified_name()
+        self.members: dict[str, Member] = {}
+        self.master: Member | None = None
+        self._ready = False
+        self._progress_step = 1
+        self._reported_blocks = 0
+        self._diagnostics_due = time.monotonic() + _DIAGNOSTICS_PERIOD
+        self._host: dict[str, Publisher] = {}
+
+    # ---- lifecycle ----------------------------------------------------------------------------------
+
+    def on_configure(self, state: State) -> TransitionCallbackReturn:
+        """Validate parameters and allocate."""
+        return self._transition(self._configure)
+
+    def on_activate(self, state: State) -> TransitionCallbackReturn:
+        """Announce itself and exchange data from now on."""
+        return self._transition(self._activate)
+
+    def on_deactivate(self, state: State) -> TransitionCallbackReturn:
+        """Stop exchanging data."""
+        self.active = False
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_error(self, state: State) -> TransitionCallbackReturn:
+        """Safe state: nothing is published any more."""
+        self.active = False
+        return TransitionCallbackReturn.SUCCESS
+
+    def _transition(self, step: Callable[[], None]) -> TransitionCallbackReturn:
+        try:
+            step()
+        except LatheError as error:
+            self.fail(error)
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def _configure(self) -> None:
+        self.table = declare.declare(self, TABLES[self.kind])
+        if self.table.stage not in ("", self.kind):
+            raise InputError(f"{self.get_name()}.stage = {self.table.stage!r}; this executable is a {self.kind}")
+        self._progress_step = max(1, self.table.window // 4)
+        self.configure_part()
+
+    def _activate(self) -> None:
+        add = self.create_publisher
+        self._host = {
+            "members": add(Member, "members", latched_qos(1)),
+            "progress": add(Progress, "progress", QoSProfile(depth=100)),
+            "diagnostics": add(DiagnosticArray, "/diagnostics", QoSProfile(depth=100)),
+        }
+        self.create_subscription(
+            Member, "members", self.guarded(self._on_member), latched_qos(_LATCHED_DEPTH)
+        )
+        self.create_subscription(CellState, "cell_state", self.guarded(self._on_cell_state), latched_qos(4))
+        self.active = True
+        self.activate_part()
+        self.announce()
+        self.reporter("active", self.get_name())
+
+    # ---- what a kind of node adds -------------------------------------------------------------------
+
+    @abstractmethod
+    def configure_part(self) -> None:
+        """Build what the node runs from its table."""
+
+    @abstractmethod
+    def activate_part(self) -> None:
+        """Make its publishers and subscriptions."""
+
+    @abstractmethod
+    def publications(self) -> list[tuple[str, str, bool]]:
+        """Fully qualified signal topic, message type, sparse or not."""
+
+    @abstractmethod
+    def subscriptions_wanted(self) -> list[str]:
+        """Fully qualified signal topics."""
+
+    def members_changed(self) -> None:
+        """A member announced something new."""
+
+    def statistics(self) -> dict[str, object]:
+        """Figures for the diagnostics."""
+        return {}
+
+    def finish(self) -> None:
+        """End in order: close files, write what is left."""
+
+    # ---- helpers ------------------------------------------------------------------------------------
+
+    def topic(self, relative: str) -> str:
+        """Fully qualified name of a relative topic after all remapping."""
+        return str(self.resolve_topic_name(remapped(self.table, relative)))
+
+    def guarded(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
+        """A callback that fails the node, by name and in one line, instead of the process with a traceback."""
+
+        def call(message: Any) -> None:
+            if self.failure or not self.active:
+                return
+            try:
+                callback(message)
+            except LatheError as error:
+                self.fail(error)
+
+        return call
+
+    def subscription_events(self, topic: str) -> SubscriptionEventCallbacks:
+        """Lost messages and publishers that do not fit become named errors."""
+
+        def incompatible(status: Any) -> None:
+            self.fail(
+                LatheError(
+                    f"{topic}: a publisher offers a quality of service that does not fit ({status.last_policy_kind}); "
+                    f"if it is a device that keeps no messages, add {topic} to {self.get_name()}.volatile_inputs"
+                )
+            )
+
+        def lost(status: Any) -> None:
+            self.get_logger().warning(f"{topic}: DDS dropped {status.total_count_change} messages")
+
+        return SubscriptionEventCallbacks(incompatible_qos=incompatible, message_lost=lost)
+
+    def fail(self, error: LatheError, *, cause: str = "error") -> None:
+        """Give up, and say so to everyone; ``cause`` is ``abandoned`` if another node is to blame."""
+        if self.failure:
+            return
+        self.failure = error
+        self.get_logger().error(str(error))
+        self.reporter(cause, self.get_name(), message=str(error), exit_code=error.exit_code)
+        if self._host:
+            self.announce()
+
+    # ---- membership ---------------------------------------------------------------------------------
+
+    def announce(self) -> None:
+        """Publish who this is and how far it has come."""
+        published = self.publications()
+        own = Member(
+            run_id=self.table.run_id,
+            name=self.full_name,
+            stage=self.kind,
+            state=Member.FAILED if self.failure else Member.READY if self._ready else Member.JOINING,
+            members=self.member_names(),
+            publishes=[topic for topic, _, _ in published],
+            types=[msgtype for _, msgtype, _ in published],
+            sparse=[sparse for _, _, sparse in published],
+            subscribes=self.subscriptions_wanted(),
+            parameters=self._effective().model_dump_json(),
+            message=str(self.failure or ""),
+        )
+        self._host["members"].publish(own)
+
+    def _effective(self) -> NodeParameters:
+        """The table with the remapping of the command line written into ``remap``."""
+        namespace = self.get_namespace().rstrip("/") + "/"
+        ports = [port.topic for port in self.ports()]
+        rules = [f"{port}:={self.topic(port).removeprefix(namespace)}" for port in ports]
+        changed = sorted({rule for rule in rules if rule.split(":=")[0] != rule.split(":=")[1]})
+        return self.table.model_copy(update={"remap": changed})
+
+    def ports(self) -> list[Any]:
+        """Ports of the stage that it runs, if it runs one."""
+        return []
+
+    def member_names(self) -> list[str]:
+        """Fully qualified names of all members; only the time master knows them."""
+        return []
+
+    def _on_member(self, member: Member) -> None:
+        if self.table.run_id and member.run_id and member.run_id != self.table.run_id:
+            return
+        self.members[member.name] = member
+        if member.members:
+            self.master = member
+        if self.master and member.name in self.master.members and member.state == Member.FAILED:
+            if member.name != self.full_name:
+                self.fail(LatheError(f"{member.name} failed: {member.message}"), cause="abandoned")
+        self.members_changed()
+        self._settle()
+
+    def _on_cell_state(self, state: CellState) -> None:
+        if state.state == CellState.FAILED and state.run_id == self.table.run_id:
+            self.fail(LatheError(f"the cell failed: {state.message}"), cause="abandoned")
+
+    @property
+    def complete(self) -> bool:
+        """Whether the master and all members that it names have announced themselves."""
+        return self.master is not None and all(name in self.members for name in self.master.members)
+
+    def _settle(self) -> None:
+        """Become ready once every input and output is matched with its peers by name."""
+        if self._ready or self.failure or not self.complete or not self.matched():
+            return
+        self._ready = True
+        self.announce()
+        self.reporter("ready", self.get_name())
+
+    def matched(self) -> bool:
+        """Whether the graph shows the publisher of each input and the members that read each output."""
+        assert self.master is not None
+        peers = [self.members[name] for name in self.master.members if name != self.full_name]
+        for topic in self.subscriptions_wanted():
+            expected = {peer.name for peer in peers if topic in peer.publishes}
+            if not expected or not expected <= _names(self.get_publishers_info_by_topic(topic)):
+                return False
+        for topic, _, _ in self.publications():
+            expected = {peer.name for peer in peers if topic in peer.subscribes}
+            if not expected <= _names(self.get_subscriptions_info_by_topic(topic)):
+                return False
+        return True
+
+    # ---- progress and time --------------------------------------------------------------------------
+
+    def progressed(self, blocks: int, samples: int, *, last: bool) -> None:
+        """Tell the time master, now and then and at the end."""
+        if last or blocks - self._reported_blocks >= self._progress_step:
+            self._reported_blocks = blocks
+            self._host["progress"].publish(
+                Progress(run_id=self.table.run_id, name=self.full_name, blocks=blocks, samples=samples)
+            )
+
+    def end(self, acknowledged: list[Publisher]) -> None:
+        """The node's part is over; wait until everybody has its last messages."""
+        from rclpy.duration import Duration
+
+        for publisher in [*acknowledged, self._host["progress"]]:
+            if not publisher.wait_for_all_acked(Duration(seconds=2)):
+                self.get_logger().warning(f"{publisher.topic}: not everybody has acknowledged the last message")
+        self.done = True
+        self.reporter("done", self.get_name())
+
+    def tick(self, now: float) -> None:
+        """Do what is due by the wall clock; nothing here touches a sample."""
+        self.next_tick = now + _TICK if not self._ready else now + 0.1
+        if self.active and not self._ready:
+            self._settle()
+        if self.active and now >= self._diagnostics_due:
+            self._diagnostics_due = now + _DIAGNOSTICS_PERIOD
+            self._publish_diagnostics()
+
+    def _publish_diagnostics(self) -> None:
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.ERROR if self.failure else DiagnosticStatus.OK,
+            name=self.full_name,
+            message=str(self.failure or ("ready" if self._ready else "waiting for members")),
+            hardware_id=self.kind,
+            values=[KeyValue(key=key, value=str(value)) for key, value in self.statistics().items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._host["diagnostics"].publish(message)
+
+
+def _names(endpoints: list[Any]) -> set[str]:
+    return {f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in endpoints}

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The spindle as time master: it starts the run, lets blocks go by window and pace, and ends it."""
+
+import json
+import time
+
+from lathe_rc_msgs.msg import CellState, Progress
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.scenario import TABLES
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderParameters
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import LatheError
+from lathe_rc.nodes.ports import latched_qos
+from lathe_rc.nodes.stage_node import StageNode
+
+_STALL = 0.1  # [s] of silence after which a member is named
+_BURST = 64  # blocks let go before other work gets its turn
+
+
+class SpindleNode(StageNode):
+    """See the module; its stage is the spindle and its encoder.
+
+    Attributes:
+        slipped: seconds that the schedule has slipped because members were slow.
+    """
+
+    stage: SpindleEncoder
+
+    def configure_part(self) -> None:
+        """See `StageNode`."""
+        super().configure_part()
+        assert isinstance(self.table, SpindleEncoderParameters)
+        self._pace = self.table
+        namespace = self.get_namespace().rstrip("/")
+        self._member_names = [
+            name if name.startswith("/") else f"{namespace}/{name}" for name in self.table.members
+        ]
+        self._completed = dict.fromkeys(self._member_names, 0)
+        self._blocks_in_run = (
+            None if self.stage.samples is None else -(-self.stage.samples // self.table.block_size)
+        )
+        self._running = False
+        self._schedule = 0.0  # monotonic time at which sample 0 would have been, were there no slips
+        self._heard = time.monotonic()
+        self._stalled = ""
+        self.slipped = 0.0
+
+    def activate_part(self) -> None:
+        """See `StageNode`."""
+        super().activate_part()
+        self._state = self.create_publisher(CellState, "cell_state", latched_qos(1))
+        self._clock_publisher = self.create_publisher(Clock, "/clock", QoSProfile(depth=10))
+        self.create_subscription(Progress, "progress", self.guarded(self._on_progress), QoSProfile(depth=1000))
+        self._say(CellState.WAITING, 0)
+
+    def member_names(self) -> list[str]:
+        """All members, itself included; nobody when it runs alone."""
+        return [self.full_name, *self._member_names] if self._member_names else []
+
+    def statistics(self) -> dict[str, object]:
+        """See `CellNode`."""
+        return {
+            **super().statistics(),
+            "blocks in flight": self.blocks - self._slowest[1],
+            "slowest member": self._slowest[0],
+            "schedule slipped [s]": round(self.slipped, 3),
+        }
+
+    def _say(self, state: int, first: int, why: str = "") -> None:
+        self._state.publish(
+            CellState(run_id=self.table.run_id, state=state, first_index=first, message=why[:1024])
+        )
+
+    @property
+    def _slowest(self) -> tuple[str, int]:
+        name = min(self._completed, key=lambda name: self._completed[name], default="")
+        return name, self._completed.get(name, self.blocks)
+
+    # ---- start --------------------------------------------------------------------------------------
+
+    def members_changed(self) -> None:
+        """Begin when every member is ready and the cell passes its check."""
+        super().members_changed()
+        if self._running or not self._member_names:
+            return
+        known = [self.members.get(name) for name in self.member_names()]
+        if all(member is not None and member.state == member.READY for member in known):
+            self._check_cell()
+            self._begin()
+
+    def _check_cell(self) -> None:
+        """The same check as before an offline run, with the parameters that the members really have."""
+        namespace = self.get_namespace().rstrip("/") + "/"
+        nodes = {}
+        for name in self.member_names():
+            member = self.members[name]
+            if member.stage not in TABLES:
+                continue
+            values = json.loads(member.parameters) | {"stage": member.stage}
+            nodes[name.removeprefix(namespace)] = TABLES[member.stage].read(name, values)
+        Cell(nodes).check()
+
+    def _begin(self) -> None:
+        self._running = True
+        self._heard = time.monotonic()
+        self._schedule = self._heard
+        self._say(CellState.RUNNING, 0)
+        self.reporter("block0", self.get_name())
+        self.release()
+
+    # ---- run ----------------------------------------------------------------------------------------
+
+    def _on_progress(self, progress: Progress) -> None:
+        if progress.name not in self._completed or progress.run_id != self.table.run_id:
+            return
+        if progress.blocks > self.blocks:
+            raise LatheError(f"{progress.name} claims {progress.blocks} blocks; {self.blocks} were sent")
+        before = self._slowest[1]
+        self._completed[progress.name] = progress.blocks
+        self._heard = time.monotonic()
+        self._stalled = ""
+        if self._slowest[1] > before:
+            samples = min(self._slowest[1] * self.table.block_size, self.samples)
+            stamp = messages.header(max(samples - 1, 0), self.table.step_ns).stamp
+            clock = Clock()
+            clock.clock.sec, clock.clock.nanosec = stamp.sec, stamp.nanosec
+            self._clock_publisher.publish(clock)
+            self.reporter("progress", self.get_name(), samples=samples)
+        if self._slowest[1] == self._blocks_in_run:
+            self._finish_run()
+        else:
+            self.release()
+
+    def _credit(self) -> bool:
+        """Whether the window lets one more block go."""
+        if not self._completed or not self.table.window:
+            return True
+        return self.blocks - self._slowest[1] < self.table.window
+
+    def release(self) -> None:
+        """Let go every block that credit and pace allow."""
+        if not self._running or self.failure or self.done:
+            return
+        factor = self._pace.speed_factor
+        size, step = self.table.block_size, self.table.step
+        for _ in range(_BURST):
+            if self.blocks == self._blocks_in_run or not self._credit():
+                return
+            if factor:
+                now = time.monotonic()
+                due = self._schedule + (self.blocks + 1) * size * step / factor
+                if now < due:
+                    self.next_tick = min(self.next_tick, due)
+                    return
+                late = now - due
+                if late > size * step / factor:
+                    # The schedule slips by the time lost: no burst to catch up.
+                    self._schedule += late
+                    self.slipped += late
+            rest = size if self.stage.samples is None else self.stage.samples - self.samples
+            samples = min(size, rest)
+            self.compute(samples, [], last=samples == rest and self.stage.samples is not None)
+        self.next_tick = time.monotonic()
+
+    def advance(self) -> None:
+        """Nothing comes in."""
+
+    def ended(self) -> None:
+        """Its last block is out; the run ends when all members have completed it."""
+        if not self._member_names:
+            self._finish_run()
+
+    def _finish_run(self) -> None:
+        self._say(CellState.ENDED, self.samples)
+        self.end([*self._publishers_by_topic.values(), self._state])
+
+    def fail(self, error: LatheError, *, cause: str = "error") -> None:
+        """As the arbiter, fail the cell with it."""
+        first = not self.failure
+        super().fail(error, cause=cause)
+        if first and hasattr(self, "_state"):
+            self._say(CellState.FAILED, self.samples, str(error))
+
+    def tick(self, now: float) -> None:
+        """See `CellNode`."""
+        super().tick(now)
+        if not self.active or self.done:
+            return
+        if not self._running and not self._member_names:
+            self._begin()
+        self.release()
+        name, blocks = self._slowest
+        if self._running and not self._credit() and now - self._heard > _STALL and self._stalled != name:
+            self._stalled = name
+            self.get_logger().warning(f"{name} has been silent for {_STALL * 1e3:.0f} ms at block {blocks}")
+            self.reporter("stall", self.get_name(), member=name, blocks=blocks)
