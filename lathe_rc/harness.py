@@ -33,10 +33,12 @@ from lathe_rc.bag.writer import BagWriter
 from lathe_rc.cell import messages
 from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
+from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
@@ -190,10 +192,27 @@ def run(
         )
 
 
+class _Watcher:
+    """A sink that turns an offline run into the events of a cell of nodes."""
+
+    def __init__(self, watch: Callable[[Event], None]) -> None:
+        self._watch = watch
+
+    def chunk(
+        self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, Sequence[Sparse]]
+    ) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        for topic, found in sparse.items():
+            for message in found:
+                if message.type == messages.LEARNING:
+                    self._watch({"event": "cycle", "node": topic, "sample": message.index, **message.values})
+        self._watch({"event": "progress", "node": "", "samples": first + samples})
+
+
 def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[Event], None]) -> Result:
     engine = Engine(cell)
     collector = Collector(cell, engine.samples)
-    sinks: list[Sink] = [collector]
+    sinks: list[Sink] = [collector, _Watcher(watch)]
     writer = None
     if bag is not None:
         table = next((t for t in scenario.nodes.values() if isinstance(t, RecorderParameters)), RecorderParameters())
@@ -206,7 +225,8 @@ def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[
         sinks.append(OfflineRecorder(cell, engine.samples, writer))
     start = time.monotonic()
     try:
-        engine.run(sinks, lambda samples: watch({"event": "progress", "node": "", "samples": samples}))
+        watch({"event": "block0", "node": cell.master.name})
+        engine.run(sinks)
     finally:
         if writer:
             writer.close()

@@ -8,6 +8,7 @@ from rosbags.rosbag2 import Reader, ReaderError
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
+from lathe_rc.cell.wire import Decoder
 from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.errors import InputError, LatheError
 
@@ -25,6 +26,7 @@ def read(path: Path) -> Recording:
     parts: dict[str, dict[str, list[Samples]]] = {}
     sparse: dict[str, SparseTopic] = {}
     expected: dict[str, int] = {}
+    decoders: dict[str, Decoder] = {}
     types: dict[str, str] = {}
     try:
         with Reader(path) as reader:
@@ -32,25 +34,22 @@ def read(path: Path) -> Recording:
             for connection in wanted:
                 types[connection.topic] = connection.msgtype
                 if connection.msgtype in DENSE:
+                    decoders[connection.topic] = Decoder(connection.msgtype)
                     parts[connection.topic] = {name: [] for name in messages.sample_fields(connection.msgtype)}
                     expected[connection.topic] = 0
                 else:
                     sparse[connection.topic] = SparseTopic()
             for connection, stamp, data in reader.messages(wanted):
-                message = messages.decode(connection.msgtype, bytes(data))
                 topic = connection.topic
                 if topic in sparse:
-                    sparse[topic].add(stamp, message)
+                    sparse[topic].add(stamp, messages.decode(connection.msgtype, bytes(data)))
                     continue
-                if message.block.first_index != expected[topic]:
-                    raise LatheError(
-                        f"{path}: {topic} goes from sample {expected[topic]} to {message.block.first_index}"
-                    )
-                samples = 0
+                block = decoders[topic].decode(bytes(data))
+                if block.first_index != expected[topic]:
+                    raise LatheError(f"{path}: {topic} goes from sample {expected[topic]} to {block.first_index}")
+                expected[topic] += block.samples
                 for name, arrays in parts[topic].items():
-                    arrays.append(getattr(message, name))
-                    samples = arrays[-1].size
-                expected[topic] += samples
+                    arrays.append(block.signals[name])
     except ReaderError as error:
         raise InputError(f"{path}: not a readable bag ({error})") from None
     dense = {

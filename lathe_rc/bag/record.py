@@ -11,6 +11,7 @@ from lathe_rc.cell.framing import Framer
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wire import Encoder
 from lathe_rc.cell.wiring import Cell
 
 SPARE_DEPTH = 32  #: queue length of signal topics beyond the window
@@ -38,6 +39,10 @@ class OfflineRecorder:
         shared = cell.master.shared
         self._cell, self._samples, self._writer = cell, samples, writer
         self._block, self._step_ns = shared.block_size, shared.step_ns
+        self._encoders = {
+            topic: Encoder(source.type, shared.run_id, f"/{source.node}", shared.step_ns)
+            for topic, source in cell.dense.items()
+        }
         self._framers = {name: Framer(shared.run_id, f"/{name}", shared.step_ns) for name in cell.stages}
         self._merger = Merger(
             {f"/{topic}": source.node for topic, source in cell.dense.items()},
@@ -69,13 +74,6 @@ class OfflineRecorder:
         self._merger.add_sparse(f"/{topic}", messages.stamp_ns(framed), messages.encode(message.type, framed))
 
     def _add_block(self, topic: str, first: int, signals: Signals, *, last: bool) -> None:
-        source = self._cell.dense[topic]
-        framed = self._framers[source.node].block(source.type, first, signals, last=last)
-        self._merger.add_block(
-            f"/{topic}",
-            messages.stamp_ns(framed),
-            messages.encode(source.type, framed),
-            first=first,
-            companions=framed.block.companions,
-            last=last,
-        )
+        companions = self._framers[self._cell.dense[topic].node].companions
+        stamp, data = self._encoders[topic].encode(first, signals, last=last, companions=companions)
+        self._merger.add_block(f"/{topic}", stamp, data, first=first, companions=companions, last=last)

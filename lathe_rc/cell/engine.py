@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The offline host: all stages of a cell in one loop."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from typing import Protocol
 
 from lathe_rc.cell.messages import MAX_BLOCK, Signals, sample_fields
@@ -14,7 +14,9 @@ from lathe_rc.errors import InputError
 class Sink(Protocol):
     """What takes the results of a run, chunk by chunk, in order."""
 
-    def chunk(self, first: int, samples: int, dense: dict[str, Signals], sparse: dict[str, list[Sparse]]) -> None:
+    def chunk(
+        self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]
+    ) -> None:
         """Take the samples ``first`` on of every topic and the sparse messages among them, by relative topic."""
 
 
@@ -45,8 +47,8 @@ class Engine:
         for stage in cell.stages.values():
             compile_kernels(stage)
 
-    def run(self, sinks: Iterable[Sink], progress: Callable[[int], None] | None = None) -> None:
-        """Run to the end; ``progress`` is told the number of samples done."""
+    def run(self, sinks: Iterable[Sink]) -> None:
+        """Run to the end."""
         receivers = list(sinks)
         for first in range(0, self.samples, self._chunk):
             samples = min(self._chunk, self.samples - first)
@@ -56,8 +58,6 @@ class Engine:
                 self._advance(stage, first, samples, dense, sparse)
             for sink in receivers:
                 sink.chunk(first, samples, dense, sparse)
-            if progress:
-                progress(first + samples)
 
     def _advance(
         self,

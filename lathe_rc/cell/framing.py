@@ -1,29 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages from what a stage computes; the same in every host."""
+"""Sparse messages from what a stage computes; the same in every host. Blocks: see `lathe_rc.cell.wire`."""
 
 from typing import Any
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.stage import Sparse
 
 
 class Framer:
-    """Makes the messages of one node.
+    """Makes the sparse messages of one node.
 
     Args:
         run_id: identity of the run.
         source: fully qualified name of the node.
         step_ns: sampling step [ns].
+
+    Attributes:
+        companions: messages made so far, which the node's next block reports.
     """
 
     def __init__(self, run_id: str, source: str, step_ns: int) -> None:
         self._run_id, self._source, self._step_ns = run_id, source, step_ns
-        self._companions = 0
+        self.companions = 0
 
     def sparse(self, message: Sparse) -> Any:
         """A message at a chosen sample; counted, so that blocks can say how many came before."""
-        self._companions += 1
+        self.companions += 1
         head = messages.header(message.index, self._step_ns)
         kind = messages.store().types[message.type]
         if message.type.startswith(messages.PACKAGE):
@@ -35,10 +37,3 @@ class Framer:
                 **message.values,
             )
         return kind(header=head, **message.values)
-
-    def block(self, msgtype: str, first: int, signals: Signals, *, last: bool) -> Any:
-        """A block; its sparse messages must have been made before."""
-        info = messages.block_info(
-            self._run_id, self._source, first, self._step_ns, last=last, companions=self._companions
-        )
-        return messages.block_message(msgtype, info, signals)

@@ -3,7 +3,7 @@
 
 from functools import cache
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -27,23 +27,6 @@ MAX_BLOCK = 8192  #: bound of the arrays of a block [sample]; the .msg files say
 
 Samples = npt.NDArray[Any]
 Signals = dict[str, Samples]  #: the arrays of a block by field name
-
-
-class BlockInfo(Protocol):
-    """What a block says about itself; see BlockInfo.msg."""
-
-    run_id: str
-    source: str
-    first_index: int
-    step_ns: int
-    last: bool
-    companions: int
-
-
-class Block(Protocol):
-    """A message that is a block of samples."""
-
-    block: BlockInfo
 
 
 @cache
@@ -88,22 +71,6 @@ def stamp_ns(message: Any) -> int:
     """Simulated time [ns] in a message's header."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-
-
-def block_message(msgtype: str, info: BlockInfo, signals: Signals) -> Any:
-    """A block message; its stamp is the time of its last sample."""
-    samples = next(iter(signals.values())).size
-    return store().types[msgtype](
-        header(info.first_index + samples - 1, info.step_ns), info, *(signals[f] for f in sample_fields(msgtype))
-    )
-
-
-def block_info(
-    run_id: str, source: str, first_index: int, step_ns: int, *, last: bool, companions: int
-) -> BlockInfo:
-    """What a block says about itself."""
-    info = store().types[f"{PACKAGE}/msg/BlockInfo"](run_id, source, first_index, step_ns, last, companions)
-    return cast("BlockInfo", info)
 
 
 def encode(msgtype: str, message: Any) -> bytes:

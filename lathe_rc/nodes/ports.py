@@ -2,14 +2,14 @@
 """Signal topics over DDS: quality of service, and the check of every block that comes in."""
 
 from collections import deque
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from lathe_rc.bag.record import SPARE_DEPTH
-from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import LatheError
 
 
@@ -39,82 +39,72 @@ class BlockQueue:
         topic: fully qualified name.
         msgtype: message type.
         parameters: of the node that reads.
+        fields: those that it reads.
 
     Attributes:
-        blocks: checked messages that wait to be used.
+        blocks: checked blocks that wait to be used.
         source: the only node whose blocks are accepted; empty until the first block of a node alone.
         lost: blocks that never came; always 0 unless the cell is free-running.
     """
 
-    def __init__(self, topic: str, msgtype: str, parameters: NodeParameters) -> None:
+    def __init__(self, topic: str, msgtype: str, parameters: NodeParameters, fields: list[str]) -> None:
         self.topic, self.type = topic, msgtype
-        self.blocks: deque[Any] = deque()
+        self.blocks: deque[Block] = deque()
         self.source = ""
         self.lost = 0
-        self._parameters = parameters
-        self._expected: int | None = None
-        self._newest: Any = None
+        self._decoder = Decoder(msgtype, fields)
+        self._run_id, self._step_ns, self._size = parameters.run_id, parameters.step_ns, parameters.block_size
+        self._free_running = not parameters.window
         self._limit = 8 * (parameters.window + SPARE_DEPTH)
+        self._expected: int | None = None
+        self._newest: Block | None = None
 
     def expect(self, source: str) -> None:
         """Accept blocks of this node alone, from sample 0 on."""
         self.source, self._expected = source, 0
 
-    def add(self, data: bytes) -> Any:
+    def add(self, data: bytes) -> Block:
         """Check a block and queue it.
-
-        Returns:
-            The message.
 
         Raises:
             LatheError: a stranger, another run or step, a gap, a repeat, arrays of different lengths, or far more
                 blocks waiting than the window allows.
         """
-        message = messages.decode(self.type, data)
-        info = message.block
-        own = self._parameters
-        lengths = {getattr(message, name).size for name in messages.sample_fields(self.type)}
-        if own.run_id and info.run_id != own.run_id:
-            raise LatheError(f"{self.topic}: block of run {info.run_id!r} from {info.source}; expected {own.run_id!r}")
-        if self.source and info.source != self.source:
-            raise LatheError(f"{self.topic}: block from {info.source}; expected {self.source}")
-        if info.step_ns != own.step_ns:
-            raise LatheError(f"{self.topic}: {info.source} has a step of {info.step_ns} ns; expected {own.step_ns}")
-        if len(lengths) != 1 or 0 in lengths:
-            raise LatheError(f"{self.topic}: {info.source} sends arrays of {sorted(lengths)} samples in one block")
+        try:
+            block = self._decoder.decode(data)
+        except ValueError as error:
+            raise LatheError(f"{self.topic}: {error}") from None
+        if self._run_id and block.run_id != self._run_id:
+            raise LatheError(f"{self.topic}: block of run {block.run_id!r} from {block.source}; expected {self._run_id!r}")
+        if self.source and block.source != self.source:
+            raise LatheError(f"{self.topic}: block from {block.source}; expected {self.source}")
+        if block.step_ns != self._step_ns:
+            raise LatheError(f"{self.topic}: {block.source} has a step of {block.step_ns} ns; expected {self._step_ns}")
         if self._expected is None:
-            self.source, self._expected = info.source, info.first_index
-        if info.first_index != self._expected and self._newest is None:
-            raise LatheError(f"{self.topic}: {info.source} begins at sample {info.first_index}; expected 0")
-        if info.first_index != self._expected:
-            self._gap(info)
-        (samples,) = lengths
-        self._expected = info.first_index + samples
-        self._newest = message
-        self.blocks.append(message)
+            self.source, self._expected = block.source, block.first_index
+        if block.first_index != self._expected:
+            self._gap(block, self._expected)
+        self._expected = block.first_index + block.samples
+        self._newest = block
+        self.blocks.append(block)
         if len(self.blocks) > self._limit:
             raise LatheError(f"{self.topic}: {len(self.blocks)} blocks wait; the node cannot keep up")
-        return message
+        return block
 
-    def _gap(self, info: messages.BlockInfo) -> None:
+    def _gap(self, block: Block, expected: int) -> None:
         """Refuse a gap or a repeat; a free-running cell goes on over a gap with the last sample held, and counts."""
-        assert self._expected is not None
-        missing = info.first_index - self._expected
-        if missing < 0 or self._parameters.window:
+        missing = block.first_index - expected
+        if missing < 0 or not self._free_running or self._newest is None:
             what = f"{missing} samples are missing" if missing > 0 else "a block came twice"
             raise LatheError(
-                f"{self.topic}: {info.source} goes from sample {self._expected} to {info.first_index}: {what}"
+                f"{self.topic}: {block.source} goes from sample {expected} to {block.first_index}: {what}"
             )
-        if missing > self._limit * self._parameters.block_size:
-            raise LatheError(f"{self.topic}: {info.source} jumps by {missing} samples")
-        for first in range(self._expected, info.first_index, self._parameters.block_size):
-            samples = min(self._parameters.block_size, info.first_index - first)
-            held = {
-                name: np.repeat(getattr(self._newest, name)[-1:], samples)
-                for name in messages.sample_fields(self.type)
-            }
-            own = messages.block_info(
-                info.run_id, info.source, first, info.step_ns, last=False, companions=info.companions
+        if missing > self._limit * self._size:
+            raise LatheError(f"{self.topic}: {block.source} jumps by {missing} samples")
+        for first in range(expected, block.first_index, self._size):
+            samples = min(self._size, block.first_index - first)
+            held = {name: np.repeat(array[-1:], samples) for name, array in self._newest.signals.items()}
+            self.blocks.append(
+                replace(self._newest, first_index=first, samples=samples, signals=held, last=False)
             )
-            self.blocks.append(messages.block_message(self.type, own, held))
             self.lost += 1

@@ -57,16 +57,21 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
     for node in nodes:
         executor.add_node(node)
     # EventsExecutor.spin() hangs in Jazzy and Kilted; a loop of spin_once() works and sees signals.
-    while not all(node.done or node.failure for node in nodes):
+    look = 0.0
+    while not stop.signal:
         now = time.monotonic()
         due = min(node.next_tick for node in nodes)
+        if due <= now:
+            for node in nodes:
+                if now >= node.next_tick and not (node.done or node.failure):
+                    node.tick(now)
+            if all(node.done for node in nodes) or any(node.failure for node in nodes):
+                return
+            if now >= look:
+                look = now + _LONGEST_WAIT
+                if reporter.orphaned:
+                    return
         executor.spin_once(timeout_sec=min(max(due - now, 0.0), _LONGEST_WAIT))
-        now = time.monotonic()
-        for node in nodes:
-            if now >= node.next_tick and not (node.done or node.failure):
-                node.tick(now)
-        if stop.signal or reporter.orphaned or any(node.failure for node in nodes):
-            return
 
 
 def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -> int:
@@ -98,6 +103,13 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
         for node in nodes:
             node.finish()
         rclpy.try_shutdown()
+
+
+def split(arguments: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:
+    """Names and kinds of the nodes NAME[:STAGE] before ``--ros-args``, and what follows."""
+    end = list(arguments).index("--ros-args") if "--ros-args" in arguments else len(arguments)
+    parts = [text.partition(":") for text in arguments[:end]]
+    return [(name, kind or name) for name, _, kind in parts], list(arguments[end:])
 
 
 def main(kind: str) -> None:

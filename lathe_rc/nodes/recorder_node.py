@@ -13,6 +13,7 @@ from lathe_rc.bag.record import SPARE_DEPTH, about
 from lathe_rc.bag.writer import BagWriter, offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.cell.recorder import RecorderParameters
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import LatheError, LossyRunError
 from lathe_rc.nodes.ports import BlockQueue, latched_qos, signal_qos
 from lathe_rc.nodes.shell import CellNode
@@ -85,12 +86,13 @@ class RecorderNode(CellNode):
     # ---- topics -------------------------------------------------------------------------------------
 
     def members_changed(self) -> None:
-        """Subscribe once all members are known; without a master, to whatever is announced."""
-        alone = self.master is None or not self.master.members
+        """Subscribe once all members are known; beside a spindle that runs alone, to whatever is announced."""
+        alone = any(
+            member.stage == SpindleEncoder.kind and not member.members for member in self.members.values()
+        )
         if not alone and (self._queues or not self.complete):
             return
-        names = list(self.members) if alone or not self.master else list(self.master.members)
-        for name in names:
+        for name in list(self.members) if self.master is None else list(self.master.members):
             member = self.members[name]
             for topic, msgtype, sparse in zip(member.publishes, member.types, member.sparse, strict=True):
                 if topic not in self._queues and topic not in self._sparse:
@@ -105,7 +107,7 @@ class RecorderNode(CellNode):
             self._sparse[topic] = source
             callback = self.guarded(lambda data: self._on_sparse(topic, msgtype, data))
         else:
-            queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table)
+            queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
             if in_cell:
                 queue.expect(source)
             callback = self.guarded(lambda data: self._on_block(queue, data))
@@ -133,14 +135,18 @@ class RecorderNode(CellNode):
     def _on_block(self, queue: BlockQueue, data: bytes) -> None:
         if self.done:
             return
-        message = queue.add(data)
+        block = queue.add(data)
         queue.blocks.clear()
-        info, stamp = message.block, messages.stamp_ns(message)
         if self._merger is None:
-            self._write(Entry(stamp, queue.topic, 0, data))
+            self._write(Entry(block.log_ns, queue.topic, 0, data))
             return
         self._merger.add_block(
-            queue.topic, stamp, data, first=info.first_index, companions=info.companions, last=info.last
+            queue.topic,
+            block.log_ns,
+            data,
+            first=block.first_index,
+            companions=block.companions,
+            last=block.last,
         )
         self._drain()
 

@@ -175,7 +175,7 @@ class SpindleNode(StageNode):
 
     def _finish_run(self) -> None:
         self._say(CellState.ENDED, self.samples)
-        self.end([*self._publishers_by_topic.values(), self._state])
+        self.end([*self._signals.values(), self._state])
 
     def fail(self, error: LatheError, *, cause: str = "error") -> None:
         """As the arbiter, fail the cell with it."""

@@ -5,7 +5,6 @@ import importlib
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 from lathe_rc_msgs.srv import Schedule
 from rclpy.publisher import Publisher
 
@@ -15,6 +14,7 @@ from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.stage import Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.track import Track
+from lathe_rc.cell.wire import Encoder, all_finite
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes.ports import BlockQueue, signal_qos
 from lathe_rc.nodes.shell import CellNode
@@ -45,23 +45,25 @@ class StageNode(CellNode):
         self.samples = 0
         self._started = False
         self._framer = Framer(self.table.run_id, self.full_name, self.table.step_ns)
+        self._encoders = [
+            (self.topic(port.topic), Encoder(port.type, self.table.run_id, self.full_name, self.table.step_ns))
+            for port in self.stage.outputs
+        ]
+        self._sparse_topics = {topic: self.topic(topic) for topic in self.stage.sparse_topics}
         self._queues: dict[str, BlockQueue] = {}
         self._tracks: dict[str, Track] = {}
-        self._read: list[tuple[str, str]] = []  # topic and field of everything that the stage reads
-        block = max(self.table.block_size, 1)
-        for port in self.stage.inputs:
-            topic = self.topic(port.topic)
-            self._read += [(topic, name) for name in port.fields if (topic, name) not in self._read]
-            self._queues.setdefault(topic, BlockQueue(topic, port.type, self.table))
-            delay = max(p.delay for p in self.stage.inputs if self.topic(p.topic) == topic)
-            fields = {name for p in self.stage.inputs if self.topic(p.topic) == topic for name in p.fields}
-            self._tracks[topic] = Track(port.type, sorted(fields), delay, block)
-        self._topics = {port.topic: self.topic(port.topic) for port in self.stage.inputs}
-        self._forward = list(dict.fromkeys(self.topic(p.topic) for p in self.stage.inputs if p.delay == 0))
+        ports = [(self.topic(port.topic), port) for port in self.stage.inputs]
+        for topic, port in ports:
+            fields = sorted({name for other, p in ports if other == topic for name in p.fields})
+            delay = max(p.delay for other, p in ports if other == topic)
+            self._queues[topic] = BlockQueue(topic, port.type, self.table, fields)
+            self._tracks[topic] = Track(port.type, fields, delay, self.table.block_size)
+        self._inputs = [(self._queues[topic], self._tracks[topic], port.delay) for topic, port in ports]
+        self._forward = [self._queues[topic] for topic in dict.fromkeys(t for t, p in ports if p.delay == 0)]
 
     def activate_part(self) -> None:
         """Make publishers, subscriptions and the service that schedules events."""
-        self._publishers_by_topic: dict[str, Publisher] = {
+        self._signals: dict[str, Publisher] = {
             topic: self.create_publisher(message_class(msgtype), topic, signal_qos(self.table))
             for topic, msgtype, _ in self.publications()
         }
@@ -130,45 +132,40 @@ class StageNode(CellNode):
     def _on_block(self, queue: BlockQueue, data: bytes) -> None:
         if self.done:
             return
-        message = queue.add(data)
-        for topic, name in self._read:
-            if topic == queue.topic and not np.isfinite(getattr(message, name)).all():
+        block = queue.add(data)
+        for name, samples in block.signals.items():
+            if not all_finite(samples):
                 raise LatheError(
-                    f"{topic}: {message.block.source} sends a {name} that is not finite in the block from sample "
-                    f"{message.block.first_index}"
+                    f"{queue.topic}: {block.source} sends a {name} that is not finite in the block from sample "
+                    f"{block.first_index}"
                 )
         self.advance()
 
-    def _load(self, topic: str, until: int) -> bool:
+    @staticmethod
+    def _load(queue: BlockQueue, track: Track, until: int) -> bool:
         """Move queued blocks into the topic's track until it reaches sample ``until``; False if they do not."""
-        queue, track = self._queues[topic], self._tracks[topic]
         while track.end < until and queue.blocks:
-            message = queue.blocks.popleft()
-            samples = getattr(message, next(iter(messages.sample_fields(queue.type)))).size
-            for name, array in track.extend(samples).items():
-                array[:] = getattr(message, name)
+            block = queue.blocks.popleft()
+            block.copy_to(track.extend(block.samples))
         return track.end >= until
 
     def _next(self) -> tuple[int, bool] | None:
         """Length of the next block and whether it is the last; None while an input is missing."""
-        found = []
-        for topic in self._forward:
-            queue = self._queues[topic]
-            if not queue.blocks:
-                return None
-            message = queue.blocks[0]
-            samples = getattr(message, next(iter(messages.sample_fields(queue.type)))).size
-            found.append((message.block.first_index, samples, bool(message.block.last)))
+        if not all(queue.blocks for queue in self._forward):
+            return None
+        heads = [queue.blocks[0] for queue in self._forward]
+        head = heads[0]
         if not self._started:
             # Alone, a node may join a stream that is under way; in a cell it begins at 0.
-            self._join(found[0][0])
-        if any(block != found[0] for block in found) or found[0][0] != self.samples:
-            raise LatheError(f"inputs are not cut into the same blocks: {dict(zip(self._forward, found, strict=True))}")
-        _, samples, last = found[0]
-        for port in self.stage.inputs:
-            if port.delay and not self._load(self.topic(port.topic), self.samples + samples - port.delay):
+            self._join(head.first_index)
+        for other in heads:
+            if other.first_index != self.samples or other.samples != head.samples:
+                spans = ", ".join(f"{b.source} {b.first_index}+{b.samples}" for b in heads)
+                raise LatheError(f"inputs are not cut into the same blocks at sample {self.samples}: {spans}")
+        for queue, track, delay in self._inputs:
+            if delay and not self._load(queue, track, self.samples + head.samples - delay):
                 return None
-        return samples, last
+        return head.samples, head.last
 
     def _join(self, first: int) -> None:
         self._started = True
@@ -183,12 +180,10 @@ class StageNode(CellNode):
             if ready is None:
                 return
             samples, last = ready
-            for topic in self._forward:
-                self._load(topic, self.samples + samples)
-            inputs = [
-                self._tracks[self.topic(port.topic)].view(self.samples - port.delay, samples)
-                for port in self.stage.inputs
-            ]
+            for queue, track, delay in self._inputs:
+                if not delay:
+                    self._load(queue, track, self.samples + samples)
+            inputs = [track.view(self.samples - delay, samples) for _, track, delay in self._inputs]
             self.compute(samples, inputs, last=last)
 
     def compute(self, samples: int, inputs: Sequence[Signals], *, last: bool) -> None:
@@ -196,25 +191,22 @@ class StageNode(CellNode):
         outputs = [messages.allocate(port.type, samples) for port in self.stage.outputs]
         for sparse in self.stage.advance(self.samples, inputs, outputs):
             framed = self._framer.sparse(sparse)
-            self._publish(sparse.topic, messages.encode(sparse.type, framed))
+            self._signals[self._sparse_topics[sparse.topic]].publish(messages.encode(sparse.type, framed))
             if sparse.type == messages.LEARNING:
                 values = {key: float(value) for key, value in sparse.values.items()}
                 self.reporter("cycle", self.get_name(), sample=sparse.index, **values)
-        for port, signals in zip(self.stage.outputs, outputs, strict=True):
-            framed = self._framer.block(port.type, self.samples, signals, last=last)
-            self._publish(port.topic, messages.encode(port.type, framed))
+        for (topic, encoder), signals in zip(self._encoders, outputs, strict=True):
+            _, data = encoder.encode(self.samples, signals, last=last, companions=self._framer.companions)
+            self._signals[topic].publish(data)
         self.blocks += 1
         self.samples += samples
         self.progressed(self.blocks, self.samples, last=last)
         if last:
             self.ended()
 
-    def _publish(self, relative: str, data: bytes) -> None:
-        self._publishers_by_topic[self.topic(relative)].publish(data)
-
     def ended(self) -> None:
         """The last block has been computed."""
-        self.end(list(self._publishers_by_topic.values()))
+        self.end(list(self._signals.values()))
         if self.lost:
             self.fail(LossyRunError(f"{self.full_name}: lost {self.lost} blocks of a free-running cell"))
 

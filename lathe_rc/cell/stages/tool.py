@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
+from lathe_rc import resources
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import NodeParameters, parameter
@@ -49,7 +50,7 @@ class ToolParameters(NodeParameters):
         if self.profile == "csv":
             if not self.profile_file:
                 raise InputError("tool.profile_file is empty; name the CSV file of the profile")
-            return read_csv(Path(self.profile_file))
+            return read_csv(resources.find(Path(self.profile_file)))
         if self.profile == "piston":
             return Piston(
                 self.piston_ovality,

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blocks as CDR bytes, at the rate that a cell needs.
+
+rosbags encodes and decodes any message, at 10 µs each. All blocks of a topic, however, are the same bytes but for a
+few numbers and the samples. So for each length of block one message is encoded by rosbags, the places of the
+numbers are found by changing them one at a time, and from then on only those places are written or read. Whatever
+does not match the layout is decoded by rosbags and learned anew: CDR itself is nowhere written by hand.
+"""
+
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import START_NS, Samples, Signals
+
+_BILLION = 1_000_000_000
+# Number in the message: struct format and a value that differs from 0 in every byte.
+_NUMBERS = {
+    "sec": ("<i", 0x01010101),
+    "nanosec": ("<I", 0x01010101),
+    "first_index": ("<Q", 0x0101010101010101),
+    "step_ns": ("<I", 0x01010101),
+    "last": ("<?", 1),
+    "companions": ("<Q", 0x0101010101010101),
+}
+
+
+def _message(
+    msgtype: str, run_id: str, source: str, samples: int, numbers: dict[str, int], fill: int = 0
+) -> bytes:
+    """A block encoded by rosbags."""
+    values = dict.fromkeys(_NUMBERS, 0) | numbers
+    types = messages.store().types
+    stamp = types["builtin_interfaces/msg/Time"](values["sec"], values["nanosec"])
+    info = types[f"{messages.PACKAGE}/msg/BlockInfo"](
+        run_id, source, values["first_index"], values["step_ns"], bool(values["last"]), values["companions"]
+    )
+    arrays = [
+        np.frombuffer(bytes([fill]) * (samples * dtype.itemsize), dtype)
+        for dtype in messages.sample_fields(msgtype).values()
+    ]
+    return messages.encode(msgtype, types[msgtype](types["std_msgs/msg/Header"](stamp, ""), info, *arrays))
+
+
+class _Layout:
+    """Where everything stands in the blocks of one type, length and source."""
+
+    def __init__(self, msgtype: str, run_id: str, source: str, samples: int) -> None:
+        self.run_id, self.source, self.samples = run_id, source, samples
+        self.template = _message(msgtype, run_id, source, samples, {})
+        self.places: dict[str, tuple[struct.Struct, int]] = {}
+        changing = np.zeros(len(self.template), dtype=bool)
+        blank = np.frombuffer(self.template, np.uint8)
+        for name, (code, value) in _NUMBERS.items():
+            changed = np.frombuffer(_message(msgtype, run_id, source, samples, {name: value}), np.uint8) != blank
+            self.places[name] = struct.Struct(code), int(np.argmax(changed))
+            changing |= changed
+        filled = np.frombuffer(_message(msgtype, run_id, source, samples, {}, fill=1), np.uint8) != blank
+        changing |= filled
+        self.fields: dict[str, tuple[np.dtype[Any], int]] = {}
+        edges = np.flatnonzero(np.diff(filled.astype(np.int8), prepend=0) == 1)
+        for (name, dtype), start in zip(messages.sample_fields(msgtype).items(), edges, strict=True):
+            self.fields[name] = dtype, int(start)
+        # Everything else is the same in each block: texts, lengths, padding.
+        bounds = np.flatnonzero(np.diff(changing.astype(np.int8), prepend=1, append=1))
+        self.constant = [
+            (int(a), int(b), self.template[a:b]) for a, b in zip(bounds[::2], bounds[1::2], strict=True)
+        ]
+
+    def fits(self, data: bytes) -> bool:
+        """Whether a message has this layout."""
+        return len(data) == len(self.template) and all(data[a:b] == text for a, b, text in self.constant)
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A block as it came; the samples are views of its bytes.
+
+    Attributes:
+        run_id, source, first_index, step_ns, last, companions: see BlockInfo.msg.
+        samples: its length.
+        log_ns: its stamp [ns].
+    """
+
+    run_id: str
+    source: str
+    first_index: int
+    step_ns: int
+    last: bool
+    companions: int
+    samples: int
+    log_ns: int
+    signals: Signals
+
+    def copy_to(self, signals: Signals) -> None:
+        """Copy samples into arrays of shape (samples,), by field."""
+        for name, array in signals.items():
+            array[:] = self.signals[name]
+
+
+def all_finite(samples: Samples) -> bool:
+    """Whether no sample is NaN or infinite."""
+    return samples.dtype.kind != "f" or bool(np.isfinite(samples).all())
+
+
+class Encoder:
+    """Makes the blocks of one topic.
+
+    Args:
+        msgtype: message type.
+        run_id: identity of the run.
+        source: fully qualified name of the node.
+        step_ns: sampling step [ns].
+    """
+
+    def __init__(self, msgtype: str, run_id: str, source: str, step_ns: int) -> None:
+        self._type, self._run_id, self._source, self._step_ns = msgtype, run_id, source, step_ns
+        self._made: dict[int, tuple[_Layout, Samples, list[tuple[str, Samples]]]] = {}
+
+    def _layout(self, samples: int) -> tuple[_Layout, Samples, list[tuple[str, Samples]]]:
+        layout = _Layout(self._type, self._run_id, self._source, samples)
+        buffer = np.frombuffer(layout.template, np.uint8).copy()
+        views = [
+            (name, np.frombuffer(buffer.data, dtype, samples, place)) for name, (dtype, place) in layout.fields.items()
+        ]
+        self._made[samples] = layout, buffer, views
+        return self._made[samples]
+
+    def encode(self, first: int, signals: Signals, *, last: bool, companions: int) -> tuple[int, bytes]:
+        """A block from sample ``first`` on, stamped with the time of its last sample.
+
+        Returns:
+            The stamp [ns] and the bytes.
+        """
+        samples = next(iter(signals.values())).size
+        layout, buffer, views = self._made.get(samples) or self._layout(samples)
+        log_ns = START_NS + (first + samples - 1) * self._step_ns
+        seconds, nanoseconds = divmod(log_ns, _BILLION)
+        for name, number in (
+            ("sec", seconds),
+            ("nanosec", nanoseconds),
+            ("first_index", first),
+            ("step_ns", self._step_ns),
+            ("last", last),
+            ("companions", companions),
+        ):
+            code, place = layout.places[name]
+            code.pack_into(buffer.data, place, number)
+        for name, view in views:
+            view[:] = signals[name]
+        return log_ns, buffer.tobytes()
+
+
+class Decoder:
+    """Reads the blocks of one topic.
+
+    Args:
+        msgtype: message type.
+        fields: those whose samples are wanted; default: all.
+    """
+
+    def __init__(self, msgtype: str, fields: list[str] | None = None) -> None:
+        self._type = msgtype
+        self._fields = list(messages.sample_fields(msgtype)) if fields is None else fields
+        self._layout: _Layout | None = None
+
+    def decode(self, data: bytes) -> Block:
+        """A block from its bytes.
+
+        Raises:
+            ValueError: the arrays of the block have different lengths, or it has none.
+        """
+        layout = self._layout
+        if layout is None or not layout.fits(data):
+            layout = self._layout = self._learn(data)
+        numbers = {name: code.unpack_from(data, place)[0] for name, (code, place) in layout.places.items()}
+        return Block(
+            layout.run_id,
+            layout.source,
+            numbers["first_index"],
+            numbers["step_ns"],
+            numbers["last"],
+            numbers["companions"],
+            layout.samples,
+            numbers["sec"] * _BILLION + numbers["nanosec"],
+            {name: np.frombuffer(data, *_view(layout, name)) for name in self._fields},
+        )
+
+    def _learn(self, data: bytes) -> _Layout:
+        message = messages.decode(self._type, data)
+        lengths = sorted({getattr(message, name).size for name in messages.sample_fields(self._type)})
+        info = message.block
+        if len(lengths) != 1 or lengths[0] == 0:
+            raise ValueError(f"{info.source} sends arrays of {lengths} samples in one block")
+        layout = _Layout(self._type, info.run_id, info.source, lengths[0])
+        if not layout.fits(data):
+            raise ValueError(f"{info.source} sends a block that is not encoded as little-endian CDR with no frame_id")
+        return layout
+
+
+def _view(layout: _Layout, name: str) -> tuple[np.dtype[Any], int, int]:
+    dtype, place = layout.fields[name]
+    return dtype, layout.samples, place

@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line, ``lathe``."""
+
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table as RichTable
+
+from lathe_rc import __version__, harness, resources
+from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.scenario import TABLES, Scenario
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError, LatheError
+
+_PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
+
+
+class _Group(click.Group):
+    """Turns the project's errors into one line and an exit code."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except LatheError as error:
+            click.echo(f"lathe: {error}", err=True)
+            ctx.exit(error.exit_code)
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__)
+def main() -> None:
+    """Emulate the control cell of a lathe for non-circular turning."""
+
+
+def _load(name: str, overrides: Sequence[str]) -> Scenario:
+    path = Path(name)
+    if not path.exists() and path.suffix == "":
+        path = path.with_suffix(".yaml")
+    return scenarios.load(resources.find(path), overrides)
+
+
+class _Watch:
+    """Shows a run's progress on the error stream."""
+
+    def __init__(self, cell: Cell, console: Console) -> None:
+        self._step, self._total = cell.master.shared.step, cell.master.samples or 0
+        self._law = cell.master.law
+        self._start = time.monotonic()
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[revolution]}  {task.fields[error]}  {task.fields[factor]}"),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+        )
+        self._task = self._bar.add_task(
+            "starting", total=self._total, revolution="", error="", factor=""
+        )
+
+    def __enter__(self) -> Callable[[harness.Event], None]:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.stop()
+
+    def __call__(self, event: harness.Event) -> None:
+        """Take an event of the run."""
+        kind, update = event["event"], self._bar.update
+        if kind == "block0":
+            self._start = time.monotonic()
+            update(self._task, description="turning")
+        elif kind == "progress":
+            simulated = event["samples"] * self._step
+            elapsed = max(time.monotonic() - self._start, 1e-9)
+            update(self._task, completed=event["samples"], factor=f"{simulated / elapsed:.1f}x real time")
+        elif kind == "cycle":
+            update(
+                self._task,
+                revolution=f"revolution {event['cycle']:.0f}",
+                error=f"error {event['rms_error'] * 1e6:.3g} µm RMS",
+            )
+        elif kind == "stall":
+            self._bar.console.print(f"{event['member']} is silent at block {event['blocks']}: the cell waits for it")
+
+
+def _table(result: harness.Result) -> RichTable:
+    table = RichTable(show_edge=False, header_style="bold", title_justify="left")
+    for column in ("", "RMS [µm]", "maximum [µm]"):
+        table.add_column(column, justify="right" if column else "left")
+    errors = result.errors
+    for label, number in (("first revolution", 0), ("last revolution", -1)):
+        table.add_row(label, f"{errors.rms[number] * 1e6:.3f}", f"{errors.largest[number] * 1e6:.3f}")
+    return table
+
+
+def _facts(result: harness.Result) -> list[str]:
+    return [
+        f"{result.blocks} blocks sent, {result.dropped} lost; {result.errors.rms.size} revolutions",
+        f"{result.simulated_s:.2f} s simulated in {result.wall_s:.2f} s: {result.real_time_factor:.1f}x real time",
+    ]
+
+
+def _run(scenario: Scenario, *, mode: harness.Mode, groups: list[list[str]], bag: Path | None) -> harness.Result:
+    console = Console(stderr=True)
+    with _Watch(Cell(scenario.nodes), console) as watch:
+        return harness.run(scenario, mode=mode, groups=groups or None, bag=bag, watch=watch)
+
+
+@main.command()
+@click.argument("scenario")
+@click.option("--mode", type=click.Choice(["offline", "composed", "processes"]), default="offline", show_default=True)
+@click.option("--group", "groups", multiple=True, metavar="NODE+NODE", help="nodes that share a process; repeatable")
+@click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of the run")
+@click.option("--speed-factor", type=click.FloatRange(min=0), help="pace against real time; 0: as fast as possible")
+@click.option("--bag", type=click.Path(path_type=Path), help="folder to record to; must not exist")
+@click.option("--set", "overrides", multiple=True, metavar="NODE.PARAM=VALUE", help="also PARAM=VALUE if shared")
+@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+def run(
+    scenario: str,
+    mode: harness.Mode,
+    groups: tuple[str, ...],
+    revolutions: float | None,
+    speed_factor: float | None,
+    bag: Path | None,
+    overrides: tuple[str, ...],
+    *,
+    as_json: bool,
+) -> None:
+    """Run a SCENARIO, a ROS 2 parameter file, to its end."""
+    changes = list(overrides)
+    master = _master(scenario, changes)
+    if revolutions is not None:
+        changes.append(f"{master}.revolutions={revolutions!r}")
+    if speed_factor is not None:
+        changes.append(f"{master}.speed_factor={speed_factor!r}")
+    loaded = _load(scenario, changes)
+    split = [group.split("+") for group in groups]
+    unknown = [name for group in split for name in group if name not in loaded.nodes]
+    if unknown:
+        raise InputError(f"--group: no node {unknown[0]!r} in the scenario; allowed: {', '.join(loaded.nodes)}")
+    if split and mode != "processes":
+        raise InputError(f"--group with --mode {mode}; allowed: --mode processes")
+    result = _run(loaded, mode=mode, groups=split, bag=bag)
+    if as_json:
+        click.echo(json.dumps(result.summary()))
+        return
+    console = Console()
+    if result.errors.rms.size:
+        console.print(_table(result))
+    for fact in _facts(result):
+        console.print(fact, highlight=False)
+    if result.bag:
+        console.print(f"bag: {result.bag}", highlight=False, soft_wrap=True)
+
+
+def _master(scenario: str, changes: list[str]) -> str:
+    return Cell(_load(scenario, changes).nodes).master.name
+
+
+@main.command()
+@click.option("--revolutions", type=click.FloatRange(min=1), default=60.0, show_default=True)
+@click.option("--folder", type=click.Path(path_type=Path), default=Path("bags"), show_default=True, help="for results")
+def demo(revolutions: float, folder: Path) -> None:
+    """Turn an oval-barrel piston: five processes over DDS, learning, everything recorded."""
+    number = 1
+    while (folder / f"demo-{number}").exists():
+        number += 1
+    place = folder / f"demo-{number}"
+    scenario = _load("piston", [f"spindle_encoder.revolutions={revolutions!r}"])
+    console = Console()
+    console.print(
+        "An oval-barrel piston at 1000 rpm with a 10 % harmonic speed deviation: five ROS 2 processes, one bag.",
+        highlight=False,
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    result = _run(scenario, mode="processes", groups=[], bag=place)
+    from lathe_rc.view import figure
+
+    picture = place.with_suffix(".png")
+    figure.save(picture, result.recording, result.errors, "Oval-barrel piston, 1000 rpm, 10 % speed deviation")
+    console.print(_table(result))
+    for fact in _facts(result):
+        console.print(fact, highlight=False)
+    console.print(f"bag:    {place}\nfigure: {picture}", highlight=False, soft_wrap=True)
+
+
+def _parameters(kind: str) -> RichTable:
+    table = RichTable(title=f"parameters of {kind}", title_justify="left", show_edge=False, header_style="bold")
+    for column in ("name", "default", "allowed", "description"):
+        table.add_column(column, overflow="fold")
+    for name, row in TABLES[kind].rows().items():
+        table.add_row(name, json.dumps(row.default, ensure_ascii=False), row.allowed(), row.doc)
+    return table
+
+
+@main.command(context_settings=_PASS_THROUGH)
+@click.argument("name", type=click.Choice(list(TABLES)))
+@click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
+def node(name: str, arguments: tuple[str, ...]) -> None:
+    """Run one node, as ``ros2 run lathe_rc NAME`` does; --help lists its parameters."""
+    if "--help" in arguments or "-h" in arguments:
+        click.echo(f"usage: lathe node {name} [--ros-args -p PARAM:=VALUE --params-file FILE -r OLD:=NEW ...]\n")
+        Console().print(_parameters(name))
+        return
+    sys.exit(_nodes([name, *arguments]))
+
+
+@main.command(context_settings=_PASS_THROUGH)
+@click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
+def container(arguments: tuple[str, ...]) -> None:
+    """Run several nodes in one process: NODE[:STAGE]... [--ros-args ...]."""
+    if not arguments or arguments[0].startswith("-"):
+        raise InputError(f"no nodes named; allowed: {', '.join(TABLES)}, each once, or NAME:STAGE")
+    sys.exit(_nodes(arguments))
+
+
+def _nodes(arguments: Sequence[str]) -> int:
+    try:
+        from lathe_rc.nodes import process
+    except ImportError as error:
+        raise InputError(
+            f"no ROS 2 here ({error}); run through ./lathe, source a ROS 2 installation, or use lathe run --mode offline"
+        ) from None
+    return process.run(*process.split(arguments))

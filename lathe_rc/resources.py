@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the scenarios and profiles that come with lathe_rc lie."""
+
+import os
+import sys
+from pathlib import Path
+
+
+def config_folders() -> list[Path]:
+    """Folders with configuration, the nearest first: a checkout, ament prefixes, the Python environment."""
+    prefixes = [prefix for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
+    shared = [Path(prefix) / "share" / "lathe_rc" / "config" for prefix in [*prefixes, sys.prefix]]
+    return [folder for folder in [Path(__file__).parents[1] / "config", *shared] if folder.is_dir()]
+
+
+def find(path: Path) -> Path:
+    """``path`` itself if it exists or is absolute; otherwise the same name in a configuration folder, if any."""
+    if path.exists() or path.is_absolute():
+        return path
+    return next((folder / path for folder in config_folders() if (folder / path).exists()), path)

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Package metadata; colcon, pip and the ament index all read it from here."""
+
+from collections import defaultdict
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+# colcon's --symlink-install runs a link to this file from its build folder
+HERE = Path(__file__).resolve().parent
+NODES = ["spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder"]
+
+
+def shared_files() -> list[tuple[str, list[str]]]:
+    """Return what goes to share/: the ament index marker, the manifest, launch files and scenarios."""
+    folders = defaultdict(list, {"share/ament_index/resource_index/packages": ["resource/lathe_rc"]})
+    folders["share/lathe_rc"].append("package.xml")
+    for path in sorted([*HERE.glob("launch/*.launch.py"), *HERE.glob("config/**/*.*")]):
+        relative = path.relative_to(HERE)
+        folders[f"share/lathe_rc/{relative.parent}"].append(str(relative))
+    return list(folders.items())
+
+
+def requirements() -> list[str]:
+    """Return the run-time requirements; the lock files are made from the same list."""
+    lines = (HERE / "requirements" / "runtime.in").read_text(encoding="utf-8").splitlines()
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+setup(
+    name="lathe_rc",
+    version="0.1.0",
+    description="The control cell of a non-circular lathe as ROS 2 nodes",
+    long_description=(HERE / "README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    license="Apache-2.0",
+    packages=find_packages(include=["lathe_rc", "lathe_rc.*"]),
+    # lathe_rc/msg_defs is a link to msg_defs: importlib.resources finds the messages in every installation
+    package_data={"lathe_rc": ["py.typed", "msg_defs/msg/*.msg", "msg_defs/srv/*.srv"]},
+    data_files=shared_files(),
+    python_requires=">=3.10",
+    install_requires=requirements(),
+    entry_points={
+        "console_scripts": ["lathe = lathe_rc.cli:main"]
+        + [f"{node} = lathe_rc.nodes.{node}:main" for node in NODES],
+    },
+    zip_safe=False,
+)

@@ -1,0 +1,462 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The set-up behind ./lathe: what it refuses, what it makes anew, what it says when a step fails."""
+
+import fcntl
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import bootstrap
+import check
+import environment
+import preconditions
+import recipe
+import ros
+import steps
+import workplace
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+# what ./lathe reads to decide whether anything has changed
+INPUTS = ["lathe", "tools", "requirements", "msg_defs", "setup.py", "setup.cfg", "package.xml"]
+LINES_SHOWN = 15
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """A checkout of its own, with nothing set up in it."""
+    return copy_to(tmp_path / "checkout")
+
+
+def copy_to(target: Path) -> Path:
+    target.mkdir(parents=True)
+    for name in INPUTS:
+        source = CHECKOUT / name
+        (shutil.copytree if source.is_dir() else shutil.copy)(source, target / name)
+    return target
+
+
+def lathe(copy: Path, *arguments: str, **environ: str) -> subprocess.CompletedProcess[str]:
+    """Call ./lathe as a user would, in an environment that owes nothing to the one the tests run in."""
+    clean = {"PATH": os.environ["PATH"], "HOME": os.environ["HOME"], "LATHE_PYTHON": workplace.BASE_PYTHON}
+    command = [copy / "lathe", *arguments]
+    return subprocess.run(command, env=clean | environ, capture_output=True, text=True, check=False)
+
+
+def fake_python(folder: Path, body: str) -> str:
+    """Return an interpreter that runs the shell commands ``body``."""
+    python = folder / "fake-python"
+    python.write_text(f"#!/bin/sh\n{body}\n")
+    python.chmod(0o755)
+    return str(python)
+
+
+def assert_refused(result: subprocess.CompletedProcess[str], copy: Path, *words: str) -> None:
+    """Check for one clear line, exit code 2, and nothing made."""
+    assert result.returncode == 2, result.stderr
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.startswith("lathe: ")
+    for word in words:
+        assert word in result.stderr
+    assert not (copy / ".lathe").exists()
+
+
+# --- refusals
+
+
+def test_python_missing(copy):
+    assert_refused(
+        lathe(copy, LATHE_PYTHON="no-such-python"), copy, "no-such-python", "sudo apt install python3"
+    )
+
+
+def test_python_unsupported(copy, tmp_path):
+    pretend = "import runpy, sys; sys.version_info = (3, 9, 2); runpy.run_path(sys.argv[1])"
+    old = fake_python(tmp_path, f"exec {workplace.BASE_PYTHON} -c '{pretend}' \"$@\"")
+    assert_refused(lathe(copy, LATHE_PYTHON=old), copy, "Python 3.9", "3.10 to 3.14", "LATHE_PYTHON=")
+
+
+def test_entry_has_nothing_that_an_old_python_cannot_parse():
+    compile_old = "import ast, sys; ast.parse(open(sys.argv[1]).read(), feature_version=(3, 6))"
+    entry = CHECKOUT / "tools" / "__main__.py"
+    subprocess.run([sys.executable, "-c", compile_old, entry], check=True)
+    assert 'f"' not in entry.read_text()
+
+
+def test_path_with_a_space(tmp_path):
+    copy = copy_to(tmp_path / "my lathe")
+    assert_refused(lathe(copy), copy, "my lathe", "' '")
+
+
+def test_compiler_missing(copy, tmp_path):
+    tools = tmp_path / "bin"
+    tools.mkdir()
+    for name in ("dirname", "readlink"):
+        (tools / name).symlink_to(shutil.which(name))
+    assert_refused(lathe(copy, PATH=str(tools)), copy, "C++ compiler", "sudo apt install g++")
+
+
+def test_venv_module_and_headers_missing(monkeypatch, tmp_path):
+    monkeypatch.setattr(preconditions.importlib.util, "find_spec", lambda _name: None)
+    monkeypatch.setattr(preconditions.sysconfig, "get_path", lambda _name: str(tmp_path))
+    monkeypatch.setattr(preconditions, "has_compilers", lambda: True)
+    version = f"python3.{sys.version_info.minor}"
+    with pytest.raises(workplace.RefusalError, match=f"sudo apt install {version}-venv {version}-dev$"):
+        preconditions.check_packages()
+
+
+def test_machine_without_wheels(monkeypatch):
+    monkeypatch.setattr(preconditions.platform, "machine", lambda: "aarch64")
+    with pytest.raises(workplace.RefusalError, match=r"no ROS 2 wheels .*aarch64"):
+        preconditions.check(None)
+
+
+# --- a sourced ROS 2
+
+
+def sourced(prefix: Path, python: str) -> dict[str, str]:
+    (prefix / "lib" / python / "site-packages" / "rclpy").mkdir(parents=True)
+    return {"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": str(prefix)}
+
+
+def test_sourced_ros_is_used_and_our_own_environment_is_not_one(tmp_path):
+    ours = str(tmp_path / ".lathe" / "install")
+    assert ros.sourced_ros({"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": f"{ours}:/opt/ros/jazzy"}) == (
+        "jazzy",
+        ("/opt/ros/jazzy",),
+    )
+    assert ros.sourced_ros({"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": ours}) is None
+    assert ros.sourced_ros({"AMENT_PREFIX_PATH": "/opt/ros/jazzy"}) is None
+
+
+def test_sourced_ros_for_another_python(copy, tmp_path):
+    result = lathe(copy, **sourced(tmp_path / "ros", "python3.99"))
+    assert_refused(result, copy, "jazzy", "Python 3.99", "LATHE_PYTHON=")
+
+
+def test_sourced_ros_keeps_its_packages():
+    locked = ["# made by uv", "numpy==2.4.6", "scipy==1.17.1", "pyyaml==6.0.3", "ruamel-yaml==0.19.1"]
+    found = ["numpy==1.26.4", "PyYAML==6.0.1", "ruamel.yaml==0.18.0"]
+    assert recipe.constrain(locked, found) == ["scipy==1.17.1", "numpy==1.26.4"]
+
+
+# --- keys and stamps
+
+
+def keys(monkeypatch, copy: Path, chosen: ros.SourcedRos | None = None) -> tuple[str, str, str]:
+    monkeypatch.setattr(recipe, "ROOT", copy)
+    monkeypatch.setattr(recipe, "REQUIREMENTS", copy / "requirements")
+    made = recipe.Recipe(chosen)
+    return made._packages_key, made._messages_key, made._package_key
+
+
+@pytest.mark.parametrize(
+    ("changed", "kept"),
+    [
+        ("requirements/ros.lock", 0),
+        ("requirements/python.lock", 0),
+        ("msg_defs/msg/BlockInfo.msg", 1),
+        ("setup.py", 2),
+        ("lathe_rc/new_module.py", 3),
+        ("README.md", 3),
+    ],
+)
+def test_a_change_remakes_what_depends_on_it_and_no_more(monkeypatch, copy, changed, kept):
+    before = keys(monkeypatch, copy)
+    path = copy / changed
+    path.parent.mkdir(exist_ok=True)
+    with path.open("a") as file:
+        file.write("# changed\n")
+    after = keys(monkeypatch, copy)
+    assert [one == other for one, other in zip(before, after, strict=True)] == [n < kept for n in range(3)]
+
+
+def test_another_source_of_ros_remakes_all(monkeypatch, copy):
+    jazzy = keys(monkeypatch, copy, ros.SourcedRos("jazzy", ("/opt/ros/jazzy",)))
+    assert not set(jazzy) & set(keys(monkeypatch, copy))
+
+
+def test_a_new_scenario_is_installed(monkeypatch, copy):
+    before = keys(monkeypatch, copy)
+    (copy / "config").mkdir()
+    (copy / "config" / "new.yaml").touch()
+    after = keys(monkeypatch, copy)
+    assert before[:2] == after[:2]
+    assert before[2] != after[2]
+
+
+@pytest.fixture
+def workshop(monkeypatch, tmp_path):
+    """A recipe whose steps only note that they were taken; a step named in ``broken`` fails."""
+    venv, install = tmp_path / "venv", tmp_path / "install"
+    for name, path in {
+        "VENV": venv,
+        "INSTALL": install,
+        "BUILD": tmp_path / "build",
+        "PACKAGES_STAMP": venv / "packages.stamp",
+        "MESSAGES_STAMP": install / "messages.stamp",
+        "ENVIRONMENT": install / "environment.json",
+    }.items():
+        monkeypatch.setattr(recipe, name, path)
+    made = recipe.Recipe(None)
+    made.taken, made.broken = [], None
+
+    def step(name: str, folder: Path):
+        def take(_lock: int) -> environment.Changes:
+            made.taken.append(name)
+            folder.mkdir(exist_ok=True)
+            (folder / name).touch()
+            if made.broken == name:
+                raise KeyboardInterrupt
+            return environment.Changes(prepend={}, assign={"MADE": "yes"})
+
+        return take
+
+    monkeypatch.setattr(made, "_make_virtual_environment", step("venv", venv))
+    monkeypatch.setattr(made, "_install_packages", step("packages", venv))
+    monkeypatch.setattr(made, "_build_messages", step("messages", install))
+    monkeypatch.setattr(made, "_install_lathe_rc", step("lathe_rc", install))
+    return made
+
+
+ALL_STEPS = ["venv", "packages", "messages", "lathe_rc"]
+
+
+def test_everything_once(workshop):
+    assert workshop.ready() is None
+    workshop.make(0)
+    assert workshop.taken == ALL_STEPS
+    assert workshop.ready() == {"prepend": {}, "assign": {"MADE": "yes"}}
+
+
+@pytest.mark.parametrize(
+    ("broken", "again"),
+    [("venv", ALL_STEPS), ("packages", ALL_STEPS), ("messages", ALL_STEPS[2:]), ("lathe_rc", ALL_STEPS[3:])],
+)
+def test_interrupted_step_is_taken_again_from_nothing(workshop, broken, again):
+    workshop.broken = broken
+    with pytest.raises(KeyboardInterrupt):
+        workshop.make(0)
+    assert workshop.ready() is None
+    workshop.broken = None
+    workshop.taken.clear()
+    (recipe.VENV / "half-made").touch()
+    workshop.make(0)
+    assert workshop.taken == again
+    assert (recipe.VENV / "half-made").exists() == ("venv" not in again)
+    assert workshop.ready()
+
+
+@pytest.mark.parametrize(("deleted", "again"), [("VENV", ALL_STEPS), ("INSTALL", ALL_STEPS[2:])])
+def test_deleted_folder_is_made_anew(workshop, deleted, again):
+    workshop.make(0)
+    workshop.taken.clear()
+    shutil.rmtree(getattr(recipe, deleted))
+    assert workshop.ready() is None
+    workshop.make(0)
+    assert workshop.taken == again
+
+
+# --- steps
+
+
+@pytest.fixture
+def step(monkeypatch, tmp_path):
+    monkeypatch.setattr(steps, "LOG", tmp_path / "log")
+    with (tmp_path / "lock").open("w") as lock:
+        yield steps.Step("the messages", "look at the sky", lock.fileno())
+
+
+def test_failed_step_shows_the_end_of_its_log_and_what_to_do(step, tmp_path, capfd):
+    with pytest.raises(steps.StepError) as failure, step:
+        step.run("sh", "-c", "seq 1 40; exit 7", environ=os.environ)
+    shown = str(failure.value)
+    assert "the messages: sh failed with exit code 7" in shown
+    assert [f"  | {n}" in shown.splitlines() for n in (40 - LINES_SHOWN, 41 - LINES_SHOWN, 40)] == [
+        False,
+        True,
+        True,
+    ]
+    log = tmp_path / "log" / "the-messages.log"
+    assert str(log) in shown
+    assert log.read_text().splitlines() == [str(n) for n in range(1, 41)]
+    assert "look at the sky" in shown
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "not finished" in err
+
+
+def test_step_reports_its_time_on_stderr_only(step, capfd):
+    with step:
+        assert step.run("echo", "one", environ=os.environ) == "one\n"
+        assert step.run("echo", "two", environ=os.environ) == "two\n"
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.split()[:2] == ["the", "messages"]
+
+
+def test_interrupted_step_leaves_no_process_behind(step, monkeypatch, tmp_path):
+    pid_file = tmp_path / "pid"
+
+    def interrupt_when_started(_process) -> None:
+        while not pid_file.exists() or not pid_file.read_text().endswith("\n"):
+            pass
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(step, "_wait", interrupt_when_started)
+    with pytest.raises(KeyboardInterrupt), step:
+        step.run("sh", "-c", f"echo $$ > {pid_file}; exec sleep 60", environ=os.environ)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid_file.read_text()), 0)
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "line"),
+    [
+        (workplace.RefusalError("no compiler"), 2, "lathe: no compiler\n"),
+        (workplace.StepError("messages: failed"), 1, "lathe: messages: failed\n"),
+        (OSError("disk full"), 1, "lathe: disk full\n"),
+        (KeyboardInterrupt(), 130, "lathe: interrupted; the next call takes the set-up up again\n"),
+    ],
+)
+def test_failed_set_up_ends_with_a_line_and_a_code(monkeypatch, capsys, raised, code, line):
+    def fail(_ros):
+        raise raised
+
+    monkeypatch.setattr(bootstrap, "set_up", fail)
+    monkeypatch.setattr(bootstrap.signal, "signal", lambda _number, _handler: None)
+    assert bootstrap.main(["setup"]) == code
+    assert capsys.readouterr() == ("", line)
+
+
+def test_second_call_waits_for_the_first(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(steps, "HOME", tmp_path)
+    asked = []
+
+    def flock(file, operation):
+        asked.append(operation)
+        if operation & fcntl.LOCK_NB:
+            raise BlockingIOError
+
+    monkeypatch.setattr(steps.fcntl, "flock", flock)
+    with steps.exclusive():
+        pass
+    assert asked == [fcntl.LOCK_EX | fcntl.LOCK_NB, fcntl.LOCK_EX]
+    assert "waiting" in capsys.readouterr().err
+
+
+# --- the environment to run in
+
+
+def test_run_environment_adds_to_the_users_own():
+    wanted = environment.changes(
+        {
+            "PATH": f"/home/x/.lathe/venv/bin:{os.defpath}",
+            "AMENT_PREFIX_PATH": "/home/x/.lathe/install",
+            "GUARD": "1",
+        }
+    )
+    user = {"PATH": "/y/.lathe/venv/bin:/usr/bin", "EDITOR": "vi", "PYTHONPATH": "/mine"}
+    result = environment.run_environment(wanted, user)
+    assert result == {
+        "PATH": "/home/x/.lathe/venv/bin:/usr/bin",
+        "AMENT_PREFIX_PATH": "/home/x/.lathe/install",
+        "PYTHONPATH": f"{workplace.ROOT}:/mine",
+        "EDITOR": "vi",
+        "GUARD": "1",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
+
+
+def test_users_discovery_range_stays():
+    result = environment.run_environment(environment.changes({}), {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"})
+    assert result["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SUBNET"
+
+
+def test_wheels_paths_are_mended(monkeypatch, tmp_path):
+    monkeypatch.setattr(ros, "VENV", tmp_path)
+    monkeypatch.setattr(ros.sysconfig, "get_path", lambda _name: "/here/include")
+    export = tmp_path / "share" / "x" / "cmake" / "export.cmake"
+    export.parent.mkdir(parents=True)
+    old = "/opt/python/cp311-cp311"
+    export.write_text(f'"{old}/include/python3.11;{old}/lib/python3.11/site-packages/numpy/_core/include"')
+    ros.mend_cmake_paths()
+    assert export.read_text() == f'"/here/include;{ros.site_packages()}/numpy/_core/include"'
+
+
+def test_command_gets_the_users_arguments_and_directory(copy, tmp_path):
+    """A complete set-up, faked down to its interpreter, which tells how it was called."""
+    venv = copy / ".lathe" / "venv" / "bin"
+    venv.mkdir(parents=True)
+    Path(fake_python(venv, 'pwd; printf "%s\\n" "$@" "$MADE"')).rename(venv / "python")
+    key = subprocess.run(
+        [workplace.BASE_PYTHON, "-c", "import recipe; print(recipe.Recipe(None)._package_key)"],
+        env={"PYTHONPATH": str(copy / "tools")},
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.strip()
+    (copy / ".lathe" / "venv" / "packages.stamp").touch()
+    (copy / ".lathe" / "install").mkdir()
+    kept = {"key": key, "changes": {"prepend": {}, "assign": {"MADE": "yes"}}}
+    (copy / ".lathe" / "install" / "environment.json").write_text(json.dumps(kept))
+    command = [copy / "lathe", "run", "a b", "--json"]
+    clean = {"PATH": os.environ["PATH"], "LATHE_PYTHON": workplace.BASE_PYTHON}
+    result = subprocess.run(command, env=clean, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines() == [str(tmp_path), "-m", "lathe_rc", "run", "a b", "--json", "yes"]
+    assert result.stderr == ""
+
+
+# --- ./lathe test
+
+
+@pytest.fixture
+def checkers(monkeypatch):
+    """Checkers that only note that they ran; those in ``failing`` find something."""
+    seen = SimpleNamespace(ran=[], failing=set(), pytest=None, verdicts=None)
+
+    def lint(name, _command):
+        seen.ran.append(name)
+        return name not in seen.failing
+
+    def run_pytest(arguments, plugins):
+        seen.pytest, seen.verdicts = arguments, plugins[0]._lines
+        return pytest.ExitCode.TESTS_FAILED if "pytest" in seen.failing else pytest.ExitCode.OK
+
+    monkeypatch.setattr(check, "lint", lint)
+    monkeypatch.setattr(check.pytest, "main", run_pytest)
+    monkeypatch.setattr(check, "version", lambda _name: check.locked_numpy())
+    monkeypatch.setattr(check.os, "chdir", lambda _path: None)
+    return seen
+
+
+@pytest.mark.parametrize("failing", [set(), {"ruff check"}, {"mypy", "ruff format"}, {"pytest"}])
+def test_all_checkers_run_and_any_failure_counts(checkers, failing):
+    checkers.failing = failing
+    assert (check.main([]) != 0) == bool(failing)
+    assert checkers.ran == ["ruff check", "ruff format", "mypy"]
+    for name in failing - {"pytest"}:
+        assert f"{name} FAILED: see above" in checkers.verdicts
+
+
+def test_system_tests_run_only_when_asked_for(checkers):
+    check.main(["-k", "cell"])
+    assert checkers.pytest == ["-m", "not system", "-k", "cell"]
+    assert any("--system" in line for line in checkers.verdicts)
+    check.main(["--system", "-k", "cell"])
+    assert checkers.pytest == ["-k", "cell"]
+    assert checkers.verdicts == []
+
+
+def test_mypy_judges_only_the_locked_numpy(checkers, monkeypatch):
+    monkeypatch.setattr(check, "version", lambda _name: "1.26.4")
+    assert check.main([]) == 0
+    assert checkers.ran == ["ruff check", "ruff format"]
+    assert any("1.26.4" in line for line in checkers.verdicts)

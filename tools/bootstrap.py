@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ./lathe does: make the environment if it is not there or out of date, then run the command in it."""
+
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+
+import preconditions
+from environment import Changes, run_environment
+from recipe import Recipe
+from ros import SourcedRos, sourced_ros
+from steps import exclusive
+from workplace import PYTHON, ROOT, RefusalError, StepError, say
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Set up, then become the command; return an exit code on failure or if there is no command to run."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, interrupt)
+    try:
+        ros = sourced_ros(os.environ)
+        if ros:
+            change_to(ros.python())
+        wanted = set_up(ros)
+    except RefusalError as refusal:
+        say(str(refusal))
+        return 2
+    except (StepError, OSError) as failure:
+        say(str(failure))
+        return 1
+    except KeyboardInterrupt:
+        say("interrupted; the next call takes the set-up up again")
+        return 130
+    if arguments[:1] != ["setup"]:
+        os.execve(PYTHON, [str(PYTHON), *command(arguments)], run_environment(wanted, os.environ))
+    return 0
+
+
+def set_up(ros: SourcedRos | None) -> Changes:
+    """Make whatever is missing or out of date and return what lathe_rc needs in its environment."""
+    recipe = Recipe(ros)
+    ready = recipe.ready()
+    if ready:
+        return ready
+    preconditions.check(ros)
+    with exclusive() as lock:
+        return recipe.ready() or recipe.make(lock)
+
+
+def command(arguments: Sequence[str]) -> list[str]:
+    """Return what the Python of the environment is to run."""
+    if arguments[:1] == ["test"]:
+        return [str(ROOT / "tools" / "check.py"), *arguments[1:]]
+    return ["-m", "lathe_rc", *arguments]
+
+
+def change_to(python: Path) -> None:
+    """Start over in another interpreter, unless it is the one that runs this."""
+    if python.resolve() != Path(sys.executable).resolve():
+        os.execv(python, [str(python), *sys.argv])
+
+
+def interrupt(_number: int, _frame: FrameType | None) -> None:
+    """End on a signal the way Ctrl-C does, so that no command of a step is left running."""
+    raise KeyboardInterrupt

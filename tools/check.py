@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""./lathe test: the linters, then the tests; all of them run, whatever the others find."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from importlib.metadata import version
+
+import pytest
+
+from workplace import REQUIREMENTS, ROOT
+
+LINTERS = {
+    "ruff check": ["ruff", "check", "--quiet"],
+    "ruff format": ["ruff", "format", "--check", "--quiet"],
+    "mypy": ["mypy", "--no-error-summary"],
+}
+LOCKED_NUMPY = re.compile(r"^numpy==(\S+) ; python_full_version >=", re.MULTILINE)
+
+
+class Verdicts:
+    """Repeats what failed before the tests, where it is seen: just above the summary of pytest.
+
+    Args:
+        lines: what to say there.
+    """
+
+    def __init__(self, lines: Sequence[str]) -> None:
+        self._lines = lines
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        """Called by pytest when it has run the tests."""
+        for line in self._lines:
+            terminalreporter.write_line(line)
+
+
+def lint(name: str, command: Sequence[str]) -> bool:
+    """Run one linter, say how it went, and return whether it found nothing."""
+    start = time.monotonic()
+    passed = subprocess.run(command, check=False).returncode == 0
+    print(f"{name:<12} {'passed' if passed else 'FAILED'} ({time.monotonic() - start:.1f} s)", flush=True)
+    return passed
+
+
+def locked_numpy() -> str:
+    """Return the version of NumPy in the lock file, which is one from Python 3.11 on."""
+    found = LOCKED_NUMPY.search((REQUIREMENTS / "python.lock").read_text(encoding="utf-8"))
+    if found is None:
+        raise LookupError("requirements/python.lock has no NumPy for Python 3.11 and later")
+    return found[1]
+
+
+def main(arguments: list[str]) -> int:
+    """Run everything on the whole checkout and return the exit code."""
+    os.chdir(ROOT)
+    linters, verdicts = dict(LINTERS), []
+    if (here := version("numpy")) != (locked := locked_numpy()):
+        del linters["mypy"]
+        verdicts.append(f"not run: mypy, because its verdict is for the types of NumPy {locked}, not {here}")
+    failed = [name for name, command in linters.items() if not lint(name, command)]
+    verdicts += [f"{name} FAILED: see above" for name in failed]
+    if "--system" in arguments:
+        arguments.remove("--system")
+        selection = []
+    else:
+        selection = ["-m", "not system"]
+        verdicts.append("not run: the tests that need system packages or privileges (./lathe test --system)")
+    code = pytest.main([*selection, *arguments], plugins=[Verdicts(verdicts)])
+    return int(code) or int(bool(failed))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The environment in which lathe_rc is built and run."""
+
+import os
+from collections.abc import Mapping
+from typing import TypedDict
+
+from ros import SourcedRos, split, split_own, wheel_environment
+from workplace import ROOT, VENV
+
+# What a shell sets for itself.
+SHELL_OWN = frozenset({"_", "OLDPWD", "PWD", "SHLVL"})
+
+
+class Changes(TypedDict):
+    """What to do to a user's environment before lathe_rc runs in it."""
+
+    prepend: dict[str, list[str]]
+    assign: dict[str, str]
+
+
+def is_path_list(name: str) -> bool:
+    """Tell whether a variable holds a list of paths: PATH, PYTHONPATH, AMENT_PREFIX_PATH and their like."""
+    return name.endswith("PATH")
+
+
+def own_environment(ros: SourcedRos | None) -> dict[str, str]:
+    """Return the least environment in which the virtual environment works: nothing of the user's is in it."""
+    environ = {"PATH": os.pathsep.join([str(VENV / "bin"), os.defpath]), "VIRTUAL_ENV": str(VENV)}
+    return environ if ros else environ | wheel_environment()
+
+
+def build_environment(ros: SourcedRos | None) -> dict[str, str]:
+    """Return the environment of the set-up's own commands.
+
+    Without a sourced ROS 2, whatever other packages the user's shell points at must not get in.
+    """
+    environ = dict(os.environ)
+    if ros is None:
+        for name in ("CMAKE_PREFIX_PATH", "COLCON_PREFIX_PATH", "CONDA_PREFIX", "PYTHONHOME", "PYTHONPATH"):
+            environ.pop(name, None)
+    return apply(changes(own_environment(ros)), environ)
+
+
+def changes(environ: Mapping[str, str]) -> Changes:
+    """Return what has to be done to any environment for it to serve like this one."""
+    system = os.defpath.split(os.pathsep)
+    result = Changes(prepend={}, assign={})
+    for name, value in environ.items():
+        if is_path_list(name):
+            result["prepend"][name] = [path for path in split(value) if path not in system]
+        elif name not in SHELL_OWN:
+            result["assign"][name] = value
+    return result
+
+
+def apply(wanted: Changes, environ: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment with the changes made.
+
+    A user's own entries stay, those of another ./lathe do not.
+    """
+    result = {**environ, **wanted["assign"]}
+    for name, entries in wanted["prepend"].items():
+        rest = [entry for entry in split_own(environ.get(name, "")) if entry not in entries]
+        result[name] = os.pathsep.join([*entries, *rest])
+    return result
+
+
+def run_environment(wanted: Changes, environ: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment in which to run lathe_rc."""
+    # The checkout goes first, so that a module has one path (and Numba one cache), wherever it is started.
+    python_path = [str(ROOT), *wanted["prepend"].get("PYTHONPATH", [])]
+    return apply(
+        Changes(prepend={**wanted["prepend"], "PYTHONPATH": python_path}, assign=wanted["assign"]),
+        {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", **environ},
+    )

