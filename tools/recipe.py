@@ -44,9 +44,9 @@ class Recipe:
         )
         self._messages_key = digest([self._packages_key], (ROOT / "msg_defs").rglob("*"))
         # lathe_rc is installed as links: only a new file that is not a module needs a new installation.
-        linked = [path for folder in ("config", "launch", "resource") for path in (ROOT / folder).rglob("*")]
+        linked = [path for folder in ("config", "launch") for path in (ROOT / folder).rglob("*.*")]
         self._package_key = digest(
-            [self._messages_key, *sorted(map(str, linked))],
+            [self._messages_key, *sorted(str(path) for path in linked if path.suffix != ".pyc")],
             [ROOT / "setup.py", ROOT / "setup.cfg", ROOT / "package.xml", tools / "environment.py"],
         )
 

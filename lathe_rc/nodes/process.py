@@ -84,6 +84,9 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
     Returns:
         The exit code: 0, or that of the first failure.
     """
+    import os
+    if os.environ.get("LATHE_BATCH"):
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     reporter = Reporter()
     rclpy.init(args=None if args is None else ["lathe", *args], signal_handler_options=SignalHandlerOptions.NO)
     stop = _Stop()

@@ -286,7 +286,7 @@ class CellNode(LifecycleNode):
             if not publisher.wait_for_all_acked(Duration(seconds=2)):
                 self.get_logger().warning(f"{publisher.topic}: not everybody has acknowledged the last message")
         self.done = True
-        self.reporter("done", self.get_name())
+        self.reporter("done", self.get_name(), cpu_s=time.process_time())
 
     def tick(self, now: float) -> None:
         """Do what is due by the wall clock; nothing here touches a sample."""
