@@ -42,11 +42,12 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.nodes.report import THROUGHPUT, VARIABLE
+
 
 Mode = Literal["offline", "composed", "processes"]
 Event = Mapping[str, Any]
 
-_VARIABLE = "LATHE_REPORT_FD"
 _SILENCE_LIMIT = 120.0  # [s] without any event: the first start on a machine compiles kernels
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
 
@@ -313,11 +314,13 @@ class Processes:
         members = [f"{name}:{self._scenario.kind(name)}" for name in group]
         ours, theirs = socket.socketpair()
         environment = os.environ | {
-            _VARIABLE: str(theirs.fileno()),
+            VARIABLE: str(theirs.fileno()),
             "ROS_DOMAIN_ID": str(self.domain),
             "ROS_LOG_DIR": str(self._folder),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
         }
+        if all(getattr(table, "speed_factor", 0.0) == 0.0 for table in self._scenario.nodes.values()):
+            environment[THROUGHPUT] = "1"
         name = "+".join(group)
         with (self._folder / f"{group[0]}.log").open("wb") as log:
             child = subprocess.Popen(

@@ -3,13 +3,12 @@
 
 from collections import deque
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from lathe_rc.errors import LatheError
 
 
-@dataclass(frozen=True, order=True)
-class Entry:
+class Entry(NamedTuple):
     """A message to be written; sorts as bags are sorted."""
 
     log_ns: int
@@ -18,8 +17,7 @@ class Entry:
     data: bytes
 
 
-@dataclass(frozen=True)
-class Block:
+class Head(NamedTuple):
     """A block message and what its info says."""
 
     entry: Entry
@@ -41,7 +39,7 @@ class Merger:
 
     def __init__(self, dense: Mapping[str, str], sparse: Mapping[str, str]) -> None:
         self._dense, self._sparse = dense, sparse
-        self._blocks: dict[str, deque[Block]] = {topic: deque() for topic in dense}
+        self._blocks: dict[str, deque[Head]] = {topic: deque() for topic in dense}
         self._waiting: list[Entry] = []
         self._sequence = dict.fromkeys([*dense, *sparse], 0)
         self._received = dict.fromkeys(sparse.values(), 0)
@@ -56,7 +54,7 @@ class Merger:
         self, topic: str, log_ns: int, data: bytes, *, first: int, companions: int, last: bool
     ) -> None:
         """Take a block message."""
-        self._blocks[topic].append(Block(self._entry(topic, log_ns, data), first, companions, last))
+        self._blocks[topic].append(Head(self._entry(topic, log_ns, data), first, companions, last))
 
     def add_sparse(self, topic: str, log_ns: int, data: bytes) -> None:
         """Take a sparse message."""
@@ -70,20 +68,22 @@ class Merger:
             LatheError: topics are cut into different blocks.
         """
         while all(self._blocks.values()):
-            heads = {topic: queue[0] for topic, queue in self._blocks.items()}
-            if len({(block.first, block.entry.log_ns, block.last) for block in heads.values()}) > 1:
-                spans = ", ".join(f"{topic} from {block.first}" for topic, block in heads.items())
-                raise LatheError(f"topics are not cut into the same blocks: {spans}")
-            if any(self._received.get(self._dense[t], 0) < block.companions for t, block in heads.items()):
-                return
-            for queue in self._blocks.values():
-                queue.popleft()
-            end = next(iter(heads.values()))
-            due = [entry for entry in self._waiting if entry.log_ns <= end.entry.log_ns]
-            self._waiting = [entry for entry in self._waiting if entry.log_ns > end.entry.log_ns]
+            heads = [queue[0] for queue in self._blocks.values()]
+            end = heads[0]
+            for head in heads:
+                if head.first != end.first or head.entry.log_ns != end.entry.log_ns or head.last != end.last:
+                    spans = ", ".join(f"{other.entry.topic} from {other.first}" for other in heads)
+                    raise LatheError(f"topics are not cut into the same blocks: {spans}")
+                if self._received.get(self._dense[head.entry.topic], 0) < head.companions:
+                    return
+            entries = [queue.popleft().entry for queue in self._blocks.values()]
+            if self._waiting:
+                entries += [entry for entry in self._waiting if entry.log_ns <= end.entry.log_ns]
+                self._waiting = [entry for entry in self._waiting if entry.log_ns > end.entry.log_ns]
             self.blocks += 1
             self.complete = end.last
-            yield sorted(due + [block.entry for block in heads.values()])
+            entries.sort()
+            yield entries
 
     def rest(self) -> list[Entry]:
         """Give back everything that is left, sorted: what an interrupted run has of its last blocks."""

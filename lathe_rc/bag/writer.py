@@ -143,7 +143,7 @@ class BagWriter:
         )
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None:
-        """Append a message.
+        """Append a message to a topic that has been announced.
 
         Raises:
             LatheError: the disk does not take it.

@@ -73,6 +73,12 @@ def stamp_ns(message: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
+def stamp_of(data: bytes) -> int:
+    """Simulated time [ns] of an encoded message whose first field is a header; nothing else of it is decoded."""
+    stamp = decode("builtin_interfaces/msg/Time", data[:12])  # the header's first field
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
 def encode(msgtype: str, message: Any) -> bytes:
     """CDR bytes of a message."""
     return bytes(store().serialize_cdr(message, msgtype))

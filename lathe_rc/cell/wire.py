@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import START_NS, Samples, Signals
+from lathe_rc.cell.messages import MAX_BLOCK, START_NS, Samples, Signals
 
 _BILLION = 1_000_000_000
+_ZEROS = np.zeros(MAX_BLOCK)
 # Number in the message: struct format and a value that differs from 0 in every byte.
 _NUMBERS = {
     "sec": ("<i", 0x01010101),
@@ -58,6 +59,7 @@ class _Layout:
             changed = np.frombuffer(_message(msgtype, run_id, source, samples, {name: value}), np.uint8) != blank
             self.places[name] = struct.Struct(code), int(np.argmax(changed))
             changing |= changed
+        self.numbers = [(code.unpack_from, place) for code, place in self.places.values()]
         filled = np.frombuffer(_message(msgtype, run_id, source, samples, {}, fill=1), np.uint8) != blank
         changing |= filled
         self.fields: dict[str, tuple[np.dtype[Any], int]] = {}
@@ -72,10 +74,15 @@ class _Layout:
 
     def fits(self, data: bytes) -> bool:
         """Whether a message has this layout."""
-        return len(data) == len(self.template) and all(data[a:b] == text for a, b, text in self.constant)
+        if len(data) != len(self.template):
+            return False
+        for a, b, text in self.constant:
+            if data[a:b] != text:
+                return False
+        return True
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Block:
     """A block as it came; the samples are views of its bytes.
 
@@ -96,14 +103,18 @@ class Block:
     signals: Signals
 
     def copy_to(self, signals: Signals) -> None:
-        """Copy samples into arrays of shape (samples,), by field."""
+        """Copy samples into arrays of shape (samples,), by field.
+
+        Raises:
+            ValueError: a sample is NaN or infinite.
+        """
         for name, array in signals.items():
             array[:] = self.signals[name]
-
-
-def all_finite(samples: Samples) -> bool:
-    """Whether no sample is NaN or infinite."""
-    return samples.dtype.kind != "f" or bool(np.isfinite(samples).all())
+            # 0 times anything finite is 0, and NaN otherwise: one product tells for the whole block.
+            if array.dtype == np.float64 and np.dot(array, _ZEROS[: self.samples]) != 0.0:
+                raise ValueError(
+                    f"{self.source} sends a {name} that is not finite in the block from sample {self.first_index}"
+                )
 
 
 class Encoder:
@@ -176,17 +187,21 @@ class Decoder:
         layout = self._layout
         if layout is None or not layout.fits(data):
             layout = self._layout = self._learn(data)
-        numbers = {name: code.unpack_from(data, place)[0] for name, (code, place) in layout.places.items()}
+        sec, nanosec, first_index, step_ns, last, companions = [
+            unpack(data, place)[0] for unpack, place in layout.numbers
+        ]
+        samples = layout.samples
+        fields = layout.fields
         return Block(
             layout.run_id,
             layout.source,
-            numbers["first_index"],
-            numbers["step_ns"],
-            numbers["last"],
-            numbers["companions"],
-            layout.samples,
-            numbers["sec"] * _BILLION + numbers["nanosec"],
-            {name: np.frombuffer(data, *_view(layout, name)) for name in self._fields},
+            first_index,
+            step_ns,
+            last,
+            companions,
+            samples,
+            sec * _BILLION + nanosec,
+            {name: np.frombuffer(data, fields[name][0], samples, fields[name][1]) for name in self._fields},
         )
 
     def _learn(self, data: bytes) -> _Layout:
@@ -200,7 +215,3 @@ class Decoder:
             raise ValueError(f"{info.source} sends a block that is not encoded as little-endian CDR with no frame_id")
         return layout
 
-
-def _view(layout: _Layout, name: str) -> tuple[np.dtype[Any], int, int]:
-    dtype, place = layout.fields[name]
-    return dtype, layout.samples, place

@@ -105,7 +105,7 @@ class RecorderNode(CellNode):
         self._open.add_topic(topic, msgtype, offered_qos(self._depth, "transient_local"))
         if sparse:
             self._sparse[topic] = source
-            callback = self.guarded(lambda data: self._on_sparse(topic, msgtype, data))
+            callback = self.guarded(lambda data: self._on_sparse(topic, data))
         else:
             queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
             if in_cell:
@@ -122,10 +122,10 @@ class RecorderNode(CellNode):
 
     # ---- data ---------------------------------------------------------------------------------------
 
-    def _on_sparse(self, topic: str, msgtype: str, data: bytes) -> None:
+    def _on_sparse(self, topic: str, data: bytes) -> None:
         if self.done:
             return
-        stamp = messages.stamp_ns(messages.decode(msgtype, data))
+        stamp = messages.stamp_of(data)
         if self._merger is None:
             self._write(Entry(stamp, topic, 0, data))
         else:

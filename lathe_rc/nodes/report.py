@@ -12,6 +12,7 @@ import socket
 import time
 
 VARIABLE = "LATHE_REPORT_FD"
+THROUGHPUT = "LATHE_THROUGHPUT"  #: set where the cell is to run as fast as it can, not at a pace
 
 
 class Reporter:

@@ -38,6 +38,7 @@ class CellNode(LifecycleNode):
         table: its parameters, once configured.
         done: it has finished its part of the run.
         failure: why it gave up.
+        handled: messages received so far.
         next_tick: monotonic time [s] at which it wants `tick` to be called.
     """
 
@@ -56,6 +57,7 @@ class CellNode(LifecycleNode):
         self.failure: LatheError | None = None
         self.next_tick = time.monotonic()
         self.active = False
+        self.handled = 0
         self.full_name = self.get_fully_qualified_name()
         self.members: dict[str, Member] = {}
         self.master: Member | None = None
@@ -154,14 +156,21 @@ class CellNode(LifecycleNode):
         """A callback that fails the node, by name and in one line, instead of the process with a traceback."""
 
         def call(message: Any) -> None:
-            if self.failure or not self.active:
-                return
-            try:
-                callback(message)
-            except LatheError as error:
-                self.fail(error)
+            self.handled += 1
+            if self.active and not self.failure:
+                self.attempt(lambda: callback(message))
 
         return call
+
+    def attempt(self, step: Callable[[], None]) -> None:
+        """Do something that may fail the node."""
+        try:
+            step()
+        except LatheError as error:
+            self.fail(error)
+
+    def work(self) -> None:
+        """Do what the messages since the last call allow."""
 
     def subscription_events(self, topic: str) -> SubscriptionEventCallbacks:
         """Lost messages and publishers that do not fit become named errors."""

@@ -14,7 +14,7 @@ from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.stage import Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.track import Track
-from lathe_rc.cell.wire import Encoder, all_finite
+from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes.ports import BlockQueue, signal_qos
 from lathe_rc.nodes.shell import CellNode
@@ -49,6 +49,7 @@ class StageNode(CellNode):
             (self.topic(port.topic), Encoder(port.type, self.table.run_id, self.full_name, self.table.step_ns))
             for port in self.stage.outputs
         ]
+        self._buffers: dict[int, list[Signals]] = {}
         self._sparse_topics = {topic: self.topic(topic) for topic in self.stage.sparse_topics}
         self._queues: dict[str, BlockQueue] = {}
         self._tracks: dict[str, Track] = {}
@@ -132,21 +133,22 @@ class StageNode(CellNode):
     def _on_block(self, queue: BlockQueue, data: bytes) -> None:
         if self.done:
             return
-        block = queue.add(data)
-        for name, samples in block.signals.items():
-            if not all_finite(samples):
-                raise LatheError(
-                    f"{queue.topic}: {block.source} sends a {name} that is not finite in the block from sample "
-                    f"{block.first_index}"
-                )
-        self.advance()
+        queue.add(data)
+
+    def work(self) -> None:
+        """Compute what the blocks that came allow."""
+        if self.active and not self.failure:
+            self.attempt(self.advance)
 
     @staticmethod
     def _load(queue: BlockQueue, track: Track, until: int) -> bool:
         """Move queued blocks into the topic's track until it reaches sample ``until``; False if they do not."""
         while track.end < until and queue.blocks:
             block = queue.blocks.popleft()
-            block.copy_to(track.extend(block.samples))
+            try:
+                block.copy_to(track.extend(block.samples))
+            except ValueError as error:
+                raise LatheError(f"{queue.topic}: {error}") from None
         return track.end >= until
 
     def _next(self) -> tuple[int, bool] | None:
@@ -188,7 +190,10 @@ class StageNode(CellNode):
 
     def compute(self, samples: int, inputs: Sequence[Signals], *, last: bool) -> None:
         """Compute and publish one block."""
-        outputs = [messages.allocate(port.type, samples) for port in self.stage.outputs]
+        outputs = self._buffers.get(samples)
+        if outputs is None:
+            outputs = [messages.allocate(port.type, samples) for port in self.stage.outputs]
+            self._buffers[samples] = outputs
         for sparse in self.stage.advance(self.samples, inputs, outputs):
             framed = self._framer.sparse(sparse)
             self._signals[self._sparse_topics[sparse.topic]].publish(messages.encode(sparse.type, framed))
