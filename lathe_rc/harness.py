@@ -62,7 +62,7 @@ class Result:
         samples: length of the run.
         blocks: blocks that the spindle sent.
         dropped: blocks that some member lost.
-        wall_s: from block 0 to the last block closed [s].
+        wall_s: from block 0 to the last block computed and recorded by every member [s].
         bag: where it is recorded; None if it was not to be kept.
         recording: all signals.
     """
@@ -187,7 +187,7 @@ def run(
             samples=cell.master.samples,
             blocks=-(-cell.master.samples // scenario.shared.block_size),
             dropped=0,
-            wall_s=(events["closed"]["monotonic_ns"] - events["block0"]["monotonic_ns"]) * 1e-9,
+            wall_s=(events["complete"]["monotonic_ns"] - events["block0"]["monotonic_ns"]) * 1e-9,
             bag=bag,
             recording=reader.read(place),
         )
@@ -394,7 +394,7 @@ class Processes:
             self._raise_failure(event)
             if not running:
                 break
-        if "closed" not in found or "block0" not in found:
+        if "closed" not in found or "complete" not in found or "block0" not in found:
             raise LatheError(f"the nodes ended before the run did{self._tails()}")
         return found
 

@@ -116,10 +116,10 @@ class SharedParameters(Table):
     nominal_rpm: Annotated[float, Gt(0), Le(60_000)] = parameter(1000.0, "nominal spindle speed", "1/min")
     seed: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(0, "seed of everything random in the cell")
     joint_state_period: Annotated[int, Ge(1)] = parameter(
-        640, "a JointState message every so many samples", "sample"
+        1280, "a JointState message every so many samples", "sample"
     )
     window: Annotated[int, Ge(0), Le(4096)] = parameter(
-        32, "blocks in flight, counted from the slowest member; 0: free-running, may lose blocks", "block"
+        64, "blocks in flight, counted from the slowest member; 0: free-running, may lose blocks", "block"
     )
     run_id: str = parameter("", "identity of the run; every block carries it")
 

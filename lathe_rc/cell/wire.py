@@ -131,6 +131,10 @@ class Encoder:
         self._type, self._run_id, self._source, self._step_ns = msgtype, run_id, source, step_ns
         self._made: dict[int, tuple[_Layout, Samples, list[tuple[str, Samples]]]] = {}
 
+    def prepare(self, samples: int) -> None:
+        """Learn the layout for a length ahead of its first block."""
+        self._layout(samples)
+
     def _layout(self, samples: int) -> tuple[_Layout, Samples, list[tuple[str, Samples]]]:
         layout = _Layout(self._type, self._run_id, self._source, samples)
         buffer = np.frombuffer(layout.template, np.uint8).copy()

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Signal topics over DDS: quality of service, and the check of every block that comes in."""
 
+import importlib
 from collections import deque
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -11,6 +13,12 @@ from lathe_rc.bag.record import SPARE_DEPTH
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import LatheError
+
+
+def message_class(msgtype: str) -> Any:
+    """The rclpy class of a message type."""
+    package, kind, name = msgtype.split("/")
+    return getattr(importlib.import_module(f"{package}.{kind}"), name)
 
 
 def signal_qos(parameters: NodeParameters, topic: str = "") -> QoSProfile:

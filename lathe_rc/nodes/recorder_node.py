@@ -15,9 +15,8 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import LatheError, LossyRunError
-from lathe_rc.nodes.ports import BlockQueue, latched_qos, signal_qos
+from lathe_rc.nodes.ports import BlockQueue, latched_qos
 from lathe_rc.nodes.shell import CellNode
-from lathe_rc.nodes.stage_node import message_class
 
 _HOST_TOPICS = {"/diagnostics": (DiagnosticArray, QoSProfile(depth=100)), "cell_state": (CellState, latched_qos(4))}
 
@@ -71,9 +70,9 @@ class RecorderNode(CellNode):
         """All signal topics of the members."""
         return [*self._queues, *self._sparse] if hasattr(self, "_queues") else []
 
-    def matched(self) -> bool:
-        """See `CellNode`; it must have subscribed first."""
-        return bool(self._queues) and super().matched()
+    def wired(self) -> bool:
+        """It is once it has subscribed to what the members announced."""
+        return bool(self._queues)
 
     def statistics(self) -> dict[str, object]:
         """See `CellNode`."""
@@ -105,20 +104,12 @@ class RecorderNode(CellNode):
         self._open.add_topic(topic, msgtype, offered_qos(self._depth, "transient_local"))
         if sparse:
             self._sparse[topic] = source
-            callback = self.guarded(lambda data: self._on_sparse(topic, data))
-        else:
-            queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
-            if in_cell:
-                queue.expect(source)
-            callback = self.guarded(lambda data: self._on_block(queue, data))
-        self.create_subscription(
-            message_class(msgtype),
-            topic,
-            callback,
-            signal_qos(self.table, topic),
-            raw=True,
-            event_callbacks=self.subscription_events(topic),
-        )
+            self.listen(topic, msgtype, lambda data: self._on_sparse(topic, data))
+            return
+        queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
+        if in_cell:
+            queue.expect(source)
+        self.listen(topic, msgtype, lambda data: self._on_block(queue, data))
 
     # ---- data ---------------------------------------------------------------------------------------
 
@@ -159,6 +150,7 @@ class RecorderNode(CellNode):
             self._blocks += 1
             self._samples = (self._log_ns - messages.START_NS) // self.table.step_ns + 1
             if self._merger.complete:
+                self.reporter("complete", self.get_name(), blocks=self._blocks)
                 self.finish()
             self.progressed(self._blocks, self._samples, last=self._merger.complete)
             if self._merger.complete:

@@ -12,13 +12,14 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.wiring import remapped
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import declare
-from lathe_rc.nodes.ports import latched_qos
+from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
 from lathe_rc.nodes.report import Reporter
 
 _TICK = 0.02  # [s] between looks at the graph while members join
@@ -39,6 +40,7 @@ class CellNode(LifecycleNode):
         done: it has finished its part of the run.
         failure: why it gave up.
         handled: messages received so far.
+        outlets, inlets: publisher and subscription of each signal topic, by fully qualified name.
         next_tick: monotonic time [s] at which it wants `tick` to be called.
     """
 
@@ -66,6 +68,8 @@ class CellNode(LifecycleNode):
         self._reported_blocks = 0
         self._diagnostics_due = time.monotonic() + _DIAGNOSTICS_PERIOD
         self._host: dict[str, Publisher] = {}
+        self.outlets: dict[str, Publisher] = {}
+        self.inlets: dict[str, Subscription[Any]] = {}
 
     # ---- lifecycle ----------------------------------------------------------------------------------
 
@@ -157,8 +161,12 @@ class CellNode(LifecycleNode):
 
         def call(message: Any) -> None:
             self.handled += 1
-            if self.active and not self.failure:
-                self.attempt(lambda: callback(message))
+            if not self.active or self.failure:
+                return
+            try:
+                callback(message)
+            except LatheError as error:
+                self.fail(error)
 
         return call
 
@@ -171,6 +179,17 @@ class CellNode(LifecycleNode):
 
     def work(self) -> None:
         """Do what the messages since the last call allow."""
+
+    def listen(self, topic: str, msgtype: str, callback: Callable[[bytes], None]) -> None:
+        """Subscribe to a signal topic; the callback gets the encoded message."""
+        self.inlets[topic] = self.create_subscription(
+            message_class(msgtype),
+            topic,
+            self.guarded(callback),
+            signal_qos(self.table, topic),
+            raw=True,
+            event_callbacks=self.subscription_events(topic),
+        )
 
     def subscription_events(self, topic: str) -> SubscriptionEventCallbacks:
         """Lost messages and publishers that do not fit become named errors."""
@@ -207,7 +226,7 @@ class CellNode(LifecycleNode):
             run_id=self.table.run_id,
             name=self.full_name,
             stage=self.kind,
-            state=Member.FAILED if self.failure else Member.READY if self._ready else Member.JOINING,
+            state=self._membership(),
             members=self.member_names(),
             publishes=[topic for topic, _, _ in published],
             types=[msgtype for _, msgtype, _ in published],
@@ -217,6 +236,17 @@ class CellNode(LifecycleNode):
             message=str(self.failure or ""),
         )
         self._host["members"].publish(own)
+
+    def _membership(self) -> int:
+        if self.failure:
+            return int(Member.FAILED)
+        if self._ready:
+            return int(Member.READY)
+        return int(Member.WIRED if self.wired() else Member.JOINING)
+
+    def wired(self) -> bool:
+        """Whether all its publishers and subscriptions are there."""
+        return True
 
     def _effective(self) -> NodeParameters:
         """The table with the remapping of the command line written into ``remap``."""
@@ -257,23 +287,30 @@ class CellNode(LifecycleNode):
 
     def _settle(self) -> None:
         """Become ready once every input and output is matched with its peers by name."""
-        if self._ready or self.failure or not self.complete or not self.matched():
+        if self._ready or self.failure or self.master is None or not self.complete:
+            return
+        if any(self.members[name].state == Member.JOINING for name in self.master.members) or not self.matched():
             return
         self._ready = True
         self.announce()
         self.reporter("ready", self.get_name())
 
     def matched(self) -> bool:
-        """Whether the graph shows the publisher of each input and the members that read each output."""
+        """Whether each input has met its publisher and each output the members that read it, by name and in fact.
+
+        The graph knows names, but runs ahead of what DDS has matched; DDS counts matches, but without names.
+        """
         assert self.master is not None
         peers = [self.members[name] for name in self.master.members if name != self.full_name]
-        for topic in self.subscriptions_wanted():
+        for topic, inlet in self.inlets.items():
             expected = {peer.name for peer in peers if topic in peer.publishes}
-            if not expected or not expected <= _names(self.get_publishers_info_by_topic(topic)):
+            found = _names(self.get_publishers_info_by_topic(topic))
+            if not expected or not expected <= found or inlet.get_publisher_count() < len(expected):
                 return False
-        for topic, _, _ in self.publications():
+        for topic, outlet in self.outlets.items():
             expected = {peer.name for peer in peers if topic in peer.subscribes}
-            if not expected <= _names(self.get_subscriptions_info_by_topic(topic)):
+            found = _names(self.get_subscriptions_info_by_topic(topic))
+            if not expected <= found or outlet.get_subscription_count() < len(expected):
                 return False
         return True
 

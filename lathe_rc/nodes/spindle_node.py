@@ -17,6 +17,7 @@ from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.stage_node import StageNode
 
 _STALL = 0.1  # [s] of silence after which a member is named
+_REPORT_PERIOD = 0.05  # [s] between reports of progress
 _BURST = 64  # blocks let go before other work gets its turn
 
 
@@ -46,6 +47,7 @@ class SpindleNode(StageNode):
         self._schedule = 0.0  # monotonic time at which sample 0 would have been, were there no slips
         self._heard = time.monotonic()
         self._stalled = ""
+        self._report_due = 0.0
         self.slipped = 0.0
 
     def activate_part(self) -> None:
@@ -128,7 +130,9 @@ class SpindleNode(StageNode):
             clock = Clock()
             clock.clock.sec, clock.clock.nanosec = stamp.sec, stamp.nanosec
             self._clock_publisher.publish(clock)
-            self.reporter("progress", self.get_name(), samples=samples)
+            if self._heard >= self._report_due:
+                self._report_due = self._heard + _REPORT_PERIOD
+                self.reporter("progress", self.get_name(), samples=samples)
         if self._slowest[1] == self._blocks_in_run:
             self._finish_run()
         else:
@@ -175,7 +179,7 @@ class SpindleNode(StageNode):
 
     def _finish_run(self) -> None:
         self._say(CellState.ENDED, self.samples)
-        self.end([*self._signals.values(), self._state])
+        self.end([*self.outlets.values(), self._state])
 
     def fail(self, error: LatheError, *, cause: str = "error") -> None:
         """As the arbiter, fail the cell with it."""

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A stage as a ROS node."""
 
-import importlib
 from collections.abc import Sequence
 from typing import Any
 
 from lathe_rc_msgs.srv import Schedule
-from rclpy.publisher import Publisher
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.framing import Framer
@@ -16,14 +14,8 @@ from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.track import Track
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import InputError, LatheError, LossyRunError
-from lathe_rc.nodes.ports import BlockQueue, signal_qos
+from lathe_rc.nodes.ports import BlockQueue, message_class, signal_qos
 from lathe_rc.nodes.shell import CellNode
-
-
-def message_class(msgtype: str) -> Any:
-    """The rclpy class of a message type."""
-    package, kind, name = msgtype.split("/")
-    return getattr(importlib.import_module(f"{package}.{kind}"), name)
 
 
 class StageNode(CellNode):
@@ -49,6 +41,8 @@ class StageNode(CellNode):
             (self.topic(port.topic), Encoder(port.type, self.table.run_id, self.full_name, self.table.step_ns))
             for port in self.stage.outputs
         ]
+        for _, encoder in self._encoders:
+            encoder.prepare(self.table.block_size)
         self._buffers: dict[int, list[Signals]] = {}
         self._sparse_topics = {topic: self.topic(topic) for topic in self.stage.sparse_topics}
         self._queues: dict[str, BlockQueue] = {}
@@ -64,19 +58,10 @@ class StageNode(CellNode):
 
     def activate_part(self) -> None:
         """Make publishers, subscriptions and the service that schedules events."""
-        self._signals: dict[str, Publisher] = {
-            topic: self.create_publisher(message_class(msgtype), topic, signal_qos(self.table))
-            for topic, msgtype, _ in self.publications()
-        }
+        for topic, msgtype, _ in self.publications():
+            self.outlets[topic] = self.create_publisher(message_class(msgtype), topic, signal_qos(self.table))
         for topic, queue in self._queues.items():
-            self.create_subscription(
-                message_class(queue.type),
-                topic,
-                self.guarded(lambda data, queue=queue: self._on_block(queue, data)),
-                signal_qos(self.table, topic),
-                raw=True,
-                event_callbacks=self.subscription_events(topic),
-            )
+            self.listen(topic, queue.type, queue.add)
         if self.stage.actions:
             self.create_service(Schedule, "~/schedule", self._on_schedule)
 
@@ -129,11 +114,6 @@ class StageNode(CellNode):
         return response
 
     # ---- data ---------------------------------------------------------------------------------------
-
-    def _on_block(self, queue: BlockQueue, data: bytes) -> None:
-        if self.done:
-            return
-        queue.add(data)
 
     def work(self) -> None:
         """Compute what the blocks that came allow."""
@@ -196,13 +176,13 @@ class StageNode(CellNode):
             self._buffers[samples] = outputs
         for sparse in self.stage.advance(self.samples, inputs, outputs):
             framed = self._framer.sparse(sparse)
-            self._signals[self._sparse_topics[sparse.topic]].publish(messages.encode(sparse.type, framed))
+            self.outlets[self._sparse_topics[sparse.topic]].publish(messages.encode(sparse.type, framed))
             if sparse.type == messages.LEARNING:
                 values = {key: float(value) for key, value in sparse.values.items()}
                 self.reporter("cycle", self.get_name(), sample=sparse.index, **values)
         for (topic, encoder), signals in zip(self._encoders, outputs, strict=True):
             _, data = encoder.encode(self.samples, signals, last=last, companions=self._framer.companions)
-            self._signals[topic].publish(data)
+            self.outlets[topic].publish(data)
         self.blocks += 1
         self.samples += samples
         self.progressed(self.blocks, self.samples, last=last)
@@ -211,7 +191,7 @@ class StageNode(CellNode):
 
     def ended(self) -> None:
         """The last block has been computed."""
-        self.end(list(self._signals.values()))
+        self.end(list(self.outlets.values()))
         if self.lost:
             self.fail(LossyRunError(f"{self.full_name}: lost {self.lost} blocks of a free-running cell"))
 

@@ -66,8 +66,9 @@ def discretise(a: Array, b: Array, delay: float, step: float, method: Discretisa
             a step that the delay leaves; ``tustin`` is the bilinear rule with that fraction interpolated.
     """
     samples = delay / step
+    # Less than a billionth of a step is rounding, on either side, and its inverse would overflow.
     whole = math.floor(samples + 1e-9)
-    part = max(samples - whole, 0.0)
+    part = samples - whole if samples - whole > 1e-9 else 0.0
     weights = np.zeros((a.shape[0], 3))
     if method == "foh":
         # The delayed input has its kink `part` of a step after each sample: integrate up to it, then on.

@@ -21,6 +21,7 @@ def _encode(
     tachogram: Array,
     counts: int,
     history: Array,
+    revolution: Array,
     angle: Array,
     speed: Array,
     index_pulse: npt.NDArray[np.uint8],
@@ -32,14 +33,18 @@ def _encode(
         n = first + k
         true, rate, _ = evaluate(n * step, nominal, lines, tachogram)
         angle_true[k], speed_true[k] = true, rate
-        before = history[(n - 1) % window]
         if counts == 0:
+            whole = np.floor(true / _TURN)
             angle[k], speed[k] = true, rate
         else:
-            angle[k] = np.floor(true * counts / _TURN) * _TURN / counts
+            # Whole revolutions apart, so that they are exact whatever the counts are.
+            count = np.floor(true * counts / _TURN)
+            whole = np.floor(count / counts)
+            angle[k] = whole * _TURN + (count - whole * counts) * _TURN / counts
             # The oldest angle of the ring stands where the new one goes.
             speed[k] = (angle[k] - history[n % window]) / (window * step)
-        index_pulse[k] = np.floor(angle[k] / _TURN) > np.floor(before / _TURN)
+        index_pulse[k] = whole > revolution[0]
+        revolution[0] = whole
         history[n % window] = angle[k]
 
 
@@ -59,6 +64,7 @@ class Encoder:
         before = np.arange(speed_window) - speed_window
         # history[n % window] holds the angle of sample n; these are the samples before the first.
         self._history = before * law.nominal * step
+        self._revolution = np.array([-1.0])
 
     def block(
         self,
@@ -73,5 +79,5 @@ class Encoder:
         law = self._law
         _encode(
             first, self._step, law.nominal, law.lines, law.tachogram, self._counts, self._history,
-            angle, speed, index_pulse, angle_true, speed_true,
+            self._revolution, angle, speed, index_pulse, angle_true, speed_true,
         )  # fmt: skip

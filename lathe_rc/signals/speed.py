@@ -104,7 +104,9 @@ class SpeedLaw:
         if not lines.size or not points < 1e7:
             return bound
         times = np.linspace(0.0, duration, int(points) + 2)
-        speed = self.at(np.union1d(times, tachogram[0][tachogram[0] < duration]))[1]
+        # A line that starts at a phase makes the speed jump: look on both sides.
+        kinks = np.concatenate((tachogram[0], lines[3], np.nextafter(lines[3], 0.0)))
+        speed = self.at(np.union1d(times, kinks[kinks < duration]))[1]
         # Between two points a sum of lines leaves their chord by at most h²/8 of its second derivative.
         sag = self.nominal * float(np.abs(lines[0] * lines[1] ** 2).sum()) * (times[1] - times[0]) ** 2 / 8
         return max(bound[0], speed.min() - sag), min(bound[1], speed.max() + sag)
@@ -123,13 +125,15 @@ class SpeedLaw:
             InputError: the spindle may stand still or turn back, so the angle may never be reached.
         """
         lowest = self.speed_range()[0]
-        if lowest <= 0.0:
-            lowest = self.speed_range(2.0 * angle / self.nominal)[0]
+        horizon = angle / lowest if lowest > 0.0 else 2.0 * angle / self.nominal
+        if lowest <= 0.0 and self.at(horizon)[0, 0] >= angle:
+            # What comes after the angle is reached does not matter.
+            lowest = self.speed_range(horizon)[0]
         if lowest <= 0.0:
             raise InputError(
                 f"spindle speed falls to {lowest:.4g} rad/s; allowed: above 0 (reduce the deviations)"
             )
-        low, high = 0, int(angle / (lowest * step)) + 2
+        low, high = 0, int(horizon / step) + 2
         while low < high:
             middle = (low + high) // 2
             if self.at(middle * step)[0, 0] >= angle:

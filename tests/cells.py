@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cells for the tests: scenarios without files, and arrays cut into blocks."""
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+from lathe_rc import harness
+from lathe_rc.cell import messages
+from lathe_rc.cell.scenario import TABLES, Scenario
+
+Values = Mapping[str, Any]
+
+NODES = ("spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool")
+
+
+def scenario(shared: Values | None = None, **nodes: Values) -> Scenario:
+    """The smallest whole cell; ``nodes`` holds values by node, those of further nodes too."""
+    common = {"run_id": "test", **(shared or {})}
+    values = {name: {**common, **nodes.get(name, {})} for name in dict.fromkeys([*NODES, *nodes])}
+    values["spindle_encoder"].setdefault("revolutions", 3.0)
+    tables = {name: TABLES[part.get("stage", name)].read(name, part) for name, part in values.items()}
+    return Scenario("test", tables)
+
+
+def run(shared: Values | None = None, **nodes: Values) -> harness.Result:
+    """Run that cell offline."""
+    return harness.run(scenario(shared, **nodes))
+
+
+def encoder(result: harness.Result) -> messages.Signals:
+    """The encoder's signals of a run."""
+    return result.recording.of_type(messages.ENCODER)
+
+
+def command(result: harness.Result) -> messages.Samples:
+    """The drive's set point in a run [m]."""
+    return result.recording.of_type(messages.COMMAND)["position"]
+
+
+def form_error(result: harness.Result) -> messages.Samples:
+    """The form error in a run [m]."""
+    return result.recording.of_type(messages.TOOL)["error"]
+
+
+#: lengths of consecutive blocks
+cuts = st.lists(st.integers(1, 300), min_size=1, max_size=12)
+
+
+def spans(lengths: Sequence[int]) -> list[tuple[int, int]]:
+    """First and last-plus-one sample of consecutive blocks."""
+    return list(itertools.pairwise([0, *itertools.accumulate(lengths)]))
+
+
+def in_blocks(lengths: Sequence[int], block: Callable[..., object], *arrays: messages.Samples) -> None:
+    """Call ``block(first, *parts)`` for each block of ``arrays``."""
+    for start, stop in spans(lengths):
+        block(start, *(array[start:stop] for array in arrays))
+
+
+def same(a: messages.Signals, b: messages.Signals) -> bool:
+    """Whether two sets of signals are equal to the bit."""
+    return a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)

@@ -1,0 +1,12 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings that all tests share."""
+
+from hypothesis import HealthCheck, settings
+
+# The same examples on every machine; --hypothesis-profile=explore looks for new ones.
+settings.register_profile(
+    "steady", derandomize=True, deadline=None, max_examples=50, database=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)  # fmt: skip
+settings.register_profile("explore", settings.get_profile("steady"), derandomize=False, max_examples=1000)
+settings.load_profile("steady")

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The coarse drive and its sensor: the difference equation against the differential equation."""
+
+import numpy as np
+import pytest
+from cells import cuts, in_blocks
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.signal import lsim
+
+from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
+from lathe_rc.plants.linear import discretise, second_order
+from lathe_rc.signals.noise import Sensor
+
+WN, ZETA, TAU = 1038.0, 0.804, 0.36e-3
+STEP = 1 / 64000
+A, B = second_order(WN, ZETA)
+FREQUENCIES = np.linspace(10.0, 6000.0, 50)
+
+
+def continuous(frequency):
+    """Wi of spec/learning.md."""
+    p = 1j * frequency
+    return np.exp(-p * TAU) / (1 + 2 * ZETA * p / WN + (p / WN) ** 2)
+
+
+def make_drive(*, delay=TAU, stroke=1e9, step=STEP, method="foh"):
+    return ElectrodynamicDrive(
+        natural_frequency=WN,
+        damping=ZETA,
+        delay=delay,
+        stroke=stroke,
+        moving_mass=1.2,
+        force_constant=30.0,
+        step=step,
+        method=method,
+    )
+
+
+def drive(command, lengths=None, **options):
+    """Position, velocity and current of a drive."""
+    motion = np.empty((3, command.size))
+    machine = make_drive(**options)
+    in_blocks(lengths or [command.size], machine.block, command, *motion)
+    return motion
+
+
+# --- frequency response
+
+
+@pytest.mark.parametrize("rate", [10_000, 64_000, 100_000])
+def test_foh_is_the_drive_behind_a_linear_interpolator(rate):
+    """A triangle of two steps has the response sinc²; what it folds back is below 1e-5 here."""
+    plant = discretise(A, B, TAU, 1 / rate, "foh")
+    triangle = np.sinc(FREQUENCIES / (2 * np.pi * rate)) ** 2
+    assert_allclose(plant.response(FREQUENCIES), continuous(FREQUENCIES) * triangle, rtol=0, atol=1e-4)
+    assert_allclose(plant.response(100.0), continuous(100.0), rtol=2e-5)
+
+
+def test_foh_error_falls_with_the_square_of_the_step():
+    steps = np.array([4e-5, 2e-5, 1e-5])
+    plants = [discretise(A, B, TAU, step, "foh") for step in steps]
+    errors = [abs(plant.response(1500.0) - continuous(1500.0)) for plant in plants]
+    assert_allclose(errors / errors[0], (steps / steps[0]) ** 2, rtol=0.01)
+
+
+@pytest.mark.parametrize("samples", [0.0, 23.0, 23.25])
+def test_tustin_warps_the_frequency_and_interpolates_the_delay(samples):
+    plant = discretise(A, B, samples * STEP, STEP, "tustin")
+    p = 2j / STEP * np.tan(FREQUENCIES * STEP / 2)
+    z = np.exp(1j * FREQUENCIES * STEP)
+    whole, part = divmod(samples, 1.0)
+    delay = z**-whole * (1 - part + part / z)
+    assert_allclose(plant.response(FREQUENCIES), delay / (1 + 2 * ZETA * p / WN + (p / WN) ** 2), rtol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["foh", "tustin"])
+def test_drive_answers_a_sine_as_its_response_says(method):
+    frequency = 2 * np.pi * 200.0  # 320 samples a period
+    time = np.arange(12800) * STEP
+    position = drive(np.sin(frequency * time), method=method)[0]
+    amplitude = 2 / 320 * (position[-320:] * np.exp(-1j * frequency * time[-320:])).sum() * 1j
+    plant = discretise(A, B, TAU, STEP, method)
+    assert_allclose(amplitude, plant.response(frequency), rtol=1e-9)
+
+
+# --- time
+
+
+@pytest.mark.parametrize("eighths", [0, 3, 8 * 23, 8 * 23 + 1, 8 * 23 + 7])
+def test_foh_is_exact_for_commands_linear_between_samples(eighths):
+    """Against a simulation with eight times the rate, where the delayed command's kinks are samples too."""
+    command = np.random.default_rng(1).normal(size=300).cumsum()
+    position, velocity, _ = drive(command, delay=eighths / 8 * STEP)
+    fine = np.arange(-8, 300 * 8) / 8  # from sample -1 on: the command rises from 0 there to its first value
+    delayed = np.interp(fine - eighths / 8, np.arange(-1, 300), np.append(0.0, command), left=0.0)
+    _, _, states = lsim((A, B[:, None], np.eye(2), np.zeros((2, 1))), delayed, (fine + 1) * STEP)
+    assert_allclose(position, states[8::8, 0], rtol=1e-9, atol=1e-9)
+    assert_allclose(velocity, states[8::8, 1], rtol=1e-9, atol=1e-6)
+
+
+def test_step_response_is_analytic():
+    """After the ramp of one step from sample -1 to 0: the mean over it of the step responses."""
+    whole = 23
+    position = drive(np.ones(3000), delay=whole * STEP)[0]
+    damped = WN * np.sqrt(1 - ZETA**2)
+
+    def ramp(t):
+        """Integral of the unit step response."""
+        t = np.maximum(t, 0.0)
+        decay = np.exp(-ZETA * WN * t)
+        turn = (2 * ZETA**2 - 1) / np.sqrt(1 - ZETA**2)
+        return t - 2 * ZETA / WN + decay / WN * (2 * ZETA * np.cos(damped * t) + turn * np.sin(damped * t))
+
+    t = (np.arange(3000) - whole) * STEP
+    assert_allclose(position, (ramp(t + STEP) - ramp(t)) / STEP, atol=1e-9)
+
+
+def test_current_is_what_the_acceleration_asks_for():
+    time = np.arange(6400) * STEP
+    _, velocity, current = drive(1e-3 * np.sin(500.0 * time))
+    acceleration = np.gradient(velocity, STEP)[1000:-1]
+    assert_allclose(current[1000:-1] * 30.0 / 1.2, acceleration, atol=1e-3 * np.abs(acceleration).max())
+
+
+def test_end_stop_holds_the_carriage_until_it_is_driven_back():
+    command = np.where(np.arange(6400) < 3200, 3e-3, -0.5e-3)
+    machine = make_drive(stroke=1e-3)
+    position, velocity, current = np.empty((3, 6400))
+    machine.block(0, command, position, velocity, current)
+    at_stop = position == 1e-3
+    assert position.max() == 1e-3
+    assert at_stop.sum() == machine.stopped
+    assert np.all(velocity[at_stop] <= 0.0)
+    arrived, left = np.flatnonzero(at_stop)[[0, -1]]
+    assert np.all(at_stop[arrived : left + 1])
+    assert 3200 < left < 3300
+    assert position[-1] == pytest.approx(-0.5e-3)
+
+
+@given(cuts, st.sampled_from(["foh", "tustin"]), st.floats(0.0, 1e-3))
+def test_cuts_change_nothing(lengths, method, delay):
+    command = np.random.default_rng(2).normal(scale=2e-3, size=sum(lengths))
+    whole = drive(command, delay=delay, stroke=1e-3, method=method)
+    assert np.array_equal(drive(command, lengths, delay=delay, stroke=1e-3, method=method), whole)
+
+
+# --- sensor
+
+
+def sense(true, lengths=None, name="drive", seed=1, noise=0.0, resolution=0.0):
+    sensor, measured = Sensor(noise, resolution, seed, name), np.empty_like(true)
+    in_blocks(lengths or [true.size], lambda _, *parts: sensor.measure(*parts), true, measured)
+    return measured
+
+
+def test_sensor_is_exact_by_default():
+    true = np.random.default_rng(3).normal(size=100)
+    assert np.array_equal(sense(true), true)
+
+
+@given(cuts)
+def test_noise_does_not_depend_on_cuts(lengths):
+    true = np.zeros(sum(lengths))
+    assert np.array_equal(sense(true, lengths, noise=1.0), sense(true, noise=1.0))
+
+
+def test_noise_is_white_and_has_its_rms():
+    noise = sense(np.zeros(100_000), noise=2e-7)
+    assert noise.std() == pytest.approx(2e-7, rel=0.01)
+    assert noise.mean() == pytest.approx(0.0, abs=2e-9)
+    assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 0.01
+
+
+def test_each_sensor_and_seed_has_its_own_noise():
+    true = np.zeros(1000)
+    streams = [sense(true, noise=1.0, name=name, seed=seed) for name in ("a", "b") for seed in (0, 1)]
+    assert np.abs(np.corrcoef(streams) - np.eye(4)).max() < 0.15
+
+
+@given(st.floats(1e-9, 1e-6))
+def test_quantisation_rounds_to_the_nearest_step(resolution):
+    true = np.random.default_rng(4).normal(scale=1e-4, size=1000)
+    measured = sense(true, resolution=resolution)
+    assert np.abs(measured - true).max() <= resolution / 2 * (1 + 1e-9)
+    assert_allclose(measured / resolution, np.rint(measured / resolution), atol=1e-6)

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Part profiles: formulas, tables and files."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from lathe_rc.errors import InputError
+from lathe_rc.signals import profile
+from lathe_rc.signals.profile import Harmonics, Measured, Piston, Polygon, ProfileTable, read_csv
+
+TURN = 2 * np.pi
+ANGLES = np.linspace(-TURN, 2 * TURN, 4001)
+
+micrometres = st.floats(-500e-6, 500e-6)
+polygons = st.builds(
+    lambda sides, radius, part: Polygon(sides, radius, radius * part),
+    st.integers(3, 12), st.floats(1e-3, 0.1), st.floats(0.3, 1.0),
+)  # fmt: skip
+
+
+# --- formulas
+
+
+@given(st.lists(st.tuples(st.integers(0, 40), micrometres, st.floats(-4.0, 4.0)), max_size=4))
+def test_harmonics_are_those_of_equation_5(terms):
+    order, amplitude, phase = (np.array([term[i] for term in terms], dtype=float) for i in range(3))
+    expected = sum((a * np.sin(i * ANGLES + p) for i, a, p in terms), np.zeros_like(ANGLES))
+    assert_allclose(Harmonics(order, amplitude, phase).deviation(ANGLES, 0.1), expected, atol=1e-15)
+
+
+def test_piston_has_its_ovality_barrel_and_widest_place():
+    piston = Piston(ovality=0.5e-3, ovality_middle=0.4e-3, barrel=30e-6, length=0.06, widest=0.02)
+    across = np.array([0.0, np.pi / 2, np.pi, 3 * np.pi / 2])
+
+    def diameters(height):
+        radius = piston.deviation(across, height)
+        return radius[0] + radius[2], radius[1] + radius[3]
+
+    along, over = diameters(0.02)
+    assert (along, along - over) == pytest.approx((0.0, 0.4e-3))
+    along, over = diameters(0.06)  # the farther end
+    assert (along, along - over) == pytest.approx((-60e-6, 0.5e-3))
+    along, over = diameters(0.0)  # half as far from the widest place
+    assert (along, along - over) == pytest.approx((-15e-6, 0.425e-3))
+
+
+@given(polygons)
+def test_polygon_lies_between_its_circles(polygon):
+    radius = polygon.deviation(ANGLES, 0.0)
+    half = np.pi / polygon.sides
+    corner = (polygon.inscribed_radius - polygon.corner_radius) / np.cos(half) + polygon.corner_radius
+    extreme = (corner - polygon.inscribed_radius) / 2
+    assert_allclose(polygon.deviation(np.array([0.0, half]), 0.0), [-extreme, extreme], atol=1e-15)
+    assert np.abs(radius).max() <= extreme + 1e-15
+
+
+@given(polygons)
+def test_polygon_turns_from_side_to_corner_without_a_kink(polygon):
+    half = np.pi / polygon.sides
+    straight = (polygon.inscribed_radius - polygon.corner_radius) * np.tan(half)
+    touch = np.arctan2(straight, polygon.inscribed_radius)
+    h = 1e-6
+    before, at, after = polygon.deviation(touch + np.array([-h, 0.0, h]), 0.0)
+    # Both slopes are that of the side; a kink would make them differ by far more than h.
+    slope = polygon.inscribed_radius * np.tan(touch) / np.cos(touch)
+    assert_allclose([(at - before) / h, (after - at) / h], slope, atol=1e-4 * polygon.inscribed_radius)
+
+
+def test_polygon_sides_are_straight_and_corners_round():
+    polygon = Polygon(sides=5, inscribed_radius=0.01, corner_radius=0.004)
+    middle = polygon.inscribed_radius - polygon.deviation(np.zeros(1), 0.0)[0]
+    side = np.linspace(-0.4, 0.4, 9)
+    assert_allclose((polygon.deviation(side, 0.0) + middle) * np.cos(side), 0.01)
+    around = np.pi / 5 + np.linspace(-0.1, 0.1, 9)
+    radius = polygon.deviation(around, 0.0) + middle
+    centre = 0.006 / np.cos(np.pi / 5)
+    assert_allclose(np.abs(radius * np.exp(1j * around) - centre * np.exp(1j * np.pi / 5)), 0.004)
+
+
+def test_polygon_of_circles_alone_is_round():
+    assert_allclose(Polygon(6, 0.01, 0.01).deviation(ANGLES, 0.0), 0.0, atol=1e-17)
+
+
+@given(polygons)
+def test_polygon_repeats_with_its_sides(polygon):
+    turned = polygon.deviation(ANGLES + TURN / polygon.sides, 0.0)
+    assert_allclose(polygon.deviation(ANGLES, 0.0), turned, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Harmonics(np.ones(2), np.ones(1), np.ones(2)), "2 orders, 1 amplitudes and 2 phases"),
+        (lambda: Polygon(2, 0.01, 0.004), "2 sides"),
+        (lambda: Polygon(3, 0.01, 0.0), "corner radius 0 m"),
+        (lambda: Polygon(3, 0.01, 0.011), "corner radius 0.011 m"),
+    ],
+)
+def test_impossible_profile_is_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+# --- tables
+
+
+def read_table(table, angles, height):
+    return np.array([profile.evaluate(angle, height, table.heights, table.table) for angle in angles])
+
+
+@pytest.mark.parametrize("order", [1, 2, 19])
+def test_table_of_harmonics_is_the_formula(order):
+    form = Harmonics(np.array([float(order)]), np.array([200e-6]), np.array([0.3]))
+    assert_allclose(read_table(ProfileTable(form), ANGLES, 0.02), form.deviation(ANGLES, 0.02), atol=1e-11)
+
+
+@given(st.floats(-0.01, 0.09))
+def test_table_of_a_piston_is_the_formula_along_the_skirt_and_its_ends_beyond(height):
+    form = Piston(ovality=0.5e-3, ovality_middle=0.4e-3, barrel=30e-6, length=0.08, widest=0.02)
+    expected = form.deviation(ANGLES, min(max(height, 0.0), 0.08))
+    assert_allclose(read_table(ProfileTable(form), ANGLES, height), expected, atol=20e-9)
+
+
+def test_table_of_a_polygon_is_the_formula():
+    form = Polygon(3, 1e-3, 0.8e-3)
+    assert_allclose(read_table(ProfileTable(form), ANGLES, 0.0), form.deviation(ANGLES, 0.0), atol=1e-9)
+
+
+def test_measured_points_are_on_the_curve():
+    angle = np.array([0.1, 1.0, 2.5, 4.0, 6.0])
+    radius = np.array([[1.0, 2.0, -1.0, 0.5, 0.0], [2.0, 3.0, 0.0, 1.5, 1.0]]) * 1e-4
+    form = Measured(angle, np.array([0.0, 0.01]), radius)
+    assert_allclose(form.deviation(angle, 0.0), radius[0], atol=1e-18)
+    assert_allclose(form.deviation(angle + TURN, 0.01), radius[1], atol=1e-16)
+    assert_allclose(form.deviation(ANGLES, 0.0025), form.deviation(ANGLES, 0.0) + 0.25e-4, atol=1e-16)
+
+
+def test_demand_of_a_harmonic_is_analytic():
+    amplitude, order, speed, acceleration = 150e-6, 6.0, 110.0, 90.0
+    table = ProfileTable(Harmonics(np.array([order]), np.array([amplitude]), np.array([0.3])))
+    demand = table.demand(speed, acceleration, feed=1e-3)
+    assert demand.stroke == pytest.approx(amplitude, rel=1e-5)
+    assert demand.velocity == pytest.approx(amplitude * order * speed, rel=1e-5)
+    # (kΩ)²·sin + k·(dΩ/dt)·cos
+    worst = amplitude * np.hypot((order * speed) ** 2, order * acceleration)
+    assert demand.acceleration == pytest.approx(worst, rel=1e-5)
+
+
+def test_feed_along_the_part_adds_to_the_velocity():
+    cone = Measured(np.array([0.0, 2.0, 4.0]), np.array([0.0, 0.01]), np.array([[0.0] * 3, [1e-4] * 3]))
+    assert ProfileTable(cone).demand(100.0, 0.0, feed=1e-3).velocity == pytest.approx(100.0 / TURN * 1e-5)
+
+
+# --- files
+
+
+def write(tmp_path, text):
+    path = tmp_path / "form.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def test_file_without_heights(tmp_path):
+    form = read_csv(write(tmp_path, "# from the CMM\n\nangle_deg, radius_um\n180,-2.5\n0,1\n 90 , 3e0\n"))
+    assert_allclose(form.angle, [0.0, np.pi / 2, np.pi])
+    assert_allclose(form.heights, [0.0])
+    assert_allclose(form.radius, [[1e-6, 3e-6, -2.5e-6]])
+
+
+@given(st.permutations([(a, h) for a in (0, 120, 240) for h in (0, 5)]))
+def test_file_with_heights_in_any_order(tmp_path_factory, places):
+    rows = "".join(f"{a},{h},{a + h}\n" for a, h in places)
+    form = read_csv(write(tmp_path_factory.mktemp("form"), TALL + rows))
+    assert_allclose(form.heights, [0.0, 0.005])
+    assert_allclose(form.radius, np.array([[0, 120, 240], [5, 125, 245]]) * 1e-6)
+
+
+HEAD = "angle_deg,radius_um\n"
+TALL = "angle_deg,height_mm,radius_um\n"
+GOOD = "0,1\n90,2\n180,3\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "header ''; allowed: angle_deg,radius_um or"),
+        ("# only a comment\n", "header ''"),
+        (GOOD, "header '0,1'"),
+        ("angle,radius\n" + GOOD, "header 'angle,radius'"),
+        (HEAD, "no points"),
+        (HEAD + "0,1\n90,2\n", "2 different angles; allowed: 3 or more"),
+        (HEAD + GOOD + "270,nan\n", ":5: 'nan'; allowed: finite numbers"),
+        (HEAD + GOOD + "inf,4\n", ":5: 'inf'; allowed: finite numbers"),
+        (HEAD + GOOD + "270,1e999\n", ":5: '1e999'; allowed: finite numbers"),
+        ("# c\n" + HEAD + "\n" + GOOD + "270,four\n", ":7: 'four' is not a number"),
+        (HEAD + GOOD + "270,\n", ":5: '' is not a number"),
+        (HEAD + GOOD + "270\n", ":5: 1 values; allowed: 2"),
+        (HEAD + GOOD + "270,1,2\n", ":5: 3 values; allowed: 2"),
+        (HEAD + GOOD + "90,2\n", ": angle 90° at height 0 mm appears more than once"),
+        (HEAD + GOOD + "360,1\n", ": angle 360°; allowed: 0 up to but not including 360"),
+        (HEAD + GOOD + "-1,1\n", ": angle -1°; allowed"),
+        (TALL + "0,0,1\n90,0,1\n180,0,1\n0,5,1\n90,5,1\n", ": no point at angle 180°, height 5 mm"),
+        (TALL + "0,0,1\n90,0,1\n180,0,1\n0,1e-9,1\n", ": heights 0 and 1e-09 mm are too close"),
+        (HEAD + GOOD + "1e-320,1\n", ": angles 0 and 9.999888672e-321° are too close"),
+        (HEAD + GOOD + "359.9999999,1\n", ": angles 359.9999999 and 360° are too close"),
+        (HEAD + GOOD + '270,"4\n', ":5: not CSV"),
+        (HEAD + '0,"1\n"\n90,2\n180,3\n', ":2: not CSV"),
+        (b"\xff\xfe\x00a\x00n", "not a text file"),
+        (b"\x00\x01\x02\x03" * 50, "header "),
+        (HEAD.encode() + b"0,\x00\n", ":2: "),
+    ],
+)
+def test_bad_file_is_refused(tmp_path, text, message):
+    path = write(tmp_path, text)
+    with pytest.raises(InputError) as refusal:
+        read_csv(path)
+    assert str(path) in str(refusal.value)
+    assert message in str(refusal.value)
+    assert len(str(refusal.value).splitlines()) == 1
+
+
+@given(st.binary(max_size=200))
+def test_junk_is_refused(tmp_path_factory, junk):
+    with pytest.raises(InputError):
+        read_csv(write(tmp_path_factory.mktemp("junk"), HEAD.encode() + b"0,1\n" + junk))
+
+
+def test_missing_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"no\.csv: cannot be read \(No such file or directory\)"):
+        read_csv(tmp_path / "no.csv")
+
+
+def test_folder_is_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_csv(tmp_path)
+
+
+def test_file_that_is_far_too_large_is_refused_unread(tmp_path):
+    path = tmp_path / "large.csv"
+    with path.open("wb") as file:
+        file.truncate(2**40)
+    with pytest.raises(InputError, match="larger than 64 MiB"):
+        read_csv(path)
