@@ -19,6 +19,7 @@ from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 
+_REFRESH = 0.1  # [s] between updates of the progress line
 _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
 
 
@@ -53,6 +54,7 @@ class _Watch:
         self._step, self._total = cell.master.shared.step, cell.master.samples or 0
         self._law = cell.master.law
         self._start = time.monotonic()
+        self._due = {"progress": 0.0, "cycle": 0.0}
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -75,12 +77,17 @@ class _Watch:
     def __call__(self, event: harness.Event) -> None:
         """Take an event of the run."""
         kind, update = event["event"], self._bar.update
+        now = time.monotonic()
+        if kind in ("progress", "cycle"):
+            if now < self._due[kind]:
+                return  # nobody reads faster, and drawing would slow an offline run down
+            self._due[kind] = now + _REFRESH
         if kind == "block0":
-            self._start = time.monotonic()
+            self._start = now
             update(self._task, description="turning")
         elif kind == "progress":
             simulated = event["samples"] * self._step
-            elapsed = max(time.monotonic() - self._start, 1e-9)
+            elapsed = max(now - self._start, 1e-9)
             update(self._task, completed=event["samples"], factor=f"{simulated / elapsed:.1f}x real time")
         elif kind == "cycle":
             update(
