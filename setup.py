@@ -41,8 +41,7 @@ setup(
     python_requires=">=3.10",
     install_requires=requirements(),
     entry_points={
-        "console_scripts": ["lathe = lathe_rc.cli:main"]
-        + [f"{node} = lathe_rc.nodes.{node}:main" for node in NODES],
+        "console_scripts": ["lathe = lathe_rc.cli:main"] + [f"{node} = lathe_rc.nodes.{node}:main" for node in NODES],
     },
     zip_safe=False,
 )

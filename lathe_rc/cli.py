@@ -2,6 +2,7 @@
 """The command line, ``lathe``."""
 
 import json
+import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -27,6 +28,8 @@ class _Group(click.Group):
     """Turns the project's errors into one line and an exit code."""
 
     def invoke(self, ctx: click.Context) -> Any:
+        # SIGTERM ends a command as Ctrl-C does: children are ended and bags closed on the way out.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             return super().invoke(ctx)
         except LatheError as error:
@@ -63,9 +66,7 @@ class _Watch:
             console=console,
             transient=True,
         )
-        self._task = self._bar.add_task(
-            "starting", total=self._total, revolution="", error="", factor=""
-        )
+        self._task = self._bar.add_task("starting", total=self._total, revolution="", error="", factor="")
 
     def __enter__(self) -> Callable[[harness.Event], None]:
         self._bar.start()
@@ -238,3 +239,11 @@ def _nodes(arguments: Sequence[str]) -> int:
             f"no ROS 2 here ({error}); run through ./lathe, source a ROS 2 installation, or use lathe run --mode offline"
         ) from None
     return process.run(*process.split(arguments))
+
+
+@main.command()
+def reference() -> None:
+    """Print the reference of nodes, topics, messages and parameters as Markdown."""
+    from lathe_rc import reference as pages
+
+    click.echo(pages.page(), nl=False)

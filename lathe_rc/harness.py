@@ -44,7 +44,6 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes.report import THROUGHPUT, VARIABLE
 
-
 Mode = Literal["offline", "composed", "processes"]
 Event = Mapping[str, Any]
 
@@ -256,8 +255,8 @@ def with_recorder(scenario: Scenario, bag: Path, *, keep: bool) -> Scenario:
 
 
 @contextlib.contextmanager
-def _domain(number: int | None) -> Iterator[int]:
-    """A ROS domain that nobody else on this machine uses."""
+def free_domain(number: int | None = None) -> Iterator[int]:
+    """A ROS domain that nobody else on this machine uses; ``number`` if one is given."""
     if number is not None:
         yield number
         return
@@ -287,13 +286,15 @@ class Processes:
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._threads: list[threading.Thread] = []
         self._abandoned: set[str] = set()
+        self._ended: set[str] = set()
+        self._newest: dict[str, Event] = {}
         self.pids: dict[str, int] = {}
         self.domain = -1
 
     def __enter__(self) -> "Processes":
         """Start them."""
         try:
-            self.domain = self._stack.enter_context(_domain(self._wanted_domain))
+            self.domain = self._stack.enter_context(free_domain(self._wanted_domain))
             self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-log-")))
             file = self._folder / "scenario.yaml"
             file.write_text(self._scenario.to_yaml(), encoding="utf-8")
@@ -360,6 +361,9 @@ class Processes:
                 event = self._events.get(timeout=silence)
             except queue.Empty:
                 raise LatheError(f"no node has reported anything for {silence:.0f} s{self._tails()}") from None
+            self._newest[event["event"]] = event
+            if event["event"] == "exit":
+                self._ended.add(event["node"])
             yield event
 
     def wait_for(self, kind: str, node: str | None = None, **values: object) -> Event:
@@ -369,9 +373,9 @@ class Processes:
             LatheError: a process ended with a failure first.
         """
         for event in self.events(_SILENCE_LIMIT):
-            if event["event"] == kind and node in (None, event["node"]):
-                if all(event.get(key) == value for key, value in values.items()):
-                    return event
+            wanted = {"event": kind, **values} | ({"node": node} if node else {})
+            if wanted.items() <= event.items():
+                return event
             self._raise_failure(event)
         raise AssertionError
 
@@ -384,19 +388,14 @@ class Processes:
         Raises:
             LatheError: a node failed or was killed; says which.
         """
-        found: dict[str, Event] = {}
-        running = set(self._children)
         for event in self.events(_SILENCE_LIMIT):
-            if event["event"] == "exit":
-                running.discard(event["node"])
-            found[event["event"]] = event
             watch(event)
             self._raise_failure(event)
-            if not running:
+            if self._ended == set(self._children):
                 break
-        if "closed" not in found or "complete" not in found or "block0" not in found:
+        if not {"block0", "complete", "closed"} <= set(self._newest):
             raise LatheError(f"the nodes ended before the run did{self._tails()}")
-        return found
+        return self._newest
 
     def _raise_failure(self, event: Event) -> None:
         """Raise what went wrong first; nodes that gave up because of another ("abandoned") are no cause."""
@@ -413,7 +412,7 @@ class Processes:
 
     def _tail(self, name: str) -> str:
         """The last line of a process's log."""
-        log = self._folder / f"{name.split('+')[0]}.log"
+        log = self._folder / f"{name.split('+', maxsplit=1)[0]}.log"
         lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines() if log.exists() else []
         return f": {lines[-1].strip()}" if lines else ""
 
@@ -437,4 +436,3 @@ class Processes:
         for thread in self._threads:
             thread.join()
         self._stack.close()
-

@@ -29,7 +29,7 @@ def _source_hash() -> str:
 if "NUMBA_CACHE_DIR" not in os.environ:
     # Numba looks for changes in the file of a kernel, not in those of the kernels that it calls: a cache
     # shared between versions of the source would go on using old arithmetic. So each version has its own.
-    numba.config.CACHE_DIR = str(platformdirs.user_cache_path("lathe_rc") / _source_hash())
+    setattr(numba.config, "CACHE_DIR", str(platformdirs.user_cache_path("lathe_rc") / _source_hash()))  # noqa: B010 - the module makes its names at run time
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:

@@ -71,9 +71,7 @@ def assert_refused(result: subprocess.CompletedProcess[str], copy: Path, *words:
 
 
 def test_python_missing(copy):
-    assert_refused(
-        lathe(copy, LATHE_PYTHON="no-such-python"), copy, "no-such-python", "sudo apt install python3"
-    )
+    assert_refused(lathe(copy, LATHE_PYTHON="no-such-python"), copy, "no-such-python", "sudo apt install python3")
 
 
 def test_python_unsupported(copy, tmp_path):

@@ -34,7 +34,12 @@ def cubic_response(radians: Array) -> Array:
     u, weight = np.polynomial.legendre.leggauss(8)
     u, weight = (u + 1.0) / 2.0, weight / 2.0
     taps = np.stack(
-        (-u * (1 - u) * (2 - u) / 6, (1 - u * u) * (2 - u) / 2, u * (1 + u) * (2 - u) / 2, -u * (1 - u * u) / 6)
+        (
+            -u * (1 - u) * (2 - u) / 6,
+            (1 - u * u) * (2 - u) / 2,
+            u * (1 + u) * (2 - u) / 2,
+            -u * (1 - u * u) / 6,
+        )
     )
     distance = np.arange(-1, 3)[:, None] - u
     phase = np.cos(distance[None] * radians[:, None, None])
@@ -78,7 +83,7 @@ class LearningLoop:
         return np.asarray(q - self.gain * self.corrected_drive(waves, speed))
 
     def supremum(self, speed: float) -> float:
-        """sup\\|Q - γZ\\| at spindle ``speed`` [rad/s], over all waves up to the Nyquist limits."""
+        """Supremum of the magnitude of Q - γZ at ``speed`` [rad/s], over all waves up to the Nyquist limits."""
         highest = min(self.grid / 2, np.pi / (self.step * speed))
         waves = np.linspace(0.0, highest, _COARSE)
         worst = waves[np.argmax(np.abs(self.operator(waves, speed)))]

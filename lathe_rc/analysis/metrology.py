@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The form error of the part, revolution by revolution."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,5 +46,5 @@ def form_errors(angle: Array, error: Array) -> FormErrors:
         # reduceat runs its last piece to the end of the array; the rest belongs to no complete revolution.
         last = slice(starts[-2], starts[-1])
         squares[-1], weight[-1] = np.sum(error[last] ** 2 * step[last]), np.sum(step[last])
-    largest = np.array([np.abs(error[a:b]).max() for a, b in zip(starts[:-1], starts[1:], strict=True)])
+    largest = np.array([np.abs(error[a:b]).max() for a, b in itertools.pairwise(starts)])
     return FormErrors(np.sqrt(squares / weight), largest, starts)

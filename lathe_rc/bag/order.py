@@ -50,9 +50,7 @@ class Merger:
         self._sequence[topic] += 1
         return Entry(log_ns, topic, self._sequence[topic], data)
 
-    def add_block(
-        self, topic: str, log_ns: int, data: bytes, *, first: int, companions: int, last: bool
-    ) -> None:
+    def add_block(self, topic: str, log_ns: int, data: bytes, *, first: int, companions: int, last: bool) -> None:
         """Take a block message."""
         self._blocks[topic].append(Head(self._entry(topic, log_ns, data), first, companions, last))
 

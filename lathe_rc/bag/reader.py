@@ -8,8 +8,8 @@ from rosbags.rosbag2 import Reader, ReaderError
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
-from lathe_rc.cell.wire import Decoder
 from lathe_rc.cell.recording import Recording, SparseTopic
+from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError
 
 DENSE = {messages.ENCODER, messages.COMMAND, messages.STATE, messages.TOOL}

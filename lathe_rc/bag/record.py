@@ -52,9 +52,7 @@ class OfflineRecorder:
         for topic, source in sorted({**cell.dense, **cell.sparse}.items()):
             writer.add_topic(f"/{topic}", source.type, qos)
 
-    def chunk(
-        self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]
-    ) -> None:
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
         pending = {topic: list(found) for topic, found in sparse.items()}
         for start in range(0, samples, self._block):

@@ -23,8 +23,9 @@ def mend(path: Path) -> int | None:
     files = sorted(path.glob("*.mcap"))
     if not files or (path / "metadata.yaml").exists():
         return None
-    new = path.with_name(f"{path.name}.mending")
-    shutil.rmtree(new, ignore_errors=True)
+    workshop = path.with_name(f"{path.name}.mending")
+    shutil.rmtree(workshop, ignore_errors=True)
+    new = workshop / path.name  # the file inside takes the folder's name
     writer = BagWriter(new, compression="zstd", chunk_size=2**20, about={"lathe_rc.mended": "true"})
     schemas: dict[int, Schema] = {}
     channels: dict[int, str] = {}
@@ -46,6 +47,6 @@ def mend(path: Path) -> int | None:
     old = path.with_name(f"{path.name}.cut")
     path.rename(old)
     new.rename(path)
-    (path / f"{new.name}.mcap").rename(path / f"{path.name}.mcap")
+    workshop.rmdir()
     shutil.rmtree(old)
     return saved

@@ -105,7 +105,7 @@ class _Writer(RosbagWriter):
     def __init__(self, path: Path, chunk_size: int, codec: CompressionType) -> None:
         super().__init__(path, version=9, storage_plugin=StoragePlugin.MCAP)
         make = partial(_McapStorage, chunk_size=chunk_size, codec=codec)
-        self.STORAGE_PLUGINS = {StoragePlugin.MCAP: make}  # type: ignore[assignment]  # wants a class, calls it
+        self.STORAGE_PLUGINS = {StoragePlugin.MCAP: make}  # type: ignore[dict-item]  # wants a class, only calls it
 
 
 class BagWriter:
@@ -121,9 +121,7 @@ class BagWriter:
         InputError: the folder exists or cannot be made.
     """
 
-    def __init__(
-        self, path: Path, *, compression: Compression, chunk_size: int, about: Mapping[str, str]
-    ) -> None:
+    def __init__(self, path: Path, *, compression: Compression, chunk_size: int, about: Mapping[str, str]) -> None:
         if path.exists():
             raise InputError(f"{path} exists; a bag is never overwritten: name another folder or remove it")
         codec = CompressionType.ZSTD if compression == "zstd" else CompressionType.NONE

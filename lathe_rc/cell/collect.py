@@ -23,9 +23,7 @@ class Collector:
                 array.fill(0)  # touches the memory now: page faults would cost a quarter of the run
         self._sparse: dict[str, list[Sparse]] = {topic: [] for topic in cell.sparse}
 
-    def chunk(
-        self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]
-    ) -> None:
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
         for topic, signals in dense.items():
             whole = self._dense[topic]

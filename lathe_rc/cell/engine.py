@@ -14,9 +14,7 @@ from lathe_rc.errors import InputError
 class Sink(Protocol):
     """What takes the results of a run, chunk by chunk, in order."""
 
-    def chunk(
-        self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]
-    ) -> None:
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Take the samples ``first`` on of every topic and the sparse messages among them, by relative topic."""
 
 
@@ -68,8 +66,7 @@ class Engine:
         sparse: dict[str, list[Sparse]],
     ) -> None:
         inputs = [
-            self._tracks[remapped(stage.shared, port.topic)].view(first - port.delay, samples)
-            for port in stage.inputs
+            self._tracks[remapped(stage.shared, port.topic)].view(first - port.delay, samples) for port in stage.inputs
         ]
         outputs = []
         for port in stage.outputs:
@@ -78,4 +75,3 @@ class Engine:
             outputs.append(dense[topic])
         for message in stage.advance(first, inputs, outputs):
             sparse.setdefault(remapped(stage.shared, message.topic), []).append(message)
-

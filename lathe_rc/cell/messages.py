@@ -80,8 +80,9 @@ def stamp_of(data: bytes) -> int:
 
 
 def encode(msgtype: str, message: Any) -> bytes:
-    """CDR bytes of a message."""
-    return bytes(store().serialize_cdr(message, msgtype))
+    """CDR bytes of a message, padded to a multiple of four as DDS hands them over."""
+    data = bytes(store().serialize_cdr(message, msgtype))
+    return data + bytes(-len(data) % 4)
 
 
 def decode(msgtype: str, data: bytes) -> Any:

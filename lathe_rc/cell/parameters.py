@@ -115,9 +115,7 @@ class SharedParameters(Table):
     block_size: Annotated[int, Ge(1), Le(MAX_BLOCK)] = parameter(64, "samples in a block", "sample")
     nominal_rpm: Annotated[float, Gt(0), Le(60_000)] = parameter(1000.0, "nominal spindle speed", "1/min")
     seed: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(0, "seed of everything random in the cell")
-    joint_state_period: Annotated[int, Ge(1)] = parameter(
-        1280, "a JointState message every so many samples", "sample"
-    )
+    joint_state_period: Annotated[int, Ge(1)] = parameter(1280, "a JointState message every so many samples", "sample")
     window: Annotated[int, Ge(0), Le(4096)] = parameter(
         64, "blocks in flight, counted from the slowest member; 0: free-running, may lose blocks", "block"
     )
@@ -160,7 +158,7 @@ class NodeParameters(SharedParameters):
         [], "scheduled events, as 'revolution 60: freeze', 'second 3.5: freeze' or 'sample 7000: clear'"
     )
     volatile_inputs: list[str] = parameter(
-        [], "input topics whose publisher keeps no messages for those who come late (a device with default QoS)"
+        [],
+        "input topics whose publisher keeps no messages for those who come late (a device with default QoS)",
     )
-    autostart: bool = parameter(True, "configure and activate by itself")
-
+    autostart: bool = parameter(default=True, doc="configure and activate by itself")

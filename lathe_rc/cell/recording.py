@@ -47,8 +47,10 @@ class Recording:
         return next(signals for topic, signals in self.dense.items() if self.types[topic] == msgtype)
 
     def digests(self) -> dict[str, str]:
-        """One digest a signal topic, by topic: SHA-256 of the SHA-256 of each field's samples in the order of the
-        fields, little-endian; of sparse topics the time stamps come first. Blocks leave no trace in it.
+        """One digest for each signal topic, by topic.
+
+        It is the SHA-256 of the SHA-256 of each field's samples in the order of the fields, little-endian; of sparse
+        topics the time stamps come first. Blocks leave no trace in it.
         """
         found = {topic: _combine(list(signals.values())) for topic, signals in self.dense.items()}
         for topic, part in self.sparse.items():
@@ -70,5 +72,5 @@ def _combine(fields: Sequence[Samples]) -> str:
     whole = hashlib.sha256()
     for samples in fields:
         little = samples.astype(samples.dtype.newbyteorder("<"), copy=False)
-        whole.update(hashlib.sha256(np.ascontiguousarray(little)).digest())
+        whole.update(hashlib.sha256(np.ascontiguousarray(little).data).digest())
     return whole.hexdigest()

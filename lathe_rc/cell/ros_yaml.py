@@ -7,7 +7,6 @@ by the C library's own strtol and strtod, as rcl_yaml_param_parser does it.
 """
 
 import ctypes
-import math
 import re
 from pathlib import Path
 
@@ -20,7 +19,8 @@ _MAX_BYTES = 1 << 20
 _MAX_DEPTH = 32
 _TRUE = {"Y", "y", "yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON"}
 _FALSE = {"N", "n", "no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF"}
-_SPECIAL = re.compile(r"[+-]?\.(nan|NaN|NAN|inf|Inf|INF)")
+_SPECIAL = re.compile(r"\.(?:nan|NaN|NAN)|[+-]?\.(?:inf|Inf|INF)")
+_PLAIN, _TEXT = "plain", "tag:yaml.org,2002:str"
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _libc.strtol.restype = ctypes.c_long
@@ -44,8 +44,7 @@ def _number(text: str) -> int | float | None:
     if whole():
         return integer
     if _SPECIAL.fullmatch(text):
-        # rcl skips everything before the letters, the sign included.
-        return math.nan if "n" == text.lstrip("+-.")[0].lower() else math.inf
+        return float(text.replace(".", ""))
     ctypes.set_errno(0)
     real = float(_libc.strtod(start, ctypes.byref(end)))
     return real if whole() else None
@@ -59,13 +58,38 @@ def scalar(text: str, *, quoted: bool = False) -> bool | int | float | str:
         return True
     if text in _FALSE:
         return False
-    number = None if "\0" in text else _number(text)
+    number = _number(text)
     return text if number is None else number
+
+
+class _Loader(yaml.SafeLoader):
+    """Leaves open what a scalar means, so that an explicit ``!!str`` can be told from what YAML would guess."""
+
+    def resolve(self, kind: object, value: object, implicit: object) -> str:
+        """The tag of a node that the file gives none."""
+        return _PLAIN
+
+
+def _check_text(text: object, where: str) -> None:
+    """Refuse what rcl would cut short or not read at all."""
+    if isinstance(text, str) and ("\0" in text or any("\ud800" <= character <= "\udfff" for character in text)):
+        raise InputError(f"{where}: {text!r}; allowed: text without NUL and surrogates")
+
+
+def _name(node: yaml.Node, where: str) -> str:
+    if not isinstance(node, yaml.ScalarNode) or not node.value.isprintable():
+        raise InputError(f"{where}:{node.start_mark.line + 1}: a key that is no name")
+    return str(node.value)
 
 
 def _value(node: yaml.Node, where: str) -> Value:
     if isinstance(node, yaml.ScalarNode):
-        return scalar(node.value, quoted=node.style in ("'", '"', "|", ">"))
+        _check_text(node.value, where)
+        # Blocks (| and >) count as plain.
+        quoted = node.style in ("'", '"')
+        if not node.value and not quoted:
+            raise InputError(f"{where}: no value; write '' for an empty text")
+        return scalar(node.value, quoted=quoted or node.tag == _TEXT)
     if isinstance(node, yaml.SequenceNode):
         items = [_value(item, where) for item in node.value]
         kinds = {type(item) for item in items}
@@ -75,14 +99,14 @@ def _value(node: yaml.Node, where: str) -> Value:
     raise InputError(f"{where}: neither a value nor a list")
 
 
-def _flatten(node: yaml.Node, where: str, prefix: str, depth: int, into: dict[str, Value]) -> None:
+def _flatten(node: yaml.Node, where: str, prefix: str, into: dict[str, Value]) -> None:
     """Collect parameters; nested maps make dotted names."""
-    if not isinstance(node, yaml.MappingNode) or depth > _MAX_DEPTH:
+    if not isinstance(node, yaml.MappingNode):
         raise InputError(f"{where}: not a map of parameters")
     for key, item in node.value:
-        name = f"{prefix}{key.value}"
-        if isinstance(item, yaml.MappingNode):
-            _flatten(item, f"{where}.{name}", f"{name}.", depth + 1, into)
+        name = f"{prefix}{_name(key, where)}"
+        if isinstance(item, yaml.MappingNode) and item.value:
+            _flatten(item, where, f"{name}.", into)
         elif name in into:
             raise InputError(f"{where}: {name} appears twice; keep one")
         else:
@@ -91,16 +115,21 @@ def _flatten(node: yaml.Node, where: str, prefix: str, depth: int, into: dict[st
 
 def _compose(text: str, source: str) -> yaml.Node | None:
     try:
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
-            raise InputError(f"{source}: YAML aliases; ROS 2 does not read them: write the value out")
-        return yaml.compose(text, Loader=yaml.SafeLoader)
+        depth = 0
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent):
+                raise InputError(f"{source}: YAML aliases; ROS 2 does not read them: write the value out")
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > _MAX_DEPTH:
+                raise InputError(f"{source}: nested more than {_MAX_DEPTH} deep; not a parameter file")
+        return yaml.compose(text, Loader=_Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = f":{mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "unreadable"
         raise InputError(f"{source}{place}: not YAML ({problem})") from None
-    except RecursionError:
-        raise InputError(f"{source}: nested too deeply") from None
+    except (ValueError, OverflowError):
+        raise InputError(f"{source}: not YAML (a character beyond Unicode)") from None
 
 
 def parse_value(text: str, source: str) -> Value:
@@ -130,9 +159,10 @@ def read(path: Path) -> dict[str, dict[str, Value]]:
         raise InputError(f"{path}: no nodes; allowed: 'NODE: {{ros__parameters: ...}}'")
     nodes: dict[str, dict[str, Value]] = {}
     for key, item in root.value:
-        name = "/**" if key.value == "/**" else key.value.removeprefix("/**/").removeprefix("/")
+        full_name = _name(key, str(path))
+        name = "/**" if full_name == "/**" else full_name.removeprefix("/**/").removeprefix("/")
         entries = item.value if isinstance(item, yaml.MappingNode) else []
         if [entry[0].value for entry in entries] != ["ros__parameters"]:
-            raise InputError(f"{path}:{key.start_mark.line + 1}: {key.value} does not hold ros__parameters alone")
-        _flatten(entries[0][1], f"{path}: {name}", "", 0, nodes.setdefault(name, {}))
+            raise InputError(f"{path}:{key.start_mark.line + 1}: {full_name} does not hold ros__parameters alone")
+        _flatten(entries[0][1], f"{path}: {name}", "", nodes.setdefault(name, {}))
     return nodes

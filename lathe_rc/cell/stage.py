@@ -253,5 +253,3 @@ def compile_kernels(stage: Stage) -> None:
         {name: np.empty(0, messages.sample_fields(port.type)[name]) for name in port.fields} for port in stage.inputs
     ]
     stage.process(0, inputs, [messages.allocate(port.type, 0) for port in stage.outputs])
-
-

@@ -45,7 +45,8 @@ class Track:
     def view(self, first: int, samples: int) -> Signals:
         """Views of the samples ``first`` on, which must have been added and not be older than the longest delay."""
         start = first - self._base
-        assert start >= 0 and first + samples <= self.end, "samples are not there"
+        assert start >= 0, "samples are too old"
+        assert first + samples <= self.end, "samples are not there yet"
         return {name: array[start : start + samples] for name, array in self._arrays.items()}
 
     def restart(self, first: int) -> None:

@@ -29,9 +29,7 @@ _NUMBERS = {
 }
 
 
-def _message(
-    msgtype: str, run_id: str, source: str, samples: int, numbers: dict[str, int], fill: int = 0
-) -> bytes:
+def _message(msgtype: str, run_id: str, source: str, samples: int, numbers: dict[str, int], fill: int = 0) -> bytes:
     """A block encoded by rosbags."""
     values = dict.fromkeys(_NUMBERS, 0) | numbers
     types = messages.store().types
@@ -68,15 +66,13 @@ class _Layout:
             self.fields[name] = dtype, int(start)
         # Everything else is the same in each block: texts, lengths, padding.
         bounds = np.flatnonzero(np.diff(changing.astype(np.int8), prepend=1, append=1))
-        self.constant = [
-            (int(a), int(b), self.template[a:b]) for a, b in zip(bounds[::2], bounds[1::2], strict=True)
-        ]
+        self.constant = [(int(a), int(b), self.template[a:b]) for a, b in zip(bounds[::2], bounds[1::2], strict=True)]
 
     def fits(self, data: bytes) -> bool:
         """Whether a message has this layout."""
         if len(data) != len(self.template):
             return False
-        for a, b, text in self.constant:
+        for a, b, text in self.constant:  # noqa: SIM110 - a generator costs more than the comparisons
             if data[a:b] != text:
                 return False
         return True
@@ -218,4 +214,3 @@ class Decoder:
         if not layout.fits(data):
             raise ValueError(f"{info.source} sends a block that is not encoded as little-endian CDR with no frame_id")
         return layout
-

@@ -67,7 +67,7 @@ class Cell:
                 self._add(self.dense, remapped(stage.shared, output.topic), Source(name, output.type))
             for topic, msgtype in stage.sparse_topics.items():
                 self._add(self.sparse, remapped(stage.shared, topic), Source(name, msgtype))
-        order: TopologicalSorter[str] = TopologicalSorter({name: () for name in made})
+        order: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(made, ()))
         for name, stage in made.items():
             for port in stage.inputs:
                 source = self._source(stage, port)
@@ -76,9 +76,7 @@ class Cell:
         try:
             self.stages = {name: made[name] for name in order.static_order()}
         except CycleError as error:
-            raise InputError(
-                f"{' -> '.join(error.args[1])}: a loop without a feedback delay cannot start"
-            ) from None
+            raise InputError(f"{' -> '.join(error.args[1])}: a loop without a feedback delay cannot start") from None
 
     def _add(self, topics: dict[str, Source], topic: str, source: Source) -> None:
         other = self.dense.get(topic) or self.sparse.get(topic)

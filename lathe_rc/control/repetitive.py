@@ -43,10 +43,10 @@ def exponential_q(width: float, grid_angle: float) -> Array:
         width: angle constant of the kernel [rad]: its time constant times the nominal speed; 0 for Q = 1.
         grid_angle: angle between grid points [rad].
     """
-    if width == 0.0:
+    square = (width / grid_angle) ** 2
+    ratio = 2.0 * square / (1.0 + 2.0 * square + np.sqrt(1.0 + 4.0 * square))
+    if ratio < _TAIL:
         return np.ones(1)
-    b = 1.0 + (grid_angle / width) ** 2 / 2.0
-    ratio = b - np.sqrt(b * b - 1.0)
     weights = (1.0 - ratio) / (1.0 + ratio) * ratio ** np.arange(ceil(np.log(_TAIL) / np.log(ratio)) + 1)
     weights[0] = 1.0 - 2.0 * weights[1:].sum()  # so that Q(0) = 1 after the cut
     return np.asarray(weights)
@@ -63,7 +63,7 @@ def cubic(before: float, left: float, right: float, after: float, u: float) -> f
 
 # Places in the integer state, the real state and the settings of the kernel.
 _NEXT, _SEEN, _CYCLE = 0, 1, 2
-_SQUARES, _LARGEST, _ANGLES, _ERRORS = 0, 1, 2, 6
+_SQUARES, _LARGEST, _ANGLES, _ERRORS, _CYCLE_SQUARES, _CYCLE_LARGEST = 0, 1, 2, 6, 10, 11
 
 _DONE, _CYCLE_ENDED, _AHEAD, _JUMPED = 0, 1, 2, 3
 
@@ -76,10 +76,10 @@ def _run(
     delay: int,
     grid: int,
     cycle: int,
-    learning: bool,
+    learning: int,
     gain: float,
     q: Array,
-    variable: bool,
+    variable: int,
     lead_time: float,
     nominal: float,
     memory: Array,
@@ -127,13 +127,19 @@ def _run(
                     whole[_NEXT] = g + 1
                     if (g + 1) % cycle == 0:
                         ended = True
+                        real[_CYCLE_SQUARES], real[_CYCLE_LARGEST] = real[_SQUARES], real[_LARGEST]
+                        real[_SQUARES] = real[_LARGEST] = 0.0
         lead = lead_time * (speed[k] if variable else nominal)
         place = (angle[k] + lead) * per_radian - cycle
         i = int(np.floor(place))
         if whole[_SEEN] > 0 and i + 2 >= whole[_NEXT]:
             return k, _AHEAD
         command[k] = cubic(
-            memory[(i - 1) & mask], memory[i & mask], memory[(i + 1) & mask], memory[(i + 2) & mask], place - i
+            memory[(i - 1) & mask],
+            memory[i & mask],
+            memory[(i + 1) & mask],
+            memory[(i + 2) & mask],
+            place - i,
         )
         if ended:
             return k + 1, _CYCLE_ENDED
@@ -195,7 +201,7 @@ class RepetitiveController:
         # A power of two, so that a mask wraps the index; it holds a cycle and what Q needs before it.
         self._memory = np.zeros(1 << (self._cycle + q.size + 8).bit_length())
         self._whole = np.zeros(3, dtype=np.int64)
-        self._real = np.zeros(10)
+        self._real = np.zeros(12)
         self._rms_before = np.nan
         self.learning = True
 
@@ -250,20 +256,15 @@ class RepetitiveController:
         return cycles
 
     def _end_cycle(self, sample: int) -> Cycle:
-        rms = float(np.sqrt(self._real[_SQUARES] / self._cycle))
+        rms = float(np.sqrt(self._real[_CYCLE_SQUARES] / self._cycle))
         contraction = rms / self._rms_before if self._rms_before > 0.0 else np.nan
         self._whole[_CYCLE] += 1
-        cycle = Cycle(
-            int(self._whole[_CYCLE]), sample, rms, float(self._real[_LARGEST]), contraction, self.learning
-        )
         self._rms_before = rms
-        self._real[_SQUARES] = self._real[_LARGEST] = 0.0
-        return cycle
+        largest = float(self._real[_CYCLE_LARGEST])
+        return Cycle(int(self._whole[_CYCLE]), sample, rms, largest, contraction, self.learning)
 
 
-def largest_feedback_delay(
-    *, grid: int, revolutions: int, lead: float, speed: float, step: float
-) -> int:
+def largest_feedback_delay(*, grid: int, revolutions: int, lead: float, speed: float, step: float) -> int:
     """Longest feedback delay [sample] at which the memory is never read before it is learned.
 
     The newest point in the memory when sample n is commanded was measured D + 3 samples before (the cubic

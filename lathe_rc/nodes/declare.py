@@ -42,8 +42,9 @@ def descriptor(row: Row) -> ParameterDescriptor:
 
 def overrides(node: Node) -> dict[str, Any]:
     """What the node was given from outside; it must have declared its overrides automatically."""
-    given = {}
-    for name, parameter in node.get_parameters_by_prefix("").items():
+    given: dict[str, Any] = {}
+    found: dict[str, Any] = node.get_parameters_by_prefix("")
+    for name, parameter in found.items():
         if name.split(".")[0] not in _OWN_OF_RCLPY:
             value = parameter.value
             given[name] = list(value) if hasattr(value, "typecode") or isinstance(value, list | tuple) else value

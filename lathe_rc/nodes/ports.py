@@ -35,9 +35,7 @@ def signal_qos(parameters: NodeParameters, topic: str = "") -> QoSProfile:
 
 def latched_qos(depth: int) -> QoSProfile:
     """Reliable; the newest message of each publisher reaches those who come late."""
-    return QoSProfile(
-        depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-    )
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class BlockQueue:
@@ -83,7 +81,9 @@ class BlockQueue:
         except ValueError as error:
             raise LatheError(f"{self.topic}: {error}") from None
         if self._run_id and block.run_id != self._run_id:
-            raise LatheError(f"{self.topic}: block of run {block.run_id!r} from {block.source}; expected {self._run_id!r}")
+            raise LatheError(
+                f"{self.topic}: block of run {block.run_id!r} from {block.source}; expected {self._run_id!r}"
+            )
         if self.source and block.source != self.source:
             raise LatheError(f"{self.topic}: block from {block.source}; expected {self.source}")
         if block.step_ns != self._step_ns:
@@ -104,15 +104,11 @@ class BlockQueue:
         missing = block.first_index - expected
         if missing < 0 or not self._free_running or self._newest is None:
             what = f"{missing} samples are missing" if missing > 0 else "a block came twice"
-            raise LatheError(
-                f"{self.topic}: {block.source} goes from sample {expected} to {block.first_index}: {what}"
-            )
+            raise LatheError(f"{self.topic}: {block.source} goes from sample {expected} to {block.first_index}: {what}")
         if missing > self._limit * self._size:
             raise LatheError(f"{self.topic}: {block.source} jumps by {missing} samples")
         for first in range(expected, block.first_index, self._size):
             samples = min(self._size, block.first_index - first)
             held = {name: np.repeat(array[-1:], samples) for name, array in self._newest.signals.items()}
-            self.blocks.append(
-                replace(self._newest, first_index=first, samples=samples, signals=held, last=False)
-            )
+            self.blocks.append(replace(self._newest, first_index=first, samples=samples, signals=held, last=False))
             self.lost += 1

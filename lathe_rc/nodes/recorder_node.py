@@ -18,7 +18,10 @@ from lathe_rc.errors import LatheError, LossyRunError
 from lathe_rc.nodes.ports import BlockQueue, latched_qos
 from lathe_rc.nodes.shell import CellNode
 
-_HOST_TOPICS = {"/diagnostics": (DiagnosticArray, QoSProfile(depth=100)), "cell_state": (CellState, latched_qos(4))}
+_HOST_TOPICS = {
+    "/diagnostics": (DiagnosticArray, QoSProfile(depth=100)),
+    "cell_state": (CellState, latched_qos(4)),
+}
 
 
 class RecorderNode(CellNode):
@@ -86,9 +89,7 @@ class RecorderNode(CellNode):
 
     def members_changed(self) -> None:
         """Subscribe once all members are known; beside a spindle that runs alone, to whatever is announced."""
-        alone = any(
-            member.stage == SpindleEncoder.kind and not member.members for member in self.members.values()
-        )
+        alone = any(member.stage == SpindleEncoder.kind and not member.members for member in self.members.values())
         if not alone and (self._queues or not self.complete):
             return
         for name in list(self.members) if self.master is None else list(self.master.members):
@@ -177,4 +178,3 @@ class RecorderNode(CellNode):
         self.reporter("closed", self.get_name(), bag=str(self._path), blocks=self._blocks, complete=complete)
         if self._lost:
             self.fail(LossyRunError(f"{self.full_name}: lost {self._lost} blocks of a free-running cell"))
-

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The shell that all nodes share: lifecycle, membership and start handshake, progress, diagnostics, end."""
 
+import os
 import time
 from abc import abstractmethod
 from collections.abc import Callable
@@ -69,7 +70,7 @@ class CellNode(LifecycleNode):
         self._diagnostics_due = time.monotonic() + _DIAGNOSTICS_PERIOD
         self._host: dict[str, Publisher] = {}
         self.outlets: dict[str, Publisher] = {}
-        self.inlets: dict[str, Subscription[Any]] = {}
+        self.inlets: dict[str, Subscription] = {}
 
     # ---- lifecycle ----------------------------------------------------------------------------------
 
@@ -113,14 +114,12 @@ class CellNode(LifecycleNode):
             "progress": add(Progress, "progress", QoSProfile(depth=100)),
             "diagnostics": add(DiagnosticArray, "/diagnostics", QoSProfile(depth=100)),
         }
-        self.create_subscription(
-            Member, "members", self.guarded(self._on_member), latched_qos(_LATCHED_DEPTH)
-        )
+        self.create_subscription(Member, "members", self.guarded(self._on_member), latched_qos(_LATCHED_DEPTH))
         self.create_subscription(CellState, "cell_state", self.guarded(self._on_cell_state), latched_qos(4))
         self.active = True
         self.activate_part()
         self.announce()
-        self.reporter("active", self.get_name())
+        self.reporter("active", self.get_name(), pid=os.getpid())
 
     # ---- what a kind of node adds -------------------------------------------------------------------
 
@@ -156,7 +155,7 @@ class CellNode(LifecycleNode):
         """Fully qualified name of a relative topic after all remapping."""
         return str(self.resolve_topic_name(remapped(self.table, relative)))
 
-    def guarded(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
+    def guarded(self, callback: Callable[[Any], object]) -> Callable[[Any], None]:
         """A callback that fails the node, by name and in one line, instead of the process with a traceback."""
 
         def call(message: Any) -> None:
@@ -180,7 +179,7 @@ class CellNode(LifecycleNode):
     def work(self) -> None:
         """Do what the messages since the last call allow."""
 
-    def listen(self, topic: str, msgtype: str, callback: Callable[[bytes], None]) -> None:
+    def listen(self, topic: str, msgtype: str, callback: Callable[[bytes], object]) -> None:
         """Subscribe to a signal topic; the callback gets the encoded message."""
         self.inlets[topic] = self.create_subscription(
             message_class(msgtype),
@@ -270,9 +269,9 @@ class CellNode(LifecycleNode):
         self.members[member.name] = member
         if member.members:
             self.master = member
-        if self.master and member.name in self.master.members and member.state == Member.FAILED:
-            if member.name != self.full_name:
-                self.fail(LatheError(f"{member.name} failed: {member.message}"), cause="abandoned")
+        peers = self.master.members if self.master else ()
+        if member.state == Member.FAILED and member.name in peers and member.name != self.full_name:
+            self.fail(LatheError(f"{member.name} failed: {member.message}"), cause="abandoned")
         self.members_changed()
         self._settle()
 

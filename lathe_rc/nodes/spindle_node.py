@@ -36,13 +36,9 @@ class SpindleNode(StageNode):
         assert isinstance(self.table, SpindleEncoderParameters)
         self._pace = self.table
         namespace = self.get_namespace().rstrip("/")
-        self._member_names = [
-            name if name.startswith("/") else f"{namespace}/{name}" for name in self.table.members
-        ]
+        self._member_names = [name if name.startswith("/") else f"{namespace}/{name}" for name in self.table.members]
         self._completed = dict.fromkeys(self._member_names, 0)
-        self._blocks_in_run = (
-            None if self.stage.samples is None else -(-self.stage.samples // self.table.block_size)
-        )
+        self._blocks_in_run = None if self.stage.samples is None else -(-self.stage.samples // self.table.block_size)
         self._running = False
         self._schedule = 0.0  # monotonic time at which sample 0 would have been, were there no slips
         self._heard = time.monotonic()
@@ -72,9 +68,7 @@ class SpindleNode(StageNode):
         }
 
     def _say(self, state: int, first: int, why: str = "") -> None:
-        self._state.publish(
-            CellState(run_id=self.table.run_id, state=state, first_index=first, message=why[:1024])
-        )
+        self._state.publish(CellState(run_id=self.table.run_id, state=state, first_index=first, message=why[:1024]))
 
     @property
     def _slowest(self) -> tuple[str, int]:

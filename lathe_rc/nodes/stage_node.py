@@ -38,7 +38,10 @@ class StageNode(CellNode):
         self._started = False
         self._framer = Framer(self.table.run_id, self.full_name, self.table.step_ns)
         self._encoders = [
-            (self.topic(port.topic), Encoder(port.type, self.table.run_id, self.full_name, self.table.step_ns))
+            (
+                self.topic(port.topic),
+                Encoder(port.type, self.table.run_id, self.full_name, self.table.step_ns),
+            )
             for port in self.stage.outputs
         ]
         for _, encoder in self._encoders:
@@ -194,4 +197,3 @@ class StageNode(CellNode):
         self.end(list(self.outlets.values()))
         if self.lost:
             self.fail(LossyRunError(f"{self.full_name}: lost {self.lost} blocks of a free-running cell"))
-

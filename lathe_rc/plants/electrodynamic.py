@@ -45,8 +45,12 @@ def _advance(
         n = first + k
         line[n % size] = command[k]
         u0, u1, u2 = line[(n - delay) % size], line[(n - delay - 1) % size], line[(n - delay - 2) % size]
-        new_x = transition[0, 0] * x + transition[0, 1] * v + weights[0, 0] * u0 + weights[0, 1] * u1 + weights[0, 2] * u2
-        new_v = transition[1, 0] * x + transition[1, 1] * v + weights[1, 0] * u0 + weights[1, 1] * u1 + weights[1, 2] * u2
+        new_x = (
+            transition[0, 0] * x + transition[0, 1] * v + weights[0, 0] * u0 + weights[0, 1] * u1 + weights[0, 2] * u2
+        )
+        new_v = (
+            transition[1, 0] * x + transition[1, 1] * v + weights[1, 0] * u0 + weights[1, 1] * u1 + weights[1, 2] * u2
+        )
         x, v = new_x, new_v
         # The end stops are inelastic: the carriage stays there until it is driven back.
         if x > stroke:

@@ -61,9 +61,9 @@ class Encoder:
 
     def __init__(self, law: SpeedLaw, step: float, counts: int, speed_window: int) -> None:
         self._law, self._step, self._counts = law, step, counts
-        before = np.arange(speed_window) - speed_window
+        before = np.arange(-speed_window, 0, dtype=np.float64)
         # history[n % window] holds the angle of sample n; these are the samples before the first.
-        self._history = before * law.nominal * step
+        self._history: Array = before * (law.nominal * step)
         self._revolution = np.array([-1.0])
 
     def block(

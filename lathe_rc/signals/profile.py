@@ -239,8 +239,7 @@ def read_csv(path: Path) -> Measured:
     if np.any(counts > 1):
         height, angle = cells[:, np.argmax(counts > 1)]
         raise InputError(
-            f"{path}: angle {angle_deg[angle]:g}° at height {heights_mm[height]:g} mm appears more than once; "
-            "keep one"
+            f"{path}: angle {angle_deg[angle]:g}° at height {heights_mm[height]:g} mm appears more than once; keep one"
         )
     radius[at] = rows[:, 2] * 1e-6
     if np.any(np.isnan(radius)):
@@ -273,7 +272,7 @@ def evaluate(angle: float, height: float, heights: Array, table: Array) -> float
     if v > 0.0:
         above = table[i + 1, j]
         value += v * (((above[0] * u + above[1]) * u + above[2]) * u + above[3] - value)
-    return value
+    return float(value)
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ class SpeedLaw:
         return max(bound[0], speed.min() - sag), min(bound[1], speed.max() + sag)
 
     def largest_acceleration(self) -> float:
-        """Upper bound of \\|dΩ/dt\\| [rad/s²]."""
+        """Upper bound of the magnitude of dΩ/dt [rad/s²]."""
         bound = float(np.abs(self.lines[0] * self.lines[1]).sum())
         if self.tachogram.shape[1] > 1:
             bound += float(np.abs(np.diff(self.tachogram[1]) / np.diff(self.tachogram[0])).max())
@@ -130,9 +130,7 @@ class SpeedLaw:
             # What comes after the angle is reached does not matter.
             lowest = self.speed_range(horizon)[0]
         if lowest <= 0.0:
-            raise InputError(
-                f"spindle speed falls to {lowest:.4g} rad/s; allowed: above 0 (reduce the deviations)"
-            )
+            raise InputError(f"spindle speed falls to {lowest:.4g} rad/s; allowed: above 0 (reduce the deviations)")
         low, high = 0, int(horizon / step) + 2
         while low < high:
             middle = (low + high) // 2
@@ -176,9 +174,7 @@ def tachogram(nominal: float, time: Array, deviation: Array) -> SpeedLaw:
     return SpeedLaw(nominal, tachogram=np.stack((time, deviation, area)))
 
 
-def band_limited_random(
-    nominal: float, rms: float, low: float, high: float, lines: int, seed: int
-) -> SpeedLaw:
+def band_limited_random(nominal: float, rms: float, low: float, high: float, lines: int, seed: int) -> SpeedLaw:
     """Random relative deviation of ``rms`` [1] between ``low`` and ``high`` [rad/s].
 
     ``lines`` equal lines, one in each of as many equal parts of the band, with frequency and phase drawn

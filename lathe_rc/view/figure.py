@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.projections.polar import PolarAxes
 
 from lathe_rc.analysis.metrology import FormErrors
 from lathe_rc.cell import messages
@@ -28,9 +29,16 @@ def save(path: Path, recording: Recording, errors: FormErrors, title: str) -> No
 
     last = errors.rms.size - 1
     form = figure.add_subplot(grid[0], projection="polar")
+    assert isinstance(form, PolarAxes)
     for number, colour, label in ((0, _FIRST, "first"), (last, _LAST, "last")):
         degrees, span = revolution(number)
-        form.plot(np.deg2rad(degrees), tool["reference"][span] * 1e6, color=colour, lw=1.2, label=f"{label} revolution")
+        form.plot(
+            np.deg2rad(degrees),
+            tool["reference"][span] * 1e6,
+            color=colour,
+            lw=1.2,
+            label=f"{label} revolution",
+        )
     low, high = tool["reference"].min() * 1e6, tool["reference"].max() * 1e6
     form.set_rlim(low - 1.2 * (high - low), high + 0.1 * (high - low))
     form.set_rlabel_position(45)
@@ -45,7 +53,11 @@ def save(path: Path, recording: Recording, errors: FormErrors, title: str) -> No
         label = f"revolution {number + 1}: {errors.rms[number] * 1e6:.3g} µm RMS"
         over_angle.plot(degrees, np.abs(tool["error"][span]) * 1e6, color=colour, lw=1.1, label=label)
     over_angle.set(
-        xlabel="spindle angle [°]", ylabel="|form error| [µm]", xlim=(0, 360), xticks=range(0, 361, 60), yscale="log"
+        xlabel="spindle angle [°]",
+        ylabel="|form error| [µm]",
+        xlim=(0, 360),
+        xticks=range(0, 361, 60),
+        yscale="log",
     )
     over_angle.set_ylim(bottom=max(errors.largest[last] * 1e6 / 300, 1e-4))
     over_angle.set_title("form error over angle", fontsize=10)
@@ -53,9 +65,9 @@ def save(path: Path, recording: Recording, errors: FormErrors, title: str) -> No
     over_angle.legend(fontsize=8)
 
     curve = figure.add_subplot(grid[2])
-    number = np.arange(1, errors.rms.size + 1)
-    curve.semilogy(number, errors.largest * 1e6, ".-", color="#999999", lw=0.8, ms=4, label="largest")
-    curve.semilogy(number, errors.rms * 1e6, ".-", color=_LAST, lw=1.2, ms=5, label="RMS")
+    revolutions = np.arange(1, errors.rms.size + 1)
+    curve.semilogy(revolutions, errors.largest * 1e6, ".-", color="#999999", lw=0.8, ms=4, label="largest")
+    curve.semilogy(revolutions, errors.rms * 1e6, ".-", color=_LAST, lw=1.2, ms=5, label="RMS")
     curve.set(xlabel="revolution", ylabel="form error [µm]")
     curve.set_title("learning, revolution by revolution", fontsize=10)
     curve.grid(visible=True, which="both", alpha=0.25)

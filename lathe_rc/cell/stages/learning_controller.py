@@ -31,15 +31,19 @@ class LearningControllerParameters(NodeParameters):
         "variable", "variable: lead angle T0·Ω (paper 000, eq. 20); constant_angle: T0·Ω0"
     )
     q_time: Annotated[float, Ge(0), Le(1)] = parameter(
-        67.0e-6, "time constant of the two-sided exponential Q at nominal speed; its width is fixed in angle", "s"
+        67.0e-6,
+        "time constant of the two-sided exponential Q at nominal speed; its width is fixed in angle",
+        "s",
     )
     learning_gain: Annotated[float, Gt(0), Le(2)] = parameter(1.0, "γ; 1 in the papers")
     points_per_revolution: Annotated[int, Ge(64), Le(65536)] = parameter(1024, "points of the memory per revolution")
     cycle_revolutions: Annotated[int, Ge(1), Le(1024)] = parameter(1, "cycle angle θ", "rev")
     feedback_delay: Annotated[int, Ge(1), Le(2**24)] = parameter(
-        2048, "samples from an error to when it is visible; at least a block, at most what the cycle leaves", "sample"
+        2048,
+        "samples from an error to when it is visible; at least a block, at most what the cycle leaves",
+        "sample",
     )
-    allow_unstable: bool = parameter(False, "start although sup|Q - Z| is not below 1")
+    allow_unstable: bool = parameter(default=False, doc="start although sup|Q - Z| is not below 1")
     model_natural_frequency: Annotated[float, Gt(0)] = parameter(1038.0, "drive model: ωn", "rad/s")
     model_damping: Annotated[float, Gt(0)] = parameter(0.804, "drive model: ζ", "1")
     model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s")

@@ -36,7 +36,9 @@ class SpindleEncoderParameters(NodeParameters):
         0, "encoder counts per revolution after quadrature; 0: an ideal encoder"
     )
     speed_window: Annotated[int, Ge(1), Le(65536)] = parameter(
-        64, "the measured speed is the angle's difference over so many samples; not used by an ideal encoder", "sample"
+        64,
+        "the measured speed is the angle's difference over so many samples; not used by an ideal encoder",
+        "sample",
     )
     revolutions: Annotated[float, Ge(0)] = parameter(0.0, "length of the run; 0: until stopped", "rev")
     speed_factor: Annotated[float, Ge(0)] = parameter(
@@ -88,9 +90,7 @@ class SpindleEncoder(Stage):
             if parameters.revolutions
             else None
         )
-        self._encoder = Encoder(
-            self.law, parameters.step, parameters.counts_per_revolution, parameters.speed_window
-        )
+        self._encoder = Encoder(self.law, parameters.step, parameters.counts_per_revolution, parameters.speed_window)
         self.declare(outputs=[Output("encoder", messages.ENCODER, Joint("angle", "speed"))])
 
     def speed_range(self) -> tuple[float, float]:

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One law, many hosts: real processes over real DDS give the bits of the offline engine."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rosbags.highlevel import AnyReader
+
+from lathe_rc import harness
+from lathe_rc.bag import reader
+from lathe_rc.cell.scenario import load
+
+PISTON = Path(__file__).parents[1] / "config" / "piston.yaml"
+SHORT = ["spindle_encoder.revolutions=6.0", "learning_controller.events=['revolution 4: freeze']"]
+SIGNALS = ("EncoderBlock", "ActuatorCommand", "ActuatorState", "ToolBlock", "LearningStatus", "Event", "JointState")
+
+
+def piston(*overrides: str):
+    return load(PISTON, [*SHORT, *overrides])
+
+
+@pytest.fixture(scope="module")
+def offline() -> dict[str, str]:
+    return harness.run(piston()).digest
+
+
+@pytest.mark.parametrize("block_size", [32, 64, 256])
+@pytest.mark.parametrize("mode", ["offline", "composed", "processes"])
+def test_every_host_and_block_size_gives_the_same_bits(offline, mode, block_size):
+    assert harness.run(piston(f"block_size={block_size}"), mode=mode).digest == offline
+
+
+def test_grouping_changes_no_bit(offline):
+    groups = [["spindle_encoder", "tool"], ["learning_controller", "electrodynamic_actuator"]]
+    assert harness.run(piston(), mode="processes", groups=groups).digest == offline
+
+
+def test_pace_changes_no_bit(offline):
+    result = harness.run(piston("spindle_encoder.speed_factor=1.0"), mode="processes")
+    assert result.digest == offline
+    assert result.real_time_factor <= 1.0
+
+
+@pytest.mark.parametrize("window", [1, 3, 500])
+def test_window_changes_no_bit(offline, window):
+    assert harness.run(piston(f"window={window}"), mode="composed").digest == offline
+
+
+@pytest.mark.parametrize("node", ["tool", "recorder"])
+def test_a_stopped_process_changes_no_bit(offline, node, tmp_path):
+    cell = harness.with_recorder(piston("spindle_encoder.speed_factor=0.5"), tmp_path / "bag", keep=True)
+    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+        processes.wait_for("cycle")
+        os.kill(processes.pids[node], signal.SIGSTOP)
+        # The spindle names the silent one; only then does it go on.
+        assert processes.wait_for("stall")["member"] == f"/{node}"
+        os.kill(processes.pids[node], signal.SIGCONT)
+        processes.wait_for_end()
+    assert reader.read(tmp_path / "bag").digests() == offline
+
+
+STRANGER = """
+import sys, rclpy
+from rclpy.node import Node
+from lathe_rc_msgs.msg import EncoderBlock, ToolBlock
+rclpy.init()
+node = Node("stranger")
+node.create_subscription(EncoderBlock, "encoder", lambda m: None, 10)
+node.create_subscription(ToolBlock, "tool", lambda m: print("heard", flush=True), 10)
+print("there", flush=True)
+rclpy.spin(node)
+"""
+
+
+def test_a_stranger_that_listens_from_the_start_changes_no_bit(offline, tmp_path):
+    cell = harness.with_recorder(piston(), tmp_path / "bag", keep=True)
+    with harness.free_domain() as domain:
+        environment = os.environ | {
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_LOG_DIR": str(tmp_path),
+        }
+        with subprocess.Popen([sys.executable, "-c", STRANGER], env=environment, stdout=subprocess.PIPE) as stranger:
+            try:
+                assert stranger.stdout.readline() == b"there\n"
+                with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
+                    processes.wait_for_end()
+                assert stranger.stdout.readline() == b"heard\n"
+            finally:
+                stranger.kill()
+    assert reader.read(tmp_path / "bag").digests() == offline
+
+
+def signal_messages(bag: Path) -> list[tuple[str, int, bytes]]:
+    with AnyReader([bag]) as bags:
+        return [
+            (connection.topic, stamp, bytes(data))
+            for connection, stamp, data in bags.messages()
+            if connection.msgtype.rpartition("/")[2] in SIGNALS
+        ]
+
+
+def test_bags_of_two_process_runs_and_of_an_offline_run_hold_the_same_messages(tmp_path):
+    for name, mode in (("a", "processes"), ("b", "processes"), ("c", "offline")):
+        harness.run(piston(), mode=mode, bag=tmp_path / name)
+    first = signal_messages(tmp_path / "a")
+    assert first == signal_messages(tmp_path / "b")
+    assert first == signal_messages(tmp_path / "c")
+    order = [(stamp, topic) for topic, stamp, _ in first]
+    assert order == sorted(order)
+
+
+def test_events_by_service_are_recorded_at_the_index_that_was_promised(tmp_path):
+    cell = harness.with_recorder(
+        load(PISTON, ["spindle_encoder.revolutions=40.0", "spindle_encoder.speed_factor=0.3"]), tmp_path / "bag", keep=True
+    )
+    script = """
+import rclpy
+from rclpy.node import Node
+from lathe_rc_msgs.srv import Schedule
+rclpy.init()
+node = Node("operator")
+client = node.create_client(Schedule, "/learning_controller/schedule")
+assert client.wait_for_service(20.0)
+for action in ("freeze", "jump"):
+    future = client.call_async(Schedule.Request(action=action, not_before=15000))
+    rclpy.spin_until_future_complete(node, future, timeout_sec=20.0)
+    print(future.result().accepted, future.result().sample_index, future.result().message)
+"""
+    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+        processes.wait_for("cycle")
+        environment = os.environ | {
+            "ROS_DOMAIN_ID": str(processes.domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_LOG_DIR": str(tmp_path),
+        }
+        lines = subprocess.run(
+            [sys.executable, "-c", script], env=environment, stdout=subprocess.PIPE, text=True, check=True
+        ).stdout.splitlines()
+        processes.wait_for_end()
+    accepted, index, *_ = lines[0].split()
+    assert accepted == "True"
+    assert int(index) >= 15000
+    assert lines[1].startswith("False 0 ")
+    assert "allowed: freeze, learn, clear" in lines[1]
+    events = reader.read(tmp_path / "bag").sparse["/learning_controller/events"]
+    assert events.values["action"] == ["freeze"]
+    assert events.values["sample_index"] == [int(index)]

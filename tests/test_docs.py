@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What users read is true: the reference page, links, the examples of the README, scenarios, the launch file."""
+
+import importlib.util
+import re
+import runpy
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from lathe_rc import cli, reference
+from lathe_rc.cell import ros_yaml, scenario
+from lathe_rc.cell.scenario import TABLES
+from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+SCENARIOS = sorted((ROOT / "config").glob("*.yaml"))
+LAUNCH = ROOT / "launch" / "cell.launch.py"
+
+_LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
+_BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+_RUN = re.compile(r"^\$ \./lathe (run .*)$", re.MULTILINE)
+_CODE = re.compile(r"```.*?```|`[^`]*`", re.DOTALL)
+
+
+def name(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def anchors(page: Path) -> set[str]:
+    """The headings of a page as links call them."""
+    found = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading).strip().lower().replace(" ", "-") for heading in found}
+
+
+class TestReference:
+    def test_page_is_what_the_command_prints(self) -> None:
+        printed = CliRunner().invoke(cli.main, ["reference"])
+        assert printed.exit_code == 0
+        page = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
+        assert page == printed.output, "run: ./lathe reference > docs/reference.md"
+
+    @pytest.mark.parametrize("kind", TABLES)
+    def test_names_every_parameter_and_topic(self, kind: str) -> None:
+        page = reference.page()
+        missing = [row for row in TABLES[kind].rows() if f"| `{row}` |" not in page]
+        if kind in STAGES:
+            stage = STAGES[kind](kind, TABLES[kind]())
+            topics = [port.topic for port in [*stage.inputs, *stage.outputs]]
+            missing += [topic for topic in [*topics, *stage.sparse_topics] if f"| `{topic}` |" not in page]
+        assert missing == []
+
+    def test_has_no_field_without_its_meaning_where_it_has_a_number(self) -> None:
+        bare = re.findall(r"^\| `\w+` \| `(?:float|u?int)[^|]*` \|\s*\|$", reference.page(), re.MULTILINE)
+        assert bare == []
+
+
+@pytest.fixture(scope="module")
+def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
+    rclpy = pytest.importorskip("rclpy")
+    from lathe_rc.harness import free_domain
+    from lathe_rc.nodes.recorder_node import RecorderNode
+    from lathe_rc.nodes.report import Reporter
+    from lathe_rc.nodes.spindle_node import SpindleNode
+    from lathe_rc.nodes.stage_node import StageNode
+
+    bag = tmp_path_factory.mktemp("docs") / "bag"
+    kinds = {"spindle_encoder": SpindleNode, "tool": StageNode, "recorder": RecorderNode}
+    with pytest.MonkeyPatch.context() as patch, free_domain() as domain:
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        rclpy.init(args=["docs", "--ros-args", "-p", f"recorder:bag:={bag}"], domain_id=domain)
+        made = {}
+        try:
+            for kind, node in kinds.items():
+                made[kind] = node(kind, kind, Reporter())
+                made[kind].trigger_configure()
+                made[kind].trigger_activate()
+                assert made[kind].failure is None
+            yield made
+        finally:
+            for node in made.values():
+                node.finish()
+                node.destroy_node()
+            rclpy.try_shutdown()
+
+
+class TestHostTopics:
+    """The reference's table of host topics against the nodes themselves."""
+
+    @pytest.mark.parametrize("topic", reference.HOST_TOPICS, ids=lambda topic: topic.name)
+    def test_are_published_and_read_as_the_table_says(self, nodes: dict[str, Any], topic: reference.HostTopic) -> None:
+        full = topic.name if topic.name.startswith("/") else f"/{topic.name}"
+        for kind, node in nodes.items():
+            outlets = [outlet for outlet in node.publishers if outlet.topic_name == full]
+            inlets = [inlet for inlet in node.subscriptions if inlet.topic_name == full]
+            assert bool(outlets) == (kind in topic.publishers), f"{kind} publishes {full}"
+            assert bool(inlets) == (kind in topic.subscribers), f"{kind} reads {full}"
+            for outlet in outlets:
+                module, _, kind_name = outlet.msg_type.__module__.partition(".")[0], "", outlet.msg_type.__name__
+                assert f"{module}/msg/{kind_name}" == topic.type
+                assert outlet.qos_profile.depth == topic.depth
+                assert outlet.qos_profile.reliability.name == "RELIABLE"
+                assert (outlet.qos_profile.durability.name == "TRANSIENT_LOCAL") == topic.latched
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+class TestPages:
+    def test_links_point_to_what_exists(self, page: Path) -> None:
+        broken = []
+        for target, anchor in _LINK.findall(_CODE.sub("", page.read_text(encoding="utf-8"))):
+            if "://" in target:
+                continue
+            path = (page.parent / target).resolve() if target else page
+            if not path.exists() or (anchor and anchor not in anchors(path)):
+                broken.append(f"{target}#{anchor}")
+        assert broken == []
+
+    def test_python_runs(self, page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """All examples of a page run, one after the other, as one program."""
+        blocks = _BLOCK.findall(page.read_text(encoding="utf-8"))
+        if not blocks:
+            pytest.skip("no Python on this page")
+        monkeypatch.chdir(tmp_path)
+        program = tmp_path / "page.py"
+        program.write_text("\n".join(blocks), encoding="utf-8")
+        runpy.run_path(str(program))
+
+    def test_commands_have_options_that_exist(self, page: Path) -> None:
+        for line in _RUN.findall(page.read_text(encoding="utf-8")):
+            words = [word for word in line.split("|")[0].split("#")[0].split() if word.startswith("--")]
+            known = {option for parameter in cli.run.params for option in parameter.opts}
+            assert set(words) <= known, line
+
+
+@pytest.mark.parametrize("path", SCENARIOS, ids=name)
+class TestScenarios:
+    def test_passes_its_check(self, path: Path) -> None:
+        Cell(scenario.load(path).nodes).check()
+
+    def test_survives_being_written_out(self, path: Path, tmp_path: Path) -> None:
+        loaded = scenario.load(path)
+        again = tmp_path / path.name
+        again.write_text(loaded.to_yaml(), encoding="utf-8")
+        assert scenario.load(again) == loaded
+
+
+class Action(SimpleNamespace):
+    """Stands in for an action of launch: keeps what it is given."""
+
+    def __init__(self, *args: object, **kwargs: object) -> None:
+        super().__init__(args=args, **kwargs)
+
+
+class Configuration:
+    """Stands in for LaunchConfiguration; the context is a dict."""
+
+    def __init__(self, key: str) -> None:
+        self._key = key
+
+    def perform(self, context: dict[str, str]) -> str:
+        return context[self._key]
+
+
+@pytest.fixture
+def launch_file(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The launch file, imported with stand-ins for launch and launch_ros."""
+    contents = {
+        "launch": ("LaunchContext", "LaunchDescription", "LaunchDescriptionEntity"),
+        "launch.actions": ("DeclareLaunchArgument", "OpaqueFunction", "Shutdown"),
+        "launch.events": (),
+        "launch.events.process": ("ProcessExited",),
+        "launch.substitutions": ("LaunchConfiguration",),
+        "launch_ros": (),
+        "launch_ros.actions": ("Node",),
+    }
+    for module, names in contents.items():
+        made = ModuleType(module)
+        for attribute in names:
+            setattr(
+                made, attribute, Configuration if attribute == "LaunchConfiguration" else type(attribute, (Action,), {})
+            )
+        monkeypatch.setitem(sys.modules, module, made)
+    spec = importlib.util.spec_from_file_location("cell_launch", LAUNCH)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class TestLaunch:
+    @pytest.fixture
+    def start(self, launch_file: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+        """What `ros2 launch` does with the description: the actions that it makes, for given arguments."""
+        monkeypatch.chdir(tmp_path)
+
+        def run(**given: str) -> list[Any]:
+            *declared, last = launch_file.generate_launch_description().args[0]
+            context = {argument.args[0]: argument.default_value for argument in declared}
+            assert set(given) <= set(context)
+            return last.function({**context, **given})
+
+        return run
+
+    def test_starts_the_five_nodes_with_one_file(self, start: Callable[..., Any], tmp_path: Path) -> None:
+        nodes = start()
+        assert {node.name for node in nodes} == set(TABLES)
+        assert all(node.package == "lathe_rc" and node.executable == node.name for node in nodes)
+        (file,) = {parameter for node in nodes for parameter in node.parameters}
+        loaded = scenario.load(Path(file))
+        assert set(loaded.nodes["spindle_encoder"].members) == set(TABLES) - {"spindle_encoder"}
+        assert loaded.nodes["recorder"].bag == str(tmp_path / f"bag_{loaded.shared.run_id}")
+
+    def test_takes_scenario_and_bag(self, start: Callable[..., Any], tmp_path: Path) -> None:
+        path = tmp_path / "cell.yaml"
+        path.write_text(
+            "/spindle: {ros__parameters: {stage: spindle_encoder, revolutions: 2}}\n"
+            + "".join(f"/{kind}: {{ros__parameters: {{}}}}\n" for kind in ("learning_controller", "tool"))
+            + "/electrodynamic_actuator: {ros__parameters: {delay: 0.36e-3}}\n",
+            encoding="utf-8",
+        )
+        nodes = {node.name: node for node in start(scenario=str(path), bag=str(tmp_path / "elsewhere"))}
+        assert nodes["spindle"].executable == "spindle_encoder"
+        values = ros_yaml.read(Path(nodes["recorder"].parameters[0]))
+        assert values["recorder"]["bag"] == str(tmp_path / "elsewhere")
+
+    def test_refuses_a_bag_that_exists(self, start: Callable[..., Any], tmp_path: Path) -> None:
+        with pytest.raises(InputError, match="exists"):
+            start(bag=str(tmp_path))
+
+    @pytest.mark.parametrize(("code", "ends"), [(0, False), (1, True), (-9, True)])
+    def test_a_failed_node_ends_the_others(self, start: Callable[..., Any], code: int, *, ends: bool) -> None:
+        react = start()[0].on_exit
+        assert bool(react(SimpleNamespace(returncode=code, process_name="tool-1"), None)) == ends

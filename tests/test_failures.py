@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What breaks is named, the rest is ended, and the bag is readable."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from lathe_rc import harness
+from lathe_rc.cell.scenario import load
+from lathe_rc.errors import InputError, LatheError
+
+PISTON = Path(__file__).parents[1] / "config" / "piston.yaml"
+NODES = ["spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder"]
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+class Killer:
+    """Sends a signal to a node at the first finished cycle."""
+
+    def __init__(self, node: str, number: int) -> None:
+        self.node, self.number, self.pids = node, number, {}
+
+    def __call__(self, event: harness.Event) -> None:
+        if event["event"] == "active":
+            self.pids[event["node"]] = event["pid"]
+        if event["event"] == "cycle" and self.number:
+            os.kill(self.pids[self.node], self.number)
+            self.number = 0
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_a_killed_node_is_named_and_the_bag_is_readable(node, tmp_path):
+    bag = tmp_path / "bag"
+    killer = Killer(node, signal.SIGKILL)
+    scenario = load(PISTON, ["spindle_encoder.revolutions=200.0", "recorder.chunk_size=65536"])
+    with pytest.raises(LatheError, match=f"^{node} was killed by SIGKILL") as failure:
+        harness.run(scenario, mode="processes", bag=bag, watch=killer)
+    assert failure.value.exit_code == 1
+    assert set(killer.pids) == set(NODES)
+    assert not any(alive(pid) for pid in killer.pids.values())
+    with AnyReader([bag]) as bags:
+        assert sum(1 for _ in bags.messages()) > 100
+    with next(bag.glob("*.mcap")).open("rb") as stream:
+        assert sum(1 for _ in make_reader(stream).iter_messages()) > 100
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_command_closes_its_bag_on_a_signal(number, tmp_path):
+    bag = tmp_path / "bag"
+    command = [sys.executable, "-m", "lathe_rc", "run", str(PISTON), "--mode", "processes", "--bag", str(bag)]
+    with subprocess.Popen([*command, "--speed-factor", "1.0"], stderr=subprocess.PIPE) as process:
+        mcap = bag / "bag.mcap"
+        # The event is the first chunk on the disk.
+        while process.poll() is None and not (mcap.exists() and mcap.stat().st_size > 1000):
+            time.sleep(0.05)
+        process.send_signal(number)
+        _, errors = process.communicate()
+    assert process.returncode == 1, errors
+    assert b"Traceback" not in errors
+    with AnyReader([bag]) as bags:
+        assert sum(1 for _ in bags.messages()) > 10
+
+
+@pytest.mark.parametrize(
+    ("node", "arguments", "expected"),
+    [
+        ("tool", ["-p", "feed:=-1.0"], "tool.feed = -1.0; allowed: a finite number from 0 [m/rev]"),
+        ("tool", ["-p", "fed:=1.0"], "tool.fed: unknown parameter"),
+        ("spindle_encoder", ["-p", "nominal_rpm:=fast"], "spindle_encoder.nominal_rpm = 'fast'; allowed: a finite number"),
+        ("learning_controller", ["-p", "events:=['soon: freeze']"], "learning_controller.events = 'soon: freeze'"),
+        ("recorder", ["-p", "bag:=/"], "/ exists; a bag is never overwritten"),
+    ],
+)
+def test_a_node_alone_refuses_bad_parameters_in_one_line(node, arguments, expected, tmp_path):
+    environment = os.environ | {"ROS_LOG_DIR": str(tmp_path), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    with harness.free_domain() as domain:
+        done = subprocess.run(
+            [sys.executable, "-m", "lathe_rc", "node", node, "--ros-args", *arguments],
+            env=environment | {"ROS_DOMAIN_ID": str(domain)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 2, done.stderr
+    assert expected in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_the_nodes_themselves_refuse_a_cell_that_cannot_work(tmp_path):
+    """Without the harness's check, as under ros2 launch: the time master checks what its members announce."""
+    scenario = load(PISTON, ["learning_controller.q_time=10e-6"])
+    cell = harness.with_recorder(scenario, tmp_path / "bag", keep=True)
+    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+        with pytest.raises(InputError, match=r"learning diverges: sup\|Q - Z\|"):
+            processes.wait_for_end()
+
+
+def test_an_existing_bag_is_refused_before_anything_starts(tmp_path):
+    with pytest.raises(InputError, match="exists; a bag is never overwritten"):
+        harness.run(load(PISTON), mode="processes", bag=tmp_path)
+
+
+def test_the_children_end_when_the_harness_is_killed(tmp_path):
+    script = """
+import sys
+from pathlib import Path
+from lathe_rc import harness
+from lathe_rc.cell.scenario import load
+cell = harness.with_recorder(load(Path(sys.argv[1]), ["spindle_encoder.speed_factor=1.0"]), Path(sys.argv[2]), keep=True)
+with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+    processes.wait_for("cycle")
+    print(*processes.pids.values(), flush=True)
+    processes.wait_for_end()
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", script, str(PISTON), str(tmp_path / "bag")], stdout=subprocess.PIPE
+    ) as process:
+        descriptors = [os.pidfd_open(int(pid)) for pid in process.stdout.readline().split()]
+        process.kill()
+    for descriptor in descriptors:
+        # Readable when the process has ended.
+        assert wait_readable(descriptor)
+        os.close(descriptor)
+    with AnyReader([tmp_path / "bag"]) as bags:
+        assert sum(1 for _ in bags.messages()) > 100
+
+
+def wait_readable(descriptor: int) -> bool:
+    import select
+
+    return bool(select.select([descriptor], [], [], 30)[0])
