@@ -4,4 +4,4 @@
 from lathe_rc.cli import main
 
 if __name__ == "__main__":
-    main()
+    main(prog_name="lathe")

@@ -21,6 +21,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 
 _REFRESH = 0.1  # [s] between updates of the progress line
+_LOG_PERIOD = 2.0  # [s] between lines where there is no terminal
 _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
 
 
@@ -65,6 +66,7 @@ class _Watch:
             TimeElapsedColumn(),
             console=console,
             transient=True,
+            disable=not console.is_terminal,
         )
         self._task = self._bar.add_task("starting", total=self._total, revolution="", error="", factor="")
 
@@ -75,10 +77,20 @@ class _Watch:
     def __exit__(self, *exception: object) -> None:
         self._bar.stop()
 
+    def _log(self, event: harness.Event, now: float) -> None:
+        """Without a terminal, a line now and then."""
+        if event["event"] == "cycle" and now >= self._due["cycle"]:
+            self._due["cycle"] = now + _LOG_PERIOD
+            error = f"error {event['rms_error'] * 1e6:.3g} µm RMS"
+            self._bar.console.print(f"revolution {event['cycle']:.0f}: {error}", highlight=False)
+
     def __call__(self, event: harness.Event) -> None:
         """Take an event of the run."""
         kind, update = event["event"], self._bar.update
         now = time.monotonic()
+        if self._bar.disable:
+            self._log(event, now)
+            return
         if kind in ("progress", "cycle"):
             if now < self._due[kind]:
                 return  # nobody reads faster, and drawing would slow an offline run down
@@ -236,7 +248,7 @@ def _nodes(arguments: Sequence[str]) -> int:
         from lathe_rc.nodes import process
     except ImportError as error:
         raise InputError(
-            f"no ROS 2 here ({error}); run through ./lathe, source a ROS 2 installation, or use lathe run --mode offline"
+            f"no ROS 2 here ({error}); run through ./lathe, source a ROS 2 installation, or use --mode offline"
         ) from None
     return process.run(*process.split(arguments))
 

@@ -115,9 +115,8 @@ def test_bags_of_two_process_runs_and_of_an_offline_run_hold_the_same_messages(t
 
 
 def test_events_by_service_are_recorded_at_the_index_that_was_promised(tmp_path):
-    cell = harness.with_recorder(
-        load(PISTON, ["spindle_encoder.revolutions=40.0", "spindle_encoder.speed_factor=0.3"]), tmp_path / "bag", keep=True
-    )
+    slow = load(PISTON, ["spindle_encoder.revolutions=40.0", "spindle_encoder.speed_factor=0.3"])
+    cell = harness.with_recorder(slow, tmp_path / "bag", keep=True)
     script = """
 import rclpy
 from rclpy.node import Node

@@ -80,7 +80,7 @@ def test_the_command_closes_its_bag_on_a_signal(number, tmp_path):
     [
         ("tool", ["-p", "feed:=-1.0"], "tool.feed = -1.0; allowed: a finite number from 0 [m/rev]"),
         ("tool", ["-p", "fed:=1.0"], "tool.fed: unknown parameter"),
-        ("spindle_encoder", ["-p", "nominal_rpm:=fast"], "spindle_encoder.nominal_rpm = 'fast'; allowed: a finite number"),
+        ("spindle_encoder", ["-p", "nominal_rpm:=fast"], "spindle_encoder.nominal_rpm = 'fast'; allowed:"),
         ("learning_controller", ["-p", "events:=['soon: freeze']"], "learning_controller.events = 'soon: freeze'"),
         ("recorder", ["-p", "bag:=/"], "/ exists; a bag is never overwritten"),
     ],
@@ -104,9 +104,9 @@ def test_the_nodes_themselves_refuse_a_cell_that_cannot_work(tmp_path):
     """Without the harness's check, as under ros2 launch: the time master checks what its members announce."""
     scenario = load(PISTON, ["learning_controller.q_time=10e-6"])
     cell = harness.with_recorder(scenario, tmp_path / "bag", keep=True)
-    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
-        with pytest.raises(InputError, match=r"learning diverges: sup\|Q - Z\|"):
-            processes.wait_for_end()
+    diverges = pytest.raises(InputError, match=r"learning diverges: sup\|Q - Z\|")
+    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes, diverges:
+        processes.wait_for_end()
 
 
 def test_an_existing_bag_is_refused_before_anything_starts(tmp_path):
@@ -120,7 +120,8 @@ import sys
 from pathlib import Path
 from lathe_rc import harness
 from lathe_rc.cell.scenario import load
-cell = harness.with_recorder(load(Path(sys.argv[1]), ["spindle_encoder.speed_factor=1.0"]), Path(sys.argv[2]), keep=True)
+slow = load(Path(sys.argv[1]), ["spindle_encoder.speed_factor=1.0"])
+cell = harness.with_recorder(slow, Path(sys.argv[2]), keep=True)
 with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
     processes.wait_for("cycle")
     print(*processes.pids.values(), flush=True)

@@ -72,21 +72,32 @@ def as_we_read(path):
         return None
 
 
+def refusal_of(path):
+    """What our reader says against a file; nothing if it reads it."""
+    try:
+        ros_yaml.read(path)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
 def typed(values):
     """Values with their types, comparable: NaN is equal to itself, 0.0 differs from -0.0 and 1 from 1.0 and True."""
     return {name: repr(value) for name, value in values.items()}
 
 
-PLAIN = (
-    "1e-3 1E6 1e+5 .5 1. .5e1 +.5 5e-324 1e-400 1e400 0x10 0X1F -0x10 0x 0x1p3 010 08 0777 0b11 0o17 1_000 1d5 +5 -0 "
-    "-0.0 9223372036854775807 9223372036854775808 -9223372036854775809 .inf -.inf +.inf .Inf .INF .iNF inf -inf infinity "
-    ".nan -.nan +.nan .NaN nan nan(5) yes no on off y n Y N true True TRUE tRUE false null ~ Null 2020-01-01 1:30 1:30:45 "
-    "= << e5 1e 1f . + é ٣"
-).split(" ")
-MARKED = ['""', "''", '"5"', "'1e3'", '"yes"', '"\\x41"', "!!str 5", "!!str yes", '!!int "5"', "!!float 5", "!foo 5", "! 5"]
+PLAIN = """
+1e-3 1E6 1e+5 .5 1. .5e1 +.5 5e-324 1e-400 1e400 0x10 0X1F -0x10 0x 0x1p3 010 08 0777 0b11 0o17 1_000 1d5 +5 -0 -0.0
+9223372036854775807 9223372036854775808 -9223372036854775809 .inf -.inf +.inf .Inf .INF .iNF inf -inf infinity
+.nan -.nan +.nan .NaN nan nan(5) yes no on off y n Y N true True TRUE tRUE false null ~ Null 2020-01-01 1:30 1:30:45
+= << e5 1e 1f . + é ٣
+""".split()  # noqa: SIM905  # three lines say it better than seventy
+MARKED = ['""', "''", '"5"', "'1e3'", '"yes"', '"\\x41"']
+MARKED += ["!!str 5", "!!str yes", '!!int "5"', "!!float 5", "!foo 5", "! 5"]
 LISTS = ["[1, 2]", "[1.0, 1e3]", "[yes, off]", '["1", "2"]', "[a, b, null]", "[1e-3]", "[0x10, 010]", "[1,\n     2]"]
 BLOCKS = ["|-\n      5", ">-\n      yes", "|\n      5", ">-\n      two\n      words", "two\n      words"]
-REFUSED = ["", "|-", "-", "[1, 2.5]", "[1e3, 2]", "[a, 1]", "[true, 1]", "@a", "`a", "%a", "[1", "a: b", "*a", '"\\ud800"']
+REFUSED = ["", "|-", "[1, 2.5]", "[1e3, 2]", "[a, 1]", "[true, 1]"]
+REFUSED += ["-", "@a", "`a", "%a", "[1", "a: b", "[a:=b]", "*a", '"\\ud800"']
 
 
 @pytest.mark.parametrize("value", PLAIN + MARKED + LISTS + BLOCKS)
@@ -145,7 +156,7 @@ def test_value_that_yaml_1_1_means_too_is_read_as_rclpy_reads_it(folder):
     assert typed(as_we_read(path)) == typed(theirs)
 
 
-@given(st.one_of(st.floats(), st.integers(-(2**63), 2**63 - 1), st.booleans()))
+@given(st.one_of(st.floats(allow_subnormal=False), st.integers(-(2**63), 2**63 - 1), st.booleans()))
 def test_value_on_the_command_line_is_read_as_in_a_file(value):
     text = {True: "true", False: "false"}[value] if isinstance(value, bool) else repr(value)
     read = ros_yaml.parse_value(text, "--set x")
@@ -205,20 +216,17 @@ NODE = "n:\n  ros__parameters:\n"
 )
 def test_hostile_file_is_refused_in_one_line(folder, text, message):
     path = write(folder, text)
-    with pytest.raises(InputError) as refusal:
-        ros_yaml.read(path)
-    assert str(refusal.value).startswith(str(path))
-    assert message in str(refusal.value)
-    assert len(str(refusal.value).splitlines()) == 1
+    refusal = refusal_of(path)
+    assert refusal.startswith(str(path))
+    assert message in refusal
+    assert len(refusal.splitlines()) == 1
 
 
 @example("n: {ros__parameters: !!python/object/apply:os.system ['true']}")
 @given(st.text(st.characters(exclude_categories=["Cs"])))
 def test_junk_is_refused_in_one_line(folder, text):
     path = write(folder, text)
-    if as_we_read(path) is None:
-        with pytest.raises(InputError, match=r"\A.*\Z"):
-            ros_yaml.read(path)
+    assert "\n" not in refusal_of(path)
 
 
 def test_missing_file_is_refused(folder):

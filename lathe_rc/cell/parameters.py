@@ -130,8 +130,8 @@ class SharedParameters(Table):
                 f"sample_rate = {self.sample_rate} Hz: its step is not a whole number of ns; "
                 f"allowed nearby: {low} or {high} Hz"
             )
-        if len(self.run_id) > 64:
-            raise InputError(f"run_id = {self.run_id!r}; allowed: at most 64 characters")
+        if not self.run_id.isprintable() or len(self.run_id.encode()) > 64:
+            raise InputError(f"run_id = {self.run_id!r}; allowed: printable text of at most 64 bytes")
 
     @property
     def step_ns(self) -> int:

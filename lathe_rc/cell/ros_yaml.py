@@ -113,15 +113,25 @@ def _flatten(node: yaml.Node, where: str, prefix: str, into: dict[str, Value]) -
             into[name] = _value(item, f"{where}.{name}")
 
 
+def _check_events(text: str, source: str) -> None:
+    """Refuse what rcl does not read, and what would take PyYAML for ever, before any of it is built."""
+    in_brackets: list[bool] = []
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise InputError(f"{source}: YAML aliases; ROS 2 does not read them: write the value out")
+        if isinstance(event, yaml.CollectionStartEvent):
+            in_brackets.append(bool(event.flow_style))
+            if len(in_brackets) > _MAX_DEPTH:
+                raise InputError(f"{source}: nested more than {_MAX_DEPTH} deep; not a parameter file")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            in_brackets.pop()
+        elif isinstance(event, yaml.ScalarEvent) and not event.style and ":" in event.value and any(in_brackets):
+            raise InputError(f"{source}: {event.value!r} in brackets; ROS 2 reads it in quotes only")
+
+
 def _compose(text: str, source: str) -> yaml.Node | None:
     try:
-        depth = 0
-        for event in yaml.parse(text, Loader=yaml.SafeLoader):
-            if isinstance(event, yaml.AliasEvent):
-                raise InputError(f"{source}: YAML aliases; ROS 2 does not read them: write the value out")
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > _MAX_DEPTH:
-                raise InputError(f"{source}: nested more than {_MAX_DEPTH} deep; not a parameter file")
+        _check_events(text, source)
         return yaml.compose(text, Loader=_Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)

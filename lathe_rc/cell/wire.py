@@ -178,6 +178,10 @@ class Decoder:
         self._fields = list(messages.sample_fields(msgtype)) if fields is None else fields
         self._layout: _Layout | None = None
 
+    def prepare(self) -> None:
+        """Let rosbags build its codec of the type ahead of the first block."""
+        messages.decode(self._type, _message(self._type, "", "", 1, {}))
+
     def decode(self, data: bytes) -> Block:
         """A block from its bytes.
 

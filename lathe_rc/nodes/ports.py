@@ -59,6 +59,7 @@ class BlockQueue:
         self.source = ""
         self.lost = 0
         self._decoder = Decoder(msgtype, fields)
+        self._decoder.prepare()
         self._run_id, self._step_ns, self._size = parameters.run_id, parameters.step_ns, parameters.block_size
         self._free_running = not parameters.window
         self._limit = 8 * (parameters.window + SPARE_DEPTH)

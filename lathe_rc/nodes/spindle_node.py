@@ -101,6 +101,7 @@ class SpindleNode(StageNode):
 
     def _begin(self) -> None:
         self._running = True
+        self.get_logger().info(f"run {self.table.run_id or '(no id)'} begins with {len(self._member_names)} members")
         self._heard = time.monotonic()
         self._schedule = self._heard
         self._say(CellState.RUNNING, 0)
@@ -173,6 +174,7 @@ class SpindleNode(StageNode):
 
     def _finish_run(self) -> None:
         self._say(CellState.ENDED, self.samples)
+        self.get_logger().info(f"run ended: {self.blocks} blocks, {self.samples} samples")
         self.end([*self.outlets.values(), self._state])
 
     def fail(self, error: LatheError, *, cause: str = "error") -> None:

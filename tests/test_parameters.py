@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameter tables: what they accept, and how they refuse the rest."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.scenario import TABLES
+from lathe_rc.errors import InputError
+
+ROWS = [(kind, name) for kind, table in TABLES.items() for name in table.rows()]
+WRONG = {bool: [1, "true"], int: [1.5, "1", True], float: ["1", True], str: [1, 1.5, False]}
+SI = {"1", "m", "rad", "s", "Hz", "rad/s", "m/s", "m/s^2", "kg", "N/A", "m/rev", "1/min", "rev", "sample", "block", "B"}
+
+
+def refusal(kind, name, value):
+    """The one line with which a table refuses a value."""
+    with pytest.raises(InputError) as refused:
+        TABLES[kind].read("some_node", {name: value})
+    text = str(refused.value)
+    assert len(text.splitlines()) == 1
+    assert text.startswith(f"some_node.{name} = {value!r}; allowed: ")
+    return text
+
+
+def row(kind, name):
+    return TABLES[kind].rows()[name]
+
+
+@pytest.mark.parametrize("kind", TABLES)
+def test_defaults_are_valid_and_told(kind):
+    table = TABLES[kind]
+    values = table.read("some_node", {})
+    assert table.read("some_node", values.model_dump()) == values
+    assert {name: part.default for name, part in table.rows().items()} == values.model_dump()
+
+
+@pytest.mark.parametrize(("kind", "name"), ROWS)
+def test_parameter_has_a_description_and_a_unit(kind, name):
+    part = row(kind, name)
+    assert any(len(word) > 2 for word in part.doc.split()), "a symbol alone describes nothing"
+    assert part.unit in SI
+    assert part.type in (bool, int, float, str)
+    assert part.allowed()
+
+
+@pytest.mark.parametrize(("kind", "name"), ROWS)
+def test_wrong_type_is_refused(kind, name):
+    part = row(kind, name)
+    wrong = WRONG[part.type]
+    if part.is_list:
+        wrong = [[value] for value in wrong] + [part.default[0] if part.default else 1.5]
+    for value in wrong:
+        assert refusal(kind, name, value).endswith(part.allowed())
+
+
+@pytest.mark.parametrize(("kind", "name"), [pair for pair in ROWS if row(*pair).type is float])
+def test_number_that_is_not_finite_is_refused(kind, name):
+    for value in (math.nan, math.inf, -math.inf):
+        refusal(kind, name, [value] if row(kind, name).is_list else value)
+
+
+@pytest.mark.parametrize(("kind", "name"), [pair for pair in ROWS if row(*pair).limits])
+def test_value_out_of_range_is_refused_with_the_range(kind, name):
+    part = row(kind, name)
+    for limit, beyond in ((part.low, -1), (part.high, 1)):
+        if math.isfinite(limit):
+            value = part.type(limit + beyond)
+            assert f"{limit:g}" in refusal(kind, name, [value] if part.is_list else value)
+    if "above" in part.limits:
+        value = part.type(part.low)
+        refusal(kind, name, [value] if part.is_list else value)
+
+
+@pytest.mark.parametrize(("kind", "name"), [pair for pair in ROWS if row(*pair).choices])
+def test_text_that_is_no_choice_is_refused_with_the_choices(kind, name):
+    assert ", ".join(row(kind, name).choices) in refusal(kind, name, "other")
+
+
+@pytest.mark.parametrize("kind", TABLES)
+def test_unknown_name_is_refused_with_the_known_ones(kind):
+    with pytest.raises(InputError) as refused:
+        TABLES[kind].read("some_node", {"nominal_rmp": 1000.0})
+    text = str(refused.value)
+    assert text.startswith("some_node.nominal_rmp: unknown parameter; allowed: ")
+    assert set(TABLES[kind].rows()) <= set(text.partition("allowed: ")[2].split(", "))
+
+
+@given(st.integers(1, 60_000))
+def test_integer_is_taken_for_a_number(rpm):
+    value = NodeParameters.read("some_node", {"nominal_rpm": rpm}).nominal_rpm
+    assert value == rpm
+    assert isinstance(value, float)
+
+
+@pytest.mark.parametrize(("rate", "neighbours"), [(65_536, "64000 or 78125"), (44_100, "40000 or 50000")])
+def test_rate_whose_step_is_no_whole_number_of_ns_is_refused_with_its_neighbours(rate, neighbours):
+    with pytest.raises(InputError, match=f"sample_rate = {rate} Hz: .* allowed nearby: {neighbours} Hz"):
+        NodeParameters.read("some_node", {"sample_rate": rate})
+
+
+@given(st.integers(1000, 1_000_000))
+def test_accepted_rate_has_an_exact_step(rate):
+    try:
+        table = NodeParameters.read("some_node", {"sample_rate": rate})
+    except InputError:
+        assert 1_000_000_000 % rate
+    else:
+        assert table.step_ns * rate == 1_000_000_000
+        assert table.step == 1 / rate
+
+
+def test_speed_is_told_in_radians():
+    assert NodeParameters.read("some_node", {"nominal_rpm": 1000}).nominal_speed == pytest.approx(104.72, abs=1e-3)
+
+
+@pytest.mark.parametrize("run_id", ["x" * 65, "é" * 33, "two\nlines", "bell\a", "\ud800"])
+def test_run_id_that_messages_cannot_carry_is_refused(run_id):
+    """BlockInfo.msg bounds it to 64, and CDR counts bytes."""
+    with pytest.raises(InputError, match=r"^run_id = .* at most 64 bytes$"):
+        NodeParameters.read("some_node", {"run_id": run_id})
+
+
+def test_table_is_frozen():
+    with pytest.raises(ValueError, match="frozen"):
+        NodeParameters.read("some_node", {}).block_size = 32

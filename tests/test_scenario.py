@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenario files: one format for every host, overrides, identity, and what is refused."""
+
+import pytest
+from cells import NODES
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lathe_rc import harness
+from lathe_rc.cell import ros_yaml
+from lathe_rc.cell.scenario import TABLES, Scenario, load
+from lathe_rc.errors import InputError
+
+CELL = """
+/**:
+  ros__parameters:
+    block_size: 32
+/spindle_encoder:
+  ros__parameters: {revolutions: 2.0, deviation_amplitude: [0.1], deviation_frequency: [10.7]}
+/learning_controller:
+  ros__parameters: {lead_time: 1.425e-3}
+/electrodynamic_actuator:
+  ros__parameters: {}
+/tool:
+  ros__parameters: {profile: csv, profile_file: forms/oval.csv}
+"""
+OVAL = "angle_deg,radius_um\n" + "".join(f"{a},{b}\n" for a, b in ((0, 0), (90, -200), (180, 0), (270, -200)))
+
+
+@pytest.fixture
+def cell(tmp_path):
+    """A scenario file with a profile beside it."""
+    (tmp_path / "forms").mkdir()
+    (tmp_path / "forms" / "oval.csv").write_text(OVAL)
+    path = tmp_path / "cell.yaml"
+    path.write_text(CELL)
+    return path
+
+
+# --- reading
+
+
+def test_file_gives_every_node_its_table(cell):
+    scenario = load(cell)
+    assert scenario.name == "cell"
+    assert tuple(scenario.nodes) == NODES
+    assert [scenario.kind(name) for name in NODES] == list(NODES)
+    assert {table.block_size for table in scenario.nodes.values()} == {32}
+    assert scenario.shared.block_size == 32
+    assert scenario.nodes["learning_controller"].lead_time == 1.425e-3
+    assert scenario.nodes["electrodynamic_actuator"].damping == 0.804
+
+
+def test_node_may_have_a_name_of_its_own(cell):
+    cell.write_text(CELL.replace("/tool:\n  ros__parameters: {", "/edge:\n  ros__parameters: {stage: tool, "))
+    scenario = load(cell)
+    assert scenario.kind("edge") == "tool"
+    assert scenario.of_kind("tool") == ["edge"]
+
+
+def test_profile_path_is_relative_to_the_file(cell, monkeypatch):
+    for folder in (cell.parent, "/"):
+        monkeypatch.chdir(folder)
+        assert load(cell).nodes["tool"].profile_file == str(cell.parent / "forms" / "oval.csv")
+
+
+def test_profile_path_on_the_command_line_is_relative_to_the_shell(cell, monkeypatch):
+    monkeypatch.chdir(cell.parent / "forms")
+    changed = load(cell, ["tool.profile_file=other.csv"])
+    assert changed.nodes["tool"].profile_file == str(cell.parent / "forms" / "other.csv")
+
+
+def test_scenario_runs(cell):
+    assert harness.run(load(cell)).errors.rms.size == 2
+
+
+# --- overrides
+
+
+@pytest.mark.parametrize(
+    ("override", "node", "name", "value"),
+    [
+        ("learning_controller.lead_time=2e-3", "learning_controller", "lead_time", 2e-3),
+        ("learning_controller.lead_law=constant_angle", "learning_controller", "lead_law", "constant_angle"),
+        ("learning_controller.feedback_delay=0x100", "learning_controller", "feedback_delay", 256),
+        ("learning_controller.allow_unstable=yes", "learning_controller", "allow_unstable", True),
+        ("learning_controller.events=['revolution 1: freeze']", "learning_controller", "events", ["revolution 1: freeze"]),
+        ("spindle_encoder.deviation_amplitude=[]", "spindle_encoder", "deviation_amplitude", []),
+        ("spindle_encoder.revolutions=3", "spindle_encoder", "revolutions", 3.0),
+        ("tool.profile_file=", "tool", "profile_file", ""),
+        (" tool.feed =1e-4", "tool", "feed", 1e-4),
+    ],
+)
+def test_override_of_a_node(cell, override, node, name, value):
+    assert getattr(load(cell, [override]).nodes[node], name) == value
+
+
+def test_override_of_a_shared_parameter_holds_for_every_node(cell):
+    cell.write_text(CELL.replace("{revolutions", "{block_size: 32, revolutions"))
+    scenario = load(cell, ["block_size=16", "seed=5", "block_size=128"])
+    assert {(table.block_size, table.seed) for table in scenario.nodes.values()} == {(128, 5)}
+
+
+def test_file_without_shared_parameters_takes_them_from_the_command_line(cell):
+    cell.write_text(CELL.partition("/spindle_encoder")[1] + CELL.partition("/spindle_encoder")[2])
+    assert load(cell, ["block_size=16"]).shared.block_size == 16
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("block_size", "--set 'block_size'; allowed: NODE.PARAM=VALUE, or PARAM=VALUE for a shared parameter"),
+        ("", "--set ''; allowed: NODE.PARAM=VALUE"),
+        ("=5", "--set '=5':  is not shared; allowed: sample_rate, block_size"),
+        ("feed=1e-3", "--set 'feed=1e-3': feed is not shared; allowed: sample_rate, block_size"),
+        ("fork.feed=1", "--set 'fork.feed=1': no node 'fork' in the scenario; allowed: spindle_encoder, learning"),
+        ("tool.fed=1", "tool.fed: unknown parameter; allowed: autostart, block_size"),
+        ("tool.=1", "tool.: unknown parameter"),
+        ("tool.feed=fast", "tool.feed = 'fast'; allowed: a finite number from 0 [m/rev]"),
+        ("tool.feed=.nan", "tool.feed = nan; allowed: a finite number from 0 [m/rev]"),
+        ("tool.feed=-1", "tool.feed = -1; allowed: a finite number from 0 [m/rev]"),
+        ("tool.feed=[1.0]", "tool.feed = [1.0]; allowed"),
+        ("tool.feed={a: 1}", "--set tool.feed: neither a value nor a list"),
+        ("tool.feed=[1.0", "--set tool.feed:1: not YAML"),
+        ("tool.stage=fork", "tool: no stage 'fork'; allowed: spindle_encoder, learning_controller"),
+        ("block_size=0", "/**.block_size = 0; allowed: an integer from 1 up to 8192 [sample]"),
+        ("block_size=64.0", "/**.block_size = 64.0; allowed: an integer"),
+        ("sample_rate=65536", "sample_rate = 65536 Hz: its step is not a whole number of ns"),
+        ("tool.block_size=8", "tool.block_size = 8: /** says 32; keep one"),
+        ("tool.seed=8", "seed = "),
+        ("/**.block_size=8", "no stage '/**'"),
+        ('tool.profile_file="a\\0b"', "allowed: text without NUL"),
+    ],
+)
+def test_bad_override_is_refused_in_one_line(cell, override, message):
+    with pytest.raises(InputError) as refusal:
+        load(cell, [override])
+    assert message in str(refusal.value)
+    assert len(str(refusal.value).splitlines()) == 1
+    assert refusal.value.exit_code == 2
+
+
+# --- bad files
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("block_size: 32", "block_sizes: 32", "/**.block_sizes: unknown parameter"),
+        ("block_size: 32", "revolutions: 2.0", "/**.revolutions: unknown parameter"),
+        ("block_size: 32", "block_size: nan", "/**.block_size = nan; allowed: an integer"),
+        ("/tool:", "/fork:", "fork: no stage 'fork'; allowed: spindle_encoder, learning_controller"),
+        ("/tool:", "/cell/tool:", "cell/tool: no stage"),
+        ("profile: csv", "profile: cvs", "tool.profile = 'cvs'; allowed: one of harmonics, piston, polygon, csv"),
+        ("[0.1]", "[0.1, .nan]", "spindle_encoder.deviation_amplitude = [0.1, nan]; allowed: a list, each a finite number"),
+        ("[0.1]", "0.1", "spindle_encoder.deviation_amplitude = 0.1; allowed: a list"),
+        ("[10.7]", "[0.0]", "spindle_encoder.deviation_frequency = [0.0]; allowed: a list, each a finite number above 0"),
+        ("revolutions: 2.0", "revolutions: two", "spindle_encoder.revolutions = 'two'; allowed: a finite number"),
+        ("revolutions: 2.0", "window: 3, revolutions: 2.0", "window = "),
+        ("  ros__parameters: {}", "  ros_parameters: {}", "electrodynamic_actuator does not hold ros__parameters alone"),
+    ],
+)
+def test_bad_value_is_refused_in_one_line(cell, old, new, message):
+    assert old in CELL
+    cell.write_text(CELL.replace(old, new))
+    with pytest.raises(InputError) as refusal:
+        load(cell)
+    assert message in str(refusal.value)
+    assert len(str(refusal.value).splitlines()) == 1
+
+
+def test_file_without_nodes_is_refused(cell):
+    cell.write_text("/**: {ros__parameters: {block_size: 32}}")
+    with pytest.raises(InputError, match="no nodes beside"):
+        load(cell)
+
+
+def test_missing_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        load(tmp_path / "no.yaml")
+
+
+# What the cell refuses when it is built or checked, before anything moves.
+LATE = [
+    (["tool.profile_file=''"], "tool.profile_file is empty; name the CSV file"),
+    (["tool.profile_file=/no/such.csv"], "/no/such.csv: cannot be read (No such file or directory)"),
+    (["spindle_encoder.deviation_frequency=[1.0, 2.0]"], "1 amplitudes, 2 frequencies and 1 phases"),
+    (["spindle_encoder.deviation_amplitude=[1.5]"], "speed falls to"),
+    (["spindle_encoder.tachogram_time=[1.0]"], "1 times and 0 deviations"),
+    (["spindle_encoder.tachogram_time=[2.0, 1.0]", "spindle_encoder.tachogram_deviation=[0.1, 0.1]"], "increase"),
+    (["spindle_encoder.random_rms=0.01", "spindle_encoder.random_low=90.0"], "band 90-60 rad/s"),
+    (["spindle_encoder.revolutions=0.0"], "spindle_encoder.revolutions = 0"),
+    (["learning_controller.events=['soon: freeze']"], "learning_controller.events = 'soon: freeze'; allowed:"),
+    (["learning_controller.events=['sample -1: freeze']"], "'sample -1: freeze'; allowed:"),
+    (["learning_controller.events=['sample 1e999: freeze']"], "'sample 1e999: freeze'; allowed:"),
+    (["learning_controller.events=['sample 1-1: freeze']"], "'sample 1-1: freeze'; allowed:"),
+    (["learning_controller.events=['sample 1: melt']"], "event 'melt'; allowed: freeze, learn, clear"),
+    (["tool.events=['sample 1: freeze']"], "event 'freeze'; allowed: none (tool has no events)"),
+    (["tool.remap=['encoder=shaft']"], "remap = 'encoder=shaft'; allowed: old:=new"),
+    (["learning_controller.q_time=1.0"], "Q filter reaches"),
+    (["learning_controller.feedback_delay=16"], "delayed by 16 samples, block_size = 32"),
+    (["tool.profile=polygon", "tool.polygon_corner_radius=1.0"], "polygon: corner radius 1 m"),
+    (["tool.profile=harmonics", "tool.harmonic_order=[2]"], "1 orders, 0 amplitudes and 1 phases"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "message"), LATE)
+def test_impossible_setting_is_refused_in_one_line(cell, overrides, message):
+    with pytest.raises(InputError) as refusal:
+        harness.run(load(cell, overrides))
+    assert message in str(refusal.value)
+    assert len(str(refusal.value).splitlines()) == 1
+
+
+# --- the complete file
+
+
+def test_complete_file_says_the_same(cell, tmp_path):
+    scenario = load(cell, ["learning_controller.events=['revolution 1: freeze']"])
+    again = tmp_path / "again.yaml"
+    again.write_text(scenario.to_yaml())
+    assert load(again).nodes == scenario.nodes
+
+
+texts = st.text(st.characters(exclude_categories=["Cs", "Cc", "Zl", "Zp", "Cn", "Co"]), max_size=16)
+odd_texts = st.sampled_from(["1e-3", "0x10", "010", "y", "n", "yes", "null", ".inf", "1E6", "5", "+5", "~", "nan", "a: b", ""])
+
+
+@given(
+    st.one_of(texts, odd_texts),
+    st.lists(st.one_of(texts, odd_texts), max_size=3),
+    st.lists(st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False), max_size=3),
+    st.floats(1e-300, 1e300),
+)
+def test_every_value_survives_the_complete_file(tmp_path_factory, run_id, names, amplitudes, seconds):
+    values = {"run_id": run_id, "members": names, "deviation_amplitude": amplitudes, "deviation_start": seconds}
+    table = TABLES["spindle_encoder"].read("spindle_encoder", values)
+    path = tmp_path_factory.mktemp("complete") / "complete.yaml"
+    path.write_text(Scenario("any", {"spindle_encoder": table}).to_yaml())
+    read = ros_yaml.read(path)["spindle_encoder"]
+    assert TABLES["spindle_encoder"].read("spindle_encoder", read) == table
+
+
+# --- identity
+
+
+def run_id(cell, *overrides):
+    return load(cell, overrides).shared.run_id
+
+
+def test_run_id_is_the_same_for_the_same_content(cell, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "forms").mkdir(parents=True)
+    (elsewhere / "forms" / "oval.csv").write_text(OVAL)
+    (elsewhere / "other.yaml").write_text("# a comment\n" + CELL.replace("1.425e-3", "0.001425"))
+    assert run_id(cell) == run_id(cell) == run_id(elsewhere / "other.yaml")
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["spindle_encoder.speed_factor=0.0", "window=3", "spindle_encoder.members=[tool]", "tool.autostart=false"],
+)
+def test_run_id_does_not_depend_on_the_host(cell, override):
+    assert run_id(cell, override) == run_id(cell)
+
+
+def test_run_id_does_not_depend_on_the_recorder(cell):
+    before = run_id(cell)
+    cell.write_text(CELL + "/recorder:\n  ros__parameters: {bag: some/where, compression: none}\n")
+    assert run_id(cell) == before
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["tool.feed=1e-9", "seed=1", "block_size=64", "learning_controller.events=['sample 1: clear']", "tool.profile=piston"],
+)
+def test_run_id_depends_on_the_content(cell, override):
+    assert run_id(cell, override) != run_id(cell)
+
+
+def test_run_id_depends_on_the_profile_s_points(cell):
+    before = run_id(cell)
+    (cell.parent / "forms" / "oval.csv").write_text(OVAL.replace("-200", "-201"))
+    assert run_id(cell) != before
+
+
+def test_run_id_may_be_given(cell):
+    assert {table.run_id for table in load(cell, ["run_id=mine"]).nodes.values()} == {"mine"}
