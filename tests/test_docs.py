@@ -22,6 +22,7 @@ from lathe_rc.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
 SCENARIOS = sorted((ROOT / "config").glob("*.yaml"))
 LAUNCH = ROOT / "launch" / "cell.launch.py"
 
@@ -104,8 +105,8 @@ class TestHostTopics:
             assert bool(outlets) == (kind in topic.publishers), f"{kind} publishes {full}"
             assert bool(inlets) == (kind in topic.subscribers), f"{kind} reads {full}"
             for outlet in outlets:
-                module, _, kind_name = outlet.msg_type.__module__.partition(".")[0], "", outlet.msg_type.__name__
-                assert f"{module}/msg/{kind_name}" == topic.type
+                package = outlet.msg_type.__module__.partition(".")[0]
+                assert f"{package}/msg/{outlet.msg_type.__name__}" == topic.type
                 assert outlet.qos_profile.depth == topic.depth
                 assert outlet.qos_profile.reliability.name == "RELIABLE"
                 assert (outlet.qos_profile.durability.name == "TRANSIENT_LOCAL") == topic.latched
@@ -123,21 +124,20 @@ class TestPages:
                 broken.append(f"{target}#{anchor}")
         assert broken == []
 
-    def test_python_runs(self, page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        """All examples of a page run, one after the other, as one program."""
-        blocks = _BLOCK.findall(page.read_text(encoding="utf-8"))
-        if not blocks:
-            pytest.skip("no Python on this page")
-        monkeypatch.chdir(tmp_path)
-        program = tmp_path / "page.py"
-        program.write_text("\n".join(blocks), encoding="utf-8")
-        runpy.run_path(str(program))
-
     def test_commands_have_options_that_exist(self, page: Path) -> None:
         for line in _RUN.findall(page.read_text(encoding="utf-8")):
             words = [word for word in line.split("|")[0].split("#")[0].split() if word.startswith("--")]
             known = {option for parameter in cli.run.params for option in parameter.opts}
             assert set(words) <= known, line
+
+
+@pytest.mark.parametrize("page", WITH_PYTHON, ids=name)
+def test_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All examples of a page, one after the other, as one program."""
+    monkeypatch.chdir(tmp_path)
+    program = tmp_path / "page.py"
+    program.write_text("\n".join(_BLOCK.findall(page.read_text(encoding="utf-8"))), encoding="utf-8")
+    runpy.run_path(str(program))
 
 
 @pytest.mark.parametrize("path", SCENARIOS, ids=name)

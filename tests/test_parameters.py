@@ -69,7 +69,7 @@ def test_value_out_of_range_is_refused_with_the_range(kind, name):
     for limit, beyond in ((part.low, -1), (part.high, 1)):
         if math.isfinite(limit):
             value = part.type(limit + beyond)
-            assert f"{limit:g}" in refusal(kind, name, [value] if part.is_list else value)
+            assert f" {limit:.10g}" in refusal(kind, name, [value] if part.is_list else value)
     if "above" in part.limits:
         value = part.type(part.low)
         refusal(kind, name, [value] if part.is_list else value)

@@ -14,7 +14,12 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cell.wiring import Cell
 
-SPARE_DEPTH = 32  #: queue length of signal topics beyond the window
+_SPARE, _FREE_RUNNING = 32, 1024  # messages
+
+
+def signal_depth(shared: SharedParameters) -> int:
+    """Queue length of signal topics: all blocks in flight and some more; many where nothing holds the spindle back."""
+    return (shared.window or _FREE_RUNNING) + _SPARE
 
 
 def about(scenario: str, shared: SharedParameters, host_topics: list[str]) -> dict[str, str]:
@@ -48,7 +53,7 @@ class OfflineRecorder:
             {f"/{topic}": source.node for topic, source in cell.dense.items()},
             {f"/{topic}": source.node for topic, source in cell.sparse.items()},
         )
-        qos = offered_qos(shared.window + SPARE_DEPTH, "transient_local")
+        qos = offered_qos(signal_depth(shared), "transient_local")
         for topic, source in sorted({**cell.dense, **cell.sparse}.items()):
             writer.add_topic(f"/{topic}", source.type, qos)
 

@@ -61,10 +61,10 @@ class Row:
         for limit in metadata:
             if isinstance(limit, Ge | Gt):
                 self.low = float(cast("float", limit.ge if isinstance(limit, Ge) else limit.gt))
-                words.append(f"{'from' if isinstance(limit, Ge) else 'above'} {self.low:g}")
+                words.append(f"{'from' if isinstance(limit, Ge) else 'above'} {self.low:.10g}")
             elif isinstance(limit, Le | Lt):
                 self.high = float(cast("float", limit.le if isinstance(limit, Le) else limit.lt))
-                words.append(f"{'up to' if isinstance(limit, Le) else 'below'} {self.high:g}")
+                words.append(f"{'up to' if isinstance(limit, Le) else 'below'} {self.high:.10g}")
             elif isinstance(limit, MinLen):
                 words.append("not empty")
         self.limits = " ".join(words)

@@ -36,6 +36,25 @@ def kind_of(node: str, values: Mapping[str, object]) -> str:
     return kind
 
 
+class _Text(str):
+    """A text that is written in quotes: without them rcl takes 1e-3 for a number and y for true, PyYAML does not."""
+
+    __slots__ = ()
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes what rcl reads back as the same value."""
+
+
+_Dumper.add_representer(_Text, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"'))
+
+
+def _quoted(value: Value) -> object:
+    if isinstance(value, list):
+        return [_quoted(item) for item in value]
+    return _Text(value) if isinstance(value, str) else value
+
+
 @dataclass(frozen=True)
 class Scenario:
     """A cell, described.
@@ -65,9 +84,9 @@ class Scenario:
         """The complete parameter file; empty lists are left out, since rcl cannot read them."""
         tree = {}
         for name, table in self.nodes.items():
-            values = {key: value for key, value in table.model_dump().items() if value != []}
+            values = {key: _quoted(value) for key, value in table.model_dump().items() if value != []}
             tree[f"/**/{name}"] = {"ros__parameters": values}
-        return yaml.safe_dump(tree, sort_keys=False, default_flow_style=None)
+        return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=None)
 
 
 def _override(text: str, nodes: dict[str, dict[str, Value]]) -> None:

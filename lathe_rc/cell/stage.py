@@ -5,6 +5,7 @@ A stage's output depends on its parameters, its state and its declared inputs al
 changes no bit. Hosts (the offline engine, a ROS node) feed it in order and know nothing of what it does.
 """
 
+import math
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -123,7 +124,7 @@ class Stage(ABC):
             trigger = Trigger(match[1], float(match[2]), match[3]) if match else None
         except ValueError:
             trigger = None
-        if trigger is None or trigger.value < 0:
+        if trigger is None or not 0 <= trigger.value < math.inf:
             raise InputError(
                 f"{self.name}.events = {text!r}; allowed: 'revolution R: ACTION', 'second T: ACTION' or "
                 "'sample N: ACTION'"

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The wired cell: stages in the order in which they compute, topics by name, and the checks before a start."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
@@ -153,11 +154,22 @@ class Cell:
                 for drive in drives:
                     self._check_profile(stage, drive, high)
             if isinstance(stage, LearningController):
-                _check_delay(stage, high)
+                self._check_delay(stage, high)
                 for output in stage.outputs:
                     for reader in self.readers(remapped(stage.shared, output.topic)):
                         if isinstance(reader, ElectrodynamicActuator):
                             _check_convergence(stage, reader, low, high)
+
+    def _check_delay(self, stage: LearningController, speed: float) -> None:
+        encoder = self.master.parameters
+        count = 2 * math.pi / encoder.counts_per_revolution if encoder.counts_per_revolution else 0.0
+        largest = stage.largest_delay(speed, count, encoder.speed_window * encoder.step)
+        delay = stage.parameters.feedback_delay
+        if delay > largest:
+            raise InputError(
+                f"{stage.name}.feedback_delay = {delay} samples: at {speed:.4g} rad/s the cycle leaves {largest}; "
+                f"allowed: {stage.shared.block_size} up to {largest}"
+            )
 
     def _check_profile(self, tool: Tool, drive: ElectrodynamicActuator, speed: float) -> None:
         acceleration = self.master.law.largest_acceleration()
@@ -173,16 +185,6 @@ class Cell:
                     f"{tool.name}.profile: {drive.name} cannot follow it at {speed:.4g} rad/s: {what} "
                     f"{asked:.4g} {unit}; allowed: {allowed:.4g} {unit} (turn slower or change the form)"
                 )
-
-
-def _check_delay(stage: LearningController, speed: float) -> None:
-    largest = stage.largest_delay(speed)
-    delay = stage.parameters.feedback_delay
-    if delay > largest:
-        raise InputError(
-            f"{stage.name}.feedback_delay = {delay} samples: at {speed:.4g} rad/s the cycle leaves {largest}; "
-            f"allowed: {stage.shared.block_size} up to {largest}"
-        )
 
 
 def _check_convergence(stage: LearningController, drive: ElectrodynamicActuator, low: float, high: float) -> None:

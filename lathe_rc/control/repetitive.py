@@ -264,12 +264,12 @@ class RepetitiveController:
         return Cycle(int(self._whole[_CYCLE]), sample, rms, largest, contraction, self.learning)
 
 
-def largest_feedback_delay(*, grid: int, revolutions: int, lead: float, speed: float, step: float) -> int:
+def largest_feedback_delay(*, grid: int, revolutions: int, lead: float, speed: float, late: float, step: float) -> int:
     """Longest feedback delay [sample] at which the memory is never read before it is learned.
 
     The newest point in the memory when sample n is commanded was measured D + 3 samples before (the cubic
     interpolation of the error looks two samples ahead); the read reaches two grid points beyond
-    φ - θ + lead. So (D + 3)·Ω·step <= θ - lead - 3 grid angles. The Q filter needs no more: it is applied when a
+    φ - θ + lead. So (D + 3)·Ω·step <= θ - lead - late - 3 grid angles. The Q filter needs no more: it is applied when a
     point is learned, to points a cycle older.
 
     Args:
@@ -277,7 +277,8 @@ def largest_feedback_delay(*, grid: int, revolutions: int, lead: float, speed: f
         revolutions: revolutions in a cycle.
         lead: largest lead angle [rad].
         speed: largest spindle speed [rad/s].
+        late: what the measured angle may be late [rad], one count of the encoder.
         step: sampling step [s].
     """
-    free = _TURN * revolutions - lead - 3 * _TURN / grid
+    free = _TURN * revolutions - lead - late - 3 * _TURN / grid
     return int(np.floor(free / (speed * step))) - LEARNING_DELAY

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from lathe_rc.bag.record import SPARE_DEPTH
+from lathe_rc.bag.record import signal_depth
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import LatheError
@@ -25,7 +25,7 @@ def signal_qos(parameters: NodeParameters, topic: str = "") -> QoSProfile:
     """Reliable, and deep enough for all blocks in flight, which a late match then still receives."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=parameters.window + SPARE_DEPTH,
+        depth=signal_depth(parameters),
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.VOLATILE
         if topic in parameters.volatile_inputs
@@ -62,7 +62,7 @@ class BlockQueue:
         self._decoder.prepare()
         self._run_id, self._step_ns, self._size = parameters.run_id, parameters.step_ns, parameters.block_size
         self._free_running = not parameters.window
-        self._limit = 8 * (parameters.window + SPARE_DEPTH)
+        self._limit = 8 * signal_depth(parameters)
         self._expected: int | None = None
         self._newest: Block | None = None
 

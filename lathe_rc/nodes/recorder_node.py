@@ -9,11 +9,12 @@ from lathe_rc_msgs.msg import CellState
 from rclpy.qos import QoSProfile
 
 from lathe_rc.bag.order import Entry, Merger
-from lathe_rc.bag.record import SPARE_DEPTH, about
+from lathe_rc.bag.record import about, signal_depth
 from lathe_rc.bag.writer import BagWriter, offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.wire import Block
 from lathe_rc.errors import LatheError, LossyRunError
 from lathe_rc.nodes.ports import BlockQueue, latched_qos
 from lathe_rc.nodes.shell import CellNode
@@ -39,10 +40,11 @@ class RecorderNode(CellNode):
             chunk_size=self.table.chunk_size,
             about=about(self.get_namespace(), self.table, host),
         )
-        self._depth = self.table.window + SPARE_DEPTH
+        self._depth = signal_depth(self.table)
         self._queues: dict[str, BlockQueue] = {}
         self._sparse: dict[str, str] = {}  # topic -> source
         self._merger: Merger | None = None
+        self._ended: set[str] = set()  # topics whose last block has come
         self._blocks = self._samples = 0
         self._log_ns = messages.START_NS
 
@@ -130,7 +132,7 @@ class RecorderNode(CellNode):
         block = queue.add(data)
         queue.blocks.clear()
         if self._merger is None:
-            self._write(Entry(block.log_ns, queue.topic, 0, data))
+            self._write_unsorted(queue, block, data)
             return
         self._merger.add_block(
             queue.topic,
@@ -142,6 +144,23 @@ class RecorderNode(CellNode):
         )
         self._drain()
 
+    def _write_unsorted(self, queue: BlockQueue, block: Block, data: bytes) -> None:
+        """Free-running, blocks may be missing, so nothing can be waited for: write in the order of arrival."""
+        self._write(Entry(block.log_ns, queue.topic, 0, data))
+        if block.last:
+            self._ended.add(queue.topic)
+        if self._ended == set(self._queues):
+            self._samples = block.first_index + block.samples
+            self._blocks = -(-self._samples // self.table.block_size)
+            self._complete()
+
+    def _complete(self) -> None:
+        """The last block of every topic is written."""
+        self.reporter("complete", self.get_name(), blocks=self._blocks)
+        self.finish()
+        self.progressed(self._blocks, self._samples, last=True)
+        self.end([])
+
     def _drain(self) -> None:
         """Write every block that is complete."""
         assert self._merger is not None
@@ -151,11 +170,9 @@ class RecorderNode(CellNode):
             self._blocks += 1
             self._samples = (self._log_ns - messages.START_NS) // self.table.step_ns + 1
             if self._merger.complete:
-                self.reporter("complete", self.get_name(), blocks=self._blocks)
-                self.finish()
-            self.progressed(self._blocks, self._samples, last=self._merger.complete)
-            if self._merger.complete:
-                self.end([])
+                self._complete()
+            else:
+                self.progressed(self._blocks, self._samples, last=False)
 
     def _write(self, entry: Entry) -> None:
         self._open.write(entry.topic, entry.log_ns, entry.data)
@@ -165,7 +182,7 @@ class RecorderNode(CellNode):
         """Write what is left and close the bag."""
         if getattr(self, "_writer", None) is None:
             return
-        complete = self._merger is not None and self._merger.complete
+        complete = bool(self._queues) and (self._merger.complete if self._merger else self._ended == set(self._queues))
         try:
             if self._merger is not None:
                 for entry in self._merger.rest():

@@ -12,7 +12,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderParameters
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import LatheError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.stage_node import StageNode
 
@@ -35,6 +35,11 @@ class SpindleNode(StageNode):
         super().configure_part()
         assert isinstance(self.table, SpindleEncoderParameters)
         self._pace = self.table
+        if self.table.members and not self.table.window and not self.table.speed_factor:
+            raise InputError(
+                f"{self.get_name()}.speed_factor = 0 with window = 0: nothing would hold the spindle back; "
+                "allowed: a speed_factor above 0, or a window"
+            )
         namespace = self.get_namespace().rstrip("/")
         self._member_names = [name if name.startswith("/") else f"{namespace}/{name}" for name in self.table.members]
         self._completed = dict.fromkeys(self._member_names, 0)

@@ -18,9 +18,9 @@ from lathe_rc.signals.noise import Sensor
 class ElectrodynamicActuatorParameters(NodeParameters):
     """The drive closed by its own loops, e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), its limits and its sensor."""
 
-    natural_frequency: Annotated[float, Gt(0)] = parameter(1038.0, "ωn", "rad/s")
-    damping: Annotated[float, Gt(0)] = parameter(0.804, "ζ", "1")
-    delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "τ", "s")
+    natural_frequency: Annotated[float, Gt(0)] = parameter(1038.0, "natural frequency ωn", "rad/s")
+    damping: Annotated[float, Gt(0)] = parameter(0.804, "damping ratio ζ", "1")
+    delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "delay τ", "s")
     discretisation: Discretisation = parameter("foh", "foh: exact for a command linear between samples; or tustin")
     stroke: Annotated[float, Gt(0)] = parameter(1e-3, "end stops at plus and minus this displacement", "m")
     max_velocity: Annotated[float, Gt(0)] = parameter(1.0, "a profile that asks for more is refused", "m/s")

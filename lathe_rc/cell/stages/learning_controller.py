@@ -77,7 +77,7 @@ class LearningController(Stage):
         # Tabulated before the start: a margin costs as much as a whole cycle of samples.
         self._speeds = parameters.nominal_speed * np.linspace(0.5, 1.5, 41)
         self._suprema = np.array([self._model_loop.supremum(speed) for speed in self._speeds])
-        self._cycle_start = 0
+        self._cycle_start = parameters.feedback_delay  # where the first error becomes visible
         delay = parameters.feedback_delay
         self.declare(
             inputs=[
@@ -103,15 +103,23 @@ class LearningController(Stage):
             step=parameters.step,
         )
 
-    def largest_delay(self, highest_speed: float) -> int:
-        """Longest feedback delay [sample] that the cycle leaves up to ``highest_speed`` [rad/s]."""
+    def largest_delay(self, highest_speed: float, count: float, speed_window: float) -> int:
+        """Longest feedback delay [sample] that the cycle leaves.
+
+        Args:
+            highest_speed: of the spindle [rad/s].
+            count: angle of one encoder count [rad]: the measured angle is late by up to that; 0 if ideal.
+            speed_window: time over which the encoder measures its speed [s]: one count more in it is a larger lead.
+        """
         parameters = self.parameters
-        fastest = highest_speed if parameters.lead_law == "variable" else parameters.nominal_speed
+        variable = parameters.lead_law == "variable"
+        fastest = highest_speed + count / speed_window if variable else parameters.nominal_speed
         return largest_feedback_delay(
             grid=parameters.points_per_revolution,
             revolutions=parameters.cycle_revolutions,
             lead=parameters.lead_time * fastest,
             speed=highest_speed,
+            late=count,
             step=parameters.step,
         )
 

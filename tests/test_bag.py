@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags: complete, in order, readable by others, and saved when the recorder dies."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from cells import run, same, scenario
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.records import Chunk, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
+from rosbags.highlevel import AnyReader
+
+from lathe_rc import harness
+from lathe_rc.bag import reader, repair
+from lathe_rc.cell import messages
+from lathe_rc.errors import InputError
+
+EVENTS = {"events": ["revolution 1.5: freeze", "sample 7000: learn"]}
+SMALL_CHUNKS = {"chunk_size": 65_536}
+
+
+def record(path, **recorder):
+    cell = scenario(learning_controller=EVENTS, recorder={**SMALL_CHUNKS, **recorder})
+    return harness.run(cell, bag=path)
+
+
+@dataclass(repr=False)
+class Recorded:
+    """A run and its bag."""
+
+    result: harness.Result
+    path: Path
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bags") / "whole"
+    return Recorded(record(path), path)
+
+
+def file_of(path: Path) -> Path:
+    return path / f"{path.name}.mcap"
+
+
+def read_by_mcap(path):
+    """Topic, log time, publish time and bytes of every message."""
+    with file_of(path).open("rb") as stream:
+        found = make_reader(stream).iter_messages(log_time_order=False)
+        return [(channel.topic, part.log_time, part.publish_time, part.data) for _, channel, part in found]
+
+
+def read_by_rosbags(path):
+    """Topic, log time and message of every message, by the definitions in the bag."""
+    with AnyReader([path]) as bags:
+        return [(c.topic, stamp, bags.deserialize(data, c.msgtype)) for c, stamp, data in bags.messages()]
+
+
+def dense_of(result, told):
+    """The signals of all blocks, put together again by topic."""
+    found = {}
+    for topic, signals in result.recording.dense.items():
+        blocks = [message for name, message in told if name == topic]
+        found[topic] = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in signals}
+    return found
+
+
+# --- content
+
+
+def test_rosbags_reads_every_sample(recorded):
+    result, path = recorded.result, recorded.path
+    found = dense_of(result, [(topic, message) for topic, _, message in read_by_rosbags(path)])
+    assert all(same(found[topic], signals) for topic, signals in result.recording.dense.items())
+
+
+def test_mcap_reads_every_sample(recorded):
+    result, path = recorded.result, recorded.path
+    decoded = [
+        (topic, messages.decode(result.recording.types[topic], data)) for topic, _, _, data in read_by_mcap(path)
+    ]
+    found = dense_of(result, decoded)
+    assert all(same(found[topic], signals) for topic, signals in result.recording.dense.items())
+
+
+def test_our_reader_finds_the_same_digests(recorded):
+    result, path = recorded.result, recorded.path
+    assert reader.read(path).digests() == result.digest
+
+
+def test_sparse_messages_are_all_there(recorded):
+    result, path = recorded.result, recorded.path
+    told = read_by_rosbags(path)
+    for topic, part in result.recording.sparse.items():
+        assert [stamp for name, stamp, _ in told if name == topic] == part.stamps
+    assert [m.action for name, _, m in told if name == "/learning_controller/events"] == ["freeze", "learn"]
+
+
+def test_messages_stand_in_the_order_of_log_time_and_topic(recorded):
+    order = [(log_time, topic) for topic, log_time, _, _ in read_by_mcap(recorded.path)]
+    assert order == sorted(order)
+
+
+def test_log_time_is_the_simulated_time_of_the_last_sample(recorded):
+    for _, log_time, message in read_by_rosbags(recorded.path):
+        assert log_time == messages.stamp_ns(message)
+        if hasattr(message, "block"):
+            samples = next(array.size for array in vars(message).values() if isinstance(array, np.ndarray))
+            assert log_time == 1_000_000_000 + (message.block.first_index + samples - 1) * 15_625
+        elif hasattr(message, "sample_index"):
+            assert log_time == 1_000_000_000 + message.sample_index * 15_625
+    assert all(log_time == publish_time for _, log_time, publish_time, _ in read_by_mcap(recorded.path))
+
+
+def test_blocks_follow_each_other_and_the_last_says_so(recorded):
+    result, path = recorded.result, recorded.path
+    for topic in result.recording.dense:
+        blocks = [message.block for name, _, message in read_by_rosbags(path) if name == topic]
+        assert [block.first_index for block in blocks] == list(range(0, result.samples, 64))
+        assert [block.last for block in blocks] == [False] * (len(blocks) - 1) + [True]
+        assert {(block.run_id, block.step_ns) for block in blocks} == {("test", 15_625)}
+        assert len({block.source for block in blocks}) == 1
+
+
+def test_block_tells_how_many_sparse_messages_came_before_it(recorded):
+    told = read_by_rosbags(recorded.path)
+    sparse = {"/coarse/learning": "/learning_controller", "/learning_controller/events": "/learning_controller"}
+    heard = dict.fromkeys(["/spindle_encoder", "/electrodynamic_actuator", "/tool", "/learning_controller"], 0)
+    for stamp in sorted({stamp for _, stamp, _ in told}):
+        now = [(topic, message) for topic, at, message in told if at == stamp]
+        for topic, _ in now:
+            if topic.endswith("/joint_states") or topic in sparse:
+                heard[sparse.get(topic, topic.removesuffix("/joint_states"))] += 1
+        for _, message in now:
+            if hasattr(message, "block"):
+                assert message.block.companions == heard[message.block.source]
+    assert all(heard.values())
+
+
+def test_two_runs_give_the_same_messages(recorded, tmp_path):
+    record(tmp_path / "again")
+    assert read_by_mcap(tmp_path / "again") == read_by_mcap(recorded.path)
+
+
+@pytest.mark.parametrize("recorder", [{"compression": "none"}, {"chunk_size": 4096}, {"chunk_size": 2**28}])
+def test_compression_and_chunks_change_no_message(recorded, tmp_path, recorder):
+    record(tmp_path / "other", **recorder)
+    assert read_by_mcap(tmp_path / "other") == read_by_mcap(recorded.path)
+
+
+# --- what is told about it
+
+
+def test_bag_says_what_it_is(recorded):
+    metadata = yaml.safe_load((recorded.path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert metadata["storage_identifier"] == "mcap"
+    assert metadata["custom_data"]["lathe_rc.scenario"] == "test"
+    assert metadata["custom_data"]["lathe_rc.run_id"] == "test"
+    assert metadata["message_count"] == len(read_by_mcap(recorded.path))
+    counts = {part["topic_metadata"]["name"]: part["message_count"] for part in metadata["topics_with_message_count"]}
+    assert counts["/tool"] == recorded.result.blocks
+
+
+def test_bag_holds_schemas_and_qos(recorded):
+    with file_of(recorded.path).open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    for channel in summary.channels.values():
+        schema = summary.schemas[channel.schema_id]
+        assert (schema.encoding, channel.message_encoding) == ("ros2msg", "cdr")
+        assert schema.name == recorded.result.recording.types[channel.topic]
+        assert schema.data
+        (offered,) = yaml.safe_load(channel.metadata["offered_qos_profiles"])
+        assert (offered["reliability"], offered["durability"]) == ("reliable", "transient_local")
+        assert channel.metadata["topic_type_hash"].startswith("RIHS01_")
+    assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
+    assert len(summary.chunk_indexes) > 5
+
+
+def test_existing_folder_is_never_overwritten(tmp_path):
+    keep = tmp_path / "bag"
+    keep.mkdir()
+    (keep / "precious").write_text("data")
+    with pytest.raises(InputError, match=r"bag exists; a bag is never overwritten"):
+        record(keep)
+    assert [path.name for path in keep.iterdir()] == ["precious"]
+
+
+def test_folder_that_cannot_be_made_is_refused(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"bag: cannot be made \(Not a directory\)"):
+        record(tmp_path / "file" / "bag")
+
+
+def test_folders_above_are_made(tmp_path):
+    record(tmp_path / "new" / "folder" / "bag")
+    assert file_of(tmp_path / "new" / "folder" / "bag").exists()
+
+
+@pytest.mark.parametrize("make", ["nothing", "file", "folder", "empty file", "junk"])
+def test_what_is_no_bag_is_refused(tmp_path, make):
+    bag = tmp_path / "bag"
+    if make == "file":
+        bag.touch()
+    elif make != "nothing":
+        bag.mkdir()
+    if make in ("empty file", "junk"):
+        file_of(bag).write_bytes(b"junk" * 100 if make == "junk" else b"")
+    with pytest.raises(InputError, match="bag: not a readable bag"):
+        reader.read(bag)
+
+
+# --- repair
+
+
+def chunks_of(path):
+    """End of each chunk in the file and the messages up to there."""
+    ends = []
+    with file_of(path).open("rb") as stream:
+        found = make_reader(stream).get_summary().chunk_indexes
+        stream.seek(0)
+        count = 0
+        for index, chunk in zip(
+            found, (r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)), strict=True
+        ):
+            count += sum(isinstance(record, Message) for record in breakup_chunk(chunk))
+            ends.append((index.chunk_start_offset + index.chunk_length, count))
+    return ends
+
+
+def cut(path, folder, length):
+    """A bag as a recorder that was killed after ``length`` bytes leaves it."""
+    broken = folder / "cut"
+    shutil.rmtree(broken, ignore_errors=True)
+    broken.mkdir()
+    file_of(broken).write_bytes(file_of(path).read_bytes()[:length])
+    return broken
+
+
+@settings(max_examples=25)
+@example(0.0)
+@example(1e-5)
+@example(0.999999)
+@example(1.0)
+@given(st.floats(0.0, 1.0))
+def test_every_complete_chunk_of_a_cut_bag_is_saved(recorded, tmp_path_factory, part):
+    result, path = recorded.result, recorded.path
+    length = int(part * file_of(path).stat().st_size)
+    expected = max((count for end, count in chunks_of(path) if end <= length), default=0)
+    broken = cut(path, tmp_path_factory.mktemp("cut"), length)
+    assert repair.mend(broken) == expected
+    assert read_by_mcap(broken) == read_by_mcap(path)[:expected]
+    assert len(read_by_rosbags(broken)) == expected
+    saved = reader.read(broken)
+    for topic, signals in saved.dense.items():
+        whole = result.recording.dense[topic]
+        assert same(signals, {name: whole[name][: signals[name].size] for name in signals})
+    assert [path.name for path in broken.parent.iterdir()] == [broken.name]
+
+
+@pytest.mark.parametrize("part", [0.3, 0.5, 0.7])
+@pytest.mark.parametrize("tail", [bytes(5000), b"\xff" * 5000, np.random.default_rng(1).bytes(5000)], ids="0Fr")
+def test_cut_bag_with_a_damaged_end_is_saved_up_to_it(recorded, tmp_path, part, tail):
+    """A crashed machine may leave anything where it meant to write."""
+    length = int(part * file_of(recorded.path).stat().st_size)
+    broken = cut(recorded.path, tmp_path, length)
+    with file_of(broken).open("ab") as stream:
+        stream.write(tail)
+    expected = max(count for end, count in chunks_of(recorded.path) if end <= length)
+    assert repair.mend(broken) == expected
+    assert read_by_mcap(broken) == read_by_mcap(recorded.path)[:expected]
+
+
+def test_saved_bag_keeps_schemas_and_qos(recorded, tmp_path):
+    broken = cut(recorded.path, tmp_path, file_of(recorded.path).stat().st_size // 2)
+    repair.mend(broken)
+
+    def told(path):
+        with file_of(path).open("rb") as stream:
+            channels = make_reader(stream).get_summary().channels.values()
+            return {channel.topic: channel.metadata for channel in channels}
+
+    assert told(broken) == told(recorded.path)
+
+
+def test_whole_bag_is_left_alone(recorded):
+    before = file_of(recorded.path).read_bytes()
+    assert repair.mend(recorded.path) is None
+    assert file_of(recorded.path).read_bytes() == before
+
+
+def test_nothing_is_made_where_there_is_no_bag(tmp_path):
+    assert repair.mend(tmp_path / "none") is None
+    assert not list(tmp_path.iterdir())
+
+
+def test_run_without_a_bag_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run(recorder={})
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: what ``lathe run --json`` prints, and how bad input is refused."""
+
+import json
+import math
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lathe_rc import harness
+from lathe_rc.cell.scenario import TABLES, load
+from lathe_rc.cli import main
+
+CELL = """
+/spindle_encoder: {ros__parameters: {revolutions: 3.0}}
+/learning_controller: {ros__parameters: {}}
+/electrodynamic_actuator: {ros__parameters: {}}
+/tool: {ros__parameters: {}}
+"""
+KEYS = ["scenario", "mode", "simulated_s", "wall_s", "real_time_factor", "revolutions", "blocks", "dropped"]
+KEYS += ["error_um", "bag", "digest"]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """A folder with a scenario, to work in; the command's handling of SIGTERM ends with the test."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cell.yaml").write_text(CELL)
+    before = signal.getsignal(signal.SIGTERM)
+    yield tmp_path
+    signal.signal(signal.SIGTERM, before)
+
+
+def lathe(*arguments):
+    return CliRunner().invoke(main, arguments)
+
+
+def told(*arguments):
+    """The object that a run prints."""
+    result = lathe("run", *arguments, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.count("\n") == 1
+    return json.loads(result.stdout)
+
+
+# --- lathe run --json
+
+
+def test_json_has_exactly_the_promised_keys():
+    assert list(told("cell.yaml")) == KEYS
+
+
+def test_json_tells_the_run(folder):
+    summary = told("cell.yaml", "--bag", "bag")
+    result = harness.run(load(folder / "cell.yaml"))
+    errors = result.errors
+    assert (summary["scenario"], summary["mode"], summary["bag"]) == ("cell", "offline", "bag")
+    assert summary["simulated_s"] == pytest.approx(0.18, rel=1e-4)
+    assert summary["real_time_factor"] == pytest.approx(summary["simulated_s"] / summary["wall_s"])
+    assert (summary["revolutions"], summary["blocks"], summary["dropped"]) == (3, 180, 0)
+    assert summary["digest"] == result.digest
+    error = summary["error_um"]
+    assert list(error) == ["first", "last", "per_revolution_rms"]
+    assert error["per_revolution_rms"] == pytest.approx(list(errors.rms * 1e6))
+    assert error["first"] == pytest.approx({"rms": errors.rms[0] * 1e6, "max": errors.largest[0] * 1e6})
+    assert error["last"] == pytest.approx({"rms": errors.rms[-1] * 1e6, "max": errors.largest[-1] * 1e6})
+
+
+def test_json_of_a_run_without_a_bag_or_a_revolution():
+    for revolutions in ("0.4", "1e-9"):
+        summary = told("cell.yaml", "--revolutions", revolutions)
+        assert summary["bag"] is None
+        assert summary["revolutions"] == 0
+        assert summary["error_um"] == {"first": None, "last": None, "per_revolution_rms": []}
+
+
+def test_json_holds_no_numbers_that_json_does_not_know():
+    def refuse(constant):
+        raise ValueError(constant)
+
+    json.loads(lathe("run", "cell.yaml", "--json").stdout, parse_constant=refuse)
+
+
+def test_stdout_of_the_process_is_the_object_alone():
+    command = [sys.executable, "-m", "lathe_rc", "run", "cell.yaml", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert list(json.loads(done.stdout)) == KEYS
+    assert "Traceback" not in done.stderr
+    assert "Warning" not in done.stderr
+
+
+def test_people_get_a_table():
+    result = lathe("run", "cell.yaml")
+    assert result.exit_code == 0
+    for text in ("first revolution", "last revolution", "RMS [µm]", "180 blocks sent, 0 lost", "x real time"):
+        assert text in result.stdout
+
+
+def test_people_get_a_short_run_too():
+    assert lathe("run", "cell.yaml", "--revolutions", "0.5").exit_code == 0
+
+
+def test_options_say_the_same_as_overrides():
+    by_option = told("cell.yaml", "--revolutions", "2.01", "--speed-factor", "0", "--set", "block_size=32")
+    by_set = told("cell.yaml", "--set", "spindle_encoder.revolutions=2.01", "--set", "block_size=32")
+    assert by_option["digest"] == by_set["digest"]
+    assert by_option["blocks"] == 242
+
+
+def test_scenario_that_comes_along_is_found_by_its_name():
+    assert told("piston", "--revolutions", "1.5")["scenario"] == "piston"
+
+
+# --- bad input
+
+ROW = "0,1\n90,2\n180,3\n"
+FORMS = {
+    "nan": ROW + "270,nan\n",
+    "inf": ROW + "270,inf\n",
+    "twice": ROW + "90,4\n",
+    "text": ROW + "270,four\n",
+    "short": ROW + "270\n",
+    "quote": ROW + '270,"4\n',
+    "few": "0,1\n",
+}
+
+
+def assert_refused(result, *texts):
+    """Exit code 2, one line on stderr, nothing on stdout."""
+    assert result.exit_code == 2, result.stderr
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1, result.stderr
+    assert result.stderr.startswith("lathe: ")
+    for text in texts:
+        assert text in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("overrides", "text"),
+    [
+        (["tool.profile=csv", "tool.profile_file=no.csv"], "no.csv: cannot be read"),
+        (["tool.profile=csv", "tool.profile_file=."], "cannot be read"),
+        (["tool.fed=1"], "tool.fed: unknown parameter"),
+        (["fork.feed=1"], "no node 'fork'"),
+        (["feed=1"], "feed is not shared"),
+        (["nonsense"], "--set 'nonsense'"),
+        (["tool.feed=fast"], "tool.feed = 'fast'; allowed: a finite number"),
+        (["tool.feed=nan"], "tool.feed = nan; allowed: a finite number"),
+        (["tool.feed=-1.0"], "tool.feed = -1.0; allowed: a finite number from 0"),
+        (["tool.harmonic_order=[2.5]"], "tool.harmonic_order = [2.5]; allowed: a list, each an integer"),
+        (["learning_controller.feedback_delay=63"], "delayed by 63 samples, block_size = 64"),
+        (["learning_controller.feedback_delay=100000"], "at 104.7 rad/s the cycle leaves "),
+        (["learning_controller.lead_time=2e-3"], "learning diverges: sup|Q - Z| = 1.047"),
+        (["electrodynamic_actuator.stroke=2e-4"], "cannot follow it at 104.7 rad/s: stroke 225 µm; allowed: 200 µm"),
+        (["sample_rate=65536"], "allowed nearby: 64000 or 78125 Hz"),
+        (["learning_controller.events=['soon: freeze']"], "learning_controller.events = 'soon: freeze'"),
+        (["learning_controller.q_time=1e-200"], "learning diverges"),
+        (["tool.remap=['tool:=/**']"], "tool"),
+    ],
+)
+def test_bad_setting_is_refused_in_one_line(overrides, text):
+    options = [part for override in overrides for part in ("--set", override)]
+    assert_refused(lathe("run", "cell.yaml", "--json", *options), text)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_bad_profile_is_refused_in_one_line(folder, form):
+    (folder / "form.csv").write_text("angle_deg,radius_um\n" + FORMS[form])
+    chosen = ["--set", "tool.profile=csv", "--set", "tool.profile_file=form.csv"]
+    assert_refused(lathe("run", "cell.yaml", *chosen), str(folder / "form.csv"))
+
+
+def test_bag_that_exists_is_refused(folder):
+    (folder / "bag").mkdir()
+    assert_refused(lathe("run", "cell.yaml", "--bag", "bag"), "bag exists; a bag is never overwritten")
+
+
+@pytest.mark.parametrize("name", ["no.yaml", "no", "."])
+def test_missing_scenario_is_refused(name):
+    assert_refused(lathe("run", name), "cannot be read")
+
+
+def test_malformed_scenario_is_refused(folder):
+    (folder / "cell.yaml").write_text(CELL + "  /tool: {\n")
+    assert_refused(lathe("run", "cell.yaml"), "cell.yaml:", "not YAML")
+
+
+@pytest.mark.parametrize("missing", ["spindle_encoder", "tool", "learning_controller", "electrodynamic_actuator"])
+def test_scenario_without_one_of_its_nodes_is_refused(folder, missing):
+    lines = [line for line in CELL.splitlines() if missing not in line]
+    (folder / "cell.yaml").write_text("\n".join(lines))
+    assert_refused(lathe("run", "cell.yaml"))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--revolutions", "-1"],
+        ["--revolutions", "0"],
+        ["--revolutions", "many"],
+        ["--revolutions", "nan"],
+        ["--revolutions", "inf"],
+        ["--speed-factor", "-1"],
+        ["--speed-factor", "nan"],
+        ["--mode", "upside-down"],
+        ["--group", "tool+fork", "--mode", "processes"],
+        ["--group", "tool+recorder"],
+    ],
+)
+def test_bad_option_is_refused(arguments):
+    result = lathe("run", "cell.yaml", *arguments)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert "Traceback" not in result.stderr
+    assert arguments[0].removeprefix("--").replace("-", "_") in result.stderr.replace("-", "_")
+
+
+# --- lathe node
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_help_of_a_node_lists_its_parameters(name):
+    result = CliRunner(env={"COLUMNS": "200"}).invoke(main, ["node", name, "--help"])
+    assert result.exit_code == 0
+    for row in TABLES[name].rows().values():
+        assert row.name in result.stdout
+        assert row.unit == "1" or f"[{row.unit}]" in result.stdout
+
+
+def test_unknown_node_is_refused_with_the_known_ones():
+    result = lathe("node", "fork")
+    assert result.exit_code == 2
+    assert all(name in result.stderr for name in TABLES)
+
+
+def test_summary_of_a_failed_learning_is_json_too():
+    """What diverges runs into the end stops: large numbers, but numbers."""
+    forced = ["--set", "learning_controller.allow_unstable=true", "--set", "learning_controller.lead_time=8e-3"]
+    error = told("cell.yaml", *forced, "--revolutions", "60")["error_um"]
+    assert all(math.isfinite(rms) for rms in error["per_revolution_rms"])
+    assert np.max(error["per_revolution_rms"]) > 100

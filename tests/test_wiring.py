@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The wired cell, and what it refuses before anything moves."""
+
+from math import pi
+
+import pytest
+from cells import NODES, run, scenario
+
+from lathe_rc import harness
+from lathe_rc.cell import messages, wiring
+from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.stage import Input, Output, Stage
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError
+
+
+class Repeater(Stage):
+    """A stage that commands what it is commanded."""
+
+    kind = "repeater"
+    Parameters = NodeParameters
+
+    def __init__(self, name, parameters):
+        super().__init__(name, parameters)
+        self.declare(
+            inputs=[Input("command_in", messages.COMMAND, ("position",))],
+            outputs=[Output("command_out", messages.COMMAND)],
+        )
+
+    def process(self, first, inputs, outputs):
+        outputs[0]["position"][:] = inputs[0]["position"]
+        return []
+
+
+@pytest.fixture
+def repeater(monkeypatch):
+    """Makes the stage known."""
+    monkeypatch.setitem(wiring.STAGES, "repeater", Repeater)
+    monkeypatch.setitem(scenarios.TABLES, "repeater", NodeParameters)
+
+
+def refusal(shared=None, **nodes):
+    """The one line with which a cell is refused."""
+    with pytest.raises(InputError) as refused:
+        harness.run(scenario(shared, **nodes))
+    assert len(str(refused.value).splitlines()) == 1
+    return str(refused.value)
+
+
+# --- topics
+
+
+def test_stages_stand_in_the_order_of_the_forward_edges():
+    backwards = dict(reversed(scenario().nodes.items()))
+    assert tuple(Cell(backwards).stages) == NODES
+
+
+def test_topic_without_publisher_is_refused():
+    assert refusal(tool={"remap": ["coarse/state:=fine/state"]}) == (
+        "tool reads fine/state, which no node of the scenario publishes"
+    )
+
+
+def test_topic_with_two_publishers_is_refused():
+    told = refusal(second_drive={"stage": "electrodynamic_actuator"})
+    assert told == "coarse/state is published by electrodynamic_actuator and second_drive; remap one of them"
+
+
+def test_sparse_topic_that_takes_a_dense_one_s_name_is_refused():
+    assert refusal(learning_controller={"remap": ["coarse/learning:=tool"]}).startswith("tool is published by ")
+
+
+def test_topic_of_another_type_is_refused():
+    assert refusal(electrodynamic_actuator={"remap": ["coarse/command:=encoder"]}) == (
+        f"electrodynamic_actuator reads encoder as {messages.COMMAND}, but spindle_encoder publishes {messages.ENCODER}"
+    )
+
+
+def test_loop_without_a_delay_is_refused(repeater):
+    there = {"stage": "repeater", "remap": ["command_in:=back", "command_out:=there"]}
+    back = {"stage": "repeater", "remap": ["command_in:=there", "command_out:=back"]}
+    told = refusal(there=there, back=back)
+    assert told.endswith("a loop without a feedback delay cannot start")
+    assert "there -> back" in told or "back -> there" in told
+
+
+def test_stage_may_be_put_between_two_others(repeater):
+    between = {"stage": "repeater", "remap": ["command_in:=coarse/command", "command_out:=coarse/checked"]}
+    with_it = run(between=between, electrodynamic_actuator={"remap": ["coarse/command:=coarse/checked"]})
+    without = run()
+    assert with_it.digest["/coarse/checked"] == without.digest["/coarse/command"]
+    assert with_it.digest["/tool"] == without.digest["/tool"]
+
+
+def test_renamed_topic_changes_nothing_else():
+    renamed = ["coarse/state:=carriage"]
+    result = run(electrodynamic_actuator={"remap": renamed}, tool={"remap": renamed})
+    assert result.digest["/carriage"] == run().digest["/coarse/state"]
+
+
+@pytest.mark.parametrize("rule", ["encoder", "encoder:=", ":=shaft", "encoder=shaft"])
+def test_malformed_remapping_is_refused(rule):
+    assert refusal(tool={"remap": [rule]}) == f"remap = {rule!r}; allowed: old:=new"
+
+
+def test_second_spindle_is_refused():
+    other = {"stage": "spindle_encoder", "revolutions": 3.0, "remap": ["encoder:=other"]}
+    assert refusal(other=other) == "2 spindle_encoder nodes in the scenario; allowed: 1"
+
+
+def test_event_in_revolutions_needs_the_spindle():
+    told = refusal(electrodynamic_actuator={"events": ["revolution 2: freeze"]})
+    assert "event 'freeze'; allowed: none" in told
+
+
+# --- checks
+
+
+@pytest.mark.parametrize(("delay", "block"), [(63, 64), (1, 2), (2047, 2048)])
+def test_block_longer_than_the_feedback_s_delay_is_refused(delay, block):
+    told = refusal({"block_size": block}, learning_controller={"feedback_delay": delay})
+    assert f"is delayed by {delay} samples, block_size = {block}; allowed: a block no longer than the delay" in told
+
+
+def test_block_as_long_as_the_feedback_s_delay_runs():
+    assert run({"block_size": 2048}).digest == run({"block_size": 1}).digest
+
+
+ORDER, AMPLITUDE, NOMINAL = 4, 100e-6, 1000 * pi / 30
+WAVE = {"harmonic_order": [ORDER], "harmonic_amplitude": [AMPLITUDE]}
+
+
+@pytest.mark.parametrize(
+    ("limit", "asked", "shown"),
+    [
+        ("stroke", AMPLITUDE, "stroke 100 µm; allowed: 99 µm"),
+        ("max_velocity", AMPLITUDE * ORDER * NOMINAL, "velocity 0.04189 m/s; allowed: 0.04147 m/s"),
+        ("max_acceleration", AMPLITUDE * (ORDER * NOMINAL) ** 2, "acceleration 17.55 m/s^2; allowed: 17.37 m/s^2"),
+    ],
+)
+def test_profile_that_the_drive_cannot_follow_is_refused_with_the_figures(limit, asked, shown):
+    run(tool=WAVE, electrodynamic_actuator={limit: 1.01 * asked})
+    told = refusal(tool=WAVE, electrodynamic_actuator={limit: 0.99 * asked})
+    assert told.startswith("tool.profile: electrodynamic_actuator cannot follow it at 104.7 rad/s: ")
+    assert shown in told
+
+
+def test_profile_is_judged_at_the_highest_speed():
+    swing = {"deviation_amplitude": [0.1], "deviation_frequency": [10.7], "revolutions": 10.0}
+    drive = {"max_velocity": 1.05 * AMPLITUDE * ORDER * NOMINAL}
+    run(tool=WAVE, electrodynamic_actuator=drive)
+    assert "at 115.2 rad/s: velocity 0.04608 m/s" in refusal(
+        tool=WAVE, electrodynamic_actuator=drive, spindle_encoder=swing
+    )
+
+
+def test_spindle_that_turns_back_is_refused():
+    swing = {"deviation_amplitude": [-1.5], "deviation_frequency": [10.7]}
+    assert "speed falls to" in refusal(spindle_encoder=swing)
+
+
+def test_endless_run_is_refused_offline():
+    assert refusal(spindle_encoder={"revolutions": 0.0}).startswith("spindle_encoder.revolutions = 0")
