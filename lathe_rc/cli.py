@@ -131,7 +131,9 @@ def _facts(result: harness.Result) -> list[str]:
 
 def _run(scenario: Scenario, *, mode: harness.Mode, groups: list[list[str]], bag: Path | None) -> harness.Result:
     console = Console(stderr=True)
-    with _Watch(Cell(scenario.nodes), console) as watch:
+    cell = Cell(scenario.nodes)
+    cell.check()
+    with _Watch(cell, console) as watch:
         return harness.run(scenario, mode=mode, groups=groups or None, bag=bag, watch=watch)
 
 

@@ -220,7 +220,7 @@ def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[
             bag,
             compression=table.compression,
             chunk_size=table.chunk_size,
-            about=about(scenario.name, scenario.shared, []),
+            about=about(scenario.shared, []),
         )
         sinks.append(OfflineRecorder(cell, engine.samples, writer))
     start = time.monotonic()

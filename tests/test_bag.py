@@ -159,7 +159,6 @@ def test_compression_and_chunks_change_no_message(recorded, tmp_path, recorder):
 def test_bag_says_what_it_is(recorded):
     metadata = yaml.safe_load((recorded.path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert metadata["storage_identifier"] == "mcap"
-    assert metadata["custom_data"]["lathe_rc.scenario"] == "test"
     assert metadata["custom_data"]["lathe_rc.run_id"] == "test"
     assert metadata["message_count"] == len(read_by_mcap(recorded.path))
     counts = {part["topic_metadata"]["name"]: part["message_count"] for part in metadata["topics_with_message_count"]}

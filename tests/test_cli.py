@@ -196,6 +196,14 @@ def test_scenario_without_one_of_its_nodes_is_refused(folder, missing):
     assert_refused(lathe("run", "cell.yaml"))
 
 
+def test_spindle_alone_ends_in_order(folder):
+    """There is no form error without a tool: say so, or say nothing of it."""
+    (folder / "cell.yaml").write_text("/spindle_encoder: {ros__parameters: {revolutions: 3.0}}")
+    for option in ([], ["--json"]):
+        result = lathe("run", "cell.yaml", *option)
+        assert result.exit_code in (0, 2), result.exception
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -22,10 +22,9 @@ def signal_depth(shared: SharedParameters) -> int:
     return (shared.window or _FREE_RUNNING) + _SPARE
 
 
-def about(scenario: str, shared: SharedParameters, host_topics: list[str]) -> dict[str, str]:
+def about(shared: SharedParameters, host_topics: list[str]) -> dict[str, str]:
     """What a bag says of itself in its metadata."""
     return {
-        "lathe_rc.scenario": scenario,
         "lathe_rc.run_id": shared.run_id,
         "lathe_rc.host_topics": json.dumps(host_topics),
     }

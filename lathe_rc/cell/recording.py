@@ -10,7 +10,7 @@ import numpy as np
 
 from lathe_rc.cell.messages import Samples, Signals
 
-_NOT_SIGNALS = {"header", "run_id", "source"}
+_NOT_SIGNALS = {"header", "run_id", "source", "__msgtype__"}
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ class RecorderNode(CellNode):
             self._path,
             compression=self.table.compression,
             chunk_size=self.table.chunk_size,
-            about=about(self.get_namespace(), self.table, host),
+            about=about(self.table, host),
         )
         self._depth = signal_depth(self.table)
         self._queues: dict[str, BlockQueue] = {}

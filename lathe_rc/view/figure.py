@@ -41,7 +41,7 @@ def save(path: Path, recording: Recording, errors: FormErrors, title: str) -> No
         )
     low, high = tool["reference"].min() * 1e6, tool["reference"].max() * 1e6
     form.set_rlim(low - 1.2 * (high - low), high + 0.1 * (high - low))
-    form.set_rlabel_position(45)
+    form.set_rlabel_position(75)
     form.set_yticks(np.linspace(low, high, 3).round())
     form.set_title("desired radius deviation [µm]", fontsize=10)
     form.tick_params(labelsize=8)
@@ -62,7 +62,7 @@ def save(path: Path, recording: Recording, errors: FormErrors, title: str) -> No
     over_angle.set_ylim(bottom=max(errors.largest[last] * 1e6 / 300, 1e-4))
     over_angle.set_title("form error over angle", fontsize=10)
     over_angle.grid(visible=True, which="major", alpha=0.3)
-    over_angle.legend(fontsize=8)
+    over_angle.legend(fontsize=8, loc="center", bbox_to_anchor=(0.5, 0.6))
 
     curve = figure.add_subplot(grid[2])
     revolutions = np.arange(1, errors.rms.size + 1)
