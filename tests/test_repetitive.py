@@ -190,7 +190,7 @@ def test_largest_delay_runs_and_a_longer_one_does_not(speed, grid, revolutions):
     def turn(delay):
         learn(np.sin, 2.5 * revolutions, make(**memory, delay=delay), speed=speed, delay=delay)
 
-    delay = largest_feedback_delay(**memory, lead=LEAD * speed, speed=speed, step=STEP)
+    delay = largest_feedback_delay(**memory, lead=LEAD * speed, speed=speed, late=0.0, step=STEP)
     turn(delay)
     with pytest.raises(LatheError, match="rad before it is learned"):
         turn(delay + LEARNING_DELAY + int(np.ceil(2 * TURN / grid / (speed * STEP))))

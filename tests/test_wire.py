@@ -111,7 +111,7 @@ def test_number_that_is_not_finite_is_refused_with_its_field(place, number):
     assert np.all(target["error"] == 1e308)
     signals["error"][place] = number
     data = encoder.encode(640, signals, last=False, companions=0)[1]
-    with pytest.raises(ValueError, match="/tool sends a error that is not finite in the block from sample 640"):
+    with pytest.raises(ValueError, match=rf"^/tool sends error = {number} at sample {640 + place}; "):
         Decoder(messages.TOOL).decode(data).copy_to(target)
 
 

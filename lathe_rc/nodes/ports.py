@@ -89,6 +89,10 @@ class BlockQueue:
             raise LatheError(f"{self.topic}: block from {block.source}; expected {self.source}")
         if block.step_ns != self._step_ns:
             raise LatheError(f"{self.topic}: {block.source} has a step of {block.step_ns} ns; expected {self._step_ns}")
+        if block.samples > self._size:
+            raise LatheError(
+                f"{self.topic}: {block.source} sends {block.samples} samples in a block; expected {self._size} at most"
+            )
         if self._expected is None:
             self.source, self._expected = block.source, block.first_index
         if block.first_index != self._expected:

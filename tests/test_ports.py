@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every block that comes in is checked: strangers, gaps, repeats and bad numbers are refused by name."""
+
+import numpy as np
+import pytest
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.stages.tool import ToolParameters
+from lathe_rc.cell.wire import Encoder
+from lathe_rc.errors import LatheError
+from lathe_rc.nodes.ports import BlockQueue
+
+SIZE = 4
+
+
+def queue(**parameters) -> BlockQueue:
+    made = BlockQueue("/encoder", messages.ENCODER, ToolParameters(run_id="run", block_size=SIZE, **parameters), ["angle"])
+    made.expect("/spindle")
+    return made
+
+
+def block(first, *, run_id="run", source="/spindle", step_ns=15_625, angle=None, size=SIZE) -> bytes:
+    signals = messages.allocate(messages.ENCODER, size)
+    signals["angle"][:] = np.arange(first, first + size) if angle is None else angle
+    return Encoder(messages.ENCODER, run_id, source, step_ns).encode(first, signals, last=False, companions=0)[1]
+
+
+def test_blocks_in_order_are_taken():
+    taken = queue()
+    for first in (0, 4, 8):
+        assert taken.add(block(first)).first_index == first
+    assert [b.first_index for b in taken.blocks] == [0, 4, 8]
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (block(4), "/spindle begins at sample 4; expected 0|goes from sample 0 to 4: 4 samples are missing"),
+        (block(0, run_id="other"), "block of run 'other' from /spindle; expected 'run'"),
+        (block(0, source="/stranger"), "block from /stranger; expected /spindle"),
+        (block(0, size=5), "/spindle sends 5 samples in a block; expected 4 at most"),
+        (block(0, step_ns=20_000), "/spindle has a step of 20000 ns; expected 15625"),
+    ],
+)
+def test_a_block_that_does_not_belong_is_refused(data, words):
+    with pytest.raises(LatheError, match=words):
+        queue().add(data)
+
+
+@pytest.mark.parametrize(("second", "words"), [(0, "a block came twice"), (8, "4 samples are missing")])
+def test_a_repeat_and_a_gap_are_refused(second, words):
+    taken = queue()
+    taken.add(block(0))
+    with pytest.raises(LatheError, match=words):
+        taken.add(block(second))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_sample_that_is_not_finite_is_refused(bad):
+    taken = queue()
+    taken.add(block(0, angle=[0.0, 1.0, bad, 3.0]))
+    with pytest.raises(ValueError, match=f"^/spindle sends angle = {bad} at sample 2; allowed: finite numbers$"):
+        taken.blocks[0].copy_to({"angle": np.zeros(SIZE)})
+
+
+def test_a_free_running_cell_counts_what_it_lost_and_holds_the_last_sample():
+    taken = queue(window=0)
+    taken.add(block(0))
+    taken.add(block(12))
+    assert taken.lost == 2
+    assert [(b.first_index, b.samples) for b in taken.blocks] == [(0, 4), (4, 4), (8, 4), (12, 4)]
+    assert list(taken.blocks[1].signals["angle"]) == [3.0] * 4
+    with pytest.raises(LatheError, match="a block came twice"):
+        taken.add(block(4))
+
+
+def test_a_jump_cannot_exhaust_memory():
+    taken = queue(window=0)
+    taken.add(block(0))
+    with pytest.raises(LatheError, match="jumps by"):
+        taken.add(block(2**40))
+
+
+def test_blocks_that_nobody_takes_cannot_exhaust_memory():
+    taken = queue(window=1)
+    with pytest.raises(LatheError, match="blocks wait; the node cannot keep up"):
+        for first in range(0, SIZE * 100_000, SIZE):
+            taken.add(block(first))
