@@ -13,6 +13,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
+from rich.text import Text
 
 from lathe_rc import __version__, harness, resources
 from lathe_rc.cell import scenario as scenarios
@@ -220,7 +221,8 @@ def _parameters(kind: str) -> RichTable:
     for column in ("name", "default", "allowed", "description"):
         table.add_column(column, overflow="fold")
     for name, row in TABLES[kind].rows().items():
-        table.add_row(name, json.dumps(row.default, ensure_ascii=False), row.allowed(), row.doc)
+        # as Text: rich would take the unit in brackets for markup
+        table.add_row(name, Text(json.dumps(row.default, ensure_ascii=False)), Text(row.allowed()), Text(row.doc))
     return table
 
 

@@ -87,9 +87,11 @@ class Result:
 
     @cached_property
     def errors(self) -> FormErrors:
-        """Form error by revolution."""
-        tool, encoder = self.recording.of_type(messages.TOOL), self.recording.of_type(messages.ENCODER)
-        return form_errors(encoder["angle_true"], tool["error"])
+        """Form error by revolution; of no revolution if the scenario has no tool."""
+        angle = self.recording.of_type(messages.ENCODER)["angle_true"]
+        if messages.TOOL not in self.recording.types.values():
+            return form_errors(angle[:0], angle[:0])
+        return form_errors(angle, self.recording.of_type(messages.TOOL)["error"])
 
     @cached_property
     def digest(self) -> dict[str, str]:

@@ -139,7 +139,7 @@ def test_measured_points_are_on_the_curve():
 
 
 def test_demand_of_a_harmonic_is_analytic():
-    amplitude, order, speed, acceleration = 150e-6, 6.0, 110.0, 90.0
+    amplitude, order, speed, acceleration = 150e-6, 6.0, 110.0, 30_000.0
     table = ProfileTable(Harmonics(np.array([order]), np.array([amplitude]), np.array([0.3])))
     demand = table.demand(speed, acceleration, feed=1e-3)
     assert demand.stroke == pytest.approx(amplitude, rel=1e-5)

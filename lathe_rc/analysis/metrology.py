@@ -37,6 +37,8 @@ def form_errors(angle: Array, error: Array) -> FormErrors:
     """
     if angle.size < 2:
         return FormErrors(np.empty(0), np.empty(0), np.zeros(1, dtype=np.int64))
+    if angle.size < 2:
+        return FormErrors(np.empty(0), np.empty(0), np.zeros(1, dtype=np.int64))
     turns = angle / (2.0 * np.pi)
     step = np.diff(turns, append=2 * turns[-1] - turns[-2])
     whole = int(np.floor(turns[-1] + 2 * step[-1]))

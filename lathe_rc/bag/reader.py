@@ -50,7 +50,7 @@ def read(path: Path) -> Recording:
                 expected[topic] += block.samples
                 for name, arrays in parts[topic].items():
                     arrays.append(block.signals[name])
-    except ReaderError as error:
+    except (ReaderError, OSError, ValueError) as error:
         raise InputError(f"{path}: not a readable bag ({error})") from None
     dense = {
         topic: {name: np.concatenate(arrays) if arrays else np.empty(0) for name, arrays in fields.items()}

@@ -2,13 +2,18 @@
 """Making a readable bag of one whose recorder was killed."""
 
 import shutil
+import struct
 from pathlib import Path
 
 from mcap.exceptions import McapError
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
+from rosbags.rosbag2.metadata import parse_qos
+from zstandard import ZstdError
 
-from lathe_rc.bag.writer import BagWriter, offered_qos
+from lathe_rc.bag.writer import BagWriter
+
+_CUT = (McapError, EOFError, struct.error, ZstdError, ValueError, KeyError)  # what a file that was cut off may raise
 
 
 def mend(path: Path) -> int | None:
@@ -37,11 +42,12 @@ def mend(path: Path) -> int | None:
                     schemas[record.id] = record
                 elif isinstance(record, Channel) and record.id not in channels:
                     channels[record.id] = record.topic
-                    writer.add_topic(record.topic, schemas[record.schema_id].name, offered_qos(1, "volatile"))
+                    (qos,) = parse_qos(record.metadata["offered_qos_profiles"])
+                    writer.add_topic(record.topic, schemas[record.schema_id].name, qos)
                 elif isinstance(record, Message):
                     writer.write(channels[record.channel_id], record.log_time, record.data)
                     saved += 1
-    except (McapError, EOFError):
+    except _CUT:
         pass  # the cut: everything before it has been saved
     writer.close()
     old = path.with_name(f"{path.name}.cut")
