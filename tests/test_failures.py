@@ -82,6 +82,7 @@ def test_the_command_closes_its_bag_on_a_signal(number, tmp_path):
         ("tool", ["-p", "fed:=1.0"], "tool.fed: unknown parameter"),
         ("spindle_encoder", ["-p", "nominal_rpm:=fast"], "spindle_encoder.nominal_rpm = 'fast'; allowed:"),
         ("learning_controller", ["-p", "events:=['soon: freeze']"], "learning_controller.events = 'soon: freeze'"),
+        ("tool", ["--params-file", "/nowhere.yaml"], "Couldn't parse params file: '--params-file /nowhere.yaml'"),
         ("recorder", ["-p", "bag:=/"], "/ exists; a bag is never overwritten"),
     ],
 )

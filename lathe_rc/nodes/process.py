@@ -65,7 +65,7 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
     look = 0.0
     while not stop.signal:
         now = time.monotonic()
-        due = min(node.next_tick for node in nodes)
+        due = min((node.next_tick for node in nodes if not node.done), default=now)
         if due <= now:
             for node in nodes:
                 if now >= node.next_tick and not (node.done or node.failure):
@@ -108,7 +108,13 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
     _tune()
     reporter = Reporter()
     os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("fastdds.xml")))
-    rclpy.init(args=None if args is None else ["lathe", *args], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=None if args is None else ["lathe", *args], signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        # rcl's own words, without the file and line of its source
+        why = str(error).splitlines()[0].partition(", at /")[0]
+        print(f"lathe: --ros-args: {why}", file=sys.stderr)
+        return InputError.exit_code
     stop = _Stop()
     nodes: list[CellNode] = []
     try:
