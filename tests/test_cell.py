@@ -69,15 +69,24 @@ from rclpy.node import Node
 from lathe_rc_msgs.msg import EncoderBlock, ToolBlock
 rclpy.init()
 node = Node("stranger")
-node.create_subscription(EncoderBlock, "encoder", lambda m: None, 10)
-node.create_subscription(ToolBlock, "tool", lambda m: print("heard", flush=True), 10)
+heard = []
+ears = [
+    node.create_subscription(EncoderBlock, "encoder", lambda m: None, 10),
+    node.create_subscription(ToolBlock, "tool", heard.append, 10),
+]
 print("there", flush=True)
+while not all(ear.get_publisher_count() for ear in ears):
+    rclpy.spin_once(node, timeout_sec=0.02)
+print("matched", flush=True)
+while not heard:
+    rclpy.spin_once(node, timeout_sec=0.1)
+print("heard", flush=True)
 rclpy.spin(node)
 """
 
 
 def test_a_stranger_that_listens_from_the_start_changes_no_bit(offline, tmp_path):
-    cell = harness.with_recorder(piston(), tmp_path / "bag", keep=True)
+    cell = harness.with_recorder(piston("spindle_encoder.speed_factor=0.5"), tmp_path / "bag", keep=True)
     with harness.free_domain() as domain:
         environment = os.environ | {
             "ROS_DOMAIN_ID": str(domain),
@@ -88,6 +97,10 @@ def test_a_stranger_that_listens_from_the_start_changes_no_bit(offline, tmp_path
             try:
                 assert stranger.stdout.readline() == b"there\n"
                 with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
+                    # Without its recorder the cell does not begin: it waits until the stranger is listening.
+                    os.kill(processes.pids["recorder"], signal.SIGSTOP)
+                    assert stranger.stdout.readline() == b"matched\n"
+                    os.kill(processes.pids["recorder"], signal.SIGCONT)
                     processes.wait_for_end()
                 assert stranger.stdout.readline() == b"heard\n"
             finally:

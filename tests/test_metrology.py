@@ -35,16 +35,14 @@ def test_speed_does_not_weigh_on_the_error(level, swing):
     assert_allclose(found.rms, np.sqrt(0.25 + 0.75 * level**2), atol=2e-3)
 
 
-@given(st.floats(0.01, 5.0))
-def test_incomplete_revolution_is_left_out(revolutions):
-    angle = steady(revolutions)
-    found = form_errors(angle, np.where(angle < TURN * np.floor(revolutions), 1.0, 100.0))
-    complete = int(np.floor(angle.size / 1000 + 1.5e-3))
-    assert found.rms.size == found.largest.size == complete
-    assert found.starts.size == complete + 1
-    if angle.size % 1000 < 998:
-        assert_allclose(found.rms, 1.0)
-        assert_allclose(found.largest, 1.0)
+@given(st.integers(2, 5000).filter(lambda samples: samples % 1000 != 999))  # there rounding decides
+def test_incomplete_revolution_is_left_out(samples):
+    complete = samples // 1000
+    angle = steady(samples / 1000)
+    found = form_errors(angle, np.where(np.arange(samples) < complete * 1000, 1.0, 100.0))
+    assert_allclose(found.rms, np.ones(complete))
+    assert_allclose(found.largest, np.ones(complete))
+    assert list(found.starts) == [1000 * revolution for revolution in range(complete + 1)]
 
 
 def test_last_sample_before_the_end_completes_a_revolution():
