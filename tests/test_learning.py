@@ -57,7 +57,7 @@ def test_steady_error_of_the_paper():
 
 def test_supremum_is_the_largest_over_all_waves():
     loop = learning_loop(lead_time=2e-3)
-    waves = np.linspace(0.0, 512.0, 100_001)
+    waves = np.linspace(0.0, 512.0, 10_001)
     assert loop.supremum(NOMINAL) == pytest.approx(np.abs(loop.operator(waves, NOMINAL)).max(), rel=1e-4)
 
 

@@ -209,6 +209,12 @@ def test_q_wider_than_the_memory_is_refused():
         make(q=exponential_q(1.0, TURN / GRID))
 
 
+def test_q_wider_than_any_memory_is_refused_before_it_is_made():
+    """A second at 60 000 rpm on the finest grid would be 14 GB of weights."""
+    with pytest.raises(InputError, match=r"reaches \d+ grid points to each side"):
+        exponential_q(1.0 * 2000 * np.pi, TURN / 65536)
+
+
 @pytest.mark.parametrize("width", [1e-300, 1e-20, 1e-9])
 def test_vanishing_q_is_none(width):
     assert_allclose(exponential_q(width, TURN / GRID)[0], 1.0)

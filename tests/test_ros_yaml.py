@@ -8,6 +8,7 @@ nothing. A scenario goes to --params-file, so rcl is the one to agree with.
 """
 
 import math
+import os
 
 import pytest
 import rclpy
@@ -234,6 +235,7 @@ def test_missing_file_is_refused(folder):
         ros_yaml.read(folder / "no.yaml")
 
 
-def test_folder_is_refused(folder):
-    with pytest.raises(InputError, match="cannot be read"):
-        ros_yaml.read(folder)
+def test_what_is_no_file_is_refused_unread(folder):
+    os.mkfifo(folder / "pipe")
+    for path in (folder, folder / "pipe"):
+        assert refusal_of(path) == f"{path}: cannot be read (not a file)"

@@ -157,6 +157,8 @@ def read(path: Path) -> dict[str, dict[str, Value]]:
         InputError: the file is missing, larger than 1 MiB, or not a ROS 2 parameter file.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: cannot be read (not a file)")
         if path.stat().st_size > _MAX_BYTES:
             raise InputError(f"{path}: larger than {_MAX_BYTES >> 20} MiB; not a parameter file")
         text = path.read_text(encoding="utf-8")

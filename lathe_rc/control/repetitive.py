@@ -23,6 +23,7 @@ Integers = npt.NDArray[np.int64]
 
 _TURN = 2.0 * np.pi
 _TAIL = 1e-12  # weight at which the kernel of Q is cut off
+_LONGEST = 1 << 25  # grid points: half the longest cycle that there can be
 LEARNING_DELAY = 3  #: samples from a measured error to its place in the memory: cubic interpolation looks ahead
 
 
@@ -42,12 +43,18 @@ def exponential_q(width: float, grid_angle: float) -> Array:
     Args:
         width: angle constant of the kernel [rad]: its time constant times the nominal speed; 0 for Q = 1.
         grid_angle: angle between grid points [rad].
+
+    Raises:
+        InputError: the kernel is far longer than any cycle.
     """
     square = (width / grid_angle) ** 2
     ratio = 2.0 * square / (1.0 + 2.0 * square + np.sqrt(1.0 + 4.0 * square))
     if ratio < _TAIL:
         return np.ones(1)
-    weights = (1.0 - ratio) / (1.0 + ratio) * ratio ** np.arange(ceil(np.log(_TAIL) / np.log(ratio)) + 1)
+    reach = ceil(np.log(_TAIL) / np.log(ratio))
+    if reach > _LONGEST:
+        raise InputError(f"Q filter reaches {reach} grid points to each side; make it narrower or the grid coarser")
+    weights = (1.0 - ratio) / (1.0 + ratio) * ratio ** np.arange(reach + 1)
     weights[0] = 1.0 - 2.0 * weights[1:].sum()  # so that Q(0) = 1 after the cut
     return np.asarray(weights)
 

@@ -175,6 +175,8 @@ def _numbers(row: list[str], path: Path, line: int) -> list[float]:
 def _table(path: Path) -> tuple[list[str], Array]:
     """Header and rows of a CSV file of numbers; lines that start with # are comments."""
     try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: cannot be read (not a file); check the profile's path")
         if path.stat().st_size > _MAX_FILE:
             raise InputError(f"{path}: larger than {_MAX_FILE // 2**20} MiB; thin the points out")
         text = path.read_text(encoding="utf-8-sig")
