@@ -104,16 +104,15 @@ class Block:
         Raises:
             ValueError: a sample is NaN or infinite.
         """
-        with np.errstate(invalid="ignore"):
-            for name, array in signals.items():
-                array[:] = self.signals[name]
-                # 0 times anything finite is 0, and NaN otherwise: one product tells for the whole block.
-                if array.dtype == np.float64 and np.dot(array, _ZEROS[: self.samples]) != 0.0:
-                    bad = int(np.flatnonzero(~np.isfinite(array))[0])
-                    raise ValueError(
-                        f"{self.source} sends {name} = {array[bad]} at sample {self.first_index + bad}; "
-                        "allowed: finite numbers"
-                    )
+        for name, array in signals.items():
+            array[:] = self.signals[name]
+            # 0 times anything finite is 0, and NaN otherwise: one product tells for the whole block.
+            if array.dtype == np.float64 and np.dot(array, _ZEROS[: self.samples]) != 0.0:
+                bad = int(np.flatnonzero(~np.isfinite(array))[0])
+                raise ValueError(
+                    f"{self.source} sends {name} = {array[bad]} at sample {self.first_index + bad}; "
+                    "allowed: finite numbers"
+                )
 
 
 class Encoder:
