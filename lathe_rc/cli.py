@@ -18,7 +18,7 @@ from rich.text import Text
 from lathe_rc import __version__, harness, resources
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import TABLES, Scenario
-from lathe_rc.cell.wiring import Cell
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
 
 _REFRESH = 0.1  # [s] between updates of the progress line
@@ -55,9 +55,8 @@ def _load(name: str, overrides: Sequence[str]) -> Scenario:
 class _Watch:
     """Shows a run's progress on the error stream."""
 
-    def __init__(self, cell: Cell, console: Console) -> None:
-        self._step, self._total = cell.master.shared.step, cell.master.samples or 0
-        self._law = cell.master.law
+    def __init__(self, console: Console) -> None:
+        self._step = 0.0
         self._start = time.monotonic()
         self._due = {"progress": 0.0, "cycle": 0.0}
         self._bar = Progress(
@@ -69,10 +68,9 @@ class _Watch:
             transient=True,
             disable=not console.is_terminal,
         )
-        self._task = self._bar.add_task("starting", total=self._total, revolution="", error="", factor="")
+        self._task = self._bar.add_task("starting", total=None, revolution="", error="", factor="")
 
     def __enter__(self) -> Callable[[harness.Event], None]:
-        self._bar.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -96,7 +94,12 @@ class _Watch:
             if now < self._due[kind]:
                 return  # nobody reads faster, and drawing would slow an offline run down
             self._due[kind] = now + _REFRESH
-        if kind == "block0":
+        if kind == "checked":
+            # Not before: a refusal is one line and nothing else.
+            self._step = event["step"]
+            update(self._task, total=event["samples"])
+            self._bar.start()
+        elif kind == "block0":
             self._start = now
             update(self._task, description="turning")
         elif kind == "progress":
@@ -131,10 +134,7 @@ def _facts(result: harness.Result) -> list[str]:
 
 
 def _run(scenario: Scenario, *, mode: harness.Mode, groups: list[list[str]], bag: Path | None) -> harness.Result:
-    console = Console(stderr=True)
-    cell = Cell(scenario.nodes)
-    cell.check()
-    with _Watch(cell, console) as watch:
+    with _Watch(Console(stderr=True)) as watch:
         return harness.run(scenario, mode=mode, groups=groups or None, bag=bag, watch=watch)
 
 
@@ -159,13 +159,12 @@ def run(
     as_json: bool,
 ) -> None:
     """Run a SCENARIO, a ROS 2 parameter file, to its end."""
-    changes = list(overrides)
-    master = _master(scenario, changes)
-    if revolutions is not None:
-        changes.append(f"{master}.revolutions={revolutions!r}")
-    if speed_factor is not None:
-        changes.append(f"{master}.speed_factor={speed_factor!r}")
-    loaded = _load(scenario, changes)
+    loaded = _load(scenario, overrides)
+    options = {"revolutions": revolutions, "speed_factor": speed_factor}
+    given = {name: value for name, value in options.items() if value is not None}
+    changes = [f"{node}.{n}={v!r}" for node in loaded.of_kind(SpindleEncoder.kind) for n, v in given.items()]
+    if changes:
+        loaded = _load(scenario, [*overrides, *changes])
     split = [group.split("+") for group in groups]
     unknown = [name for group in split for name in group if name not in loaded.nodes]
     if unknown:
@@ -183,10 +182,6 @@ def run(
         console.print(fact, highlight=False)
     if result.bag:
         console.print(f"bag: {result.bag}", highlight=False, soft_wrap=True)
-
-
-def _master(scenario: str, changes: list[str]) -> str:
-    return Cell(_load(scenario, changes).nodes).master.name
 
 
 @main.command()

@@ -29,11 +29,12 @@ from typing import Any, Literal
 from lathe_rc.analysis.metrology import FormErrors, form_errors
 from lathe_rc.bag import reader, repair
 from lathe_rc.bag.record import OfflineRecorder, about
-from lathe_rc.bag.writer import BagWriter
+from lathe_rc.bag.writer import BagWriter, refuse_existing
 from lathe_rc.cell import messages
 from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.recording import Recording
@@ -59,8 +60,6 @@ class Result:
         scenario: what ran.
         mode: the host.
         samples: length of the run.
-        blocks: blocks that the spindle sent.
-        dropped: blocks that some member lost.
         wall_s: from block 0 to the last block computed and recorded by every member [s].
         bag: where it is recorded; None if it was not to be kept.
         recording: all signals.
@@ -69,11 +68,19 @@ class Result:
     scenario: Scenario
     mode: str
     samples: int
-    blocks: int
-    dropped: int
     wall_s: float
     bag: Path | None
     recording: Recording = field(repr=False)
+
+    @property
+    def blocks(self) -> int:
+        """Blocks that the spindle sent."""
+        return -(-self.samples // self.scenario.shared.block_size)
+
+    @property
+    def dropped(self) -> int:
+        """Blocks that some member lost: none, since a run that loses any ends in a LossyRunError."""
+        return 0
 
     @property
     def simulated_s(self) -> float:
@@ -147,7 +154,8 @@ def run(
             a process.
         groups: nodes that share a process, for ``processes``; nodes that are not named have their own.
         bag: folder to record to; None: nothing is kept.
-        watch: called with every event, from the thread that called `run`.
+        watch: called with every event, from the thread that called `run`. The first is ``checked``, with the
+            run's samples and step [s]: from then on nothing is refused.
         domain: ROS domain; None: a free one.
 
     Raises:
@@ -159,8 +167,9 @@ def run(
     cell.check()
     if cell.master.samples is None:
         raise InputError(f"{cell.master.name}.revolutions = 0; the run needs an end: allowed above 0")
-    if bag is not None and bag.exists():
-        raise InputError(f"{bag} exists; a bag is never overwritten: name another folder or remove it")
+    if bag is not None:
+        refuse_existing(bag)
+    watch({"event": "checked", "node": cell.master.name, "samples": cell.master.samples, "step": scenario.shared.step})
     if mode == "offline":
         return _offline(scenario, cell, bag, watch)
     with contextlib.ExitStack() as stack:
@@ -186,8 +195,6 @@ def run(
             scenario=scenario,
             mode=mode if not groups else "grouped",
             samples=cell.master.samples,
-            blocks=-(-cell.master.samples // scenario.shared.block_size),
-            dropped=0,
             wall_s=(events["complete"]["monotonic_ns"] - events["block0"]["monotonic_ns"]) * 1e-9,
             bag=bag,
             recording=reader.read(place),
@@ -233,19 +240,16 @@ def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[
         if writer:
             writer.close()
     wall = time.monotonic() - start
-    blocks = -(-engine.samples // scenario.shared.block_size)
-    return Result(scenario, "offline", engine.samples, blocks, 0, wall, bag, collector.recording())
+    return Result(scenario, "offline", engine.samples, wall, bag, collector.recording())
 
 
 def with_recorder(scenario: Scenario, bag: Path, *, keep: bool) -> Scenario:
     """The scenario as its processes run it: with a recorder on ``bag``, and a spindle that waits for all members."""
     nodes = dict(scenario.nodes)
     recorders = scenario.of_kind(RECORDER)
-    shared = {name: getattr(scenario.shared, name) for name in type(scenario.shared).model_fields}
+    shared = {name: getattr(scenario.shared, name) for name in SharedParameters.model_fields}
     name = recorders[0] if recorders else RECORDER
-    table = nodes.get(name) or RecorderParameters(
-        **{k: v for k, v in shared.items() if k in RecorderParameters.model_fields and k != "events"}
-    )
+    table = nodes.get(name) or RecorderParameters(**shared)
     changes: dict[str, object] = {"bag": str(bag.resolve())}
     if not keep:
         changes["compression"] = "none"

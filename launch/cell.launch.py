@@ -16,11 +16,11 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from lathe_rc import harness, resources
+from lathe_rc.bag.writer import refuse_existing
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -52,8 +52,7 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     scenario = scenarios.load(path)
     Cell(scenario.nodes).check()
     bag = place(scenario, LaunchConfiguration("bag").perform(context))
-    if bag.exists():
-        raise InputError(f"{bag} exists; a bag is never overwritten: name another folder or remove it")
+    refuse_existing(bag)
     complete = harness.with_recorder(scenario, bag, keep=True)
     with tempfile.NamedTemporaryFile("w", encoding="utf-8", prefix="lathe_", suffix=".yaml", delete=False) as file:
         file.write(complete.to_yaml())

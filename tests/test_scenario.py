@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scenario files: one format for every host, overrides, identity, and what is refused."""
 
+import cells
 import pytest
 from cells import NODES
 from hypothesis import given, settings
@@ -288,3 +289,10 @@ def test_run_id_depends_on_the_profile_s_points(cell):
 
 def test_run_id_may_be_given(cell):
     assert {table.run_id for table in load(cell, ["run_id=mine"]).nodes.values()} == {"mine"}
+
+
+def test_a_recorder_that_is_added_takes_only_what_all_nodes_share(tmp_path):
+    made = cells.scenario({"block_size": 32}, spindle_encoder={"stage": "spindle_encoder", "autostart": False})
+    recorder = harness.with_recorder(made, tmp_path / "bag", keep=True).nodes["recorder"]
+    assert (recorder.block_size, recorder.run_id) == (32, "test")
+    assert (recorder.stage, recorder.autostart) == ("", True)

@@ -108,6 +108,16 @@ class _Writer(RosbagWriter):
         self.STORAGE_PLUGINS = {StoragePlugin.MCAP: make}  # type: ignore[dict-item]  # wants a class, only calls it
 
 
+def refuse_existing(path: Path) -> None:
+    """Refuse a place where a bag cannot be begun.
+
+    Raises:
+        InputError: something is there already.
+    """
+    if path.exists():
+        raise InputError(f"{path} exists; a bag is never overwritten: name another folder or remove it")
+
+
 class BagWriter:
     """A bag being written.
 
@@ -122,8 +132,7 @@ class BagWriter:
     """
 
     def __init__(self, path: Path, *, compression: Compression, chunk_size: int, about: Mapping[str, str]) -> None:
-        if path.exists():
-            raise InputError(f"{path} exists; a bag is never overwritten: name another folder or remove it")
+        refuse_existing(path)
         codec = CompressionType.ZSTD if compression == "zstd" else CompressionType.NONE
         self._writer = _Writer(path, chunk_size, codec)
         for key, text in about.items():
