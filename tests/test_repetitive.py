@@ -8,16 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis.learning import cubic_response, q_response
-from lathe_rc.control.repetitive import (
-    LEARNING_DELAY,
-    LeadLaw,
-    RepetitiveController,
-    cubic,
-    exponential_q,
-    largest_feedback_delay,
-)
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.control.correction import Correction, CorrectionLaw
+from lathe_rc.control.interpolation import cubic, cubic_response
+from lathe_rc.control.lead import LeadLaw, Preview
+from lathe_rc.control.q_filter import Exponential, Unity
+from lathe_rc.control.repetitive import LEARNING_DELAY, RepetitiveController, largest_feedback_delay
+from lathe_rc.errors import LatheError
+from lathe_rc.signals import speed
 
 TURN = 2 * np.pi
 GRID = 1024
@@ -27,28 +24,40 @@ LEAD = 1.425e-3
 DELAY = 100
 
 
-def make(**changes):
+NO_CORRECTION = Correction(CorrectionLaw.NONE, 1038.0, 0.804)
+
+
+def make(*, lead_law=LeadLaw.VARIABLE, lead_time=LEAD, speed_law=None, window=1, constant=0.0, q=None, **changes):
+    """A controller; ``q`` is a filter, made for its cycle, or None for Q = 1."""
     settings = {
         "grid": GRID,
         "revolutions": 1,
-        "q": np.ones(1),
         "gain": 1.0,
-        "lead_law": LeadLaw.VARIABLE,
-        "lead_time": LEAD,
+        "soft_start": 0.0,
+        "preview": Preview(lead_law, lead_time, speed_law or speed.constant(SPEED), STEP, window, constant),
+        "correction": NO_CORRECTION,
         "nominal": SPEED,
         "delay": DELAY,
-    }
-    return RepetitiveController(**(settings | changes))
+        "join_below": np.inf,
+        "step": STEP,
+    } | changes
+    cycle = settings["grid"] * settings["revolutions"]
+    return RepetitiveController(**settings, q=(q or Unity)(cycle))
 
 
-def learn(error, revolutions, controller=None, *, speed=SPEED, lengths=None, delay=DELAY):
+def exponential(width):
+    """Maker of an exponential Q with an angle constant [rad] on the grid of the tests."""
+    return lambda cycle: Exponential(width * GRID / TURN, cycle)
+
+
+def learn(error, revolutions, controller=None, *, turning=SPEED, lengths=None, delay=DELAY):
     """Turn at a steady speed past an error that is a function of the angle.
 
     Returns the angle, the command and the cycles.
     """
     controller = controller or make()
-    samples = int(revolutions * TURN / (speed * STEP))
-    angle = np.arange(samples) * (speed * STEP)
+    samples = int(revolutions * TURN / (turning * STEP))
+    angle = np.arange(samples) * (turning * STEP)
     past = np.concatenate((np.zeros(delay), angle))[:samples]
     late = np.concatenate((np.zeros(delay), error(angle)))[:samples]
     command, cycles = np.empty(samples), []
@@ -56,7 +65,7 @@ def learn(error, revolutions, controller=None, *, speed=SPEED, lengths=None, del
         cycles += controller.block(
             start,
             angle=angle[start:stop],
-            speed=np.full(stop - start, speed),
+            speed=np.full(stop - start, turning),
             past_angle=past[start:stop],
             error=late[start:stop],
             command=command[start:stop],
@@ -64,27 +73,7 @@ def learn(error, revolutions, controller=None, *, speed=SPEED, lengths=None, del
     return angle, command, cycles
 
 
-# --- Q and the interpolator
-
-
-@given(st.floats(1e-3, 1.0), st.integers(64, 4096))
-def test_q_has_its_closed_form(width, grid):
-    waves = np.linspace(0.0, np.pi, 20)
-    kappa = width * grid / TURN
-    closed = 1 / (1 + 4 * kappa**2 * np.sin(waves / 2) ** 2)
-    assert_allclose(q_response(exponential_q(width, TURN / grid), waves), closed, atol=1e-9)
-
-
-@given(st.one_of(st.just(0.0), st.floats(0.0, 1.0)))
-def test_q_keeps_the_mean(width):
-    weights = exponential_q(width, TURN / GRID)
-    assert weights[0] + 2 * weights[1:].sum() == pytest.approx(1.0, abs=1e-15)
-
-
-def test_q_nears_the_form_of_the_paper_on_a_fine_grid():
-    frequency = np.array([500.0, 1000.0, 1500.0, 2000.0])
-    weights = exponential_q(67e-6 * SPEED, TURN / 8192)
-    assert_allclose(q_response(weights, frequency / SPEED * TURN / 8192), 1 / (1 + (frequency * 67e-6) ** 2), rtol=1e-4)
+# --- the interpolators
 
 
 @given(st.lists(st.floats(-10, 10), min_size=4, max_size=4), st.floats(0.0, 1.0))
@@ -110,11 +99,12 @@ def within(read):
     return np.abs(np.mod(read + np.pi, TURN) - np.pi) > 4 * TURN / GRID
 
 
-@pytest.mark.parametrize("speed", [60.0, 100.0, 140.0])
+@pytest.mark.parametrize("turning", [60.0, 100.0, 140.0])
 @pytest.mark.parametrize("law", list(LeadLaw))
-def test_error_is_added_once_a_cycle_and_read_ahead_by_the_lead(law, speed):
-    angle, command, _ = learn(lambda a: np.sin(3 * a + 0.4), 4.0, make(lead_law=law), speed=speed)
-    lead = LEAD * (speed if law is LeadLaw.VARIABLE else SPEED)
+def test_error_is_added_once_a_cycle_and_read_ahead_by_the_lead(law, turning):
+    angle, command, _ = learn(lambda a: np.sin(3 * a + 0.4), 4.0, make(lead_law=law), turning=turning)
+    # The known law of exact preview is the nominal speed.
+    lead = LEAD * (turning if law in (LeadLaw.VARIABLE, LeadLaw.VARIABLE_SECOND_ORDER) else SPEED)
     read = angle + lead
     expected = np.floor(read / TURN) * np.sin(3 * read + 0.4)
     assert_allclose(command[within(read)], expected[within(read)], atol=3e-7)
@@ -127,9 +117,8 @@ def test_gain_scales_what_is_learned():
 
 
 def test_q_smooths_what_is_kept_but_not_what_is_new():
-    q = exponential_q(0.05, TURN / GRID)
-    gain = q_response(q, np.array([8 * TURN / GRID]))[0]
-    controller = make(q=q, lead_time=0.0)
+    gain = exponential(0.05)(GRID).response(np.array([8 * TURN / GRID]))[0]
+    controller = make(q=exponential(0.05), lead_time=0.0)
     angle, command, _ = learn(lambda a: np.sin(8 * a), 3.9, controller)
     for cycle in (1, 2, 3):
         middle = (angle > (cycle + 0.4) * TURN) & (angle < (cycle + 0.6) * TURN)
@@ -173,7 +162,7 @@ def test_cycle_is_reported_at_the_sample_that_completes_it():
 def test_cuts_change_nothing(lengths, law):
     lengths = [20 * n for n in lengths]
     revolutions = (sum(lengths) + 0.5) * SPEED * STEP / TURN
-    q = exponential_q(0.0067, TURN / GRID)
+    q = exponential(0.0067)
     _, whole, cycles = learn(np.sin, revolutions, make(lead_law=law, q=q))
     _, parts, cycles_of_parts = learn(np.sin, revolutions, make(lead_law=law, q=q), lengths=lengths)
     assert np.array_equal(whole, parts)
@@ -184,16 +173,16 @@ def test_cuts_change_nothing(lengths, law):
 
 
 @given(st.floats(20.0, 300.0), st.sampled_from([64, 1024, 4096]), st.integers(1, 2))
-def test_largest_delay_runs_and_a_longer_one_does_not(speed, grid, revolutions):
+def test_largest_delay_runs_and_a_longer_one_does_not(turning, grid, revolutions):
     memory = {"grid": grid, "revolutions": revolutions}
 
     def turn(delay):
-        learn(np.sin, 2.5 * revolutions, make(**memory, delay=delay), speed=speed, delay=delay)
+        learn(np.sin, 2.5 * revolutions, make(**memory, delay=delay), turning=turning, delay=delay)
 
-    delay = largest_feedback_delay(**memory, lead=LEAD * speed, speed=speed, late=0.0, step=STEP)
+    delay = largest_feedback_delay(**memory, lead=LEAD * turning, speed=turning, late=0.0, looks_ahead=2, step=STEP)
     turn(delay)
     with pytest.raises(LatheError, match="rad before it is learned"):
-        turn(delay + LEARNING_DELAY + int(np.ceil(2 * TURN / grid / (speed * STEP))))
+        turn(delay + LEARNING_DELAY + int(np.ceil(2 * TURN / grid / (turning * STEP))))
 
 
 def test_jump_of_the_angle_is_named():
@@ -201,20 +190,6 @@ def test_jump_of_the_angle_is_named():
     angle = np.array([0.0, 0.1, 0.2, 4.0, 4.1])
     late = np.concatenate(([0.0], angle[:-1]))
     with pytest.raises(LatheError, match="sample 4: the spindle angle jumps to 4 rad"):
-        controller.block(0, angle=angle, speed=np.ones(5), past_angle=late, error=np.zeros(5), command=np.empty(5))
-
-
-def test_q_wider_than_the_memory_is_refused():
-    with pytest.raises(InputError, match=r"reaches \d+ grid points to each side; allowed: less than half"):
-        make(q=exponential_q(1.0, TURN / GRID))
-
-
-def test_q_wider_than_any_memory_is_refused_before_it_is_made():
-    """A second at 60 000 rpm on the finest grid would be 14 GB of weights."""
-    with pytest.raises(InputError, match=r"reaches \d+ grid points to each side"):
-        exponential_q(1.0 * 2000 * np.pi, TURN / 65536)
-
-
-@pytest.mark.parametrize("width", [1e-300, 1e-20, 1e-9])
-def test_vanishing_q_is_none(width):
-    assert_allclose(exponential_q(width, TURN / GRID)[0], 1.0)
+        list(
+            controller.block(0, angle=angle, speed=np.ones(5), past_angle=late, error=np.zeros(5), command=np.empty(5))
+        )

@@ -2,8 +2,8 @@
 """Formulas of the learning loop: stability, contraction, steady error.
 
 The loop maps what the memory holds at ν waves per revolution to (Q(ν) - γ·Z(νΩ))·itself in a cycle
-(paper 001, eqs 1-5; Z = Wi/W0 is the drive with the lead). It converges when sup|Q - γZ| < 1 over all ν up to
-the grid's Nyquist limit. Q, Z and the interpolators are taken as they run, not as their continuous ideals.
+(paper 001, eqs 1-5; Z = Wi/W0 is the drive with lead and correction). It converges when sup|Q - γZ| < 1 over all ν
+up to the grid's Nyquist limit. Q, Z and the interpolators are taken as they run, not as their continuous ideals.
 """
 
 from collections.abc import Callable
@@ -12,38 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.control.correction import Correction, CorrectionLaw
+from lathe_rc.control.interpolation import cubic_response, derivative_responses
+from lathe_rc.control.q_filter import QFilter
+
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 Response = Callable[[Array], Complex]
 
-_COARSE, _FINE = 257, 65  # points over all waves, then around the worst of them
-
-
-def q_response(q: Array, radians: Array) -> Array:
-    """Response of a zero-phase filter with weights q_0, q_±1, ... at ``radians`` per point, shape (n,)."""
-    lags = np.arange(1, q.size)
-    return np.asarray(q[0] + 2.0 * np.cos(np.outer(radians, lags)) @ q[1:])
-
-
-def cubic_response(radians: Array) -> Array:
-    """Response of Lagrange cubic interpolation at ``radians`` per point, mean over the place between points.
-
-    The interpolator also makes images at multiples of the sampling rate less this frequency; the drive
-    attenuates those and they are left out here.
-    """
-    u, weight = np.polynomial.legendre.leggauss(8)
-    u, weight = (u + 1.0) / 2.0, weight / 2.0
-    taps = np.stack(
-        (
-            -u * (1 - u) * (2 - u) / 6,
-            (1 - u * u) * (2 - u) / 2,
-            u * (1 + u) * (2 - u) / 2,
-            -u * (1 - u * u) / 6,
-        )
-    )
-    distance = np.arange(-1, 3)[:, None] - u
-    phase = np.cos(distance[None] * radians[:, None, None])
-    return np.asarray((phase * taps * weight).sum(axis=(1, 2)))
+_COARSE, _FINE, _PEAKS = 1025, 65, 3  # points over all waves, then around each of the worst peaks
 
 
 @dataclass(frozen=True)
@@ -52,46 +29,78 @@ class LearningLoop:
 
     Args:
         drive: response of the drive's position to its command at a frequency [rad/s].
-        q: weights of Q on the grid.
+        q: zero-phase Q on the grid.
         grid: memory points per revolution.
         gain: learning gain γ.
-        lead_time: T0 [s]; the lead angle is T0·Ω for the variable law.
+        lead_time: T0 [s] of the lead law; the lead angle is T0·Ω for all laws but the constant one.
+        constant_lead: lead angle whatever the speed [rad].
+        correction: 1/W0 after the lead.
         nominal: nominal speed Ω0 [rad/s].
         variable_lead: False for the constant lead angle T0·Ω0.
         step: sampling step [s].
     """
 
     drive: Response
-    q: Array
+    q: QFilter
     grid: int
     gain: float
     lead_time: float
+    constant_lead: float
+    correction: Correction
     nominal: float
     variable_lead: bool
     step: float
 
+    def _correction(self, waves: Array, speed: float) -> Complex:
+        """1/W0 with the interpolation of the memory, without the lead."""
+        correction, radians = self.correction, 2 * np.pi * waves / self.grid
+        a1, a2 = correction.inverse
+        p, law = 1j * waves * speed, correction.law
+        if law in (CorrectionLaw.SECOND_ORDER_INVERSE, CorrectionLaw.SECOND_ORDER_INVERSE_DYNAMIC):
+            read, first, second = derivative_responses(radians)
+            per_second = self.grid / (2 * np.pi) * speed
+            return np.asarray(read + a1 * per_second * first + a2 * per_second**2 * second)
+        factor = np.ones_like(p)
+        if law is CorrectionLaw.LEAD_LAG:
+            factor = (1 + p * correction.lead) / (1 + p * correction.lag)
+        elif law is CorrectionLaw.EXACT:
+            angular = 1j * waves * self.nominal
+            factor = (1 + a1 * p + a2 * p**2) / (1 + a1 * angular + a2 * angular**2)
+        return np.asarray(cubic_response(radians) * factor)
+
     def corrected_drive(self, waves: Array, speed: float) -> Complex:
-        """Z at ``waves`` per revolution and spindle ``speed`` [rad/s]: drive, lead and both interpolators."""
+        """Z at ``waves`` per revolution and spindle ``speed`` [rad/s]: drive, lead, correction, interpolators."""
         frequency = waves * speed
-        lead = self.lead_time * (speed if self.variable_lead else self.nominal)
-        interpolators = cubic_response(2 * np.pi * waves / self.grid) * cubic_response(frequency * self.step)
-        return np.asarray(self.drive(frequency) * np.exp(1j * waves * lead) * interpolators)
+        lead = self.lead_time * (speed if self.variable_lead else self.nominal) + self.constant_lead
+        measured = cubic_response(frequency * self.step)
+        return np.asarray(self.drive(frequency) * np.exp(1j * waves * lead) * self._correction(waves, speed) * measured)
 
     def operator(self, waves: Array, speed: float) -> Complex:
         """Q - γZ, the factor of a cycle, at ``waves`` per revolution, shape (n,)."""
-        q = q_response(self.q, 2 * np.pi * waves / self.grid)
+        q = self.q.response(2 * np.pi * waves / self.grid)
         return np.asarray(q - self.gain * self.corrected_drive(waves, speed))
 
-    def supremum(self, speed: float) -> float:
-        """Supremum of the magnitude of Q - γZ at ``speed`` [rad/s], over all waves up to the Nyquist limits."""
+    def worst(self, speed: float) -> tuple[float, float]:
+        """Supremum of the magnitude of Q - γZ at ``speed`` [rad/s] and the waves per revolution where it is.
+
+        Over all waves up to the Nyquist limits of grid and sampling.
+        """
         highest = min(self.grid / 2, np.pi / (self.step * speed))
         waves = np.linspace(0.0, highest, _COARSE)
-        worst = waves[np.argmax(np.abs(self.operator(waves, speed)))]
+        size = np.abs(self.operator(waves, speed))
+        inner = np.flatnonzero((size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:])) + 1
+        peaks = np.append(inner, (0, _COARSE - 1))
+        peaks = peaks[np.argsort(size[peaks])[-_PEAKS:]]
         beside = highest / (_COARSE - 1)
-        near = np.linspace(max(worst - beside, 0.0), min(worst + beside, highest), _FINE)
-        return float(np.abs(self.operator(near, speed)).max())
+        near = np.concatenate([np.linspace(w - beside, w + beside, _FINE) for w in waves[peaks]]).clip(0.0, highest)
+        fine = np.abs(self.operator(near, speed))
+        return float(fine.max()), float(near[np.argmax(fine)])
+
+    def supremum(self, speed: float) -> float:
+        """See `worst`."""
+        return self.worst(speed)[0]
 
     def steady_error(self, waves: Array, speed: float) -> Complex:
         """δ/Xd = (1 - Q)/(γZ + 1 - Q), what is left after many cycles (paper 001, eq. 3), shape (n,)."""
-        q = q_response(self.q, 2 * np.pi * waves / self.grid)
+        q = self.q.response(2 * np.pi * waves / self.grid)
         return np.asarray((1.0 - q) / (self.gain * self.corrected_drive(waves, speed) + 1.0 - q))

@@ -129,10 +129,15 @@ class Stage(ABC):
                 f"{self.name}.events = {text!r}; allowed: 'revolution R: ACTION', 'second T: ACTION' or "
                 "'sample N: ACTION'"
             )
-        self._check_action(trigger.action)
+        self.check_action(trigger.action)
         return trigger
 
-    def _check_action(self, action: str) -> None:
+    def check_action(self, action: str) -> None:
+        """Refuse an event that cannot be carried out.
+
+        Raises:
+            InputError: the stage does not know it, or lacks what it needs.
+        """
         if action not in self.actions:
             known = ", ".join(self.actions) or f"none ({self.kind} has no events)"
             raise InputError(f"{self.name}: event {action!r}; allowed: {known}")
@@ -141,10 +146,14 @@ class Stage(ABC):
         """Let an event take effect at sample ``index``, which the host has not issued yet.
 
         Raises:
-            InputError: the stage does not know the action.
+            InputError: the stage cannot carry it out.
         """
-        self._check_action(action)
+        self.check_action(action)
         self._scheduled.append((index, action))
+
+    def _scheduled_actions(self, action: str) -> bool:
+        """Whether the scenario lists an event with this action."""
+        return any(trigger.action == action for trigger in self._triggers)
 
     def _angle(self) -> tuple[int, str] | None:
         """Input and field with the measured spindle angle, if the stage reads it."""

@@ -6,12 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 
+import numpy as np
+
+from lathe_rc.analysis.learning import Response
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stage import Input, Stage
 from lathe_rc.cell.stages import STAGES
-from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.learning_controller import LearningController
+from lathe_rc.cell.stages.profile import ProfileStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError
@@ -142,7 +146,6 @@ class Cell:
         low, high = self.master.speed_range()
         if low <= 0.0:
             raise InputError(f"{self.master.name}: speed falls to {low:.4g} rad/s; allowed: above 0")
-        drives = [stage for stage in self.stages.values() if isinstance(stage, ElectrodynamicActuator)]
         for stage in self.stages.values():
             for port in stage.inputs:
                 if 0 < port.delay < stage.shared.block_size:
@@ -151,19 +154,29 @@ class Cell:
                         f"{stage.shared.block_size}; allowed: a block no longer than the delay"
                     )
             if isinstance(stage, Tool):
-                for drive in drives:
-                    self._check_profile(stage, drive, high)
+                self._check_profile(stage, high)
             if isinstance(stage, LearningController):
                 self._check_delay(stage, high)
-                for output in stage.outputs:
-                    for reader in self.readers(remapped(stage.shared, output.topic)):
-                        if isinstance(reader, ElectrodynamicActuator):
-                            _check_convergence(stage, reader, low, high)
+                self._check_preview(stage)
+                for response, drive in self._learned(stage):
+                    _check_convergence(stage, drive, response, low, high)
+
+    def _learned(self, stage: LearningController) -> list[tuple[Response, str]]:
+        """Responses and names of the drives that a channel commands."""
+        commands = {remapped(stage.shared, output.topic) for output in stage.outputs}
+        return [
+            (response, drive.name)
+            for drive in self.stages.values()
+            if isinstance(drive, Drive)
+            for topic, response in drive.responses().items()
+            if remapped(drive.shared, topic) in commands and any(port.topic == topic for port in drive.inputs)
+        ]
 
     def _check_delay(self, stage: LearningController, speed: float) -> None:
         encoder = self.master.parameters
         count = 2 * math.pi / encoder.counts_per_revolution if encoder.counts_per_revolution else 0.0
-        largest = stage.largest_delay(speed, count, encoder.speed_window * encoder.step)
+        acceleration = self.master.law.largest_acceleration()
+        largest = stage.largest_delay(speed, acceleration, count, encoder.speed_window * encoder.step)
         delay = stage.parameters.feedback_delay
         if delay > largest:
             raise InputError(
@@ -171,29 +184,55 @@ class Cell:
                 f"allowed: {stage.shared.block_size} up to {largest}"
             )
 
-    def _check_profile(self, tool: Tool, drive: ElectrodynamicActuator, speed: float) -> None:
+    def _check_preview(self, stage: LearningController) -> None:
+        if stage.parameters.lead_law != "exact_preview":
+            return
+        told, true = stage.parameters.speed_law(), self.master.law
+        if not (np.array_equal(told.lines, true.lines) and np.array_equal(told.tachogram, true.tachogram)):
+            raise InputError(
+                f"{stage.name}.lead_law = exact_preview, but it does not know the speed of {self.master.name}; give "
+                f"it the same deviation, tachogram and random parameters"
+            )
+
+    def _check_profile(self, tool: Tool, speed: float) -> None:
+        """The first drive carries the profile; the others what it leaves."""
+        owner, drive = self._form(tool), tool.parameters.drives[0]
+        source = self.stages[self.dense[remapped(tool.shared, f"{drive}/state")].node]
+        if owner is None or owner.form is None or not isinstance(source, Drive):
+            return
         acceleration = self.master.law.largest_acceleration()
-        demand = tool.profile.demand(speed, acceleration, tool.parameters.feed)
-        limits = drive.parameters
-        for what, asked, allowed, unit in (
-            ("stroke", demand.stroke * 1e6, limits.stroke * 1e6, "µm"),
-            ("velocity", demand.velocity, limits.max_velocity, "m/s"),
-            ("acceleration", demand.acceleration, limits.max_acceleration, "m/s^2"),
-        ):
-            if asked > allowed:
-                raise InputError(
-                    f"{tool.name}.profile: {drive.name} cannot follow it at {speed:.4g} rad/s: {what} "
-                    f"{asked:.4g} {unit}; allowed: {allowed:.4g} {unit} (turn slower or change the form)"
-                )
+        demand = owner.form.profile.demand(speed, acceleration, owner.parameters.feed)
+        for topic, limits in source.limits().items():
+            if remapped(source.shared, topic) != remapped(tool.shared, f"{drive}/state"):
+                continue
+            for what, asked, allowed, unit in (
+                ("stroke", demand.stroke * 1e6, limits.stroke * 1e6, "µm"),
+                ("velocity", demand.velocity, limits.velocity, "m/s"),
+                ("acceleration", demand.acceleration, limits.acceleration, "m/s^2"),
+            ):
+                if asked > allowed:
+                    raise InputError(
+                        f"{owner.name}.profile: {source.name} cannot follow it at {speed:.4g} rad/s: {what} "
+                        f"{asked:.4g} {unit}; allowed: {allowed:.4g} {unit} (turn slower or change the form)"
+                    )
+
+    def _form(self, tool: Tool) -> Tool | ProfileStage | None:
+        """The stage that has the tool's desired form."""
+        if tool.form is not None:
+            return tool
+        source = self.stages[self.dense[remapped(tool.shared, "reference")].node]
+        return source if isinstance(source, ProfileStage) else None
 
 
-def _check_convergence(stage: LearningController, drive: ElectrodynamicActuator, low: float, high: float) -> None:
-    loop = stage.loop(drive.drive.plant.response)
-    supremum, speed = max((loop.supremum(s), s) for s in (low, (low + high) / 2, high))
-    if supremum >= 1.0 and not stage.parameters.allow_unstable:
-        parameters = stage.parameters
+def _check_convergence(stage: LearningController, drive: str, response: Response, low: float, high: float) -> None:
+    loop, parameters = stage.loop(response), stage.parameters
+    if parameters.law == "time_periodic":
+        low = high = parameters.nominal_speed
+    (supremum, waves), speed = max((loop.worst(s), s) for s in (low, (low + high) / 2, high))
+    if supremum >= 1.0 and not parameters.allow_unstable:
         raise InputError(
-            f"{stage.name}: learning diverges: sup|Q - Z| = {supremum:.4g} at {speed:.4g} rad/s with lead_time = "
-            f"{parameters.lead_time * 1e3:.4g} ms, q_time = {parameters.q_time * 1e6:.4g} µs; allowed: below 1 "
-            "(widen Q, change the lead, or set allow_unstable)"
+            f"{stage.name}: learning diverges with {drive}: sup|Q - Z| = {supremum:.4g} at {waves * speed:.5g} rad/s "
+            f"({waves:.4g} waves at {speed:.4g} rad/s) with lead_time = {parameters.lead_time * 1e3:.4g} ms, q_time = "
+            f"{parameters.q_time * 1e6:.4g} µs; allowed: below 1 (widen Q, change the lead, damp the drive, or set "
+            "allow_unstable)"
         )

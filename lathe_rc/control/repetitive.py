@@ -1,156 +1,188 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The P-integrator in the angle domain: repetitive control whose memory is indexed by spindle angle.
+"""The P-integrator: repetitive control whose memory is indexed by an angle.
 
     M(φ) = Q·M(φ - θ) + γ·δ(φ)          what is learned (paper 001, Fig. 2; γ = 1 in the papers)
-    A(φ) = M(φ - θ + lead)              what the drive is told (paper 000, eq. 21 as reads of one memory)
+    A(φ) = (1/W0)·M(φ - θ + lead)       what the drive is told (paper 000, eq. 21 as reads of one memory)
 
-θ is the cycle angle. The lead answers the delay of the drive: T0·Ω(t) in the angle domain (paper 000,
-eq. 20) or the constant angle T0·Ω0. Q is a zero-phase smoothing filter over the angle with Q(0) = 1.
+θ is the cycle angle. With the spindle's angle for φ this is Fig. 1b of paper 000; with Ω0·t for φ the cycle is
+the fixed time θ/Ω0, its Fig. 1a. The lead (`lead`), the zero-phase Q (`q_filter`) and 1/W0 (`correction`) have
+modules of their own.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import IntEnum
-from math import ceil
 
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.control.correction import Correction, CorrectionLaw, invariant
+from lathe_rc.control.interpolation import cubic, read, read_derivatives
+from lathe_rc.control.lead import Preview
+from lathe_rc.control.q_filter import QFilter
+from lathe_rc.errors import LatheError
 from lathe_rc.jit import kernel
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 _TURN = 2.0 * np.pi
-_TAIL = 1e-12  # weight at which the kernel of Q is cut off
-_LONGEST = 1 << 25  # grid points: half the longest cycle that there can be
 LEARNING_DELAY = 3  #: samples from a measured error to its place in the memory: cubic interpolation looks ahead
 
+# Places in the integer state: next grid point to learn, samples seen, cycles ended, first point of the smoothed
+# chunk, grid point from which errors count, whether the sample at hand is half learned, whether a cycle ended in it,
+# whether the memory was replaced since the last sample.
+_NEXT, _SEEN, _CYCLE, _CHUNK, _FROM, _HALF, _ENDED, _REPLACED = 0, 1, 2, 3, 4, 5, 6, 7
+# Places in the real state: sum of squares and largest error of the cycle at hand and of the last one, the newest
+# four angles and errors, v and v' of Wk2, its last place and input, the lead-lag term's state and last input.
+_SQUARES, _LARGEST, _CYCLE_SQUARES, _CYCLE_LARGEST, _ANGLES, _ERRORS, _INVARIANT, _PLACE, _INPUT, _LAG = (
+    0, 1, 2, 3, 4, 8, 12, 14, 15, 16,
+)  # fmt: skip
+_REALS = 18
+_NO_CHUNK = -(1 << 62)
 
-class LeadLaw(IntEnum):
-    """How far ahead of the spindle the memory is read."""
-
-    CONSTANT_ANGLE = 0
-    VARIABLE = 1
-
-
-def exponential_q(width: float, grid_angle: float) -> Array:
-    """Weights q_0, q_1, ... of the two-sided exponential Q on the angle grid, for lags 0, ±1, ...
-
-    Its response is 1/(1 + 4κ²·sin²(ν/2)) for ν radians per grid point and κ = width/grid_angle: the form
-    1/(1 + (ω·width)²) of paper 001 with the second difference for the second derivative.
-
-    Args:
-        width: angle constant of the kernel [rad]: its time constant times the nominal speed; 0 for Q = 1.
-        grid_angle: angle between grid points [rad].
-
-    Raises:
-        InputError: the kernel is far longer than any cycle.
-    """
-    square = (width / grid_angle) ** 2
-    ratio = 2.0 * square / (1.0 + 2.0 * square + np.sqrt(1.0 + 4.0 * square))
-    if ratio < _TAIL:
-        return np.ones(1)
-    reach = ceil(np.log(_TAIL) / np.log(ratio))
-    if reach > _LONGEST:
-        raise InputError(f"Q filter reaches {reach} grid points to each side; make it narrower or the grid coarser")
-    weights = (1.0 - ratio) / (1.0 + ratio) * ratio ** np.arange(reach + 1)
-    weights[0] = 1.0 - 2.0 * weights[1:].sum()  # so that Q(0) = 1 after the cut
-    return np.asarray(weights)
+_DONE, _CYCLE_ENDED, _AHEAD, _JUMPED, _SMOOTH = 0, 1, 2, 3, 4  # why the kernel stopped
 
 
 @kernel
-def cubic(before: float, left: float, right: float, after: float, u: float) -> float:
-    """Lagrange cubic through four equidistant points at ``u`` in [0, 1] between the middle two."""
-    c1 = right - before / 3.0 - left / 2.0 - after / 6.0
-    c2 = (before + right) / 2.0 - left
-    c3 = (after - before) / 6.0 + (left - right) / 2.0
-    return left + u * (c1 + u * (c2 + u * c3))
+def _soft(u: float) -> float:
+    """Rises smoothly from 0 at ``u`` = 0 to 1 at ``u`` = 1."""
+    return 1.0 if u >= 1.0 else u * u * (3.0 - 2.0 * u)
 
 
-# Places in the integer state, the real state and the settings of the kernel.
-_NEXT, _SEEN, _CYCLE = 0, 1, 2
-_SQUARES, _LARGEST, _ANGLES, _ERRORS, _CYCLE_SQUARES, _CYCLE_LARGEST = 0, 1, 2, 6, 10, 11
+@kernel
+def _learn(
+    grid: int,
+    cycle: int,
+    learning: int,
+    gain: float,
+    ramp: float,
+    chunk: Array,
+    memory: Array,
+    whole: Integers,
+    real: Array,
+) -> bool:
+    """Learn the grid points between the middle two of the last four errors; False if it needs the next chunk."""
+    mask = memory.size - 1
+    per_radian = grid / _TURN
+    angles, errors = real[_ANGLES : _ANGLES + 4], real[_ERRORS : _ERRORS + 4]
+    if not angles[2] > angles[1]:
+        return True
+    rate = 1.0 / (angles[2] - angles[1])
+    while whole[_NEXT] / per_radian <= angles[2]:
+        g = whole[_NEXT]
+        if learning and not 0 <= g - whole[_CHUNK] < chunk.size:
+            return False
+        u = (g / per_radian - angles[1]) * rate
+        delta = cubic(errors[0], errors[1], errors[2], errors[3], u)
+        y = memory[(g - cycle) & mask]
+        if learning:
+            y = chunk[g - whole[_CHUNK]]
+            if g >= whole[_FROM]:
+                y += delta * (gain if ramp == 0.0 else gain * _soft((g - whole[_FROM]) / ramp))
+        memory[g & mask] = y
+        real[_SQUARES] += delta * delta
+        real[_LARGEST] = max(real[_LARGEST], abs(delta))
+        whole[_NEXT] = g + 1
+        if (g + 1) % cycle == 0:
+            whole[_ENDED] = 1
+            real[_CYCLE_SQUARES], real[_CYCLE_LARGEST] = real[_SQUARES], real[_LARGEST]
+            real[_SQUARES] = real[_LARGEST] = 0.0
+    return True
 
-_DONE, _CYCLE_ENDED, _AHEAD, _JUMPED = 0, 1, 2, 3
+
+@kernel
+def _command(
+    law: int,
+    per_radian: float,
+    place: float,
+    rate: float,
+    bend: float,
+    settings: Array,
+    memory: Array,
+    real: Array,
+) -> float:
+    """Set point of the drive for the memory at ``place`` [grid point]."""
+    i = int(np.floor(place))
+    u = place - i
+    a1, a2 = settings[0], settings[1]
+    if law in (2, 3):
+        value, first, second = read_derivatives(memory, i, u)
+        slope, bow = first * per_radian, second * per_radian**2
+        turning = bend if law == 3 else 0.0
+        return value + float(a1 * rate * slope + a2 * (rate**2 * bow + turning * slope))
+    value = read(memory, i, u)
+    if law == 0:
+        return value
+    before = real[_INPUT]
+    real[_INPUT] = value
+    if law == 1:
+        # y = v + (T1 - T2)·dv/dt with T2·dv/dt + v = u, exact for u linear between samples.
+        lag = float(settings[3] * real[_LAG] + settings[4] * before + settings[5] * value)
+        real[_LAG] = lag
+        return lag + float(settings[6]) * (value - lag)
+    distance = 0.0 if np.isnan(real[_PLACE]) else (place - real[_PLACE]) / per_radian
+    real[_PLACE] = place
+    return invariant(value, before, distance, rate, bend, a1, a2, settings[2], real[_INVARIANT : _INVARIANT + 2])
 
 
 @kernel
 def _run(
     first: int,
     start: int,
-    stop: int,
     delay: int,
     grid: int,
     cycle: int,
     learning: int,
     gain: float,
-    q: Array,
-    variable: int,
-    lead_time: float,
-    nominal: float,
+    ramp: float,
+    law: int,
+    looks_ahead: int,
+    settings: Array,
+    chunk: Array,
     memory: Array,
     whole: Integers,
     real: Array,
     angle: Array,
-    speed: Array,
+    lead: Array,
+    rate: Array,
+    bend: Array,
     past_angle: Array,
     error: Array,
     command: Array,
 ) -> tuple[int, int]:
-    """Step from sample ``start`` of the block until ``stop`` or the end of a cycle; returns (reached, reason)."""
-    mask = memory.size - 1
+    """Step from sample ``start`` of the block until something has to be done outside; returns (reached, reason)."""
     per_radian = grid / _TURN
     angles, errors = real[_ANGLES : _ANGLES + 4], real[_ERRORS : _ERRORS + 4]
-    for k in range(start, stop):
-        ended = False
+    if whole[_REPLACED] and start < angle.size:
+        # Errors that are still on their way belong to the memory that was replaced.
+        whole[_REPLACED] = 0
+        whole[_FROM] = int(np.ceil(angle[start] * per_radian))
+    for k in range(start, angle.size):
         if first + k >= delay:
             new_angle, new_error = past_angle[k], error[k]
             if whole[_SEEN] == 0:
                 angles[:] = new_angle
                 errors[:] = new_error
                 whole[_NEXT] = int(np.ceil(new_angle * per_radian))
-            else:
+                whole[_FROM] = max(whole[_FROM], whole[_NEXT])
+            elif whole[_HALF] == 0:
                 angles[0], angles[1], angles[2], angles[3] = angles[1], angles[2], angles[3], new_angle
                 errors[0], errors[1], errors[2], errors[3] = errors[1], errors[2], errors[3], new_error
-            whole[_SEEN] += 1
+            whole[_SEEN] += 1 - whole[_HALF]
             if abs(angles[3] - angles[2]) > np.pi:
                 return k, _JUMPED
-            if angles[2] > angles[1]:
-                rate = 1.0 / (angles[2] - angles[1])
-                while whole[_NEXT] / per_radian <= angles[2]:
-                    g = whole[_NEXT]
-                    u = (g / per_radian - angles[1]) * rate
-                    delta = cubic(errors[0], errors[1], errors[2], errors[3], u)
-                    y = memory[(g - cycle) & mask]
-                    if learning:
-                        smooth = q[0] * y
-                        for j in range(1, q.size):
-                            smooth += q[j] * (memory[(g - cycle - j) & mask] + memory[(g - cycle + j) & mask])
-                        y = smooth + gain * delta
-                    memory[g & mask] = y
-                    real[_SQUARES] += delta * delta
-                    real[_LARGEST] = max(real[_LARGEST], abs(delta))
-                    whole[_NEXT] = g + 1
-                    if (g + 1) % cycle == 0:
-                        ended = True
-                        real[_CYCLE_SQUARES], real[_CYCLE_LARGEST] = real[_SQUARES], real[_LARGEST]
-                        real[_SQUARES] = real[_LARGEST] = 0.0
-        lead = lead_time * (speed[k] if variable else nominal)
-        place = (angle[k] + lead) * per_radian - cycle
-        i = int(np.floor(place))
-        if whole[_SEEN] > 0 and i + 2 >= whole[_NEXT]:
+            whole[_HALF] = 1
+            if not _learn(grid, cycle, learning, gain, ramp, chunk, memory, whole, real):
+                return k, _SMOOTH
+            whole[_HALF] = 0
+        place = (angle[k] + lead[k]) * per_radian - cycle
+        if whole[_SEEN] > 0 and np.floor(place) + looks_ahead >= whole[_NEXT]:
             return k, _AHEAD
-        command[k] = cubic(
-            memory[(i - 1) & mask],
-            memory[i & mask],
-            memory[(i + 1) & mask],
-            memory[(i + 2) & mask],
-            place - i,
-        )
-        if ended:
+        command[k] = _command(law, per_radian, place, rate[k], bend[k], settings, memory, real)
+        if whole[_ENDED]:
+            whole[_ENDED] = 0
             return k + 1, _CYCLE_ENDED
-    return stop, _DONE
+    return angle.size, _DONE
 
 
 @dataclass(frozen=True)
@@ -171,18 +203,20 @@ class RepetitiveController:
     Args:
         grid: memory points per revolution.
         revolutions: revolutions in a cycle: θ = 2π·revolutions.
-        q: weights of the zero-phase Q, see `exponential_q`.
+        q: zero-phase Q over a cycle.
         gain: learning gain γ.
-        lead_law: constant or variable lead angle.
-        lead_time: T0 [s].
+        soft_start: revolutions over which the gain rises from 0 when learning begins; 0: at once.
+        preview: lead law.
+        correction: 1/W0.
         nominal: nominal spindle speed Ω0 [rad/s].
         delay: samples until a measured error is visible.
-
-    Raises:
-        InputError: Q is wider than the memory can hold.
+        join_below: largest error of a cycle [m] with which the channel begins to learn; inf: at once.
+        step: sampling step [s].
 
     Attributes:
         learning: False holds the memory as it is.
+        joined: False as long as the error before the channel is beyond ``join_below``.
+        correction: may be replaced by one of the same law between two blocks or at the end of a cycle.
     """
 
     def __init__(
@@ -190,31 +224,71 @@ class RepetitiveController:
         *,
         grid: int,
         revolutions: int,
-        q: Array,
+        q: QFilter,
         gain: float,
-        lead_law: LeadLaw,
-        lead_time: float,
+        soft_start: float,
+        preview: Preview,
+        correction: Correction,
         nominal: float,
         delay: int,
+        join_below: float,
+        step: float,
     ) -> None:
         self._grid, self._cycle, self._q, self._gain = grid, grid * revolutions, q, gain
-        if 2 * q.size > self._cycle:
-            raise InputError(
-                f"Q filter reaches {q.size - 1} grid points to each side; allowed: less than half the cycle of "
-                f"{self._cycle} points (make it narrower)"
-            )
-        self._variable, self._lead_time, self._nominal = lead_law is LeadLaw.VARIABLE, lead_time, nominal
-        self._delay = delay
+        self._ramp = soft_start * grid
+        self._preview, self._nominal, self._delay, self._step = preview, nominal, delay, step
         # A power of two, so that a mask wraps the index; it holds a cycle and what Q needs before it.
-        self._memory = np.zeros(1 << (self._cycle + q.size + 8).bit_length())
-        self._whole = np.zeros(3, dtype=np.int64)
-        self._real = np.zeros(12)
+        self._memory = np.zeros(1 << (self._cycle + q.chunk + q.reach + 8).bit_length())
+        self._chunk = np.empty(q.chunk)
+        self._whole = np.zeros(8, dtype=np.int64)
+        self._real = np.zeros(_REALS)
+        self._real[_PLACE] = np.nan
         self._rms_before = np.nan
-        self.learning = True
+        self.learning, self.joined = True, np.isinf(join_below)
+        self._join_below = join_below
+        self.correction = correction
+        self._smooth()  # compiles what the first chunk needs
+        self._whole[_CHUNK] = _NO_CHUNK
+
+    @property
+    def correction(self) -> Correction:
+        """The correction 1/W0."""
+        return self._correction
+
+    @correction.setter
+    def correction(self, correction: Correction) -> None:
+        self._correction = correction
+        settings = np.zeros(7)
+        settings[:2] = correction.inverse
+        settings[2] = self._nominal
+        if correction.law is CorrectionLaw.LEAD_LAG:
+            decay = np.exp(-self._step / correction.lag)
+            rest = (1.0 - decay) * correction.lag / self._step
+            settings[3:] = decay, rest - decay, 1.0 - rest, correction.lead / correction.lag
+        self._settings = settings
 
     def clear(self) -> None:
-        """Forget everything that was learned."""
+        """Forget everything that was learned; learning begins anew, softly if so asked."""
         self._memory[:] = 0.0
+        self._replaced()
+
+    def _replaced(self) -> None:
+        self._whole[_CHUNK] = _NO_CHUNK
+        self._whole[_REPLACED] = 1
+
+    def memory(self) -> Array:
+        """The newest value at each grid point of the cycle [m], from angle 0 on, shape (cycle,)."""
+        newest = np.arange(self._whole[_NEXT] - self._cycle, self._whole[_NEXT])
+        points = np.empty(self._cycle)
+        points[newest % self._cycle] = self._memory[newest & (self._memory.size - 1)]
+        return points
+
+    def remember(self, points: Array) -> None:
+        """Replace what was learned by ``points`` as `memory` gives them; the channel counts as joined."""
+        places = np.arange(self._memory.size) + self._whole[_NEXT] - self._memory.size
+        self._memory[places & (self._memory.size - 1)] = points[places % self._cycle]
+        self._replaced()
+        self.joined = True
 
     def block(
         self,
@@ -225,7 +299,7 @@ class RepetitiveController:
         past_angle: Array,
         error: Array,
         command: Array,
-    ) -> list[Cycle]:
+    ) -> Iterator[Cycle]:
         """Step through a block; all arrays have the shape (n,).
 
         Args:
@@ -236,23 +310,25 @@ class RepetitiveController:
             error: the measured error of that earlier sample [m]; ignored before sample ``delay``.
             command: filled with the set point of the drive [m].
 
-        Returns:
-            The cycles that ended in this block.
+        Yields:
+            The cycles that end in this block; the block goes on after each.
 
         Raises:
             LatheError: the spindle turned so fast that the memory would have been read where nothing is
                 learned yet, or its angle jumped.
         """
-        cycles = []
-        reached, reason = 0, _CYCLE_ENDED
-        while reason == _CYCLE_ENDED:
+        lead, rate, bend = self._preview.block(first, speed)
+        reached, reason = 0, _SMOOTH
+        while reason in (_CYCLE_ENDED, _SMOOTH):
             reached, reason = _run(
-                first, reached, angle.size, self._delay, self._grid, self._cycle, self.learning, self._gain, self._q,
-                self._variable, self._lead_time, self._nominal, self._memory, self._whole, self._real,
-                angle, speed, past_angle, error, command,
+                first, reached, self._delay, self._grid, self._cycle, self.learning and self.joined, self._gain,
+                self._ramp, int(self._correction.law), self._correction.looks_ahead, self._settings, self._chunk,
+                self._memory, self._whole, self._real, angle, lead, rate, bend, past_angle, error, command,
             )  # fmt: skip
-            if reason == _CYCLE_ENDED:
-                cycles.append(self._end_cycle(first + reached - 1))
+            if reason == _SMOOTH:
+                self._smooth()
+            elif reason == _CYCLE_ENDED:
+                yield self._end_cycle(first + reached - 1)
         if reason == _AHEAD:
             raise LatheError(
                 f"sample {first + reached}: the memory is read at {angle[reached]:.6g} rad before it is learned; "
@@ -260,24 +336,37 @@ class RepetitiveController:
             )
         if reason == _JUMPED:
             raise LatheError(f"sample {first + reached}: the spindle angle jumps to {past_angle[reached]:.6g} rad")
-        return cycles
+
+    def _smooth(self) -> None:
+        """Apply Q to the cycle before, for the chunk of grid points that learning has come to."""
+        size, reach = self._q.chunk, self._q.reach
+        base = int(self._whole[_NEXT]) // size * size
+        before = np.arange(base - self._cycle - reach, base - self._cycle + size + reach)
+        self._q.smooth(self._memory[before & (self._memory.size - 1)], self._chunk)
+        self._whole[_CHUNK] = base
 
     def _end_cycle(self, sample: int) -> Cycle:
         rms = float(np.sqrt(self._real[_CYCLE_SQUARES] / self._cycle))
+        largest = float(self._real[_CYCLE_LARGEST])
         contraction = rms / self._rms_before if self._rms_before > 0.0 else np.nan
         self._whole[_CYCLE] += 1
         self._rms_before = rms
-        largest = float(self._real[_CYCLE_LARGEST])
-        return Cycle(int(self._whole[_CYCLE]), sample, rms, largest, contraction, self.learning)
+        cycle = Cycle(int(self._whole[_CYCLE]), sample, rms, largest, contraction, self.learning and self.joined)
+        if not self.joined and largest <= self._join_below:
+            self.joined = True
+            self._whole[_FROM] = self._whole[_NEXT]
+        return cycle
 
 
-def largest_feedback_delay(*, grid: int, revolutions: int, lead: float, speed: float, late: float, step: float) -> int:
+def largest_feedback_delay(
+    *, grid: int, revolutions: int, lead: float, speed: float, late: float, looks_ahead: int, step: float
+) -> int:
     """Longest feedback delay [sample] at which the memory is never read before it is learned.
 
     The newest point in the memory when sample n is commanded was measured D + 3 samples before (the cubic
-    interpolation of the error looks two samples ahead); the read reaches two grid points beyond
-    φ - θ + lead. So (D + 3)·Ω·step <= θ - lead - late - 3 grid angles. The Q filter needs no more: it is applied when a
-    point is learned, to points a cycle older.
+    interpolation of the error looks two samples ahead); the read reaches some grid points beyond
+    φ - θ + lead. So (D + 3)·Ω·step <= θ - lead - late - (looks_ahead + 1) grid angles. The Q filter needs no more: it
+    is applied when a point is learned, to points a cycle older.
 
     Args:
         grid: memory points per revolution.
@@ -285,7 +374,8 @@ def largest_feedback_delay(*, grid: int, revolutions: int, lead: float, speed: f
         lead: largest lead angle [rad].
         speed: largest spindle speed [rad/s].
         late: what the measured angle may be late [rad], one count of the encoder.
+        looks_ahead: grid points after its place that a read looks at.
         step: sampling step [s].
     """
-    free = _TURN * revolutions - lead - late - 3 * _TURN / grid
+    free = _TURN * revolutions - lead - late - (looks_ahead + 1) * _TURN / grid
     return int(np.floor(free / (speed * step))) - LEARNING_DELAY

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tool's edge against the desired form of the part."""
+"""The desired form of the part under the tool's edge."""
 
 import numpy as np
 import numpy.typing as npt
@@ -13,33 +13,34 @@ _TURN = 2.0 * np.pi
 
 
 @kernel
-def form(
+def _height(angle: float, feed: float, start_height: float, part: int) -> float:
+    turns = angle / _TURN
+    if part > 0:
+        turns -= part * np.floor(turns / part)
+    return start_height + feed * turns
+
+
+@kernel
+def desired(
     heights: Array,
     table: Array,
     feed: float,
     start_height: float,
+    part: int,
     angle: Array,
     angle_true: Array,
-    position: Array,
-    measured_position: Array,
     reference: Array,
-    displacement: Array,
-    error: Array,
-    measured_error: Array,
+    expected: Array,
     height: Array,
 ) -> None:
-    """Fill reference, displacement, errors and height of a block; arrays of shape (n,) [rad, m].
+    """Fill the desired displacement at the true and at the measured angle, and the height; shape (n,) [rad, m].
 
-    δ = Xd - X at the true spindle angle (paper 000, Fig. 1). What the controller can know differs: the desired
-    form at the measured angle, less the measured displacement.
+    ``part`` is the revolutions after which the next part begins; 0 for one endless part.
     """
     for k in range(angle.size):
-        height[k] = start_height + feed * (angle_true[k] / _TURN)
+        height[k] = _height(angle_true[k], feed, start_height, part)
         reference[k] = evaluate(angle_true[k], height[k], heights, table)
-        displacement[k] = position[k]
-        error[k] = reference[k] - displacement[k]
         if angle[k] == angle_true[k]:
-            expected = reference[k]
+            expected[k] = reference[k]
         else:
-            expected = evaluate(angle[k], start_height + feed * (angle[k] / _TURN), heights, table)
-        measured_error[k] = expected - measured_position[k]
+            expected[k] = evaluate(angle[k], _height(angle[k], feed, start_height, part), heights, table)

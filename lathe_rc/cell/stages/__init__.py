@@ -4,9 +4,10 @@
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
 from lathe_rc.cell.stages.learning_controller import LearningController
+from lathe_rc.cell.stages.profile import ProfileStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.tool import Tool
 
 STAGES: dict[str, type[Stage]] = {
-    stage.kind: stage for stage in (SpindleEncoder, LearningController, ElectrodynamicActuator, Tool)
+    stage.kind: stage for stage in (SpindleEncoder, LearningController, ElectrodynamicActuator, ProfileStage, Tool)
 }

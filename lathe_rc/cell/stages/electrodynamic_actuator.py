@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coarse electrodynamic tool drive."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 from annotated_types import Ge, Gt, Le
 
+from lathe_rc.analysis.learning import Response
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
+from lathe_rc.cell.stage import Input, Joint, Output, Sparse
+from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
 from lathe_rc.plants.linear import Discretisation
 from lathe_rc.signals.noise import Sensor
@@ -31,7 +33,7 @@ class ElectrodynamicActuatorParameters(NodeParameters):
     resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
 
 
-class ElectrodynamicActuator(Stage):
+class ElectrodynamicActuator(Drive):
     """See `lathe_rc.plants.electrodynamic`.
 
     Attributes:
@@ -60,6 +62,15 @@ class ElectrodynamicActuator(Stage):
             inputs=[Input("coarse/command", messages.COMMAND, ("position",))],
             outputs=[Output("coarse/state", messages.STATE, Joint("position", "velocity", "effort"))],
         )
+
+    def responses(self) -> Mapping[str, Response]:
+        """See `Drive`."""
+        return {"coarse/command": self.drive.plant.response}
+
+    def limits(self) -> Mapping[str, Limits]:
+        """See `Drive`."""
+        table = self.parameters
+        return {"coarse/state": Limits(table.stroke, table.max_velocity, table.max_acceleration)}
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""

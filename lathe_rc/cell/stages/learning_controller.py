@@ -2,92 +2,92 @@
 """Self-learning controller of one channel."""
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
 
 from lathe_rc.analysis.learning import LearningLoop, Response
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.messages import MAX_BLOCK, Signals
 from lathe_rc.cell.stage import Input, Output, Sparse, Stage
-from lathe_rc.control.repetitive import (
-    LeadLaw,
-    RepetitiveController,
-    exponential_q,
-    largest_feedback_delay,
-)
+from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
+from lathe_rc.control import memory_file
+from lathe_rc.control.correction import Correction
+from lathe_rc.control.identification import DriveIdentifier, Identified
+from lathe_rc.control.repetitive import Cycle, RepetitiveController, largest_feedback_delay
+from lathe_rc.errors import InputError
 from lathe_rc.plants.linear import discretise, second_order
 
-_LEAD_LAWS = {"variable": LeadLaw.VARIABLE, "constant_angle": LeadLaw.CONSTANT_ANGLE}
-
-
-class LearningControllerParameters(NodeParameters):
-    """The angle-domain P-integrator, and the drive model that its stability margin is computed from."""
-
-    lead_time: Annotated[float, Ge(0), Le(1)] = parameter(1.425e-3, "T0: the drive's delay that the lead answers", "s")
-    lead_law: Literal["variable", "constant_angle"] = parameter(
-        "variable", "variable: lead angle T0·Ω (paper 000, eq. 20); constant_angle: T0·Ω0"
-    )
-    q_time: Annotated[float, Ge(0), Le(1)] = parameter(
-        67.0e-6,
-        "time constant of the two-sided exponential Q at nominal speed; its width is fixed in angle",
-        "s",
-    )
-    learning_gain: Annotated[float, Gt(0), Le(2)] = parameter(1.0, "γ; 1 in the papers")
-    points_per_revolution: Annotated[int, Ge(64), Le(65536)] = parameter(1024, "points of the memory per revolution")
-    cycle_revolutions: Annotated[int, Ge(1), Le(1024)] = parameter(1, "cycle angle θ", "rev")
-    feedback_delay: Annotated[int, Ge(1), Le(2**24)] = parameter(
-        2048,
-        "samples from an error to when it is visible; at least a block, at most what the cycle leaves",
-        "sample",
-    )
-    allow_unstable: bool = parameter(default=False, doc="start although sup|Q - Z| is not below 1")
-    model_natural_frequency: Annotated[float, Gt(0)] = parameter(1038.0, "drive model: ωn", "rad/s")
-    model_damping: Annotated[float, Gt(0)] = parameter(0.804, "drive model: ζ", "1")
-    model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s")
+_FILE_ACTIONS = ("save", "load")
 
 
 class LearningController(Stage):
-    """See `lathe_rc.control.repetitive`."""
+    """See `lathe_rc.control.repetitive`.
+
+    Attributes:
+        parameters: its table.
+    """
 
     kind = "learning_controller"
     Parameters = LearningControllerParameters
-    actions = ("freeze", "learn", "clear")
+    actions = ("freeze", "learn", "clear", *_FILE_ACTIONS)
 
     def __init__(self, name: str, parameters: LearningControllerParameters) -> None:
-        super().__init__(name, parameters)
         self.parameters = parameters
-        grid_angle = 2 * np.pi / parameters.points_per_revolution
-        self._q = exponential_q(parameters.q_time * parameters.nominal_speed, grid_angle)
+        super().__init__(name, parameters)
+        self._q = parameters.make_q()
         self._controller = RepetitiveController(
             grid=parameters.points_per_revolution,
             revolutions=parameters.cycle_revolutions,
             q=self._q,
             gain=parameters.learning_gain,
-            lead_law=_LEAD_LAWS[parameters.lead_law],
-            lead_time=parameters.lead_time,
+            soft_start=parameters.soft_start,
+            preview=parameters.make_preview(),
+            correction=parameters.make_correction(),
             nominal=parameters.nominal_speed,
             delay=parameters.feedback_delay,
+            join_below=parameters.join_below or np.inf,
+            step=parameters.step,
         )
-        a, b = second_order(parameters.model_natural_frequency, parameters.model_damping)
-        model = discretise(a, b, parameters.model_delay, parameters.step, "foh")
-        self._model_loop = self.loop(model.response)
-        # Tabulated before the start: a margin costs as much as a whole cycle of samples.
-        self._speeds = parameters.nominal_speed * np.linspace(0.5, 1.5, 41)
-        self._suprema = np.array([self._model_loop.supremum(speed) for speed in self._speeds])
-        self._cycle_start = parameters.feedback_delay  # where the first error becomes visible
+        self._joined = self._controller.joined
+        self._check_identification()
+        self._model = Identified(parameters.model_natural_frequency, parameters.model_damping, np.nan)
+        self._margins = _Margins(self)
         delay = parameters.feedback_delay
-        self.declare(
-            inputs=[
-                Input("encoder", messages.ENCODER, ("angle", "speed")),
-                Input("encoder", messages.ENCODER, ("angle",), delay),
-                Input("tool", messages.TOOL, ("measured_error",), delay),
-            ],
-            outputs=[Output("coarse/command", messages.COMMAND)],
+        self._cycle_start = delay  # where the first error becomes visible
+        inputs = [
+            Input("encoder", messages.ENCODER, ("angle", "speed")),
+            Input("encoder", messages.ENCODER, ("angle",), delay),
+            Input("tool", messages.TOOL, ("measured_error",), delay),
+        ]
+        inputs += [Input(f"{drive}/state", messages.STATE, ("measured_position",), delay) for drive in parameters.finer]
+        if parameters.identify:
+            inputs.append(Input("coarse/state", messages.STATE, ("measured_position",), delay))
+        self._identifier = DriveIdentifier(
+            model_delay=parameters.model_delay,
+            feedback_delay=delay,
+            bandwidth=parameters.identification_bandwidth,
+            forgetting=parameters.identification_forgetting,
+            step=parameters.step,
+            block=MAX_BLOCK,
         )
+        self.declare(inputs=inputs, outputs=[Output("coarse/command", messages.COMMAND)])
         self.sparse_topics["coarse/learning"] = messages.LEARNING
+        if self._scheduled_actions("load") and not self._scheduled_actions("save"):
+            self._read_memory()
+
+    def _check_identification(self) -> None:
+        parameters = self.parameters
+        if parameters.correction_model == "identified" and not parameters.identify:
+            raise InputError(f"{self.name}.correction_model = identified without identification; set identify as well")
+
+    # ---- the loop, for checks and margins -----------------------------------------------------------
+
+    @property
+    def correction(self) -> Correction:
+        """1/W0 as it is at the moment."""
+        return self._controller.correction
 
     def loop(self, drive: Response) -> LearningLoop:
         """The learning loop around a drive with the given response."""
@@ -97,67 +97,163 @@ class LearningController(Stage):
             q=self._q,
             grid=parameters.points_per_revolution,
             gain=parameters.learning_gain,
-            lead_time=parameters.lead_time,
+            lead_time=parameters.preview_time,
+            constant_lead=parameters.constant_lead,
+            correction=self.correction,
             nominal=parameters.nominal_speed,
-            variable_lead=parameters.lead_law == "variable",
+            variable_lead=parameters.lead_law != "constant_angle",
             step=parameters.step,
         )
 
-    def largest_delay(self, highest_speed: float, count: float, speed_window: float) -> int:
+    def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
         """Longest feedback delay [sample] that the cycle leaves.
 
         Args:
-            highest_speed: of the spindle [rad/s].
+            speed: largest of the spindle [rad/s].
+            acceleration: largest of the spindle [rad/s²].
             count: angle of one encoder count [rad]: the measured angle is late by up to that; 0 if ideal.
             speed_window: time over which the encoder measures its speed [s]: one count more in it is a larger lead.
         """
         parameters = self.parameters
-        variable = parameters.lead_law == "variable"
-        fastest = highest_speed + count / speed_window if variable else parameters.nominal_speed
+        if parameters.law == "time_periodic":
+            speed, acceleration, count = parameters.nominal_speed, 0.0, 0.0
+        jitter = count / speed_window
+        window = parameters.acceleration_window * parameters.step
         return largest_feedback_delay(
             grid=parameters.points_per_revolution,
             revolutions=parameters.cycle_revolutions,
-            lead=parameters.lead_time * fastest,
-            speed=highest_speed,
+            lead=parameters.largest_lead(speed + jitter, acceleration + 2.0 * jitter / window),
+            speed=speed,
             late=count,
+            looks_ahead=self.correction.looks_ahead,
             step=parameters.step,
         )
 
+    # ---- events -------------------------------------------------------------------------------------
+
+    def check_action(self, action: str) -> None:
+        """See `Stage`."""
+        super().check_action(action)
+        if action in _FILE_ACTIONS and not self.parameters.memory_file:
+            raise InputError(f"{self.name}.memory_file is empty; name the file for the event {action!r}")
+
+    def schedule(self, action: str, index: int) -> None:
+        """See `Stage`; a memory that cannot be loaded is refused now."""
+        self.check_action(action)
+        if action == "load":
+            self._read_memory()
+        super().schedule(action, index)
+
+    def _read_memory(self) -> np.ndarray:
+        parameters = self.parameters
+        path = Path(parameters.memory_file)
+        return memory_file.load(path, parameters.cycle_points, parameters.points_per_revolution)
+
     def perform(self, action: str) -> None:
         """See `Stage`."""
+        controller = self._controller
         if action == "clear":
-            self._controller.clear()
+            controller.clear()
+        elif action == "save":
+            grid = self.parameters.points_per_revolution
+            memory_file.save(Path(self.parameters.memory_file), controller.memory(), grid)
+        elif action == "load":
+            controller.remember(self._read_memory())
         else:
-            self._controller.learning = action == "learn"
+            controller.learning = action == "learn"
+
+    # ---- samples ------------------------------------------------------------------------------------
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
-        (encoder, past, tool), (command,) = inputs, outputs
-        cycles = self._controller.block(
-            first,
-            angle=encoder["angle"],
-            speed=encoder["speed"],
-            past_angle=past["angle"],
-            error=tool["measured_error"],
-            command=command["position"],
-        )
-        sparse = []
-        for cycle in cycles:
-            values = {
-                "cycle": cycle.number,
-                "rms_error": cycle.rms,
-                "max_error": cycle.largest,
-                "contraction": cycle.contraction,
-                "stability_margin": self._margin(cycle.sample_index),
-                "learning": cycle.learning,
-            }
-            sparse.append(Sparse("coarse/learning", messages.LEARNING, cycle.sample_index, values))
+        (encoder, past, tool, *others), (command,) = inputs, outputs
+        parameters = self.parameters
+        angle, speed, past_angle, error = encoder["angle"], encoder["speed"], past["angle"], tool["measured_error"]
+        if parameters.law == "time_periodic":
+            angle = parameters.nominal_speed * (parameters.step * np.arange(first, first + angle.size))
+            past_angle = angle - parameters.nominal_speed * (parameters.step * parameters.feedback_delay)
+            speed = np.full(angle.size, parameters.nominal_speed)
+        for finer in others[: len(parameters.finer)]:
+            error = error + finer["measured_position"]
+        position = others[-1]["measured_position"] if parameters.identify else None
+        identified, sparse = 0, []
+        for cycle in self._controller.block(
+            first, angle=angle, speed=speed, past_angle=past_angle, error=error, command=command["position"]
+        ):
+            if position is not None:
+                reached = cycle.sample_index + 1 - first
+                self._identifier.block(first, identified, reached, position)
+                identified = reached
+            sparse += self._end_cycle(cycle)
+        if position is not None:
+            self._identifier.block(first, identified, position.size, position)
+            self._identifier.commanded(first, command["position"])
         return sparse
 
-    def _margin(self, sample: int) -> float:
-        """1 - sup|Q - Z| at the mean speed of the cycle that ends at ``sample``."""
-        start, self._cycle_start = self._cycle_start, sample
-        speed = 2 * np.pi * self.parameters.cycle_revolutions / ((sample - start) * self.shared.step)
-        if not self._speeds[0] <= speed <= self._speeds[-1]:
-            return 1.0 - self._model_loop.supremum(speed)
-        return 1.0 - float(np.interp(speed, self._speeds, self._suprema))
+    def _end_cycle(self, cycle: Cycle) -> list[Sparse]:
+        parameters = self.parameters
+        found = self._identifier.fit() if parameters.identify else None
+        if found is not None:
+            self._model = found
+            if parameters.correction_model == "identified" and cycle.learning:
+                self._controller.correction = replace(
+                    self.correction, natural_frequency=found.natural_frequency, damping=found.damping
+                )
+        start, self._cycle_start = self._cycle_start, cycle.sample_index
+        seconds = (cycle.sample_index - start) * self.shared.step
+        status = {
+            "cycle": cycle.number,
+            "rms_error": cycle.rms,
+            "max_error": cycle.largest,
+            "contraction": cycle.contraction,
+            "stability_margin": self._margins.at(2 * np.pi * parameters.cycle_revolutions / seconds, self._model),
+            "learning": cycle.learning,
+            "joined": self._controller.joined,
+            "model_natural_frequency": self._model.natural_frequency,
+            "model_damping": self._model.damping,
+            "model_residual": self._model.residual,
+        }
+        sparse = [Sparse("coarse/learning", messages.LEARNING, cycle.sample_index, status)]
+        if self._controller.joined and not self._joined:
+            self._joined = True
+            sparse.append(Sparse(f"{self.name}/events", messages.EVENT, cycle.sample_index, {"action": "joined"}))
+        return sparse
+
+
+class _Margins:
+    """1 - sup|Q - γZ| of a drive model, tabulated as it is asked for: one costs as much as a cycle of samples."""
+
+    def __init__(self, stage: LearningController) -> None:
+        self._stage = stage
+        self._speeds = stage.parameters.nominal_speed / 40 * np.arange(20, 61)
+        self._responses: dict[tuple[str, ...], Response] = {}
+        self._suprema: dict[tuple[object, ...], float] = {}
+
+    def _response(self, model: Identified) -> Response:
+        # Three digits of a model are more than its margin is good for, and a steady one is computed once.
+        key = _three_digits(model.natural_frequency, model.damping)
+        if key not in self._responses:
+            parameters = self._stage.parameters
+            a, b = second_order(model.natural_frequency, model.damping)
+            self._responses[key] = discretise(a, b, parameters.model_delay, parameters.step, "foh").response
+        return self._responses[key]
+
+    def _supremum(self, speed: float, model: Identified) -> float:
+        inverted = self._stage.correction
+        models = (model.natural_frequency, model.damping, inverted.natural_frequency, inverted.damping)
+        key = (speed, _three_digits(*models))
+        if key not in self._suprema:
+            self._suprema[key] = self._stage.loop(self._response(model)).supremum(speed)
+        return self._suprema[key]
+
+    def at(self, speed: float, model: Identified) -> float:
+        """The margin at ``speed`` [rad/s], between tabulated speeds by interpolation."""
+        after = int(np.searchsorted(self._speeds, speed))
+        if not 0 < after < self._speeds.size:
+            return 1.0 - self._stage.loop(self._response(model)).supremum(speed)
+        beside = self._speeds[after - 1 : after + 1]
+        return 1.0 - float(np.interp(speed, beside, [self._supremum(float(s), model) for s in beside]))
+
+
+def _three_digits(*numbers: float) -> tuple[str, ...]:
+    return tuple(f"{number:.3g}" for number in numbers)

@@ -2,78 +2,36 @@
 """The tool against the part: desired form, displacement, form error."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import MinLen
 
-from lathe_rc import resources
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
+from lathe_rc.cell.stages.form import Form, FormParameters
 from lathe_rc.errors import InputError
-from lathe_rc.plants.tool import form
-from lathe_rc.signals.profile import Harmonics, Piston, Polygon, Profile, ProfileTable, read_csv
 
 
-class ToolParameters(NodeParameters):
-    """The desired form of the part and the feed along it."""
+class ToolParameters(FormParameters):
+    """The drives that move the tool, and the desired form of the part unless a profile node publishes it."""
 
-    profile: Literal["harmonics", "piston", "polygon", "csv"] = parameter("harmonics", "kind of profile")
-    profile_file: str = parameter("", "csv: file with angle_deg, (height_mm,) radius_um", path=True)
-    harmonic_order: list[Annotated[int, Ge(0), Le(2000)]] = parameter(
-        [], "harmonics: waves per revolution; none at all: an oval of 225 µm (paper 000, Fig. 6)"
+    reference: Literal["own", "topic"] = parameter(
+        "own", "own: the form below; topic: what a profile node publishes, which others can read before the tool"
     )
-    harmonic_amplitude: list[float] = parameter([], "harmonics: amplitudes", "m")
-    harmonic_phase: list[float] = parameter([], "harmonics: phases at angle 0; empty: all 0", "rad")
-    piston_ovality: Annotated[float, Ge(0)] = parameter(
-        0.5e-3, "piston: difference of the diameters at the ends of the skirt", "m"
+    drives: Annotated[list[str], MinLen(1)] = parameter(
+        ["coarse"], "what moves the tool against the part, by the first word of its state topic; motions add up"
     )
-    piston_ovality_middle: Annotated[float, Ge(0)] = parameter(0.4e-3, "piston: the same at the widest place", "m")
-    piston_barrel: Annotated[float, Ge(0)] = parameter(30e-6, "piston: radius lost towards the ends", "m")
-    piston_length: Annotated[float, Gt(0)] = parameter(0.06, "piston: length of the skirt", "m")
-    piston_widest: Annotated[float, Ge(0)] = parameter(0.02, "piston: widest place from the start", "m")
-    polygon_sides: Annotated[int, Ge(3), Le(64)] = parameter(3, "polygon: number of sides")
-    polygon_inscribed_radius: Annotated[float, Gt(0)] = parameter(1e-3, "polygon: radius of the inscribed circle", "m")
-    polygon_corner_radius: Annotated[float, Gt(0)] = parameter(0.8e-3, "polygon: radius of the corners", "m")
-    feed: Annotated[float, Ge(0)] = parameter(0.0, "advance along the part", "m/rev")
-    start_height: Annotated[float, Ge(0)] = parameter(0.0, "where along the part the run begins", "m")
-
-    def form(self) -> Profile:
-        """The profile.
-
-        Raises:
-            InputError: lists of different lengths, sizes that do not fit, or a file that cannot be used.
-        """
-        if self.profile == "csv":
-            if not self.profile_file:
-                raise InputError("tool.profile_file is empty; name the CSV file of the profile")
-            return read_csv(resources.find(Path(self.profile_file)))
-        if self.profile == "piston":
-            return Piston(
-                self.piston_ovality,
-                self.piston_ovality_middle,
-                self.piston_barrel,
-                self.piston_length,
-                self.piston_widest,
-            )
-        if self.profile == "polygon":
-            return Polygon(self.polygon_sides, self.polygon_inscribed_radius, self.polygon_corner_radius)
-        order, amplitude = self.harmonic_order, self.harmonic_amplitude
-        if not order and not amplitude:
-            order, amplitude = [2], [225e-6]
-        phase = self.harmonic_phase or [0.0] * len(order)
-        return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
 
 
 class Tool(Stage):
-    """Sums the drives and compares with the desired form.
+    """Sums the motions (paper 001, Fig. 1a) and compares with the desired form.
 
     Attributes:
         parameters: its table.
-        profile: the form as it is run.
+        form: of the part; None if a profile node has it.
     """
 
     kind = "tool"
@@ -82,31 +40,32 @@ class Tool(Stage):
     def __init__(self, name: str, parameters: ToolParameters) -> None:
         super().__init__(name, parameters)
         self.parameters = parameters
-        self.profile = ProfileTable(parameters.form())
-        self.declare(
-            inputs=[
-                Input("encoder", messages.ENCODER, ("angle", "angle_true")),
-                Input("coarse/state", messages.STATE, ("position", "measured_position")),
-            ],
-            outputs=[Output("tool", messages.TOOL, Joint("displacement"))],
-        )
+        self.form = Form(name, parameters) if parameters.reference == "own" else None
+        if len(set(parameters.drives)) < len(parameters.drives):
+            raise InputError(f"{name}.drives = {parameters.drives}; allowed: each drive once")
+        what = Input("encoder", messages.ENCODER, ("angle", "angle_true"))
+        if self.form is None:
+            what = Input("reference", messages.REFERENCE, ("reference", "expected", "height"))
+        states = [
+            Input(f"{drive}/state", messages.STATE, ("position", "measured_position")) for drive in parameters.drives
+        ]
+        self.declare(inputs=[what, *states], outputs=[Output("tool", messages.TOOL, Joint("displacement"))])
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
-        """See `Stage`."""
-        (encoder, drive), (tool,) = inputs, outputs
-        form(
-            self.profile.heights,
-            self.profile.table,
-            self.parameters.feed,
-            self.parameters.start_height,
-            encoder["angle"],
-            encoder["angle_true"],
-            drive["position"],
-            drive["measured_position"],
-            tool["reference"],
-            tool["displacement"],
-            tool["error"],
-            tool["measured_error"],
-            tool["height"],
-        )
+        """δ = Xd - X at the true spindle angle (paper 000, Fig. 1).
+
+        What a controller can know differs: the desired form at the measured angle, less the measured motions.
+        """
+        (what, *states), (tool,) = inputs, outputs
+        known, displacement = tool["measured_error"], tool["displacement"]
+        if self.form is None:
+            tool["reference"][:], known[:], tool["height"][:] = what["reference"], what["expected"], what["height"]
+        else:
+            self.form.block(what, tool["reference"], known, tool["height"])
+        displacement[:] = states[0]["position"]
+        known -= states[0]["measured_position"]
+        for state in states[1:]:
+            displacement += state["position"]
+            known -= state["measured_position"]
+        np.subtract(tool["reference"], displacement, out=tool["error"])
         return []

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The desired form of the part as parameters, and what evaluates it under the tool."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+
+from lathe_rc import resources
+from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.errors import InputError
+from lathe_rc.plants.tool import desired
+from lathe_rc.signals.profile import Harmonics, Piston, Polygon, Profile, ProfileTable, read_csv
+
+
+class FormParameters(NodeParameters):
+    """The desired form of the part and the feed along it."""
+
+    profile: Literal["harmonics", "piston", "polygon", "csv"] = parameter("harmonics", "kind of profile")
+    profile_file: str = parameter("", "csv: file with angle_deg, (height_mm,) radius_um", path=True)
+    harmonic_order: list[Annotated[int, Ge(0), Le(2000)]] = parameter(
+        [], "harmonics: waves per revolution; none at all: an oval of 225 µm (paper 000, Fig. 6)"
+    )
+    harmonic_amplitude: list[float] = parameter([], "harmonics: amplitudes", "m")
+    harmonic_phase: list[float] = parameter([], "harmonics: phases at angle 0; empty: all 0", "rad")
+    piston_ovality: Annotated[float, Ge(0)] = parameter(
+        0.5e-3, "piston: difference of the diameters at the ends of the skirt", "m"
+    )
+    piston_ovality_middle: Annotated[float, Ge(0)] = parameter(0.4e-3, "piston: the same at the widest place", "m")
+    piston_barrel: Annotated[float, Ge(0)] = parameter(30e-6, "piston: radius lost towards the ends", "m")
+    piston_length: Annotated[float, Gt(0)] = parameter(0.06, "piston: length of the skirt", "m")
+    piston_widest: Annotated[float, Ge(0)] = parameter(0.02, "piston: widest place from the start", "m")
+    polygon_sides: Annotated[int, Ge(3), Le(64)] = parameter(3, "polygon: number of sides")
+    polygon_inscribed_radius: Annotated[float, Gt(0)] = parameter(1e-3, "polygon: radius of the inscribed circle", "m")
+    polygon_corner_radius: Annotated[float, Gt(0)] = parameter(0.8e-3, "polygon: radius of the corners", "m")
+    feed: Annotated[float, Ge(0)] = parameter(0.0, "advance along the part", "m/rev")
+    start_height: Annotated[float, Ge(0)] = parameter(0.0, "where along the part the run begins", "m")
+    part_revolutions: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
+        0, "after so many revolutions the next part begins at start_height; 0: one endless part", "rev"
+    )
+
+    def form(self, node: str) -> Profile:
+        """The profile of a node.
+
+        Raises:
+            InputError: lists of different lengths, sizes that do not fit, or a file that cannot be used.
+        """
+        if self.profile == "csv":
+            if not self.profile_file:
+                raise InputError(f"{node}.profile_file is empty; name the CSV file of the profile")
+            return read_csv(resources.find(Path(self.profile_file)))
+        if self.profile == "piston":
+            return Piston(
+                self.piston_ovality,
+                self.piston_ovality_middle,
+                self.piston_barrel,
+                self.piston_length,
+                self.piston_widest,
+            )
+        if self.profile == "polygon":
+            return Polygon(self.polygon_sides, self.polygon_inscribed_radius, self.polygon_corner_radius)
+        order, amplitude = self.harmonic_order, self.harmonic_amplitude
+        if not order and not amplitude:
+            order, amplitude = [2], [225e-6]
+        phase = self.harmonic_phase or [0.0] * len(order)
+        return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
+
+
+class Form:
+    """A form, tabulated.
+
+    Args:
+        node: that it belongs to.
+        parameters: its table.
+
+    Attributes:
+        profile: its table.
+    """
+
+    def __init__(self, node: str, parameters: FormParameters) -> None:
+        self.profile = ProfileTable(parameters.form(node))
+        self._parameters = parameters
+
+    def block(self, encoder: Signals, reference: Samples, expected: Samples, height: Samples) -> None:
+        """Fill the desired displacement and what a controller can know of it, and the height [m], shape (n,)."""
+        parameters = self._parameters
+        desired(
+            self.profile.heights,
+            self.profile.table,
+            parameters.feed,
+            parameters.start_height,
+            parameters.part_revolutions,
+            encoder["angle"],
+            encoder["angle_true"],
+            reference,
+            expected,
+            height,
+        )

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the learning controller, and the pieces of its law that they describe."""
+
+from collections.abc import Callable
+from typing import Annotated, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
+
+from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.stages.speed_law import SpeedLawParameters
+from lathe_rc.control.correction import Correction, CorrectionLaw
+from lathe_rc.control.lead import LeadLaw, Preview
+from lathe_rc.control.q_filter import Exponential, Gaussian, LowPass, MovingAverage, QFilter
+
+_LEAD_LAWS = {law.name.lower(): law for law in LeadLaw}
+_Q_FILTERS: dict[str, Callable[[float, int], QFilter]] = {
+    "exponential": Exponential,
+    "gaussian": Gaussian,
+    "moving_average": MovingAverage,
+}
+_CORRECTIONS = {law.name.lower(): law for law in CorrectionLaw}
+
+
+class LearningControllerParameters(SpeedLawParameters):
+    """Law, lead, Q and correction of a channel, and the drive model that its stability margin is computed from.
+
+    The speed deviations are what ``exact_preview`` knows in advance; no other law uses them.
+    """
+
+    law: Literal["angle_domain", "time_periodic"] = parameter(
+        "angle_domain", "memory over the spindle angle (paper 000, Fig. 1b) or over time (Fig. 1a)"
+    )
+    lead_time: Annotated[float, Ge(0), Le(1)] = parameter(
+        1.425e-3, "T0: the delay that the lead answers; with a second-order inverse only the drive's pure delay", "s"
+    )
+    lead_law: Literal["variable", "constant_angle", "variable_second_order", "exact_preview"] = parameter(
+        "variable",
+        "variable: T0·Ω (000, eq. 20); constant_angle: T0·Ω0; variable_second_order: T0·Ω + T0²/2·dΩ/dt; "
+        "exact_preview: φ(t+T0) - φ(t) of the deviations below",
+    )
+    acceleration_window: Annotated[int, Ge(1), Le(65536)] = parameter(
+        1, "dΩ/dt is the measured speed's difference over so many samples", "sample"
+    )
+    correction: Literal["none", "lead_lag", "second_order_inverse", "second_order_inverse_dynamic", "exact"] = (
+        parameter("none", "1/W0 beside the lead; exact: Wk2 then Wk1 (000, eqs 13-14), for which T0 counts in full")
+    )
+    correction_model: Literal["given", "identified"] = parameter(
+        "given", "drive model of the correction: the one below, or the one identified as long as the channel learns"
+    )
+    lead_lag_lead: Annotated[float, Ge(0), Le(1)] = parameter(0.0, "correction lead_lag: T1", "s")
+    lead_lag_lag: Annotated[float, Ge(0), Le(1)] = parameter(0.0, "correction lead_lag: T2", "s")
+    q_filter: Literal["exponential", "gaussian", "moving_average", "fir"] = parameter(
+        "exponential", "kind of the zero-phase Q; fir: flat up to q_pass"
+    )
+    q_time: Annotated[float, Ge(0), Le(1)] = parameter(
+        67.0e-6, "width of Q at nominal speed: Q = 1 - (ω·q_time)² for low ω; fixed in angle; not of fir", "s"
+    )
+    q_pass: Annotated[float, Gt(0)] = parameter(4000.0, "fir: end of the pass band at nominal speed", "rad/s")
+    q_stop: Annotated[float, Gt(0)] = parameter(10000.0, "fir: begin of the stop band at nominal speed", "rad/s")
+    q_ripple: Annotated[float, Gt(1e-8), Lt(0.5)] = parameter(1e-4, "fir: ripple in both bands")
+    learning_gain: Annotated[float, Gt(0), Le(2)] = parameter(1.0, "γ; 1 in the papers")
+    soft_start: Annotated[float, Ge(0), Le(1024)] = parameter(
+        0.0, "the gain rises from 0 over so many revolutions when learning begins; 0: at once", "rev"
+    )
+    join_below: Annotated[float, Ge(0)] = parameter(
+        0.0, "the channel learns from the first cycle on whose largest error is within this; 0: at once", "m"
+    )
+    finer: list[str] = parameter(
+        [],
+        "drives after this channel: their motion is added to the tool's error, so that it learns its own error",
+    )
+    points_per_revolution: Annotated[int, Ge(64), Le(65536)] = parameter(1024, "points of the memory per revolution")
+    cycle_revolutions: Annotated[int, Ge(1), Le(1024)] = parameter(
+        1, "cycle angle θ; the whole part if it is as long", "rev"
+    )
+    feedback_delay: Annotated[int, Ge(1), Le(2**24)] = parameter(
+        2048,
+        "samples from an error to when it is visible; at least a block, at most what the cycle leaves",
+        "sample",
+    )
+    memory_file: str = parameter("", "file that the events save and load write and read", path=True)
+    allow_unstable: bool = parameter(default=False, doc="start although sup|Q - Z| is not below 1")
+    identify: bool = parameter(default=False, doc="identify the drive from its command and measured position")
+    identification_bandwidth: Annotated[float, Gt(0)] = parameter(
+        1000.0, "bandwidth of its filters: above the profile's harmonics, below the noise", "rad/s"
+    )
+    identification_forgetting: Annotated[float, Ge(0), Lt(1)] = parameter(
+        0.5, "weight that a cycle's measurements keep after the next"
+    )
+    model_natural_frequency: Annotated[float, Gt(0)] = parameter(1038.0, "drive model: ωn", "rad/s")
+    model_damping: Annotated[float, Gt(0)] = parameter(0.804, "drive model: ζ")
+    model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s")
+
+    @property
+    def cycle_points(self) -> int:
+        """Grid points in a cycle."""
+        return self.points_per_revolution * self.cycle_revolutions
+
+    def make_q(self) -> QFilter:
+        """The Q filter.
+
+        Raises:
+            InputError: it is wider than the memory can hold, or its bands are out of order.
+        """
+        per_point = self.points_per_revolution / (2 * np.pi)  # grid points per radian
+        if self.q_filter == "fir":
+            edge = 1.0 / (self.nominal_speed * per_point)
+            return LowPass(self.q_pass * edge, self.q_stop * edge, self.q_ripple, self.cycle_points)
+        return _Q_FILTERS[self.q_filter](self.q_time * self.nominal_speed * per_point, self.cycle_points)
+
+    def make_correction(self) -> Correction:
+        """The correction with its given model.
+
+        Raises:
+            InputError: a lead-lag term without a lag.
+        """
+        return Correction(
+            _CORRECTIONS[self.correction],
+            self.model_natural_frequency,
+            self.model_damping,
+            self.lead_lag_lead,
+            self.lead_lag_lag,
+        )
+
+    @property
+    def preview_time(self) -> float:
+        """What the lead law answers [s]: T0, or with the exact correction the model's delay alone."""
+        return self.model_delay if self.correction == "exact" else self.lead_time
+
+    @property
+    def constant_lead(self) -> float:
+        """Lead angle that does not depend on the speed [rad]: of Wk2, which has constant parameters in the angle."""
+        return (self.lead_time - self.preview_time) * self.nominal_speed
+
+    def make_preview(self) -> Preview:
+        """The lead law.
+
+        Raises:
+            InputError: the deviations do not fit together.
+        """
+        return Preview(
+            _LEAD_LAWS[self.lead_law],
+            self.preview_time,
+            self.speed_law(),
+            self.step,
+            self.acceleration_window,
+            self.constant_lead,
+        )
+
+    def largest_lead(self, speed: float, acceleration: float) -> float:
+        """Largest lead angle [rad] at a largest measured ``speed`` [rad/s] and ``acceleration`` [rad/s²]."""
+        time = self.preview_time
+        if self.lead_law == "constant_angle":
+            return time * self.nominal_speed + self.constant_lead
+        bend = 0.5 * time**2 * acceleration if self.lead_law == "variable_second_order" else 0.0
+        return time * speed + bend + self.constant_lead

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Corrections 1/W0 between the memory and the drive (papers 000 and 001).
+
+    none                          the lead alone
+    lead_lag                      (1 + pT1)/(1 + pT2) after it
+    second_order_inverse          1 + a1·p + a2·p² of the memory with p² = Ω²s²  (s = d/dφ; exact at constant speed)
+    second_order_inverse_dynamic  the same with p² = Ω²s² + (dΩ/dt)·s
+    exact                         Wk2 then Wk1 (000, eqs 13-14): the drive model with constant parameters in the
+                                  angle domain, then its inverse in time
+
+a1 = 2ζ/ωn, a2 = 1/ωn² belong to a drive model e^{-pτ}/(1 + a1·p + a2·p²); its delay τ is left to the lead.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+
+Array = npt.NDArray[np.float64]
+
+
+class CorrectionLaw(IntEnum):
+    """See the module."""
+
+    NONE = 0
+    LEAD_LAG = 1
+    SECOND_ORDER_INVERSE = 2
+    SECOND_ORDER_INVERSE_DYNAMIC = 3
+    EXACT = 4
+
+
+@dataclass(frozen=True)
+class Correction:
+    """A correction with its drive model.
+
+    Args:
+        law: which.
+        natural_frequency: of the drive model, ωn [rad/s].
+        damping: of the drive model, ζ.
+        lead: T1 of the lead-lag term [s].
+        lag: T2 of the lead-lag term [s]; above 0 where it is used.
+
+    Raises:
+        InputError: the lead-lag term has no lag.
+    """
+
+    law: CorrectionLaw
+    natural_frequency: float
+    damping: float
+    lead: float = 0.0
+    lag: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.law is CorrectionLaw.LEAD_LAG and not self.lag > 0.0:
+            raise InputError(f"lag_time = {self.lag:g} s with correction lead_lag; allowed: above 0")
+
+    @property
+    def inverse(self) -> tuple[float, float]:
+        """Coefficients a1 [s], a2 [s²] of the inverse 1 + a1·p + a2·p²."""
+        return 2.0 * self.damping / self.natural_frequency, 1.0 / self.natural_frequency**2
+
+    @property
+    def looks_ahead(self) -> int:
+        """Grid points after the place where the memory is read that the interpolation looks at."""
+        return 4 if self.law in (CorrectionLaw.SECOND_ORDER_INVERSE, CorrectionLaw.SECOND_ORDER_INVERSE_DYNAMIC) else 2
+
+
+@kernel
+def invariant(
+    y: float, before: float, distance: float, rate: float, bend: float, a1: float, a2: float, nominal: float, v: Array
+) -> float:
+    """One sample of Wk2 then Wk1; returns the set point.
+
+    Wk2: a2Ω0²·v'' + a1Ω0·v' + v = Y in the angle (Runge-Kutta of fourth order, Y linear from ``before`` to ``y``
+    over ``distance`` [rad]). Wk1: v + a1·dv/dt + a2·d²v/dt² with d/dt of the angle ``rate`` and ``bend``; v' and v''
+    are there already, so nothing is differentiated. ``v`` holds v and v'.
+    """
+    b1, b2 = a1 * nominal, a2 * nominal**2
+    middle, half = 0.5 * (before + y), 0.5 * distance
+    x1, s1 = v[1], (before - v[0] - b1 * v[1]) / b2
+    x2 = v[1] + half * s1
+    s2 = (middle - (v[0] + half * x1) - b1 * x2) / b2
+    x3 = v[1] + half * s2
+    s3 = (middle - (v[0] + half * x2) - b1 * x3) / b2
+    x4 = v[1] + distance * s3
+    s4 = (y - (v[0] + distance * x3) - b1 * x4) / b2
+    v[0] += distance / 6.0 * (x1 + 2.0 * (x2 + x3) + x4)
+    v[1] += distance / 6.0 * (s1 + 2.0 * (s2 + s3) + s4)
+    second = (y - v[0] - b1 * v[1]) / b2
+    return float(v[0] + a1 * rate * v[1] + a2 * (rate**2 * second + bend * v[1]))

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identification of a drive while it runs, from its command u and its measured position x.
+
+    u(t - τ) = x + a1·dx/dt + a2·d²x/dt²        a1 = 2ζ/ωn, a2 = 1/ωn², τ known
+
+Both sides pass the same low-pass (λ/(p + λ))³, whose states give the filtered derivatives: nothing is
+differentiated. Least squares over the cycles that have ended, older ones with a forgetting factor. One harmonic is
+enough for both coefficients; the speed of the spindle may vary.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.jit import kernel
+
+Array = npt.NDArray[np.float64]
+
+_LOOK_BACK = 2  # samples of the command that a delay with a fraction needs
+_LEAST_EXCITED = 1e-6  # determinant of the normal equations, 1 for independent regressors
+
+
+@kernel
+def _accumulate(
+    first: int,
+    start: int,
+    stop: int,
+    delay: int,
+    part: float,
+    bandwidth: float,
+    step: float,
+    commands: Array,
+    position: Array,
+    state: Array,
+    sums: Array,
+) -> None:
+    """Filter and sum the samples ``start`` to ``stop`` of a block; ``delay`` [sample] is that of the command."""
+    mask = commands.size - 1
+    half = 0.5 * bandwidth * step  # bilinear rule
+    keep, take = (1.0 - half) / (1.0 + half), half / (1.0 + half)
+    u, x = state[:4], state[4:]
+    for k in range(start, stop):
+        n = first + k - delay
+        if n < _LOOK_BACK:
+            continue
+        new_u = (1.0 - part) * commands[n & mask] + part * commands[(n - 1) & mask]
+        new_x = position[k]
+        for stage in range(4):
+            old_u, old_x = u[stage], x[stage]
+            u[stage], x[stage] = new_u, new_x
+            if stage < 3:
+                new_u = keep * u[stage + 1] + take * (new_u + old_u)
+                new_x = keep * x[stage + 1] + take * (new_x + old_x)
+        first_derivative = bandwidth * (x[2] - x[3])
+        second_derivative = bandwidth**2 * (x[1] - 2.0 * x[2] + x[3])
+        rest = u[3] - x[3]
+        sums[0] += first_derivative * first_derivative
+        sums[1] += first_derivative * second_derivative
+        sums[2] += second_derivative * second_derivative
+        sums[3] += first_derivative * rest
+        sums[4] += second_derivative * rest
+        sums[5] += rest * rest
+        sums[6] += u[3] * u[3]
+
+
+@dataclass(frozen=True)
+class Identified:
+    """A drive model from measurements.
+
+    Attributes:
+        natural_frequency: ωn [rad/s].
+        damping: ζ.
+        residual: RMS of what the model does not explain over the RMS of the command.
+    """
+
+    natural_frequency: float
+    damping: float
+    residual: float
+
+
+class DriveIdentifier:
+    """Fits ωn and ζ of a second-order drive behind a known delay.
+
+    Args:
+        model_delay: τ [s].
+        feedback_delay: samples until a measured position is visible.
+        bandwidth: λ of the filters [rad/s]: above the profile's harmonics, below the noise.
+        forgetting: weight of a cycle when the next one ends, 0 up to 1.
+        step: sampling step [s].
+        block: longest block [sample].
+    """
+
+    def __init__(
+        self,
+        *,
+        model_delay: float,
+        feedback_delay: int,
+        bandwidth: float,
+        forgetting: float,
+        step: float,
+        block: int,
+    ) -> None:
+        whole = int(np.floor(model_delay / step + 1e-9))
+        self._delay, self._part = feedback_delay + whole, max(model_delay / step - whole, 0.0)
+        self._bandwidth, self._forgetting, self._step = bandwidth, forgetting, step
+        self._commands = np.zeros(1 << (self._delay + block + _LOOK_BACK).bit_length())
+        self._state, self._sums = np.zeros(8), np.zeros(7)
+
+    def block(self, first: int, start: int, stop: int, position: Array) -> None:
+        """Take the measured positions ``start`` to ``stop`` of a block that begins at sample ``first`` [m]."""
+        _accumulate(
+            first, start, stop, self._delay, self._part, self._bandwidth, self._step,
+            self._commands, position, self._state, self._sums,
+        )  # fmt: skip
+
+    def commanded(self, first: int, command: Array) -> None:
+        """Remember the set points of a block [m], once all of it is known."""
+        self._commands[np.arange(first, first + command.size) & (self._commands.size - 1)] = command
+
+    def fit(self) -> Identified | None:
+        """What the measurements so far say; None while they say nothing. Older ones weigh less from now on."""
+        s11, s12, s22, s1, s2, rest, command = self._sums
+        found = None
+        # Relative to independent regressors: the units of the two differ by orders of magnitude.
+        determinant = s11 * s22 - s12 * s12
+        if determinant > _LEAST_EXCITED * s11 * s22 > 0.0:
+            a1 = (s1 * s22 - s2 * s12) / determinant
+            a2 = (s2 * s11 - s1 * s12) / determinant
+            if a1 > 0.0 and a2 > 0.0:
+                unexplained = max(rest - a1 * s1 - a2 * s2, 0.0)
+                frequency = float(1.0 / np.sqrt(a2))
+                found = Identified(frequency, float(a1 * frequency / 2.0), float(np.sqrt(unexplained / command)))
+        self._sums *= self._forgetting
+        return found

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading a grid between its points: value and derivatives."""
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.jit import kernel
+
+Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+
+@kernel
+def cubic(before: float, left: float, right: float, after: float, u: float) -> float:
+    """Lagrange cubic through four equidistant points at ``u`` in [0, 1] between the middle two."""
+    c1 = right - before / 3.0 - left / 2.0 - after / 6.0
+    c2 = (before + right) / 2.0 - left
+    c3 = (after - before) / 6.0 + (left - right) / 2.0
+    return left + u * (c1 + u * (c2 + u * c3))
+
+
+@kernel
+def read(ring: Array, i: int, u: float) -> float:
+    """Value at ``i`` + ``u`` of a ring whose length is a power of two; looks at the points i-1 to i+2."""
+    mask = ring.size - 1
+    return cubic(ring[(i - 1) & mask], ring[i & mask], ring[(i + 1) & mask], ring[(i + 2) & mask], u)
+
+
+@kernel
+def read_derivatives(ring: Array, i: int, u: float) -> tuple[float, float, float]:
+    """Value and first two derivatives [1/point, 1/point²] at ``i`` + ``u``; looks at the points i-3 to i+4.
+
+    The derivatives are central differences of fourth order at the grid points, interpolated like the value.
+    """
+    mask = ring.size - 1
+    a, b, c, d = ring[(i - 3) & mask], ring[(i - 2) & mask], ring[(i - 1) & mask], ring[i & mask]
+    e, f, g, h = ring[(i + 1) & mask], ring[(i + 2) & mask], ring[(i + 3) & mask], ring[(i + 4) & mask]
+    first = cubic((a - e) + 8.0 * (d - b), (b - f) + 8.0 * (e - c), (c - g) + 8.0 * (f - d), (d - h) + 8.0 * (g - e), u)
+    second = cubic(
+        16.0 * (b + d) - (a + e) - 30.0 * c,
+        16.0 * (c + e) - (b + f) - 30.0 * d,
+        16.0 * (d + f) - (c + g) - 30.0 * e,
+        16.0 * (e + g) - (d + h) - 30.0 * f,
+        u,
+    )
+    return cubic(c, d, e, f, u), first / 12.0, second / 12.0
+
+
+def cubic_response(radians: Array) -> Array:
+    """Response of `read` at ``radians`` per point, mean over the place between points; shape (n,).
+
+    The interpolator also makes images at multiples of the sampling rate less this frequency; the drive
+    attenuates those and they are left out here.
+    """
+    u, weight = np.polynomial.legendre.leggauss(8)
+    u, weight = (u + 1.0) / 2.0, weight / 2.0
+    taps = np.stack(
+        (
+            -u * (1 - u) * (2 - u) / 6,
+            (1 - u * u) * (2 - u) / 2,
+            u * (1 + u) * (2 - u) / 2,
+            -u * (1 - u * u) / 6,
+        )
+    )
+    distance = np.arange(-1, 3)[:, None] - u
+    phase = np.cos(distance[None] * radians[:, None, None])
+    return np.asarray((phase * taps * weight).sum(axis=(1, 2)))
+
+
+def derivative_responses(radians: Array) -> tuple[Array, Complex, Array]:
+    """Responses of the three results of `read_derivatives`, per point; shape (n,) each."""
+    value = cubic_response(radians)
+    first = 1j * (8.0 * np.sin(radians) - np.sin(2.0 * radians)) / 6.0
+    second = (16.0 * np.cos(radians) - np.cos(2.0 * radians) - 15.0) / 6.0
+    return value, np.asarray(first * value, dtype=np.complex128), second * value

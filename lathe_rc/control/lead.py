@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lead laws: how far ahead of the spindle the memory is read, so that a delay T0 is answered.
+
+    constant_angle          T0·Ω0                        right at the nominal speed only
+    variable                T0·Ω(t)                      paper 000, eq. (20)
+    variable_second_order   T0·Ω(t) + (T0²/2)·dΩ/dt      the next term of φ(t+T0) - φ(t)
+    exact_preview           φ(t+T0) - φ(t)               for a speed law that is known in advance
+
+What is read at ψ = φ + lead acts T0 later. A correction that differentiates the memory with respect to time needs
+dψ/dt and d²ψ/dt² as well: to first order in T0 the speed and the acceleration at t + T0.
+"""
+
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.jit import kernel
+from lathe_rc.signals.speed import SpeedLaw, evaluate
+
+Array = npt.NDArray[np.float64]
+
+
+class LeadLaw(IntEnum):
+    """See the module."""
+
+    CONSTANT_ANGLE = 0
+    VARIABLE = 1
+    VARIABLE_SECOND_ORDER = 2
+    EXACT_PREVIEW = 3
+
+
+@kernel
+def _look_ahead(
+    first: int,
+    step: float,
+    law: int,
+    lead_time: float,
+    constant: float,
+    nominal: float,
+    lines: Array,
+    tachogram: Array,
+    history: Array,
+    speed: Array,
+    lead: Array,
+    rate: Array,
+    bend: Array,
+) -> None:
+    window = history.size
+    for k in range(speed.size):
+        n = first + k
+        # The oldest speed of the ring stands where the new one goes; NaN before it was written.
+        oldest = history[n % window]
+        acceleration = 0.0 if np.isnan(oldest) else (speed[k] - oldest) / (window * step)
+        history[n % window] = speed[k]
+        if law == 3:
+            here, _, _ = evaluate(n * step, nominal, lines, tachogram)
+            there, rate[k], bend[k] = evaluate(n * step + lead_time, nominal, lines, tachogram)
+            lead[k] = there - here
+        else:
+            lead[k] = lead_time * (nominal if law == 0 else speed[k])
+            if law == 2:
+                lead[k] += 0.5 * lead_time**2 * acceleration
+            rate[k] = speed[k] + lead_time * acceleration
+            bend[k] = acceleration
+        lead[k] += constant
+
+
+class Preview:
+    """Looks ahead by a lead time.
+
+    Args:
+        law: lead law.
+        lead_time: T0 [s].
+        speed_law: nominal speed Ω0; for ``EXACT_PREVIEW`` also its deviations.
+        step: sampling step [s].
+        window: samples over which dΩ/dt is a difference of the measured speed; it lags by half of them.
+        constant: lead angle [rad] beside that of the law, whatever the speed.
+    """
+
+    def __init__(
+        self, law: LeadLaw, lead_time: float, speed_law: SpeedLaw, step: float, window: int, constant: float = 0.0
+    ) -> None:
+        self._law, self._lead_time, self._speed_law, self._step = law, lead_time, speed_law, step
+        self._constant = constant
+        self._history = np.full(window, np.nan)
+
+    def block(self, first: int, speed: Array) -> tuple[Array, Array, Array]:
+        """Lead [rad], dψ/dt [rad/s] and d²ψ/dt² [rad/s²] for the measured ``speed`` [rad/s], shape (n,) each."""
+        lead, rate, bend = np.empty(speed.size), np.empty(speed.size), np.empty(speed.size)
+        known = self._speed_law
+        _look_ahead(
+            first, self._step, int(self._law), self._lead_time, self._constant, known.nominal, known.lines,
+            known.tachogram, self._history, speed, lead, rate, bend,
+        )  # fmt: skip
+        return lead, rate, bend

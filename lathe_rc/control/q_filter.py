@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Zero-phase smoothing filters over the angle: the Q of repetitive control (paper 001: Q = 1 + Wф).
+
+All have Q(0) = 1 and a width fixed in angle. With the width κ in grid points they agree for long waves,
+Q(ν) ≈ 1 - (κν)² for ν radians per grid point, so that one `q_time` means the same for each:
+
+    exponential      1/(1 + 4κ²·sin²(ν/2))      kernel r^|j|: two first-order recursions
+    Gaussian         exp(-(κν)²)                kernel of standard deviation √2·κ
+    moving average   sin(aν)/(aν), a = √6·κ     running sum
+    FIR              Kaiser-windowed low-pass, flat up to a pass frequency
+
+A filter is applied to a fixed number of grid points at a time (`chunk`), with `reach` more on each side. Where
+a chunk begins is fixed on the grid, so the lengths of blocks change no bit. The cost of a point does not
+depend on the width for the exponential and the moving average, and grows with its logarithm for the others.
+"""
+
+from abc import ABC, abstractmethod
+from math import ceil
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft, signal
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+
+Array = npt.NDArray[np.float64]
+
+_TAIL = 1e-12  # weight at which a kernel is cut off
+_EDGES = 256  # frequencies at which the ripple of a band is checked
+_CHUNK = 256  # grid points filtered at a time, if the kernel is no longer
+
+
+class QFilter(ABC):
+    """A zero-phase filter over the grid.
+
+    Args:
+        reach: grid points that it looks at to each side.
+        cycle: grid points in a cycle of the memory.
+
+    Attributes:
+        reach: see above.
+        chunk: grid points that `smooth` yields at a time.
+
+    Raises:
+        InputError: it is wider than the memory can hold.
+    """
+
+    def __init__(self, reach: int, cycle: int) -> None:
+        if 2 * reach >= cycle:
+            raise InputError(
+                f"Q filter reaches {reach} grid points to each side; allowed: less than half the cycle of {cycle} "
+                "points (make it narrower)"
+            )
+        self.reach = reach
+        # At least as long as it reaches: the margins then cost no more than the points, whatever the width.
+        self.chunk = min(max(_CHUNK, reach), cycle - reach)
+
+    @abstractmethod
+    def smooth(self, points: Array, smoothed: Array) -> None:
+        """Filter ``points`` (shape (chunk + 2·reach,)) into ``smoothed`` (shape (chunk,))."""
+
+    @abstractmethod
+    def response(self, radians: Array) -> Array:
+        """Real response at ``radians`` per grid point, shape (n,)."""
+
+
+class Unity(QFilter):
+    """Q = 1: nothing is forgotten."""
+
+    def __init__(self, cycle: int) -> None:
+        super().__init__(0, cycle)
+
+    def smooth(self, points: Array, smoothed: Array) -> None:
+        """See `QFilter`."""
+        smoothed[:] = points
+
+    def response(self, radians: Array) -> Array:
+        """See `QFilter`."""
+        return np.ones_like(radians)
+
+
+@kernel
+def _two_sided(ratio: float, reach: int, points: Array, smoothed: Array) -> None:
+    gain = (1.0 - ratio) / (1.0 + ratio)
+    forward = 0.0
+    for k in range(points.size - reach):
+        forward = ratio * forward + points[k]
+        if k >= reach:
+            smoothed[k - reach] = forward
+    backward = 0.0
+    for k in range(points.size - 1, reach - 1, -1):
+        # What came from the right so far excludes the point itself, which the forward pass has.
+        if k < points.size - reach:
+            smoothed[k - reach] = gain * (smoothed[k - reach] + ratio * backward)
+        backward = ratio * backward + points[k]
+
+
+class Exponential(QFilter):
+    """Two-sided exponential, the Q of papers 000 and 001: 1/(1 + (ω·width)²) in the limit of a fine grid.
+
+    Args:
+        width: κ, its angle constant in grid points.
+        cycle: grid points in a cycle.
+    """
+
+    def __init__(self, width: float, cycle: int) -> None:
+        self._square = width**2
+        self._ratio = 2.0 * self._square / (1.0 + 2.0 * self._square + np.sqrt(1.0 + 4.0 * self._square))
+        super().__init__(ceil(np.log(_TAIL) / np.log(self._ratio)) if self._ratio > 0.0 else 0, cycle)
+
+    def smooth(self, points: Array, smoothed: Array) -> None:
+        """See `QFilter`."""
+        _two_sided(self._ratio, self.reach, points, smoothed)
+
+    def response(self, radians: Array) -> Array:
+        """See `QFilter`."""
+        return np.asarray(1.0 / (1.0 + 4.0 * self._square * np.sin(radians / 2.0) ** 2))
+
+
+@kernel
+def _running_mean(reach: int, end: float, points: Array, smoothed: Array) -> None:
+    scale = 1.0 / (2 * reach - 1 + 2.0 * end)
+    total = 0.0
+    for k in range(1, 2 * reach):
+        total += points[k]
+    for k in range(smoothed.size):
+        if k:
+            total += points[k + 2 * reach - 1] - points[k]
+        smoothed[k] = scale * (total + end * (points[k] + points[k + 2 * reach]))
+
+
+class MovingAverage(QFilter):
+    """Mean over the angle to both sides; the points at its ends count by the part of them that is inside.
+
+    Args:
+        width: κ in grid points; it averages over √6·κ grid angles to each side.
+        cycle: grid points in a cycle.
+    """
+
+    def __init__(self, width: float, cycle: int) -> None:
+        side = max(np.sqrt(6.0) * width - 0.5, 0.0)  # beyond the half of the middle point
+        super().__init__(ceil(side), cycle)
+        self._end = float(side - (self.reach - 1)) if self.reach else 0.0
+
+    def smooth(self, points: Array, smoothed: Array) -> None:
+        """See `QFilter`."""
+        if self.reach:
+            _running_mean(self.reach, self._end, points, smoothed)
+        else:
+            smoothed[:] = points
+
+    def response(self, radians: Array) -> Array:
+        """See `QFilter`."""
+        if not self.reach:
+            return np.ones_like(radians)
+        inner = 2 * self.reach - 1
+        # Sum of cosines over the whole points (Dirichlet kernel), with its limit where ν is a multiple of 2π.
+        half = np.sin(radians / 2.0)
+        small = np.abs(half) < 1e-9
+        whole = np.where(small, inner, np.sin(inner * radians / 2.0) / np.where(small, 1.0, half))
+        ends = 2.0 * self._end * np.cos(self.reach * radians)
+        return np.asarray((whole + ends) / (inner + 2.0 * self._end))
+
+
+class Weights(QFilter):
+    """Any symmetric kernel, by fast Fourier transforms of a fixed length.
+
+    Args:
+        weights: q_0, q_±1, ...; scaled so that Q(0) = 1.
+        cycle: grid points in a cycle.
+    """
+
+    def __init__(self, weights: Array, cycle: int) -> None:
+        super().__init__(weights.size - 1, cycle)
+        weights = weights / (weights[0] + 2.0 * weights[1:].sum())
+        self._length = fft.next_fast_len(self.chunk + 2 * self.reach, real=True)
+        circle = np.zeros(self._length)
+        circle[: weights.size] = weights
+        circle[self._length - self.reach :] = weights[:0:-1]
+        self._spectrum = fft.rfft(circle).real
+        self._weights = weights
+
+    def smooth(self, points: Array, smoothed: Array) -> None:
+        """See `QFilter`."""
+        spectrum = fft.rfft(points, self._length)
+        spectrum *= self._spectrum
+        smoothed[:] = fft.irfft(spectrum, self._length)[self.reach : self.reach + self.chunk]
+
+    def response(self, radians: Array) -> Array:
+        """See `QFilter`."""
+        # cos(jν) by Horner's rule for Chebyshev polynomials: memory does not grow with the kernel.
+        series = np.concatenate((self._weights[:1], 2.0 * self._weights[1:]))
+        return np.asarray(np.polynomial.chebyshev.chebval(np.cos(radians), series))
+
+
+class Gaussian(Weights):
+    """Gaussian Q = exp(-(κν)²).
+
+    Args:
+        width: κ in grid points.
+        cycle: grid points in a cycle.
+    """
+
+    def __init__(self, width: float, cycle: int) -> None:
+        # Longer than the cycle is refused below, and need not be computed first.
+        reach = min(ceil(2.0 * width * np.sqrt(-np.log(_TAIL))), cycle)
+        super().__init__(np.exp(-((np.arange(reach + 1) / max(2.0 * width, _TAIL)) ** 2)), cycle)
+
+
+class LowPass(Weights):
+    """Zero-phase FIR low-pass, designed with a Kaiser window.
+
+    Args:
+        passed: end of the pass band [rad per grid point].
+        stopped: begin of the stop band [rad per grid point].
+        ripple: largest deviation from 1 in the pass band and from 0 in the stop band [1].
+        cycle: grid points in a cycle.
+
+    Raises:
+        InputError: the bands do not lie in order between 0 and the Nyquist limit π.
+    """
+
+    def __init__(self, passed: float, stopped: float, ripple: float, cycle: int) -> None:
+        if not 0.0 < passed < stopped <= np.pi:
+            raise InputError(
+                f"FIR Q filter: pass band to {passed:.4g}, stop band from {stopped:.4g} rad per grid point; allowed: "
+                f"0 < pass < stop <= {np.pi:.4g}"
+            )
+        taps, beta = signal.kaiserord(-20.0 * np.log10(ripple / 2.0), (stopped - passed) / np.pi)
+        bands = np.concatenate((np.linspace(0.0, passed, _EDGES), np.linspace(stopped, np.pi, _EDGES)))
+        wanted = np.repeat([1.0, 0.0], _EDGES)
+        taps = min(taps | 1, 2 * cycle + 1)  # odd, so that its middle is a point; far too long is refused below
+        while True:
+            taper = signal.firwin(taps, (passed + stopped) / 2.0, window=("kaiser", beta), fs=2.0 * np.pi)
+            super().__init__(np.asarray(taper[taps // 2 :]), cycle)
+            if np.abs(self.response(bands) - wanted).max() <= ripple:
+                break
+            taps += 2  # Kaiser's formula is short of a point or two where the transition is wide
