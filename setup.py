@@ -8,7 +8,17 @@ from setuptools import find_packages, setup
 
 # colcon's --symlink-install runs a link to this file from its build folder
 HERE = Path(__file__).resolve().parent
-NODES = ["spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder"]
+NODES = [
+    "spindle_encoder",
+    "profile",
+    "learning_controller",
+    "electrodynamic_actuator",
+    "piezo_actuator",
+    "series_drive",
+    "vibration",
+    "tool",
+    "recorder",
+]
 
 
 def shared_files() -> list[tuple[str, list[str]]]:

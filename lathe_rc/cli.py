@@ -20,6 +20,7 @@ from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.studies.command import study
 
 _REFRESH = 0.1  # [s] between updates of the progress line
 _LOG_PERIOD = 2.0  # [s] between lines where there is no terminal
@@ -43,6 +44,9 @@ class _Group(click.Group):
 @click.version_option(__version__)
 def main() -> None:
     """Emulate the control cell of a lathe for non-circular turning."""
+
+
+main.add_command(study)
 
 
 def _load(name: str, overrides: Sequence[str]) -> Scenario:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Form errors, revolution by revolution."""
+"""Form errors and roundness, revolution by revolution, and profiles as files."""
 
 import numpy as np
 import pytest
@@ -7,10 +7,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis.metrology import form_errors
+from lathe_rc.analysis import profile_csv
+from lathe_rc.analysis.metrology import (
+    POINTS,
+    evenly,
+    form_errors,
+    gaussian,
+    measure,
+    roughness,
+    roundness,
+    undulations,
+)
+from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
+from lathe_rc.signals.profile import Harmonics, read_csv
 
 TURN = 2 * np.pi
+EVEN = np.arange(POINTS) * (TURN / POINTS)
+
+amplitudes = st.floats(1e-9, 1e-4)
+phases = st.floats(-3.1, 3.1)
 
 
 def steady(revolutions, samples=1000):
@@ -23,6 +39,7 @@ def test_sine_has_its_rms_and_largest():
     found = form_errors(angle, np.floor(angle / TURN + 1e-9) * np.sin(4 * angle) + 0.5)
     assert_allclose(found.rms, np.sqrt(np.arange(3) ** 2 / 2 + 0.25))
     assert_allclose(found.largest, [0.5, 1.5, 2.5], rtol=1e-4)
+    assert_allclose(found.peak_to_valley, [0.0, 2.0, 4.0], rtol=1e-4)
     assert list(found.starts) == [0, 1000, 2000, 3000]
 
 
@@ -42,6 +59,7 @@ def test_incomplete_revolution_is_left_out(samples):
     found = form_errors(angle, np.where(np.arange(samples) < complete * 1000, 1.0, 100.0))
     assert_allclose(found.rms, np.ones(complete))
     assert_allclose(found.largest, np.ones(complete))
+    assert_allclose(found.peak_to_valley, np.zeros(complete))
     assert list(found.starts) == [1000 * revolution for revolution in range(complete + 1)]
 
 
@@ -55,5 +73,258 @@ def test_last_sample_before_the_end_completes_a_revolution():
 @pytest.mark.parametrize("samples", [0, 1, 2, 5])
 def test_very_short_run_has_no_revolution(samples):
     found = form_errors(np.arange(samples) * 1e-3, np.ones(samples))
-    assert found.rms.size == found.largest.size == 0
+    assert found.rms.size == found.largest.size == found.peak_to_valley.size == 0
     assert list(found.starts) == [0]
+
+
+# --- even angles
+
+
+def wandering(swing, revolutions=2.05):
+    """Angles at 64 kHz of a spindle whose speed swings."""
+    law = speed.harmonic(104.72, np.array([swing]), np.array([150.0]), np.array([0.3]))
+    return law.at(np.arange(law.samples_until(revolutions * TURN, 1 / 64_000)) / 64_000)[0]
+
+
+@given(st.floats(0.0, 0.6), st.integers(1, 100), phases)
+def test_even_angles_do_not_see_the_speed(swing, waves, phase):
+    angle = wandering(swing)
+    found = evenly(angle, np.sin(waves * angle + phase))
+    assert found.shape == (2, POINTS)
+    # A cubic spline errs by 5/384·h⁴ of the fourth derivative; ends count a little more.
+    assert_allclose(found, np.tile(np.sin(waves * EVEN + phase), (2, 1)), atol=0.1 * (waves * 3e-3) ** 4 + 1e-9)
+
+
+def test_even_angles_cover_the_revolutions_of_the_form_errors():
+    angle = np.arange(0.0, 2 * TURN, 0.01)
+    for samples in (angle.size, angle.size - 2, angle.size - 3):
+        revolutions = form_errors(angle[:samples], angle[:samples]).rms.size
+        assert evenly(angle[:samples], angle[:samples], 64).shape == (revolutions, 64)
+
+
+def test_end_of_a_run_holds_its_last_value():
+    angle = steady(2)[:-1]
+    assert_allclose(evenly(angle, angle, 1000)[-1, -1], angle[-1])
+    assert_allclose(evenly(angle, angle, 1000)[-1, :-1], angle[1000:])
+
+
+@pytest.mark.parametrize("samples", [0, 1, 2, 5])
+def test_very_short_run_has_nothing_to_measure(samples):
+    found = measure(np.arange(samples) * 1e-3, np.ones(samples))
+    assert found.profile.shape == (0, POINTS)
+    assert found.roundness.rms.size == found.roughness.ra.size == found.form.rms.size == 0
+    assert found.undulations.amplitude.shape == (0, 51)
+
+
+def test_angle_of_an_encoder_is_refused():
+    with pytest.raises(InputError, match="sample 500"):
+        evenly(np.maximum(steady(1), steady(1)[501] * (np.arange(1000) >= 500)), np.ones(1000))
+    with pytest.raises(InputError, match="2 points"):
+        evenly(steady(1), np.ones(1000), 2)
+
+
+# --- undulations
+
+
+@given(st.dictionaries(st.integers(1, 50), st.tuples(amplitudes, phases), min_size=1, max_size=5))
+def test_undulations_are_the_harmonics_of_a_profile(content):
+    """In the convention of the profiles of the cell, one by one, whatever else is there."""
+    order = np.array(list(content))
+    amplitude, phase = np.array(list(content.values())).T
+    found = undulations(Harmonics(order, amplitude, phase).deviation(EVEN, 0.0)[None], 50)
+    assert_allclose(found.amplitude[0, order], amplitude, atol=1e-17)
+    assert_allclose(np.exp(1j * found.phase[0, order]), np.exp(1j * phase), atol=1e-6)
+    others = np.setdiff1d(np.arange(51), order)
+    assert found.amplitude[0, others].max() < 1e-17
+
+
+@given(st.floats(-1.0, 1.0))
+def test_undulation_zero_is_the_mean(mean):
+    found = undulations(np.full((1, 64), mean), 0)
+    assert_allclose(found.amplitude * np.sin(found.phase), mean)
+
+
+def test_too_many_undulations_are_refused():
+    assert undulations(np.zeros((1, 64)), 31).amplitude.shape == (1, 32)
+    for highest in (32, -1):
+        with pytest.raises(InputError, match=f"up to {highest} UPR of 64 points"):
+            undulations(np.zeros((1, 64)), highest)
+
+
+# --- Gaussian filter
+
+
+def convolved(profile, cutoff):
+    """The filter as ISO 16610-21 writes it: a Gaussian weighting function, wound round the part."""
+    alpha = np.sqrt(np.log(2) / np.pi)
+    width = alpha / cutoff  # in revolutions
+    distance = (np.arange(profile.size) / profile.size)[:, None] + np.arange(-3, 4)
+    weight = (np.exp(-np.pi * (distance / width) ** 2) / width).sum(axis=1) / profile.size
+    return np.real(np.fft.ifft(np.fft.fft(profile) * np.fft.fft(weight)))
+
+
+@pytest.mark.parametrize("cutoff", [1.5, 15.0, 50.0])
+def test_gaussian_is_the_weighting_function_of_the_standard(cutoff):
+    profile = np.random.default_rng(0).normal(size=1024)
+    assert_allclose(gaussian(profile, cutoff), convolved(profile, cutoff), atol=1e-12)
+
+
+@given(st.integers(1, 500), st.sampled_from([15.0, 50.0, 150.0, 500.0]))
+def test_gaussian_keeps_half_at_its_cutoff(waves, cutoff):
+    wave = np.sin(waves * EVEN)
+    assert_allclose(gaussian(wave, cutoff), 0.5 ** ((waves / cutoff) ** 2) * wave, atol=1e-12)
+
+
+@pytest.mark.parametrize("cutoff", [0.0, -1.0, 146.3, np.nan])
+def test_cutoff_without_enough_points_is_refused(cutoff):
+    assert gaussian(np.ones(1024), 146.0).size == 1024
+    with pytest.raises(InputError, match="filter cut-off"):
+        gaussian(np.ones(1024), cutoff)
+
+
+# --- roundness
+
+
+@given(st.floats(0.0, 1e-3), phases, st.floats(0.01, 0.1))
+def test_eccentric_circle_gives_back_its_centre(eccentricity, direction, radius):
+    """A true circle about another centre: the axis sees e·cos(φ - α) + sqrt(R² - e²·sin²(φ - α))."""
+    turned = EVEN - direction
+    profile = eccentricity * np.cos(turned) + np.sqrt(radius**2 - (eccentricity * np.sin(turned)) ** 2)
+    found = roundness(profile[None])
+    assert_allclose(found.x, eccentricity * np.cos(direction), atol=1e-15)
+    assert_allclose(found.y, eccentricity * np.sin(direction), atol=1e-15)
+    assert_allclose(found.eccentricity, eccentricity, atol=1e-15)
+    assert_allclose(found.radius, radius, atol=0.26 * eccentricity**2 / radius + 1e-15)
+    assert_allclose(found.peak_to_valley, eccentricity**2 / (2 * radius), rtol=0.02, atol=1e-14)
+
+
+@given(amplitudes, st.integers(2, 50), phases, st.floats(-1e-3, 1e-3), st.floats(-1e-3, 1e-3))
+def test_centre_and_size_do_not_change_the_roundness(amplitude, waves, phase, x, size):
+    lobes = amplitude * np.sin(waves * EVEN + phase)
+    found = roundness((lobes + size + x * np.cos(EVEN) - 2 * x * np.sin(EVEN))[None])
+    assert_allclose(found.rms, amplitude / np.sqrt(2), rtol=1e-9, atol=1e-15)
+    assert_allclose(found.peak_to_valley, np.ptp(lobes), rtol=1e-6, atol=1e-14)
+    assert_allclose(found.peak_to_valley, 2 * amplitude, rtol=2e-3)
+    assert_allclose((found.radius[0], found.x[0], found.y[0]), (size, x, -2 * x), atol=1e-15)
+
+
+def test_least_squares_circle_is_that_of_a_general_solver():
+    profile = np.random.default_rng(2).normal(size=(3, 512))
+    angle = np.arange(512) * (TURN / 512)
+    terms = np.stack((np.ones(512), np.cos(angle), np.sin(angle)), axis=1)
+    fit, squares, *_ = np.linalg.lstsq(terms, profile.T, rcond=None)
+    found = roundness(profile)
+    assert_allclose((found.radius, found.x, found.y), fit, atol=1e-12)
+    assert_allclose(found.rms, np.sqrt(squares / 512))
+
+
+def test_roundness_of_the_long_waves_leaves_chatter_out():
+    chatter = 1e-6 * np.sin(200 * EVEN)
+    lobes = 3e-6 * np.sin(3 * EVEN) + 1e-3 * np.cos(EVEN)
+    found = roundness((lobes + chatter)[None], cutoff=50.0)
+    assert_allclose(found.rms, 3e-6 / np.sqrt(2), rtol=4e-3)
+    assert_allclose(found.x, 1e-3)
+    assert roundness((lobes + chatter)[None]).rms > 1.05 * found.rms
+
+
+# --- roughness
+
+
+@given(amplitudes, st.integers(150, 500))
+def test_roughness_of_a_sine(amplitude, waves):
+    """Ra = 2A/π and Rq = A/√2; the oval beside it belongs to the form."""
+    found = roughness((amplitude * np.sin(waves * EVEN) + 1e-4 * np.sin(2 * EVEN))[None], 50.0)
+    # At 150 UPR the filter of 50 UPR takes 1/512 of the amplitude along; of the oval it leaves 0.1 % · A.
+    oval = 1e-4 * (1 - 0.5 ** (2 / 50) ** 2)
+    assert_allclose(found.ra, 2 * amplitude / np.pi, rtol=3e-3, atol=oval)
+    assert_allclose(found.rq, np.hypot(amplitude, oval) / np.sqrt(2), rtol=3e-3)
+
+
+def test_roughness_of_white_noise_leaves_out_the_long_waves():
+    noise = np.random.default_rng(3).normal(size=(200, 1024))
+    order = np.minimum(np.arange(1024), 1024 - np.arange(1024))
+    kept = np.sqrt(np.mean((1 - 0.5 ** ((order / 100.0) ** 2)) ** 2))
+    found = roughness(noise, 100.0)
+    assert_allclose(found.rq.mean(), kept, rtol=0.01)
+    assert_allclose(found.ra.mean(), kept * np.sqrt(2 / np.pi), rtol=0.01)
+
+
+# --- all together
+
+
+@given(st.floats(0.0, 0.5))
+def test_measurement_does_not_depend_on_the_speed(swing):
+    angle = wandering(swing)
+    error = 5e-6 * np.cos(angle) + 2e-6 * np.sin(3 * angle + 0.4) + 0.1e-6 * np.sin(120 * angle)
+    found = measure(angle, error, roughness_cutoff=30.0)
+    assert_allclose(found.form.rms, np.sqrt((5e-6**2 + 2e-6**2 + 0.1e-6**2) / 2), rtol=1e-3)
+    assert_allclose(found.roundness.rms, np.sqrt((2e-6**2 + 0.1e-6**2) / 2), rtol=1e-3)
+    assert_allclose(found.undulations.amplitude[:, [1, 3]], [[5e-6, 2e-6]] * 2, rtol=1e-6)
+    assert_allclose(found.roughness.rq, 0.1e-6 / np.sqrt(2), rtol=0.02)
+
+
+def test_material_is_missing_where_the_error_is_positive():
+    angle = wandering(0.1)
+    found = measure(angle, 5e-6 * np.cos(angle))
+    assert_allclose(found.roundness.x, -5e-6)
+    assert_allclose(found.profile[:, 0], -5e-6)
+
+
+# --- files
+
+
+def test_one_profile_can_be_read_back(tmp_path):
+    radius = Harmonics(np.array([2, 7]), np.array([1e-4, 3e-6]), np.array([0.1, 2.0])).deviation(EVEN, 0.0)
+    profile_csv.write(tmp_path / "profile.csv", radius, comment="revolution 60\nof a run")
+    lines = (tmp_path / "profile.csv").read_text().splitlines()
+    assert lines[:2] == ["# revolution 60 of a run", "angle_deg,radius_um"]
+    back = read_csv(tmp_path / "profile.csv")
+    assert_allclose(back.angle, EVEN, atol=1e-12)
+    assert_allclose(back.radius, radius[None], atol=1e-15)
+
+
+def test_revolutions_with_heights_can_be_read_back(tmp_path):
+    radius = np.random.default_rng(4).normal(scale=1e-5, size=(3, 90))
+    heights = np.array([0.0, 0.25e-3, 0.5e-3])
+    profile_csv.write(tmp_path / "profile.csv", radius, heights=heights)
+    back = read_csv(tmp_path / "profile.csv")
+    assert_allclose(back.heights, heights)
+    assert_allclose(back.radius, radius, atol=1e-15)
+
+
+def test_revolutions_without_heights_are_numbered(tmp_path):
+    profile_csv.write(tmp_path / "profile.csv", np.array([[1e-6, 2e-6, 3e-6], [4e-6, 5e-6, 6e-6]]))
+    assert (tmp_path / "profile.csv").read_text().splitlines() == [
+        "angle_deg,revolution,radius_um", "0,1,1", "120,1,2", "240,1,3", "0,2,4", "120,2,5", "240,2,6",
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="header"):
+        read_csv(tmp_path / "profile.csv")
+
+
+@pytest.mark.parametrize("fault", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_profile_is_written_whole_or_not_at_all(tmp_path, monkeypatch, fault):
+    path = tmp_path / "profile.csv"
+    path.write_text("before")
+
+    def fail(file, *_, **__):
+        file.write("angle_deg,rad")
+        raise fault
+
+    monkeypatch.setattr(np, "savetxt", fail)
+    with pytest.raises((InputError, KeyboardInterrupt)):
+        profile_csv.write(path, np.zeros(8))
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_profiles_that_cannot_be_written_are_refused(tmp_path):
+    path = tmp_path / "profile.csv"
+    with pytest.raises(InputError, match="not finite"):
+        profile_csv.write(path, np.array([0.0, np.nan, 0.0]))
+    with pytest.raises(InputError, match="no feed"):
+        profile_csv.write(path, np.zeros((2, 8)), heights=np.zeros(2))
+    with pytest.raises(InputError, match="2 revolutions and 3 heights"):
+        profile_csv.write(path, np.zeros((2, 8)), heights=np.arange(3.0))
+    with pytest.raises(InputError, match="No such file"):
+        profile_csv.write(tmp_path / "nowhere" / "profile.csv", np.zeros(8))
+    assert list(tmp_path.iterdir()) == []

@@ -1,13 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The form error of the part, revolution by revolution."""
+"""The form of the part, revolution by revolution, as the workshop reads it.
+
+`form_errors` weighs the samples of a run by the angle that they stand for. All else starts from `evenly`, which
+interpolates them at even angles, so that it does not matter how fast the spindle passed a place; a profile is then an
+array of shape (revolutions, points) whose last axis goes once round from angle 0.
+
+Undulations per revolution are UPR. Terms are those of ISO 12181-1 (roundness) and ISO 21920-2 (roughness), the filter
+is that of ISO 16610-21 for closed profiles.
+"""
 
 import itertools
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+
+from lathe_rc.errors import InputError
 
 Array = npt.NDArray[np.float64]
+
+POINTS = 4096  #: even angles in a revolution, about as many as the cell has samples at 1000 rpm
+_PER_UNDULATION = 7  # points that an undulation at the filter's cut-off needs
 
 
 @dataclass(frozen=True)
@@ -17,12 +31,20 @@ class FormErrors:
     Attributes:
         rms: root mean square over the angle [m].
         largest: largest magnitude [m].
+        peak_to_valley: largest less smallest value [m].
         starts: index of the first sample of each revolution, and of the sample after the last.
     """
 
     rms: Array
     largest: Array
+    peak_to_valley: Array
     starts: npt.NDArray[np.int64]
+
+
+def _starts(turns: Array, step: Array) -> npt.NDArray[np.int64]:
+    """First sample of each complete revolution and of the one after; ``step`` in revolutions."""
+    whole = int(np.floor(turns[-1] + 2 * step[-1]))
+    return np.searchsorted(turns, np.arange(whole + 1))
 
 
 def form_errors(angle: Array, error: Array) -> FormErrors:
@@ -36,13 +58,11 @@ def form_errors(angle: Array, error: Array) -> FormErrors:
     A revolution that the run ends within is left out, unless less than two samples are missing.
     """
     if angle.size < 2:
-        return FormErrors(np.empty(0), np.empty(0), np.zeros(1, dtype=np.int64))
-    if angle.size < 2:
-        return FormErrors(np.empty(0), np.empty(0), np.zeros(1, dtype=np.int64))
+        return FormErrors(np.empty(0), np.empty(0), np.empty(0), np.zeros(1, dtype=np.int64))
     turns = angle / (2.0 * np.pi)
     step = np.diff(turns, append=2 * turns[-1] - turns[-2])
-    whole = int(np.floor(turns[-1] + 2 * step[-1]))
-    starts = np.searchsorted(turns, np.arange(whole + 1))
+    starts = _starts(turns, step)
+    whole = starts.size - 1
     edges = starts[:-1]
     squares = np.add.reduceat(error * error * step, edges)[:whole] if whole else np.empty(0)
     weight = np.add.reduceat(step, edges)[:whole] if whole else np.empty(0)
@@ -50,5 +70,218 @@ def form_errors(angle: Array, error: Array) -> FormErrors:
         # reduceat runs its last piece to the end of the array; the rest belongs to no complete revolution.
         last = slice(starts[-2], starts[-1])
         squares[-1], weight[-1] = np.sum(error[last] ** 2 * step[last]), np.sum(step[last])
-    largest = np.array([np.abs(error[a:b]).max() for a, b in itertools.pairwise(starts)])
-    return FormErrors(np.sqrt(squares / weight), largest, starts)
+    revolutions = [error[a:b] for a, b in itertools.pairwise(starts)]
+    largest = np.array([np.abs(revolution).max() for revolution in revolutions])
+    peak_to_valley = np.array([np.ptp(revolution) for revolution in revolutions])
+    return FormErrors(np.sqrt(squares / weight), largest, peak_to_valley, starts)
+
+
+def evenly(angle: Array, values: Array, points: int = POINTS) -> Array:
+    """Values of each complete revolution at the angles 0, 2π/points, …, by cubic splines.
+
+    Args:
+        angle: true spindle angle [rad], increasing, shape (n,).
+        values: of each sample, shape (n,).
+        points: in a revolution.
+
+    Returns:
+        Shape (revolutions, points); revolutions as in `form_errors`. Where the run ends up to two samples before
+        the last revolution does, the last value is held.
+
+    Raises:
+        InputError: the angle does not increase, or there are too few points.
+    """
+    if points < 3:
+        raise InputError(f"{points} points in a revolution; allowed: 3 or more")
+    if angle.size < 2:
+        return np.empty((0, points))
+    if not np.all(np.diff(angle) > 0.0):
+        k = int(np.argmin(np.diff(angle) > 0.0))
+        raise InputError(
+            f"the angle goes from {angle[k]:g} to {angle[k + 1]:g} rad at sample {k}; allowed: an increasing angle "
+            "(take the true one, not that of the encoder)"
+        )
+    turns = angle / (2.0 * np.pi)
+    whole = _starts(turns, np.array([turns[-1] - turns[-2]])).size - 1
+    at = np.arange(whole * points) / points
+    spline = CubicSpline(turns, values)
+    return np.asarray(spline(np.clip(at, turns[0], turns[-1]))).reshape(whole, points)
+
+
+@dataclass(frozen=True)
+class Undulations:
+    """Harmonics of each profile: r(φ) = Σ amplitude·sin(UPR·φ + phase), as profiles are given to the cell.
+
+    Attributes:
+        amplitude: [m], shape (revolutions, highest UPR + 1); UPR 0 is the magnitude of the mean.
+        phase: [rad], from -π to π, the same shape.
+    """
+
+    amplitude: Array
+    phase: Array
+
+
+def undulations(profile: Array, highest: int) -> Undulations:
+    """Harmonics up to ``highest`` UPR of profiles at even angles [m], shape (revolutions, points).
+
+    Raises:
+        InputError: the profile has too few points for so many undulations.
+    """
+    points = profile.shape[-1]
+    if not 0 <= highest < points / 2:
+        raise InputError(
+            f"harmonics up to {highest} UPR of {points} points; allowed: from 0, less than half the points"
+        )
+    waves = np.fft.rfft(profile, axis=-1)[..., : highest + 1] / points
+    waves[..., 1:] *= 2.0
+    return Undulations(np.abs(waves), np.angle(1j * waves))
+
+
+def gaussian(profile: Array, cutoff: float) -> Array:
+    """The long waves of profiles, by the Gaussian filter of ISO 16610-21 for closed profiles.
+
+    An undulation of n UPR keeps exp(-π·(α·n/cutoff)²) of its amplitude, α = sqrt(ln 2/π): half of it at the cut-off.
+
+    Args:
+        profile: at even angles [m], shape (revolutions, points); so is the result.
+        cutoff: [UPR]; ISO 12181-2 has 15, 50, 150, 500 and 1500.
+
+    Raises:
+        InputError: the cut-off leaves less than seven points in an undulation.
+    """
+    points = profile.shape[-1]
+    if not 0.0 < cutoff <= points / _PER_UNDULATION:
+        raise InputError(
+            f"filter cut-off {cutoff:g} UPR for {points} points; allowed: above 0 and up to a seventh of the points"
+        )
+    order = np.arange(points // 2 + 1)
+    kept = np.exp(-np.log(2.0) * (order / cutoff) ** 2)
+    return np.fft.irfft(np.fft.rfft(profile, axis=-1) * kept, n=points, axis=-1)
+
+
+@dataclass(frozen=True)
+class Roundness:
+    """Least-squares circle of each profile and the deviation from it, shape (revolutions,).
+
+    Attributes:
+        radius: of the circle, as deviation from the radius that the profile is measured from [m].
+        x, y: its centre [m], x at angle 0 and y at π/2.
+        peak_to_valley: RONt [m].
+        rms: RONq [m].
+    """
+
+    radius: Array
+    x: Array
+    y: Array
+    peak_to_valley: Array
+    rms: Array
+
+    @property
+    def eccentricity(self) -> Array:
+        """Distance of the centre from the axis [m]."""
+        return np.hypot(self.x, self.y)
+
+
+def roundness(profile: Array, cutoff: float | None = None) -> Roundness:
+    """Least-squares circle (LSCI of ISO 12181-1) and roundness deviations from it.
+
+    The circle is R + x·cos φ + y·sin φ, its form for a centre near the axis. An eccentric true circle of radius R
+    seems out of round by e²/2R.
+
+    Args:
+        profile: radius deviations at even angles [m], shape (revolutions, points).
+        cutoff: the deviations are those of the long waves up to this [UPR], see `gaussian`; None: all.
+
+    Raises:
+        InputError: see `gaussian`.
+    """
+    angle = 2.0 * np.pi * np.arange(profile.shape[-1]) / profile.shape[-1]
+    cosine, sine = np.cos(angle), np.sin(angle)
+    radius = profile.mean(axis=-1)
+    x, y = 2.0 * (profile * cosine).mean(axis=-1), 2.0 * (profile * sine).mean(axis=-1)
+    circle = radius[..., None] + x[..., None] * cosine + y[..., None] * sine
+    deviation = profile - circle
+    if cutoff is not None:
+        deviation = gaussian(deviation, cutoff)
+    return Roundness(radius, x, y, np.ptp(deviation, axis=-1), np.sqrt((deviation**2).mean(axis=-1)))
+
+
+@dataclass(frozen=True)
+class Roughness:
+    """Roughness around the part, shape (revolutions,).
+
+    Attributes:
+        ra: arithmetic mean deviation [m].
+        rq: root mean square deviation [m].
+    """
+
+    ra: Array
+    rq: Array
+
+
+def roughness(profile: Array, cutoff: float) -> Roughness:
+    """Ra and Rq of what the Gaussian filter takes away: undulations above ``cutoff`` UPR, half of those at it.
+
+    A revolution that does not end where it began has a step there, whose sharp part counts as roughness.
+
+    Args:
+        profile: at even angles [m], shape (revolutions, points).
+        cutoff: [UPR].
+
+    Raises:
+        InputError: see `gaussian`.
+    """
+    short = profile - gaussian(profile, cutoff)
+    return Roughness(np.abs(short).mean(axis=-1), np.sqrt((short**2).mean(axis=-1)))
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What the workshop reads of each complete revolution.
+
+    Attributes:
+        profile: deviation of the part's radius from the desired form at even angles [m], shape (revolutions, points).
+        form: its RMS and extremes, from the samples themselves.
+        undulations, roundness, roughness: of the profile.
+    """
+
+    profile: Array
+    form: FormErrors
+    undulations: Undulations
+    roundness: Roundness
+    roughness: Roughness
+
+
+def measure(
+    angle: Array,
+    error: Array,
+    *,
+    points: int = POINTS,
+    highest: int = 50,
+    roundness_cutoff: float | None = None,
+    roughness_cutoff: float = 50.0,
+) -> Measurement:
+    """Measure the part that a run has turned.
+
+    The form error is desired less actual, so the part's radius deviates by its opposite: where the error is
+    positive, material is missing.
+
+    Args:
+        angle: true spindle angle [rad], increasing, shape (n,).
+        error: form error [m], shape (n,).
+        points: even angles in a revolution.
+        highest: of the undulations [UPR].
+        roundness_cutoff: see `roundness`.
+        roughness_cutoff: see `roughness` [UPR].
+
+    Raises:
+        InputError: too few points for the undulations or for a cut-off, or an angle that does not increase.
+    """
+    profile = -evenly(angle, error, points)
+    return Measurement(
+        profile,
+        form_errors(angle, error),
+        undulations(profile, highest),
+        roundness(profile, roundness_cutoff),
+        roughness(profile, roughness_cutoff),
+    )

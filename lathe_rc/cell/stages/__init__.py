@@ -4,10 +4,23 @@
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
 from lathe_rc.cell.stages.learning_controller import LearningController
+from lathe_rc.cell.stages.piezo_actuator import PiezoActuator
 from lathe_rc.cell.stages.profile import ProfileStage
+from lathe_rc.cell.stages.series_drive import SeriesDriveStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.tool import Tool
+from lathe_rc.cell.stages.vibration import Vibration
 
 STAGES: dict[str, type[Stage]] = {
-    stage.kind: stage for stage in (SpindleEncoder, LearningController, ElectrodynamicActuator, ProfileStage, Tool)
+    stage.kind: stage
+    for stage in (
+        SpindleEncoder,
+        ProfileStage,
+        LearningController,
+        ElectrodynamicActuator,
+        PiezoActuator,
+        SeriesDriveStage,
+        Vibration,
+        Tool,
+    )
 }

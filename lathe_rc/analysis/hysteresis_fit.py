@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identification of a Prandtl-Ishlinskii hysteresis from a measured loop.
+
+A play's output depends on its threshold and the input alone, so for given thresholds the displacement is linear in
+the weights,
+
+    y = y0 + p0·u + Σ p_i·F_i(u),    p0, p_i >= 0,
+
+and least squares with bounds find them. What the plays remember of the time before the record is unknown; the fit
+begins where the input has passed through its range for the first time, for by then it has taken every play along.
+
+The loop must be quasi-static: the lag of a fast drive would be taken for hysteresis.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import lsq_linear
+
+from lathe_rc.errors import InputError
+from lathe_rc.plants.hysteresis import THRESHOLDS, PrandtlIshlinskii, check_thresholds, plays
+from lathe_rc.signals.table import read_table
+
+Array = npt.NDArray[np.float64]
+
+_HEADER = ("command_um", "displacement_um")
+_WHOLE = 0.95  # of the range counts as all of it
+_LEAST = 1e-9  # a slope below this cannot be inverted
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A measured loop.
+
+    Args:
+        command: displacement that the voltage stands for [m], shape (n,).
+        displacement: measured [m], shape (n,).
+
+    Raises:
+        InputError: not as many of each, none at all, or a number that is not finite.
+    """
+
+    command: Array
+    displacement: Array
+
+    def __post_init__(self) -> None:
+        command, displacement = self.command, self.displacement
+        if command.size != displacement.size or not command.size:
+            raise InputError(
+                f"hysteresis loop: {command.size} commands and {displacement.size} displacements; give as many of "
+                "each, at least one"
+            )
+        if not (np.all(np.isfinite(command)) and np.all(np.isfinite(displacement))):
+            raise InputError("hysteresis loop: not all numbers are finite; remove those that are not")
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What a fit found, relative to the half-stroke.
+
+    Attributes:
+        model: the hysteresis.
+        offset: of the displacement [m].
+        residual: RMS of what the model leaves, over that of the displacement about its mean.
+    """
+
+    model: PrandtlIshlinskii
+    offset: float
+    residual: float
+
+
+def identify(loop: Loop, stroke: float, thresholds: Array = THRESHOLDS) -> Identified:
+    """Fit the weights to a loop.
+
+    Args:
+        loop: the measurement; one and a half loops or more.
+        stroke: half-stroke of the drive [m].
+        thresholds: of the plays, relative to the half-stroke, increasing, shape (n,).
+
+    Raises:
+        InputError: thresholds out of order, or a loop that does not return, does not move a play, or has no slope.
+    """
+    check_thresholds(thresholds)
+    command = loop.command / stroke
+    low, high = command.min(), command.max()
+    whole = _WHOLE * (high - low)
+    start = int(np.argmax(np.maximum.accumulate(command) - np.minimum.accumulate(command) >= whole))
+    command, displacement = command[start:], loop.displacement[start:] / stroke
+    if np.ptp(command) < whole or high == low:
+        raise InputError(
+            f"hysteresis loop: the command does not go through its range of {(high - low) * stroke * 1e6:.4g} µm and "
+            "back again; record one and a half loops or more"
+        )
+    # A play turns over when the input turns by twice its threshold.
+    idle = thresholds[2.0 * thresholds >= whole]
+    if idle.size:
+        raise InputError(
+            f"hysteresis loop: a range of {(high - low) * stroke * 1e6:.4g} µm does not take a play of "
+            f"{idle[0] * stroke * 1e6:.4g} µm to each side along; allowed: a wider loop, or thresholds below "
+            f"{whole / 2.0:.4g} of the stroke"
+        )
+    side = 1.0 if command[0] > (low + high) / 2.0 else -1.0
+    known = plays(thresholds, command[0] - side * thresholds, command)
+    columns = np.column_stack((np.ones_like(command), command, known))
+    bounds = np.append(-np.inf, np.zeros(thresholds.size + 1))
+    fit = lsq_linear(columns, displacement, (bounds, np.inf), method="bvls")
+    offset, proportional, weights = fit.x[0], fit.x[1], fit.x[2:]
+    if proportional < _LEAST:
+        raise InputError(
+            f"hysteresis loop: proportional part {proportional:.3g}; allowed: above 0 (does the displacement rise "
+            "with the command?)"
+        )
+    left = displacement - columns @ fit.x
+    residual = float(np.sqrt(np.mean(left**2)) / np.std(displacement))
+    return Identified(PrandtlIshlinskii(thresholds, weights, float(proportional)), float(offset) * stroke, residual)
+
+
+def read_csv(path: Path) -> Loop:
+    """Read a loop from a CSV file with the columns ``command_um`` and ``displacement_um`` [µm], in order of time.
+
+    Raises:
+        InputError: the file is missing or malformed, or holds a number that is not finite.
+    """
+    _, rows = read_table(path, [_HEADER], "hysteresis loop")
+    if not rows.size:
+        raise InputError(f"{path}: no points; give one and a half loops or more")
+    return Loop(*(rows.T * 1e-6))
+
+
+def from_signals(
+    dense: Mapping[str, Mapping[str, Array]], command: str = "/fine/command", state: str = "/fine/state"
+) -> Loop:
+    """A loop from the signals of a recorded run.
+
+    Args:
+        dense: of a `lathe_rc.cell.recording.Recording`, as `lathe_rc.bag.reader.read` gives it.
+        command: topic with the drive's command; its linearisation must be off.
+        state: topic with the drive's state.
+
+    Raises:
+        InputError: a topic is not there.
+    """
+    for topic in (command, state):
+        if topic not in dense:
+            raise InputError(f"{topic} is not in the recording; there are {', '.join(sorted(dense)) or 'no topics'}")
+    return Loop(dense[command]["position"], dense[state]["measured_position"])

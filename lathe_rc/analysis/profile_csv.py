@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Profiles as CSV files, in the columns that `lathe_rc.signals.profile.read_csv` reads."""
+
+import contextlib
+import os
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import InputError
+
+Array = npt.NDArray[np.float64]
+
+_CLOSEST = 1e-9  # [m] between two heights, as the reader wants it
+
+
+def _columns(radius: Array, heights: Array | None) -> tuple[str, Array]:
+    """Header and rows."""
+    points = radius.shape[-1]
+    angle = 360.0 * np.arange(points) / points
+    if radius.ndim == 1:
+        return "angle_deg,radius_um", np.stack((angle, radius * 1e6), axis=1)
+    revolutions = radius.shape[0]
+    if heights is None:
+        name, places = "revolution", np.arange(1.0, revolutions + 1.0)
+    else:
+        if heights.size != revolutions:
+            raise InputError(f"profile of {revolutions} revolutions and {heights.size} heights; give as many of each")
+        if np.any(np.diff(np.sort(heights)) < _CLOSEST):
+            raise InputError(
+                f"heights of a profile less than {_CLOSEST:g} m apart (no feed?); give none, or write one revolution"
+            )
+        name, places = "height_mm", heights * 1e3
+    rows = (np.tile(angle, revolutions), np.repeat(places, points), radius.ravel() * 1e6)
+    return f"angle_deg,{name},radius_um", np.stack(rows, axis=1)
+
+
+def write(path: Path, radius: Array, *, heights: Array | None = None, comment: str = "") -> None:
+    """Write profiles at even angles, whole or not at all; an existing file is replaced.
+
+    The columns are ``angle_deg,radius_um`` for one profile, ``angle_deg,height_mm,radius_um`` for several with
+    heights (both can be read back as a profile), and ``angle_deg,revolution,radius_um`` for several without, the
+    first being revolution 1.
+
+    Args:
+        path: of the file.
+        radius: radius deviations or form errors [m], shape (points,) or (revolutions, points).
+        heights: position along the part of each revolution [m], shape (revolutions,).
+        comment: a line at the top of the file.
+
+    Raises:
+        InputError: a number that is not finite, heights that coincide, or a place that cannot be written to.
+    """
+    if not np.all(np.isfinite(radius)):
+        raise InputError(f"{path}: the profile holds numbers that are not finite; write revolutions without them")
+    header, rows = _columns(radius, heights)
+    if comment:
+        header = f"# {' '.join(comment.split())}\n{header}"
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with unfinished.open("w", encoding="utf-8") as file:
+            np.savetxt(file, rows, fmt="%.12g", delimiter=",", header=header, comments="")
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+    finally:
+        with contextlib.suppress(OSError):  # gone, unless writing failed
+            unfinished.unlink()

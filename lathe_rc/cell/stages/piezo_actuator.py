@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fine piezo tool drive."""
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+
+from lathe_rc.analysis.learning import Response
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.stage import Joint, Output, Sparse
+from lathe_rc.cell.stages.drive import Drive
+from lathe_rc.cell.stages.set_point import SetPoint, SetPointParameters
+from lathe_rc.errors import InputError
+from lathe_rc.plants.hysteresis import (
+    THRESHOLDS,
+    WEIGHTS,
+    BoucWen,
+    BoucWenInverse,
+    Hysteresis,
+    PrandtlIshlinskii,
+    PrandtlIshlinskiiInverse,
+)
+from lathe_rc.plants.linear import Discretisation
+from lathe_rc.plants.piezo import PiezoDrive, Stack
+from lathe_rc.signals.noise import Sensor
+
+
+class PiezoActuatorParameters(SetPointParameters):
+    """Set point, resonance 1/(1 + 2ζp/ωn + p²/ωn²), amplifier, hysteresis and its linearisation, creep, sensor."""
+
+    natural_frequency: Annotated[float, Gt(0)] = parameter(14600.0, "natural frequency ωn", "rad/s")
+    damping: Annotated[float, Gt(0)] = parameter(0.299, "damping ratio ζ; 0.02 for a bare actuator", "1")
+    amplifier_lag: Annotated[float, Ge(0), Le(0.1)] = parameter(
+        0.0, "time constant of the amplifier; 0: none; 40e-6 for a bare actuator", "s"
+    )
+    discretisation: Discretisation = parameter("foh", "foh: exact for a command linear between samples; or tustin")
+    stroke: Annotated[float, Gt(0)] = parameter(15e-6, "displacement at plus and minus full voltage", "m")
+    full_voltage: Annotated[float, Gt(0)] = parameter(100.0, "voltage from the middle at the full stroke", "V")
+    hysteresis: Literal["none", "prandtl_ishlinskii", "bouc_wen"] = parameter(
+        "prandtl_ishlinskii", "hysteresis of the ceramics, relative to the stroke"
+    )
+    play_thresholds: list[Annotated[float, Gt(0)]] = parameter(
+        [], "prandtl_ishlinskii: increasing thresholds of the plays; empty: ten, i/11"
+    )
+    play_weights: list[float] = parameter([], "prandtl_ishlinskii: their weights; empty: ten of 0.04767")
+    play_proportional: Annotated[float, Gt(0)] = parameter(0.7617, "prandtl_ishlinskii: weight p0 of no play")
+    bouc_wen_a: Annotated[float, Gt(0)] = parameter(0.33, "bouc_wen: A")
+    bouc_wen_beta: float = parameter(0.7, "bouc_wen: β")
+    bouc_wen_gamma: float = parameter(0.3, "bouc_wen: γ")
+    linearisation: Literal["none", "inverse"] = parameter("inverse", "inverse: the hysteresis is undone beforehand")
+    identified_scale: Annotated[float, Gt(0)] = parameter(
+        1.0, "error of its identification: factor on the weights of the plays, or on A; 0.85 is 15 % low"
+    )
+    creep_per_decade: Annotated[float, Ge(0), Le(1)] = parameter(
+        0.0, "creep in each decade of time relative to the displacement; 0: none"
+    )
+    creep_shortest: Annotated[float, Gt(0)] = parameter(0.1, "shortest time constant of the creep", "s")
+    creep_decades: Annotated[int, Ge(1), Le(12)] = parameter(3, "time constants of the creep, a decade apart")
+    noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
+    resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
+
+    def _operators(self) -> tuple[Hysteresis, Hysteresis]:
+        """The hysteresis and the inverse of what was identified."""
+        if self.hysteresis == "bouc_wen":
+            bouc_wen = BoucWen(self.bouc_wen_a, self.bouc_wen_beta, self.bouc_wen_gamma)
+            return bouc_wen, BoucWenInverse(bouc_wen.identified(self.identified_scale))
+        plays = PrandtlIshlinskii(
+            np.array(self.play_thresholds) if self.play_thresholds else THRESHOLDS,
+            np.array(self.play_weights) if self.play_weights else WEIGHTS,
+            self.play_proportional,
+        )
+        return plays, PrandtlIshlinskiiInverse(plays.identified(self.identified_scale))
+
+    def stack(self, node: str) -> Stack:
+        """Amplifier and ceramics of a node, at rest.
+
+        Raises:
+            InputError: a hysteresis without an inverse, or a lag far shorter than the step.
+        """
+        try:
+            forward, inverse = self._operators() if self.hysteresis != "none" else (None, None)
+            return Stack(
+                stroke=self.stroke,
+                amplifier_lag=self.amplifier_lag,
+                hysteresis=forward,
+                inverse=inverse if self.linearisation == "inverse" else None,
+                creep_per_decade=self.creep_per_decade,
+                creep_times=self.creep_shortest * np.logspace(0, self.creep_decades - 1, self.creep_decades),
+                step=self.step,
+                method=self.discretisation,
+            )
+        except InputError as error:
+            raise InputError(f"{node}: {error}") from None
+
+
+class PiezoActuator(Drive):
+    """See `lathe_rc.plants.piezo`.
+
+    Attributes:
+        parameters: its table.
+        drive: the machine.
+    """
+
+    kind = "piezo_actuator"
+    Parameters = PiezoActuatorParameters
+
+    def __init__(self, name: str, parameters: PiezoActuatorParameters) -> None:
+        super().__init__(name, parameters)
+        self.parameters = parameters
+        self.drive = PiezoDrive(
+            parameters.stack(name),
+            natural_frequency=parameters.natural_frequency,
+            damping=parameters.damping,
+            full_voltage=parameters.full_voltage,
+            step=parameters.step,
+            method=parameters.discretisation,
+        )
+        self._set_point = SetPoint(name, parameters)
+        self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
+        self.declare(
+            inputs=self._set_point.inputs,
+            outputs=[Output("fine/state", messages.STATE, Joint("position", "velocity", "effort"))],
+        )
+
+    def responses(self) -> Mapping[str, Response]:
+        """See `Drive`."""
+        return {"fine/command": self.drive.response}
+
+    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+        """See `Stage`."""
+        (state,) = outputs
+        set_point = np.empty_like(state["position"])
+        self._set_point.fill(inputs, set_point)
+        self.drive.block(set_point, state["position"], state["velocity"], state["effort"])
+        self._sensor.measure(state["position"], state["measured_position"])
+        return []

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Piezo and tool on the coarse carriage: both drives as one stage, for no block may cut what couples them."""
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+from pydantic import create_model
+
+from lathe_rc.analysis.learning import Response
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.stage import Input, Joint, Output, Sparse
+from lathe_rc.cell.stages.drive import Drive, Limits
+from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
+from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters
+from lathe_rc.cell.stages.set_point import SetPoint
+from lathe_rc.errors import InputError
+from lathe_rc.plants.linear import Discretisation
+from lathe_rc.plants.series import SeriesDrive
+from lathe_rc.signals.noise import Sensor
+
+T = TypeVar("T", bound=NodeParameters)
+
+_COARSE = "coarse"  # the displacement that the drive knows itself
+
+
+_SHARED = (*NodeParameters.model_fields, "discretisation")  # one value for both drives
+
+
+def _own(table: type[NodeParameters]) -> list[str]:
+    """The parameters of a drive that stand in the series drive's table under a prefix."""
+    return [name for name in table.model_fields if name not in _SHARED]
+
+
+class SeriesParameters(NodeParameters):
+    """What the series drive has beyond the parameters of both drives."""
+
+    mass_ratio: Annotated[float, Ge(0), Le(1)] = parameter(0.1, "mass of the tool over coarse_moving_mass", "1")
+    discretisation: Discretisation = parameter("foh", "foh: exact for commands linear between samples; or tustin")
+
+    def _half(self, prefix: str, table: type[T]) -> T:
+        own = {name: getattr(self, prefix + name) for name in _own(table)}
+        return table(**own, **{name: getattr(self, name) for name in _SHARED})
+
+    @property
+    def coarse(self) -> ElectrodynamicActuatorParameters:
+        """The table of the coarse drive."""
+        return self._half("coarse_", ElectrodynamicActuatorParameters)
+
+    @property
+    def fine(self) -> PiezoActuatorParameters:
+        """The table of the fine drive."""
+        return self._half("fine_", PiezoActuatorParameters)
+
+
+def _prefixed(prefix: str, table: type[NodeParameters]) -> dict[str, Any]:
+    fields = table.model_fields
+    return {prefix + name: (fields[name].annotation, fields[name]) for name in _own(table)}
+
+
+SeriesDriveParameters = create_model(
+    "SeriesDriveParameters",
+    __base__=SeriesParameters,
+    __doc__="Both drives as one mechanical system (paper 001, Fig. 1b); the tool is at the sum of both states.",
+    __module__=__name__,
+    **{
+        **_prefixed("coarse_", ElectrodynamicActuatorParameters),
+        **_prefixed("fine_", PiezoActuatorParameters),
+        "coarse_moving_mass": (Annotated[float, Gt(0)], parameter(1.2, "carriage and coil, without the tool", "kg")),
+    },
+)
+
+
+class SeriesDriveStage(Drive):
+    """See `lathe_rc.plants.series`.
+
+    Attributes:
+        parameters: its table.
+        drive: the machine.
+    """
+
+    kind = "series_drive"
+    Parameters = SeriesDriveParameters
+
+    def __init__(self, name: str, parameters: SeriesParameters) -> None:
+        super().__init__(name, parameters)
+        self.parameters = parameters
+        coarse, fine = parameters.coarse, parameters.fine
+        stack = fine.stack(name)
+        try:
+            self.drive = SeriesDrive(
+                stack,
+                carriage_frequency=coarse.natural_frequency,
+                carriage_damping=coarse.damping,
+                delay=coarse.delay,
+                carriage_stroke=coarse.stroke,
+                moving_mass=coarse.moving_mass,
+                force_constant=coarse.force_constant,
+                tool_frequency=fine.natural_frequency,
+                tool_damping=fine.damping,
+                full_voltage=fine.full_voltage,
+                mass_ratio=parameters.mass_ratio,
+                feedback=_COARSE in fine.compensates,
+                resolution=coarse.resolution,
+                step=parameters.step,
+                method=parameters.discretisation,
+            )
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from None
+        self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
+        self._set_point = SetPoint(name, fine, inside=(_COARSE,))
+        # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
+        self._coarse_noise = Sensor(coarse.noise_rms, 0.0, parameters.seed, f"{name}/coarse")
+        self._fine_sensor = Sensor(fine.noise_rms, fine.resolution, parameters.seed, f"{name}/fine")
+        self.declare(
+            inputs=[Input("coarse/command", messages.COMMAND, ("position",)), *self._set_point.inputs],
+            outputs=[
+                Output("coarse/state", messages.STATE, Joint("position", "velocity", "effort")),
+                Output("fine/state", messages.STATE),
+            ],
+        )
+
+    def responses(self) -> Mapping[str, Response]:
+        """See `Drive`."""
+        return {"coarse/command": self.drive.coarse_response, "fine/command": self.drive.response}
+
+    def limits(self) -> Mapping[str, Limits]:
+        """See `Drive`."""
+        return {"coarse/state": self._limits}
+
+    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+        """See `Stage`."""
+        command, *others = inputs
+        coarse, fine = outputs
+        set_point, noise = np.empty((2, coarse["position"].size))
+        self._set_point.fill(others, set_point)
+        self._coarse_noise.measure(np.zeros_like(noise), noise)
+        self.drive.block(
+            first, command["position"], set_point, noise,
+            coarse["position"], coarse["velocity"], coarse["effort"], coarse["measured_position"],
+            fine["position"], fine["velocity"], fine["effort"],
+        )  # fmt: skip
+        self._fine_sensor.measure(fine["position"], fine["measured_position"])
+        return []

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Vibration of the tool against the part, as a source of displacement."""
+
+import zlib
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
+from lathe_rc.errors import InputError
+from lathe_rc.signals import vibration
+from lathe_rc.signals.noise import Sensor
+
+
+class VibrationParameters(NodeParameters):
+    """Random vibration within a band, harmonic lines, and the sensor that measures their sum."""
+
+    random_rms: Annotated[float, Ge(0)] = parameter(0.2e-6, "random vibration: RMS; 0: none", "m")
+    random_low: Annotated[float, Gt(0)] = parameter(200.0, "lower end of its band", "rad/s")
+    random_high: Annotated[float, Gt(0)] = parameter(2000.0, "upper end of its band", "rad/s")
+    random_lines: Annotated[int, Ge(1), Le(1024)] = parameter(32, "spectral lines that it is made of")
+    line_amplitude: list[float] = parameter([], "harmonic vibrations: amplitudes", "m")
+    line_frequency: list[Annotated[float, Gt(0)]] = parameter([], "their frequencies", "rad/s")
+    line_phase: list[float] = parameter([], "their phases at sample 0; empty: all 0", "rad")
+    noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the sensor, RMS; 0: none", "m")
+    resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the sensor; 0: none", "m")
+
+
+class Vibration(Stage):
+    """See `lathe_rc.signals.vibration`.
+
+    Attributes:
+        parameters: its table.
+        lines: amplitude [m], frequency [rad/s] and phase [rad] of each line, shape (3, n).
+    """
+
+    kind = "vibration"
+    Parameters = VibrationParameters
+
+    def __init__(self, name: str, parameters: VibrationParameters) -> None:
+        super().__init__(name, parameters)
+        self.parameters = parameters
+        # Two vibrations of a cell differ by their names; the 1 keeps each apart from its own sensor.
+        random = np.random.default_rng(np.random.SeedSequence([parameters.seed, zlib.crc32(name.encode()), 1]))
+        phase = parameters.line_phase or [0.0] * len(parameters.line_amplitude)
+        given = vibration.harmonic(
+            np.array(parameters.line_amplitude), np.array(parameters.line_frequency), np.array(phase)
+        )
+        drawn = vibration.band_limited_random(
+            parameters.random_rms, parameters.random_low, parameters.random_high, parameters.random_lines, random
+        )
+        self.lines = np.concatenate((given, drawn), axis=1)
+        nyquist = np.pi / parameters.step
+        if self.lines[1].max(initial=0.0) >= nyquist:
+            raise InputError(
+                f"{name}: vibration at {self.lines[1].max():g} rad/s; allowed: below {nyquist:g} rad/s, half the "
+                "sample rate"
+            )
+        self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
+        self.declare(
+            # The angle itself is not used: the spindle's blocks say which samples are due.
+            inputs=[Input("encoder", messages.ENCODER, ("angle",))],
+            outputs=[Output("vibration/state", messages.STATE, Joint("position", "velocity"))],
+        )
+
+    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+        """See `Stage`."""
+        (state,) = outputs
+        vibration.evaluate(first, self.parameters.step, self.lines, state["position"], state["velocity"])
+        state["effort"][:] = 0.0
+        self._sensor.measure(state["position"], state["measured_position"])
+        return []

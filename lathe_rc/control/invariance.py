@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Correction that makes a first-order plant the same in the angle at any spindle speed.
+
+The plant is 1/(1 + T0·p). Two elements stand before it, the substitute first (paper 000, eqs 13-17):
+
+    Wk2:  (θ0/Ω)·dv/dt + v = Y          the plant that is wanted, 1/(1 + θ0·s) in the angle
+    Wk1:  u = v + T0·dv/dt              the inverse of the plant that there is
+
+so that the plant's output is v itself, however the speed varies. dv/dt = (Ω/θ0)·(Y - v) is known from Wk2, so
+nothing is differentiated. Operators with varying parameters do not commute: Wk1 before Wk2 is not the same.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import LatheError
+from lathe_rc.jit import kernel
+
+Array = npt.NDArray[np.float64]
+
+
+@kernel
+def _advance(
+    time_constant: float,
+    angle_constant: float,
+    state: Array,
+    angle: Array,
+    speed: Array,
+    desired: Array,
+    substitute: Array,
+    command: Array,
+) -> int:
+    """Step through a block; returns the sample at which the spindle turns back, or the number of samples.
+
+    ``state`` holds v, and angle and Y of the sample before; the angle is NaN before the first.
+    """
+    v, last_angle, last = state[0], state[1], state[2]
+    for k in range(angle.size):
+        h = (angle[k] - last_angle) / angle_constant
+        if h < 0.0:
+            return k
+        if h > 0.0:
+            # In the angle the equation has constant coefficients: exact for Y linear in the angle over the step.
+            part = -np.expm1(-h)
+            mean = part / h
+            v += (last - v) * part + (desired[k] - last) * (1.0 - mean)
+        last_angle, last = angle[k], desired[k]
+        substitute[k] = v
+        command[k] = v + time_constant * speed[k] / angle_constant * (desired[k] - v)
+    state[0], state[1], state[2] = v, last_angle, last
+    return angle.size
+
+
+class FirstOrderInvariance:
+    """Wk2 and Wk1 before a first-order plant; at rest before the first sample.
+
+    Args:
+        time_constant: T0 of the plant [s].
+        angle_constant: θ0 of the substitute [rad]; T0·Ω0 makes it the plant at the nominal speed.
+    """
+
+    def __init__(self, time_constant: float, angle_constant: float) -> None:
+        self._time_constant, self._angle_constant = time_constant, angle_constant
+        self._state = np.array([0.0, np.nan, 0.0])
+
+    def block(self, *, angle: Array, speed: Array, desired: Array, substitute: Array, command: Array) -> None:
+        """Step through a block; all arrays have the shape (n,).
+
+        Args:
+            angle: spindle angle [rad], not falling.
+            speed: spindle speed Ω [rad/s].
+            desired: Y, in any unit; linear in the angle between samples.
+            substitute: filled with v, the output of Wk2, which is what the plant will do.
+            command: filled with u, the input of the plant.
+
+        Raises:
+            LatheError: the angle falls.
+        """
+        reached = _advance(
+            self._time_constant, self._angle_constant, self._state, angle, speed, desired, substitute, command
+        )  # fmt: skip
+        if reached < angle.size:
+            raise LatheError(f"the spindle turns back to {angle[reached]:.6g} rad; invariance needs a rising angle")

@@ -1,0 +1,320 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rate-independent hysteresis of piezo ceramics, and the inverse operators that linearise it.
+
+Input and output are relative: 1 is the half-stroke, at full voltage. Nothing here knows of time: the output
+depends on the path of the input alone, and on each monotone piece of it only on where the piece ends.
+
+Prandtl-Ishlinskii: weighted plays beside a proportional part,
+
+    y = p0·u + Σ p_i·F_i(u),    F_i ← max(u - r_i, min(u + r_i, F_i)).
+
+Its inverse is such an operator as well (Kuhnen 2003, "Modeling, identification and compensation of complex
+hysteretic nonlinearities"); it exists while all partial slopes p0 + p_1 + ... + p_i are positive.
+
+Bouc-Wen with n = 1, written in u so that the rate cancels:
+
+    y = g·(u - h),    dh = A·du - β·h·|du| - γ·|h|·du,
+
+g such that a steady loop over ±1 ends at ±1. While u goes one way, h obeys a linear equation in u with one change
+of rate where h passes 0, so a step of any length is taken exactly. The inverse solves that step for its length,
+sample by sample; it exists while dy/du = g·(1 - dh/du) is positive, which is 2Aβ/(β + γ) < 1.
+
+Source: spec/learning.md; paper 001 for the loop of 10-15 % that the linearisation has to remove.
+"""
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import brentq
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+
+Array = npt.NDArray[np.float64]
+
+#: Ten plays; with them the loop over ±1 is 13 % of its height wide and ends at ±1.
+THRESHOLDS = np.arange(1, 11) / 11
+WEIGHTS = np.full(10, 0.04767)
+PROPORTIONAL = 0.7617
+
+_LINEAR, _PLAYS, _BOUC_WEN, _BOUC_WEN_INVERSE = 0, 1, 2, 3
+
+
+class Law(NamedTuple):
+    """An operator as kernels take it: which one, and its constants; its state is an array of its own."""
+
+    kind: int
+    table: Array
+
+
+LINEAR = Law(_LINEAR, np.empty((0, 0)))  #: output = input; it has no state
+
+
+class Hysteresis(Protocol):
+    """An operator with memory, at rest at 0 when made.
+
+    Attributes:
+        law: for kernels that step it themselves, see `advance`.
+        state: its memory, shape (n,).
+        steepest: largest slope dy/du that it can have.
+    """
+
+    law: Law
+    state: Array
+    steepest: float
+
+    def block(self, value: Array, result: Array) -> None:
+        """Step through a block; relative input and output, shape (n,)."""
+
+
+@kernel
+def _relax(rate: float, travel: float) -> float:
+    """(1 - e^{-rate·travel})/rate, which is the travel itself where the rate is 0."""
+    x = rate * travel
+    # Below, the next term x/2 is less than rounding, and the quotient of subnormal numbers would be more.
+    if x < 1e-17:
+        return travel
+    return float(-np.expm1(-x) / rate)
+
+
+@kernel
+def _travel(rate: float, relaxed: float) -> float:
+    """Inverse of `_relax`."""
+    x = rate * relaxed
+    if x < 1e-17:
+        return relaxed
+    return float(-np.log1p(-x) / rate)
+
+
+@kernel
+def _move(h: float, travel: float, shape: Array) -> float:
+    """The hysteretic part after ``travel`` >= 0; positive in the direction of travel, as ``h`` is."""
+    a, beta, gamma = shape[0], shape[1], shape[2]
+    if h < 0.0:
+        slope = a - (beta - gamma) * h
+        to_zero = _travel(beta - gamma, -h / slope)
+        if travel < to_zero:
+            return float(h + slope * _relax(beta - gamma, travel))
+        h, travel = 0.0, travel - to_zero
+    return float(h + (a - (beta + gamma) * h) * _relax(beta + gamma, travel))
+
+
+@kernel
+def _solve(slope: float, rate: float, target: float) -> float:
+    """The d with d - slope·(1 - e^{-rate·d})/rate = target, for 0 <= slope < 1.
+
+    The left side is convex and rises, and the start is not below the root: Newton's steps go down to it.
+    """
+    d = target / (1.0 - slope)
+    while True:
+        better = d - (d - slope * _relax(rate, d) - target) / (1.0 - slope * np.exp(-rate * d))
+        if not better < d:
+            return d
+        d = better
+
+
+@kernel
+def _needed(h: float, target: float, shape: Array) -> float:
+    """Travel in which travel less the gain of the hysteretic part is ``target`` >= 0; ``h`` as in `_move`."""
+    a, beta, gamma = shape[0], shape[1], shape[2]
+    travel = 0.0
+    if h < 0.0:
+        slope = a - (beta - gamma) * h
+        to_zero = _travel(beta - gamma, -h / slope)
+        if target < to_zero + h:
+            return _solve(slope, beta - gamma, target)
+        h, travel, target = 0.0, to_zero, target - (to_zero + h)
+    return float(travel + _solve(a - (beta + gamma) * h, beta + gamma, target))
+
+
+@kernel
+def _play(position: float, threshold: float, value: float) -> float:
+    return min(max(position, value - threshold), value + threshold)
+
+
+@kernel
+def plays(thresholds: Array, start: Array, value: Array) -> Array:
+    """Positions of plays alone, shape (n, m).
+
+    Args:
+        thresholds: r_i, shape (m,).
+        start: positions before the first sample, shape (m,).
+        value: input, shape (n,).
+    """
+    positions = np.empty((value.size, thresholds.size))
+    for i in range(thresholds.size):
+        position = start[i]
+        for k in range(value.size):
+            position = _play(position, thresholds[i], value[k])
+            positions[k, i] = position
+    return positions
+
+
+@kernel
+def advance(kind: int, table: Array, state: Array, start: int, value: float) -> float:
+    """Step an operator to the input ``value``; returns the output and changes ``state``.
+
+    Args:
+        kind: of the `Law`.
+        table: of the `Law`. Plays: rows thresholds (first 0) and weights (first p0). Bouc-Wen: A, β, γ, g.
+        state: holds the positions of the plays, or u and h, from ``start`` on. (A slice would cost more than a step.)
+        start: place of the operator's own state.
+        value: relative input.
+    """
+    if kind == _PLAYS:
+        result = table[1, 0] * value
+        for i in range(1, table.shape[1]):
+            place = start + i - 1
+            state[place] = _play(state[place], table[0, i], value)
+            result += table[1, i] * state[place]
+        return float(result)
+    if kind in (_BOUC_WEN, _BOUC_WEN_INVERSE):
+        u, h, gain = state[start], state[start + 1], table[0, 3]
+        if kind == _BOUC_WEN_INVERSE:
+            rise = value / gain - (u - h)
+            way = 1.0 if rise > 0.0 else -1.0
+            new_u = u + way * _needed(way * h, way * rise, table[0])
+        else:
+            new_u = value
+        way = 1.0 if new_u > u else -1.0
+        h = way * _move(way * h, way * (new_u - u), table[0])
+        state[start], state[start + 1] = new_u, h
+        return float(new_u if kind == _BOUC_WEN_INVERSE else gain * (new_u - h))
+    return value
+
+
+@kernel
+def _block(kind: int, table: Array, state: Array, value: Array, result: Array) -> None:
+    for k in range(value.size):
+        result[k] = advance(kind, table, state, 0, value[k])
+
+
+class _Operator:
+    """What all operators share."""
+
+    def __init__(self, law: Law, state: Array, steepest: float) -> None:
+        self.law, self.state, self.steepest = law, state, steepest
+
+    def block(self, value: Array, result: Array) -> None:
+        """See `Hysteresis`."""
+        _block(*self.law, self.state, value, result)
+
+
+def check_thresholds(thresholds: Array) -> None:
+    """Refuse thresholds of plays that are not above 0 and increasing.
+
+    Raises:
+        InputError: they are not.
+    """
+    if not np.all(np.diff(thresholds, prepend=0.0) > 0.0) or not np.all(np.isfinite(thresholds)):
+        raise InputError(f"play thresholds {thresholds.tolist()}; allowed: above 0 and increasing")
+
+
+def _weighted(thresholds: Array, weights: Array, proportional: float, state: Array) -> tuple[Law, Array, float]:
+    table = np.stack((np.append(0.0, thresholds), np.append(proportional, weights)))
+    return Law(_PLAYS, table), state, float(np.cumsum(table[1]).max())
+
+
+class PrandtlIshlinskii(_Operator):
+    """Weighted plays.
+
+    Args:
+        thresholds: r_i, half-widths of the plays, above 0 and increasing, shape (n,).
+        weights: p_i, shape (n,).
+        proportional: p0.
+
+    Raises:
+        InputError: thresholds out of order, or slopes without an inverse.
+    """
+
+    def __init__(
+        self, thresholds: Array = THRESHOLDS, weights: Array = WEIGHTS, proportional: float = PROPORTIONAL
+    ) -> None:
+        if thresholds.size != weights.size:
+            raise InputError(f"plays: {thresholds.size} thresholds and {weights.size} weights; give as many of each")
+        check_thresholds(thresholds)
+        slopes = proportional + np.append(0.0, np.cumsum(weights))
+        if not (np.all(slopes > 0.0) and np.all(np.isfinite(slopes))):
+            raise InputError(
+                f"play weights: slope {slopes[np.argmin(slopes > 0.0)]:g} after {np.argmin(slopes > 0.0)} plays; "
+                "allowed: above 0 for p0 and each sum p0 + p1 + ... (else there is no inverse)"
+            )
+        self.thresholds, self.weights, self.proportional = thresholds, weights, proportional
+        super().__init__(*_weighted(thresholds, weights, proportional, np.zeros(thresholds.size)))
+
+    def identified(self, scale: float) -> "PrandtlIshlinskii":
+        """The model of an identification that found the plays' weights ``scale`` times too large; at rest."""
+        return PrandtlIshlinskii(self.thresholds, self.weights * scale, self.proportional)
+
+
+class PrandtlIshlinskiiInverse(_Operator):
+    """The operator that undoes `PrandtlIshlinskii`; plays as well, in closed form.
+
+    Args:
+        forward: what to undo. Its present state is taken over, so at rest the inverse is at rest too.
+    """
+
+    def __init__(self, forward: PrandtlIshlinskii) -> None:
+        r, p, slopes = forward.thresholds, forward.weights, forward.proportional + np.cumsum(forward.weights)
+        before = slopes - p  # slope while play i still stands
+        before[:1] = forward.proportional
+        # Where play i begins to move, the output has gone r'_i and the input r_i.
+        thresholds = np.cumsum(before * np.diff(r, prepend=0.0))
+        beyond = np.append(np.cumsum((p * forward.state)[::-1])[::-1][1:], 0.0)[: r.size]
+        state = slopes * forward.state + beyond
+        super().__init__(*_weighted(thresholds, -p / (slopes * before), 1.0 / forward.proportional, state))
+
+
+class BoucWen(_Operator):
+    """Bouc-Wen with n = 1 in the form y = g·(u - h).
+
+    Args:
+        a: A, initial slope of h; 0.33 with the others makes a loop of 13 %.
+        beta: β.
+        gamma: γ.
+        gain: g; None: the one with which a steady loop over ±1 ends at ±1.
+
+    Raises:
+        InputError: h grows without bound, or there is no inverse.
+    """
+
+    def __init__(self, a: float = 0.33, beta: float = 0.7, gamma: float = 0.3, gain: float | None = None) -> None:
+        if not (a > 0.0 and -beta < gamma <= beta):
+            raise InputError(f"Bouc-Wen A = {a:g}, β = {beta:g}, γ = {gamma:g}; allowed: A > 0 and -β < γ <= β")
+        self._fall = 2.0 * a * beta / (beta + gamma)
+        if not self._fall < 1.0:
+            raise InputError(
+                f"Bouc-Wen A = {a:g}, β = {beta:g}, γ = {gamma:g}: 2Aβ/(β + γ) = {self._fall:g}; allowed: below 1 "
+                "(else the loop turns back on itself and there is no inverse)"
+            )
+        self.a, self.beta, self.gamma = a, beta, gamma
+        self.gain = 1.0 / (1.0 - self._end_of_loop()) if gain is None else gain
+        table = np.array([[a, beta, gamma, self.gain]])
+        super().__init__(Law(_BOUC_WEN, table), np.zeros(2), self.gain)
+
+    def _end_of_loop(self) -> float:
+        """The hysteretic part at the end of a steady loop over ±1: what a way of 2 turns into its opposite."""
+        shape = np.array([self.a, self.beta, self.gamma])
+        bound = self.a / (self.beta + self.gamma)
+        return float(brentq(lambda h: _move(-h, 2.0, shape) - h, 0.0, bound, xtol=1e-15))
+
+    @property
+    def flattest(self) -> float:
+        """Smallest slope dy/du that it can have."""
+        return self.gain * (1.0 - self._fall)
+
+    def identified(self, scale: float) -> "BoucWen":
+        """The model of an identification that found A ``scale`` times too large; at rest."""
+        return BoucWen(self.a * scale, self.beta, self.gamma, self.gain)
+
+
+class BoucWenInverse(_Operator):
+    """The operator that undoes `BoucWen`: each sample's step in u is solved for.
+
+    Args:
+        forward: what to undo; its present state is taken over.
+    """
+
+    def __init__(self, forward: BoucWen) -> None:
+        super().__init__(Law(_BOUC_WEN_INVERSE, forward.law.table), forward.state.copy(), 1.0 / forward.flattest)

@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fine piezo drive: linearisation, amplifier, hysteresis, creep, resonance.
+
+    set point -> inverse hysteresis -> amplifier 1/(1 + pT) -> hysteresis -> creep -> resonance -> displacement
+
+    resonance: 1/(1 + 2ζp/ωn + p²/ωn²)
+    creep:     1 + c·Σ 1/(1 + pτ_i), τ_i a decade apart: after a step about c·lg(t) more
+
+The hysteresis is ahead of the resonance and works on displacements relative to the stroke. The set point is held
+within the stroke and the voltage within its range; samples where that cuts something off are counted.
+
+Source: paper 001 (Wpk of eqs 6-9); parameters of spec/learning.md.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+from lathe_rc.plants.hysteresis import LINEAR, Hysteresis, Law, advance
+from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
+
+Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+_ROUNDING = 1e-9  # of the stroke: an exact inverse may pass full voltage by rounding
+
+# Places in the state of a stack; after them those of creep, inverse and hysteresis.
+VOLTAGE, _DEMAND, _EXTENSION, _MEMORIES = 0, 1, 2, 3
+
+
+class StackTable(NamedTuple):
+    """Constants of a `Stack` for kernels.
+
+    Attributes:
+        stroke: [m].
+        inverse, forward: linearisation and hysteresis.
+        inverse_size: numbers in the state of the inverse.
+        decay, now, before: the amplifier's lag, weights of its last output and of its inputs.
+        creep: the same of each lag of the creep, shape (n, 3).
+        creep_gain: of each of them.
+    """
+
+    stroke: float
+    inverse: Law
+    inverse_size: int
+    forward: Law
+    decay: float
+    now: float
+    before: float
+    creep: Array
+    creep_gain: float
+
+
+@kernel
+def extend(stack: StackTable, state: Array, set_point: float) -> tuple[float, bool]:
+    """Step a stack; returns the extension it would have unloaded [m], and whether something was cut off.
+
+    Args:
+        stack: its constants.
+        state: its memory, changed; ``state[VOLTAGE]`` is the amplifier's output relative to full voltage.
+        set_point: wanted extension [m].
+    """
+    wanted = set_point / stack.stroke
+    within = min(max(wanted, -1.0), 1.0)
+    inverse = _MEMORIES + stack.creep.shape[0]
+    forward = inverse + stack.inverse_size
+    demand = advance(stack.inverse.kind, stack.inverse.table, state, inverse, within)
+    applied = min(max(demand, -1.0), 1.0)
+    voltage = stack.decay * state[VOLTAGE] + stack.now * applied + stack.before * state[_DEMAND]
+    extension = stack.stroke * advance(stack.forward.kind, stack.forward.table, state, forward, voltage)
+    crept = extension
+    creep = stack.creep
+    for i in range(creep.shape[0]):
+        place = _MEMORIES + i
+        state[place] = creep[i, 0] * state[place] + creep[i, 1] * extension + creep[i, 2] * state[_EXTENSION]
+        crept += stack.creep_gain * state[place]
+    state[VOLTAGE], state[_DEMAND], state[_EXTENSION] = voltage, applied, extension
+    return crept, wanted != within or abs(demand) > 1.0 + _ROUNDING
+
+
+def _lag(time: float, step: float, method: Discretisation) -> DiscretePlant:
+    """1/(1 + p·time), times in s."""
+    if time < step / 1000.0:
+        raise InputError(f"lag of {time:g} s at a step of {step:g} s; allowed: 0 or at least {step / 1000.0:g} s")
+    return discretise(np.array([[-1.0 / time]]), np.array([1.0 / time]), 0.0, step, method)
+
+
+def _row(lag: DiscretePlant) -> Array:
+    return np.array([lag.transition[0, 0], lag.weights[0, 0], lag.weights[0, 1]])
+
+
+class Stack:
+    """Amplifier and ceramics, up to the extension that a stack without load and mass would have.
+
+    Args:
+        stroke: displacement at full voltage, to each side [m].
+        amplifier_lag: T [s]; 0 for none.
+        hysteresis: of the ceramics; None for none.
+        inverse: what linearises it; None for nothing.
+        creep_per_decade: c, relative creep in a decade of time; 0 for none.
+        creep_times: τ_i [s], a decade apart; used where there is creep, shape (n,).
+        step: sampling step [s].
+        method: discretisation of the lags, see `lathe_rc.plants.linear.discretise`.
+
+    Attributes:
+        table: its constants for `extend`.
+        state: its memory for `extend`.
+        steepest: largest change of the extension in a sample, over that of the set point in the same sample.
+
+    Raises:
+        InputError: a lag that is far shorter than the step.
+    """
+
+    def __init__(
+        self,
+        *,
+        stroke: float,
+        amplifier_lag: float,
+        hysteresis: Hysteresis | None,
+        inverse: Hysteresis | None,
+        creep_per_decade: float,
+        creep_times: Array,
+        step: float,
+        method: Discretisation,
+    ) -> None:
+        self._amplifier = _lag(amplifier_lag, step, method) if amplifier_lag else None
+        self._creep = [_lag(time, step, method) for time in creep_times] if creep_per_decade else []
+        amplifier = _row(self._amplifier) if self._amplifier else np.array([0.0, 1.0, 0.0])
+        creep = np.array([_row(lag) for lag in self._creep]).reshape(-1, 3)
+        none = np.empty(0)
+        inverse_state = inverse.state.copy() if inverse else none
+        forward_state = hysteresis.state.copy() if hysteresis else none
+        self.table = StackTable(
+            stroke=stroke,
+            inverse=inverse.law if inverse else LINEAR,
+            inverse_size=inverse_state.size,
+            forward=hysteresis.law if hysteresis else LINEAR,
+            decay=amplifier[0],
+            now=amplifier[1],
+            before=amplifier[2],
+            creep=creep,
+            creep_gain=creep_per_decade,
+        )
+        self.state = np.concatenate((np.zeros(_MEMORIES + len(creep)), inverse_state, forward_state))
+        self.steepest = float(
+            (inverse.steepest if inverse else 1.0)
+            * amplifier[1]
+            * (hysteresis.steepest if hysteresis else 1.0)
+            * (1.0 + creep_per_decade * creep[:, 1].sum())
+        )
+
+    def response(self, frequency: npt.ArrayLike) -> Complex:
+        """Amplifier and creep at ``frequency`` [rad/s]; the hysteresis is taken as linearised to a gain of 1."""
+        frequency = np.asarray(frequency, dtype=np.float64)
+        whole = np.ones(frequency.shape, dtype=np.complex128)
+        for lag in self._creep:
+            whole += self.table.creep_gain * lag.response(frequency)
+        return whole * self._amplifier.response(frequency) if self._amplifier else whole
+
+
+@kernel
+def _advance(
+    transition: Array,
+    weights: Array,
+    stack: StackTable,
+    memory: Array,
+    full_voltage: float,
+    state: Array,
+    set_point: Array,
+    position: Array,
+    velocity: Array,
+    voltage: Array,
+) -> int:
+    """Step the drive through a block; returns the number of samples in saturation."""
+    x, v, before = state[0], state[1], state[2]
+    saturated = 0
+    for k in range(set_point.size):
+        extension, cut = extend(stack, memory, set_point[k])
+        saturated += cut
+        x, v = (
+            transition[0, 0] * x + transition[0, 1] * v + weights[0, 0] * extension + weights[0, 1] * before,
+            transition[1, 0] * x + transition[1, 1] * v + weights[1, 0] * extension + weights[1, 1] * before,
+        )
+        before = extension
+        position[k], velocity[k], voltage[k] = x, v, memory[VOLTAGE] * full_voltage
+    state[0], state[1], state[2] = x, v, before
+    return saturated
+
+
+class PiezoDrive:
+    """The drive as a machine: set point in, motion and voltage out.
+
+    Args:
+        stack: amplifier and ceramics; the drive takes over its state.
+        natural_frequency: ωn [rad/s].
+        damping: ζ [1].
+        full_voltage: voltage at the full stroke [V].
+        step: sampling step [s].
+        method: discretisation, see `lathe_rc.plants.linear.discretise`.
+
+    Attributes:
+        plant: the difference equation of the resonance.
+        saturated: samples so far in which the set point or the voltage was cut off.
+    """
+
+    def __init__(
+        self,
+        stack: Stack,
+        *,
+        natural_frequency: float,
+        damping: float,
+        full_voltage: float,
+        step: float,
+        method: Discretisation,
+    ) -> None:
+        self.plant: DiscretePlant = discretise(*second_order(natural_frequency, damping), 0.0, step, method)
+        self.saturated = 0
+        self._stack, self._full_voltage = stack, full_voltage
+        self._state = np.zeros(3)
+
+    def response(self, frequency: npt.ArrayLike) -> Complex:
+        """Wpk of paper 001 at ``frequency`` [rad/s]: linearised drive, as its difference equations run."""
+        return np.asarray(self._stack.response(frequency) * self.plant.response(frequency))
+
+    def block(self, set_point: Array, position: Array, velocity: Array, voltage: Array) -> None:
+        """Step through a block; arrays of shape (n,) [m, m, m/s, V]. At rest at 0 before the first."""
+        self.saturated += _advance(
+            self.plant.transition, self.plant.weights, self._stack.table, self._stack.state, self._full_voltage,
+            self._state, set_point, position, velocity, voltage,
+        )  # fmt: skip

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of numbers in CSV files: one reader, so that every bad file is refused in the same way."""
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import InputError
+
+Array = npt.NDArray[np.float64]
+
+_MAX_FILE = 64 * 2**20
+
+
+def _text(path: Path, what: str) -> str:
+    try:
+        # Reading a pipe would wait for its writer, for ever.
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: cannot be read (not a file); check the path of the {what}")
+        if path.stat().st_size > _MAX_FILE:
+            raise InputError(f"{path}: larger than {_MAX_FILE // 2**20} MiB; thin the points out")
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path of the {what}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; allowed: CSV in UTF-8") from None
+
+
+def _number(text: str, path: Path, line: int) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        raise InputError(f"{path}:{line}: {text.strip()!r} is not a number") from None
+    if not math.isfinite(number):
+        raise InputError(f"{path}:{line}: {text.strip()!r}; allowed: finite numbers")
+    return number
+
+
+def read_table(path: Path, headers: Sequence[Sequence[str]], what: str) -> tuple[list[str], Array]:
+    """Read a CSV file of numbers; empty lines and those that start with # are left out.
+
+    Args:
+        path: of the file.
+        headers: the headers of which it must have one.
+        what: the file holds, for messages.
+
+    Returns:
+        The header and the rows, shape (n, columns).
+
+    Raises:
+        InputError: the file is missing, far too large, malformed, or holds a number that is not finite.
+    """
+    rows: list[tuple[int, list[str]]] = []
+    for n, line in enumerate(_text(path, what).splitlines(), 1):
+        if line.strip() and line.lstrip()[0] != "#":
+            try:
+                rows += [(n, row) for row in csv.reader([line], strict=True)]
+            except csv.Error as error:
+                raise InputError(f"{path}:{n}: not CSV ({error})") from None
+    header = [name.strip() for name in rows[0][1]] if rows else []
+    if header not in [list(known) for known in headers]:
+        allowed = " or ".join(",".join(known) for known in headers)
+        raise InputError(f"{path}: header {','.join(header)!r}; allowed: {allowed}")
+    numbers = []
+    for n, row in rows[1:]:
+        if len(row) != len(header):
+            raise InputError(f"{path}:{n}: {len(row)} values; allowed: {len(header)}, as in the header")
+        numbers.append([_number(text, path, n) for text in row])
+    return header, np.array(numbers).reshape(-1, len(header))

@@ -1,0 +1,383 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``lathe study``: the frame, and what each study finds."""
+
+import json
+import signal
+from dataclasses import FrozenInstanceError, fields
+
+import numpy as np
+import pytest
+from cells import cuts, in_blocks
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from lathe_rc.analysis.step_fit import SecondOrder
+from lathe_rc.cli import main
+from lathe_rc.control.invariance import FirstOrderInvariance
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.signals import speed
+from lathe_rc.studies import STUDIES, angle_domain, drive_models, invariance
+from lathe_rc.studies.angle_domain import AngleDomainParameters
+from lathe_rc.studies.drive_models import DriveModelsParameters
+from lathe_rc.studies.invariance import InvarianceParameters
+
+KEYS = {
+    "invariance": [
+        "speeds", "angles", "corrected", "uncorrected", "max_spread_corrected", "max_spread_uncorrected",
+        "deviation_amplitude", "deviation_frequencies", "deviation_spread_corrected", "deviation_spread_uncorrected",
+        "deviation_spread_wrong_order", "figure",
+    ],
+    "angle-domain": [
+        "amplitudes", "frequencies", "tolerance", "gost", "exact", "quasi_static", "linearised",
+        "good_to_exact", "good_to_quasi_static", "good_to_linearised", "figure",
+    ],
+    "drive-models": ["file", "time_s", "measured", "harmonic_rad_s", "models", "figure"],
+}  # fmt: skip
+#: settings with which a study takes a moment only
+QUICK = {
+    "invariance": ["deviation_frequencies=213"],
+    "angle-domain": ["amplitudes=0.05,0.1", "frequencies=50,200"],
+    "drive-models": [],
+}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """A folder to work in; the command's handling of SIGTERM ends with the test."""
+    monkeypatch.chdir(tmp_path)
+    before = signal.getsignal(signal.SIGTERM)
+    yield tmp_path
+    signal.signal(signal.SIGTERM, before)
+
+
+def study(*arguments, sets=()):
+    options = [part for override in sets for part in ("--set", override)]
+    return CliRunner().invoke(main, ["study", *arguments, *options])
+
+
+def told(name, *arguments, sets=()):
+    """The object that a study prints."""
+    result = study(name, "--json", *arguments, sets=sets or QUICK[name])
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.count("\n") == 1
+    assert result.stderr == ""
+    return json.loads(result.stdout)
+
+
+# --- the frame
+
+
+def test_without_a_name_the_studies_are_listed():
+    result = study()
+    assert result.exit_code == 0
+    assert [line.split()[0] for line in result.stdout.splitlines()] == list(STUDIES)
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_help_lists_the_parameters(name):
+    result = study(name, "--help")
+    assert result.exit_code == 0
+    for row in STUDIES[name].parameters.rows().values():
+        assert row.name in result.stdout
+        assert row.unit == "1" or f"[{row.unit}]" in result.stdout
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_parameters_have_defaults_within_their_limits(name):
+    assert STUDIES[name].parameters().model_dump()
+
+
+@pytest.mark.parametrize("name", KEYS)
+def test_json_has_exactly_the_promised_keys(folder, name):
+    def refuse(constant):
+        raise ValueError(constant)
+
+    result = study(name, "--json", sets=QUICK[name])
+    assert list(json.loads(result.stdout, parse_constant=refuse)) == KEYS[name]
+    assert [path.name for path in folder.iterdir()] == [f"study-{name}.png"]
+
+
+@pytest.mark.parametrize("name", KEYS)
+def test_people_get_a_table_of_80_columns_and_the_place_of_the_figure(folder, name):
+    result = CliRunner(env={"COLUMNS": "80"}).invoke(
+        main, ["study", name, "--figure", "a.png", *(p for s in QUICK[name] for p in ("--set", s))]
+    )
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.splitlines()[-1] == "figure: a.png"
+    assert max(map(len, result.stdout.splitlines())) <= 80
+    assert "…" not in result.stdout
+    assert result.stderr == ""
+    assert (folder / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", KEYS)
+def test_result_is_frozen_and_the_same_again(name):
+    table = {s.partition("=")[0]: json.loads(f"[{s.partition('=')[2]}]") for s in QUICK[name]}
+    subject = STUDIES[name]
+    given_ = subject.parameters(**table)
+    seen = []
+
+    def track(items):
+        for item in items:
+            seen.append(item)
+            yield item
+
+    first, second = subject.run(given_), subject.run(given_, track)
+    assert first.to_json() == second.to_json()
+    assert seen
+    with pytest.raises(FrozenInstanceError):
+        setattr(first, fields(first)[0].name, None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["fork"], "no study 'fork'; allowed: invariance, "),
+        (["invariance", "--set", "t0_ms"], "--set 't0_ms'; allowed: PARAM=VALUE"),
+        (["invariance", "--set", "t0=2"], "invariance.t0: unknown parameter; allowed: "),
+        (["invariance", "--set", "t0_ms=0"], "invariance.t0_ms = 0; allowed: a finite number above 0 up to 1000 [ms]"),
+        (["invariance", "--set", "t0_ms=nan"], "invariance.t0_ms = nan; allowed: a finite number"),
+        (["invariance", "--set", "t0_ms=2,3"], "invariance.t0_ms = '2,3'; allowed: a finite number"),
+        (["invariance", "--set", "t0_ms=[2]"], "invariance.t0_ms = [2]; allowed: a finite number"),
+        (["invariance", "--set", "t0_ms="], "invariance.t0_ms = ''; allowed: a finite number"),
+        (["invariance", "--set", "t0_ms=[2"], "--set t0_ms"),
+        (["invariance", "--set", "t0_ms={a: 2}"], "--set t0_ms"),
+        (["invariance", "--set", "speeds=84,fast"], "invariance.speeds = [84, 'fast']; allowed: a list, each a finite"),
+        (["invariance", "--set", "speeds=84,-1"], "invariance.speeds = [84, -1]; allowed: a list"),
+        (["invariance", "--set", "speeds=[]"], "invariance.speeds = ['']; allowed: a list"),
+        (["invariance", "--set", "speeds=84,,126"], "invariance.speeds = [84, '', 126]; allowed: a list"),
+        (["invariance", "--set", "speeds=1,105"], "allowed: from 10.5 rad/s"),
+        (["angle-domain", "--set", "waves=2.5"], "angle-domain.waves = 2.5; allowed: an integer from 1"),
+        (["angle-domain", "--set", "amplitudes=0.1"], "amplitudes = [0.1]; allowed: two or more, increasing"),
+        (["angle-domain", "--set", "frequencies=9,8"], "frequencies = [9.0, 8.0]; allowed: two or more, increasing"),
+        (["drive-models", "--set", "file=no.csv"], "no.csv: cannot be read"),
+        (["drive-models", "--figure", "a.pdf"], "--figure a.pdf; allowed: a file name that ends in .png"),
+        (["drive-models", "--figure", "no/a.png"], "no such folder"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(folder, arguments, text):
+    result = study(*arguments)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1, result.stderr
+    assert result.stderr.startswith("lathe: ")
+    assert text in result.stderr
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("text", ["84,105,126.5", "[84, 105, 126.5]", " 84 , 1.05e2,126.5"])
+def test_lists_are_numbers_with_commas(text):
+    assert told("invariance", sets=["deviation_frequencies=213", f"speeds={text}"])["speeds"] == [84.0, 105.0, 126.5]
+
+
+def test_one_number_is_a_list_of_one_and_the_last_setting_counts():
+    assert told("invariance", sets=[*QUICK["invariance"], "speeds=84,105", "speeds=120"])["speeds"] == [120.0]
+
+
+def test_empty_lists_are_refused_from_python_too():
+    with pytest.raises(InputError, match="at least one"):
+        InvarianceParameters(speeds=[])
+
+
+# --- the correction of paper 000, eqs 13-17
+
+laws = st.builds(
+    lambda amplitude, frequency, phase: speed.harmonic(
+        105.0, np.array([amplitude]), np.array([frequency]), np.array([phase])
+    ),
+    st.floats(0.0, 0.6),
+    st.floats(1.0, 1500.0),
+    st.floats(0.0, 6.0),
+)
+
+
+def corrected(law, desired, lengths=None, step=1e-5):
+    """Angle, v and u; ``desired`` of the angle."""
+    angle, omega, _ = law.at(np.arange(1000) * step)
+    wanted = desired(angle)
+    substitute, command = np.empty((2, angle.size))
+    machine = FirstOrderInvariance(2e-3, 0.21)
+
+    def block(first, a, w, y, v, u):
+        machine.block(angle=a, speed=w, desired=y, substitute=v, command=u)
+
+    in_blocks(lengths or [angle.size], block, angle, omega, wanted, substitute, command)
+    return angle, substitute, command
+
+
+@given(laws)
+def test_substitute_is_a_function_of_the_angle_alone(law):
+    """Analytic, for a step and for a ramp over the angle, at any speed law."""
+    angle, v, _ = corrected(law, np.ones_like)
+    assert_allclose(v, -np.expm1(-angle / 0.21), atol=1e-12)
+    angle, v, _ = corrected(law, lambda angle: angle)
+    assert_allclose(v, angle + 0.21 * np.expm1(-angle / 0.21), atol=1e-12)
+
+
+@given(laws)
+def test_command_is_the_inverse_of_the_plant(law):
+    """u = v + T0·dv/dt, here with dv/dt by differences."""
+    _, v, u = corrected(law, lambda angle: np.sin(2 * angle))
+    assert_allclose(u[1:-1], (v + 2e-3 * np.gradient(v, 1e-5))[1:-1], atol=2e-4)
+
+
+@given(cuts)
+def test_length_of_blocks_changes_no_bit(lengths):
+    lengths = [*lengths, max(1000 - sum(lengths), 0)]
+    lengths = [b for n, b in enumerate(lengths) if sum(lengths[: n + 1]) <= 1000] or [1000]
+    law = speed.harmonic(105.0, np.array([0.1]), np.array([213.0]), np.zeros(1))
+    used = sum(lengths)
+    for cut, whole in zip(corrected(law, np.cos, lengths), corrected(law, np.cos), strict=True):
+        assert np.array_equal(cut[:used], whole[:used])
+
+
+def test_spindle_may_stand_but_not_turn_back():
+    machine = FirstOrderInvariance(2e-3, 0.21)
+    v, u = np.empty((2, 3))
+    machine.block(angle=np.array([0.0, 0.1, 0.1]), speed=np.zeros(3), desired=np.ones(3), substitute=v, command=u)
+    assert v[1] == v[2] > 0.0
+    with pytest.raises(LatheError, match=r"turns back to 0\.05 rad"):
+        machine.block(angle=np.array([0.05]), speed=np.zeros(1), desired=np.ones(1), substitute=v[:1], command=u[:1])
+
+
+# --- invariance
+
+
+def test_corrected_responses_coincide_and_others_do_not():
+    found = told("invariance")
+    corrected_, alone, angles = (np.array(found[key]) for key in ("corrected", "uncorrected", "angles"))
+    assert corrected_.shape == alone.shape == (3, angles.size)
+    assert_allclose(corrected_, np.tile(-np.expm1(-angles / 0.21), (3, 1)), atol=1e-6)
+    for row, omega in zip(alone, found["speeds"], strict=True):
+        assert_allclose(row, -np.expm1(-angles / (2e-3 * omega)), atol=1e-9)
+    assert found["max_spread_corrected"] == np.ptp(corrected_, axis=0).max() < 1e-6
+    assert found["max_spread_uncorrected"] == np.ptp(alone, axis=0).max() > 0.1
+
+
+def test_deviation_changes_nothing_in_the_right_order_only():
+    found = told("invariance", sets=["deviation_frequencies=10.7,213,1000"])
+    right, wrong, alone = (
+        np.array(found[f"deviation_spread_{chain}"]) for chain in ("corrected", "wrong_order", "uncorrected")
+    )
+    assert np.all(right < 1e-6)
+    assert np.all(alone > 0.05)
+    # The error of the wrong order grows with dΩ/dt, until the correction is worse than none.
+    assert np.all(np.diff(wrong) > 0.0)
+    assert wrong[0] < 0.1 * alone[0]
+    assert wrong[-1] > alone[-1]
+
+
+def test_at_constant_speed_the_order_does_not_matter():
+    angles = np.linspace(0.0, 1.0, 50)
+    right, _, wrong = invariance.responses(speed.constant(126.0), 2e-3, 105.0, angles)
+    assert_allclose(right, wrong, atol=1e-6)
+
+
+# --- angle domain
+
+
+def test_errors_stand_by_amplitude_and_frequency():
+    found = told("angle-domain")
+    for kind in ("exact", "quasi_static", "linearised"):
+        assert np.shape(found[kind]) == (2, 2)
+    errors = np.array(found["quasi_static"])
+    assert np.array(found["exact"]).max() < 1e-6
+    # a_2·dΩ/dt·sX through the drive: as the amplitude and as the frequency.
+    gain = abs(1 / np.polyval([1 / 1038**2, 2 * 0.804 / 1038, 1.0], 2j * 1000 * np.pi / 30))
+    estimate = np.outer([0.05, 0.1], [50.0, 200.0]) * 2 * 1000 * np.pi / 30 / 1038**2 * gain**2
+    assert_allclose(errors, estimate, rtol=0.06)
+
+
+def test_good_to_is_the_last_frequency_within_the_tolerance():
+    found = angle_domain.run(
+        AngleDomainParameters(amplitudes=[0.01, 0.1, 0.3], frequencies=[10.0, 50.0, 200.0], tolerance=2e-3)
+    )
+    told_ = found.to_json()
+    for kind in ("exact", "quasi_static", "linearised"):
+        for row, limit in zip(told_[kind], told_[f"good_to_{kind}"], strict=True):
+            good = [f for f, error in zip(told_["frequencies"], row, strict=True) if error <= 2e-3]
+            assert limit == (max(good) if good else None)
+    assert told_["good_to_exact"] == [200.0] * 3
+    assert told_["good_to_quasi_static"] == [200.0, 50.0, 10.0]
+    assert told_["good_to_linearised"][2] is None
+
+
+def test_figure_of_a_map_that_is_good_or_bad_everywhere():
+    """No contour of the tolerance then, and no warning."""
+    for tolerance in ("0.9", "1e-12"):
+        told("angle-domain", sets=[*QUICK["angle-domain"], f"tolerance={tolerance}"])
+
+
+# --- drive models
+
+
+def model(found, name, *, fitted=True):
+    (one,) = [m for m in found["models"] if m["name"] == name and m["fitted"] == fitted]
+    return one
+
+
+def test_fits_of_the_simulated_drive():
+    found = told("drive-models")
+    assert found["file"] is None
+    assert model(found, "first order")["parameters"]["time_constant"] == pytest.approx(2e-3, rel=0.02)
+    assert model(found, "delay")["parameters"]["delay"] == pytest.approx(2e-3, rel=0.1)
+    exact = model(found, "second order with delay")
+    assert exact["parameters"] == pytest.approx(
+        {"natural_frequency": 1038.0, "damping": 0.804, "delay": 0.36e-3}, rel=1e-3
+    )
+    assert exact["rms"] < 1e-5
+    for one in found["models"]:
+        assert one["rms"] == pytest.approx(np.sqrt(np.mean(np.subtract(one["step"], found["measured"]) ** 2)), rel=1e-3)
+
+
+def test_learning_with_each_model():
+    """|Q - Z| by hand at the oval's harmonic; where the inverse is that of the drive only Q is left."""
+    found = told("drive-models")
+    omega = 2 * 1000 * np.pi / 30
+    q = 1 / (1 + (omega * 130e-6) ** 2)
+    drive = SecondOrder(1038.0, 0.804, 0.36e-3).response(np.array([omega]))[0]
+    assert found["harmonic_rad_s"] == pytest.approx(omega)
+    assert model(found, "second order with delay")["contraction"] == pytest.approx(1 - q, rel=0.02)
+    printed = model(found, "delay", fitted=False)
+    assert printed["contraction"] == pytest.approx(abs(q - drive * np.exp(2e-3j * omega)), rel=1e-6)
+    first = model(found, "first order", fitted=False)
+    assert first["contraction"] == pytest.approx(abs(q - drive * (1 + 2e-3j * omega)), rel=1e-6)
+    converges = {m["name"]: m["converges"] for m in found["models"] if m["fitted"]}
+    assert converges == {
+        "first order": False,
+        "delay": True,
+        "second order": False,
+        "second order with delay": True,
+    }
+
+
+def test_lead_of_the_paper_needs_its_filter():
+    """T0 = 2 ms converges with Q of 104 µs and more (spec)."""
+    for q_time, converges in (("100e-6", False), ("108e-6", True)):
+        found = told("drive-models", sets=[f"q_time={q_time}"])
+        assert model(found, "delay", fitted=False)["converges"] is converges
+
+
+def test_measured_response_takes_the_place_of_the_simulated(folder):
+    time = np.linspace(0.0, 30e-3, 400)
+    response = SecondOrder(500.0, 1.2, 1e-3).step(time)
+    rows = "".join(f"{t * 1e3},{h}\n" for t, h in zip(time, response, strict=True))
+    (folder / "step.csv").write_text("time_ms,response\n" + rows)
+    found = told("drive-models", sets=["file=step.csv"])
+    assert found["file"] == "step.csv"
+    assert_allclose(found["measured"], response)
+    best = model(found, "second order with delay")["parameters"]
+    assert best == pytest.approx({"natural_frequency": 500.0, "damping": 1.2, "delay": 1e-3}, rel=1e-3)
+    by_python = drive_models.run(DriveModelsParameters(file="step.csv"))
+    assert by_python.to_json()["models"] == found["models"]
+
+
+def test_step_test_has_no_half_step_of_latency():
+    """What is simulated as a measurement is the step response itself, for any drive."""
+    for wn, damping, delay in ((1038.0, 0.804, 0.36e-3), (100.0, 3.0, 0.0), (5000.0, 0.1, 1e-3)):
+        true = SecondOrder(wn, damping, delay)
+        found = drive_models.run(DriveModelsParameters(natural_frequency=wn, damping=damping, delay=delay))
+        assert_allclose(found.measured.response, true.step(found.measured.time), atol=2e-3)
+        assert found.measured.rms(true) < 3e-4

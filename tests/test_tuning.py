@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parameters behind the table of paper 001."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from lathe_rc.analysis.structures import cycles
+from lathe_rc.analysis.tuning import (
+    FREQUENCIES,
+    HIGHEST,
+    LEAD_LAG,
+    LIMITS,
+    PLAIN,
+    PRINTED,
+    START,
+    Tuning,
+    nearest,
+    smallest_deviation,
+)
+from lathe_rc.errors import LatheError
+
+
+def test_start_has_fourteen_entries_within_ten_per_cent():
+    deviations = np.abs(START.deviations())
+    assert np.count_nonzero(deviations <= 0.1) == 14
+    assert deviations.max() < 0.105
+
+
+def test_plain_meets_the_limit_of_each_row():
+    assert np.all(np.abs(PLAIN.deviations()) <= LIMITS[:, None])
+    assert np.abs(PLAIN.deviations()).max() < 0.098
+    assert max(PLAIN.suprema()) < 0.97
+
+
+def test_lead_lag_is_within_six_per_cent_everywhere():
+    assert np.abs(LEAD_LAG.deviations()).max() < 0.055
+    assert max(LEAD_LAG.suprema()) < 0.9505
+
+
+@pytest.mark.parametrize("tuning", [START, PLAIN, LEAD_LAG])
+def test_suprema_are_those_of_a_dense_grid(tuning):
+    channels = zip((tuning.coarse, tuning.fine), HIGHEST, strict=True)
+    dense = [np.abs(channel.factor(np.linspace(0.0, highest, 200_001))).max() for channel, highest in channels]
+    assert_allclose(tuning.suprema(), dense, rtol=1e-6)
+
+
+@pytest.mark.parametrize("tuning", [PLAIN, LEAD_LAG])
+def test_table_is_what_enough_cycles_leave(tuning):
+    """The structures, cycle by cycle: each channel's memory learns from its own error alone."""
+    coarse, fine = tuning.coarse, tuning.fine
+    factors = np.abs([channel.factor(FREQUENCIES) for channel in (coarse, fine)])
+    memory = np.zeros((3, 4), dtype=complex)  # of the first channel, a second coarse one and the piezo
+    for _ in range(int(cycles(factors, 1e-12).max())):
+        first = 1.0 - coarse.z(FREQUENCIES) * memory[0]
+        second = first - coarse.z(FREQUENCIES) * memory[1]
+        piezo = first - fine.z(FREQUENCIES) * memory[2]
+        for place, (channel, error) in enumerate(((coarse, first), (coarse, second), (fine, piezo))):
+            memory[place] = channel.q(FREQUENCIES) * memory[place] + error
+    direct = first - fine.drive(FREQUENCIES) * first
+    assert_allclose(np.abs([first, direct, second, piezo]), tuning.table(), rtol=1e-4)
+
+
+def test_nearest_changes_one_digit():
+    found = nearest()
+    assert found == PLAIN
+    assert found == replace(START, coarse=replace(START.coarse, q_time=66.9e-6))
+
+
+def test_nearest_of_what_is_met_already_is_the_start():
+    assert nearest(limits=np.full(4, 0.11)) == START
+
+
+def test_nearest_gives_up():
+    with pytest.raises(LatheError, match="within 1 steps"):
+        nearest(limits=np.full(4, 0.01), changes=1)
+
+
+def worst(tuning: Tuning) -> float:
+    return float(np.abs(np.log(tuning.table() / PRINTED)).max())
+
+
+def test_search_betters_the_start_even_from_three_starts():
+    found = smallest_deviation(lead_lag=True, starts=3, digits=4)
+    assert worst(found) < 0.06 < worst(START)
+    assert max(found.suprema()) < 0.951
+    for channel, start in ((found.coarse, START.coarse), (found.fine, START.fine)):
+        assert 0.75 <= channel.natural_frequency / start.natural_frequency <= 1.34
+        assert 0.74 <= channel.damping / start.damping <= 1.34
+        assert all(1e-4 <= time <= 2e-3 for time in channel.lead_lag)
+
+
+def test_weights_shift_the_deviation_to_the_heavy_row():
+    found = smallest_deviation(lead_lag=False, weights=LIMITS / 0.1, starts=2, digits=4)
+    deviations = np.abs(found.deviations()).max(axis=1)
+    assert found.coarse.lead_lag == found.fine.lead_lag == (0.0, 0.0)
+    assert deviations[[0, 1, 3]].max() < 0.088
+    assert 0.10 < deviations[2] < 0.135
+
+
+def test_search_gives_up_where_nothing_is_stable_enough():
+    with pytest.raises(LatheError, match=r"margin of 0\.9"):
+        smallest_deviation(lead_lag=False, margin=0.9, starts=1)
