@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis.structures import cycles
+from lathe_rc.analysis.responses import lead, lead_lag
+from lathe_rc.analysis.structures import cycles, steady_error, supremum
 from lathe_rc.analysis.tuning import (
     FREQUENCIES,
     HIGHEST,
@@ -21,6 +22,8 @@ from lathe_rc.analysis.tuning import (
     smallest_deviation,
 )
 from lathe_rc.errors import LatheError
+from lathe_rc.plants.linear import discretise
+from lathe_rc.plants.linear import second_order as matrices
 
 
 def test_start_has_fourteen_entries_within_ten_per_cent():
@@ -61,6 +64,34 @@ def test_table_is_what_enough_cycles_leave(tuning):
             memory[place] = channel.q(FREQUENCIES) * memory[place] + error
     direct = first - fine.drive(FREQUENCIES) * first
     assert_allclose(np.abs([first, direct, second, piezo]), tuning.table(), rtol=1e-4)
+
+
+@pytest.mark.parametrize("tuning", [PLAIN, LEAD_LAG])
+@pytest.mark.parametrize("speed", [0.9, 1.0, 1.1])
+def test_a_cell_of_default_rates_has_the_same_errors(tuning, speed):
+    """Drives as difference equations at 64 kHz, Q over 1024 points whose width is fixed at 1000 rpm."""
+    nominal, points, step = 1000 * np.pi / 30, 1024, 1 / 64_000
+    errors = []
+    for channel in (tuning.coarse, tuning.fine):
+        a, b = matrices(channel.natural_frequency, channel.damping)
+        drive = discretise(a, b, channel.delay, step, "foh")
+        width = channel.q_time * nominal * points / (2 * np.pi)
+
+        def q(frequency, width=width):
+            return 1 / (1 + 4 * width**2 * np.sin(np.pi * frequency / (speed * nominal * points)) ** 2)
+
+        def z(frequency, channel=channel, drive=drive):
+            corrections = lead(frequency, channel.lead_time) * lead_lag(frequency, *channel.lead_lag)
+            return drive.response(frequency) * corrections
+
+        assert supremum(lambda w, q=q, z=z: q(w) - z(w), points / 2 * speed * nominal).magnitude < 0.98
+        errors.append(steady_error(q(FREQUENCIES), z(FREQUENCIES)))
+    if speed == 1.0:
+        coarse, fine = errors
+        direct = coarse * (1.0 - drive.response(FREQUENCIES))
+        run = np.abs([coarse, direct, coarse**2, coarse * fine])
+        assert_allclose(run, tuning.table(), rtol=3e-3)
+        assert np.all(np.abs(run / PRINTED - 1.0) <= LIMITS[:, None])
 
 
 def test_nearest_changes_one_digit():

@@ -3,9 +3,10 @@
 
 from typing import Any
 
-from lathe_rc.studies import angle_domain, drive_models, invariance, speed_deviation
+from lathe_rc.studies import angle_domain, drive_models, invariance, multichannel, piston, speed_deviation
 from lathe_rc.studies.study import Study
 
 STUDIES: dict[str, Study[Any]] = {
-    study.name: study for study in (invariance.STUDY, angle_domain.STUDY, drive_models.STUDY, speed_deviation.STUDY)
+    module.STUDY.name: module.STUDY
+    for module in (invariance, speed_deviation, multichannel, piston, angle_domain, drive_models)
 }

@@ -8,7 +8,6 @@ protocol ``frozen`` holds the memory from there on, ``learning`` goes on learnin
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -16,9 +15,9 @@ import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
-from lathe_rc import harness, resources
-from lathe_rc.cell import messages, scenario
+from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import parameter
+from lathe_rc.studies import cells
 from lathe_rc.studies.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:
@@ -171,8 +170,8 @@ def _settings(parameters: SpeedDeviationParameters) -> dict[str, list[Overrides]
 
 def _run_cell(parameters: SpeedDeviationParameters, wd: float, controller: Overrides) -> tuple[Array, Array]:
     """Revolutions since the deviation began, and the form error [µm]."""
-    base = scenario.load(resources.find(Path("speed_deviation.yaml")))
-    nominal, rate = base.shared.nominal_speed, base.shared.sample_rate
+    shared = cells.load("speed_deviation").shared
+    nominal, rate = shared.nominal_speed, shared.sample_rate
     start = round(_CYCLES * parameters.cycle_revolutions * 2 * np.pi / nominal * rate) / rate
     shown = max(_SHOWN, 3 * np.pi / wd)
     frozen = parameters.protocol == "frozen"
@@ -205,18 +204,11 @@ def _run_cell(parameters: SpeedDeviationParameters, wd: float, controller: Overr
         },
         "tool": {"harmonic_order": [parameters.harmonic], "harmonic_amplitude": [amplitude]},
     }
-    changes = [f"{node}.{name}={_yaml(value)}" for node, table in values.items() for name, value in table.items()]
-    result = harness.run(scenario.load(resources.find(Path("speed_deviation.yaml")), changes))
+    result = cells.run("speed_deviation", **values)
     first = round((start + deviating - shown) * rate)
     angle = result.recording.of_type(messages.ENCODER)["angle_true"][first:]
     error = result.recording.of_type(messages.TOOL)["error"][first:]
     return (angle - angle[0]) / (2 * np.pi), error * 1e6
-
-
-def _yaml(value: object) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return repr(value).replace("'", '"') if isinstance(value, list) else str(value)
 
 
 def run(parameters: SpeedDeviationParameters, track: Track = untracked) -> SpeedDeviationResult:
