@@ -2,13 +2,16 @@
 """Draws img/piezo.png of piezo.md and prints its tables."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
+from lathe_rc import harness
 from lathe_rc.analysis.hysteresis_fit import Loop, identify
-from lathe_rc.cell import messages
+from lathe_rc.cell import messages, scenario
+from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuator, PiezoActuatorParameters
 from lathe_rc.cell.stages.series_drive import SeriesDriveParameters, SeriesDriveStage
 
@@ -20,18 +23,27 @@ KINDS = {"prandtl_ishlinskii": "#1f6f8b", "bouc_wen": "#c0392b"}
 Array = npt.NDArray[np.float64]
 
 
-def swing(frequency: float, amplitude: float = 1.0, periods: int = 4) -> Array:
-    """A sine of so many half-strokes [m] at ``frequency`` [Hz]."""
-    samples = round(periods * RATE / frequency)
-    return amplitude * STROKE * np.sin(2 * np.pi * frequency * np.arange(samples) / RATE)
+def swing(frequency: float) -> Array:
+    """Four sines over the whole stroke [m] at ``frequency`` [Hz]."""
+    return STROKE * np.sin(2 * np.pi * frequency * np.arange(round(4 * RATE / frequency)) / RATE)
 
 
-def position(set_point: Array, **values: str | float) -> Array:
-    """Displacement of a piezo drive [m]."""
+def position(set_point: Array, **values: Any) -> Array:
+    """Displacement of a piezo drive as its sensor measures it, by default without noise [m]."""
     stage = PiezoActuator("piezo_actuator", PiezoActuatorParameters.read("piezo_actuator", values))
     state = messages.allocate(messages.STATE, set_point.size)
     stage.advance(0, [{"position": set_point}], [state])
-    return np.asarray(state["position"])
+    return np.asarray(state["measured_position"])
+
+
+def error(**values: Any) -> Array:
+    """What a drive leaves of the last second of a swing at 1 Hz [m]."""
+    return np.asarray((position(SLOW, **values) - SLOW)[-RATE:])
+
+
+def percent(rest: Array) -> str:
+    """RMS over the half-stroke."""
+    return f"{100 * np.sqrt(np.mean(rest**2)) / STROKE:.3f} %"
 
 
 def series(ratio: float, damping: float = 0.299) -> SeriesDriveStage:
@@ -40,52 +52,79 @@ def series(ratio: float, damping: float = 0.299) -> SeriesDriveStage:
     return SeriesDriveStage("series_drive", SeriesDriveParameters.read("series_drive", values))
 
 
-def row(values: Array, digits: int = 4) -> str:
-    """Cells of a table."""
-    return " | ".join(f"{value:.{digits}f}" for value in values)
+def bend(frequency: float) -> float:
+    """Extension over the carriage's amplitude, the piezo's set point being 0."""
+    command = 1e-6 * np.sin(frequency * np.arange(RATE) / RATE)
+    states = [messages.allocate(messages.STATE, RATE) for _ in range(2)]
+    series(0.1).advance(0, [{"position": command}, {"position": np.zeros(RATE)}], states)
+    carriage, extension = (state["position"][-RATE // 2 :] for state in states)
+    return float(np.std(extension) / np.std(carriage))
 
 
-period = RATE  # of a swing at 1 Hz, in samples
-slow = swing(1.0)
+SLOW = swing(1.0)
 figure = Figure(figsize=(13, 4.0), layout="constrained")
 loops, left, coupling = figure.subplots(1, 3)
 
-print("| hysteresis | loop | left, exact model | 5 % low | 15 % low | 15 % high |")
+print("| `hysteresis` | loop | exact | 5 % low | 15 % low | 15 % high |")
 print("| --- | ---: | ---: | ---: | ---: | ---: |")
 for kind, colour in KINDS.items():
-    bare = position(slow, hysteresis=kind, linearisation="none")[-period:]
-    # At the zeros of the command, on the way up and on the way down.
-    width = (bare[period // 2] - bare[0]) / np.ptp(bare)
-    cells = []
-    for scale in (1.0, 0.95, 0.85, 1.15):
-        error = (position(slow, hysteresis=kind, identified_scale=scale) - slow)[-period:]
-        cells.append(np.sqrt(np.mean(error**2)) / STROKE)
-        if scale in (1.0, 0.85):
-            style = {"color": colour, "ls": "-" if scale < 1.0 else ":"}
-            left.plot(np.arange(period) / period, error * 1e6, label=f"{kind}, factor {scale:g}", **style)
-    print(f"| `{kind}` | {100 * width:.1f} % | " + " | ".join(f"{100 * cell:.3f} %" for cell in cells) + " |")
-    loops.plot(slow[-period:] * 1e6, bare * 1e6, color=colour, lw=1.0, label=kind)
-loops.plot(slow[-period:] * 1e6, position(slow)[-period:] * 1e6, color="#444444", lw=0.8, label="linearised")
+    bare = position(SLOW, hysteresis=kind, linearisation="none")[-RATE:]
+    width = (bare[RATE // 2] - bare[0]) / np.ptp(bare)  # at the zeros of the command, on its way down and up
+    rests = {scale: error(hysteresis=kind, identified_scale=scale) for scale in (1.0, 0.95, 0.85, 1.15)}
+    print(f"| `{kind}` | {100 * width:.1f} % | {' | '.join(percent(rest) for rest in rests.values())} |")
+    dashes = "-" if kind == "prandtl_ishlinskii" else "--"
+    loops.plot(SLOW[-RATE:] * 1e6, bare * 1e6, color=colour, ls=dashes, lw=1.3, label=kind)
+    left.plot(np.arange(RATE) / RATE, rests[0.85] * 1e6, color=colour, lw=1.1, label=f"{kind}, 15 % low")
+    left.plot(np.arange(RATE) / RATE, rests[1.0] * 1e6, color=colour, lw=1.1, ls=":", label=f"{kind}, exact")
+loops.plot(SLOW[-RATE:] * 1e6, position(SLOW)[-RATE:] * 1e6, color="#777777", lw=0.9, label="linearised")
 
-print("\n| loop recorded at | noise | left by the fit | p0 | p1 … p10 | left when it linearises |")
+print("\n| loop at | noise | left by the fit | p0 | p1 … p10 | left when it linearises |")
 print("| ---: | ---: | ---: | ---: | --- | ---: |")
-for frequency, noise in ((1.0, 0.0), (1.0, 50e-9), (20.0, 0.0), (100.0, 0.0)):
+for frequency, noise in ((1.0, 0.0), (1.0, 50e-9), (10.0, 0.0), (100.0, 0.0)):
     command = swing(frequency)
-    loop = Loop(
-        command,
-        position(command, linearisation="none") + noise * np.random.default_rng(0).standard_normal(command.size),
-    )
-    found = identify(loop, STROKE)
-    weights = found.model.weights
-    model = PiezoActuatorParameters(play_weights=weights.tolist(), play_proportional=found.model.proportional)
-    # The drive keeps its own hysteresis, so the found inverse goes into the set point.
-    inverse = np.empty_like(slow)
-    model_stack = model.stack("identified").table.inverse
-    from lathe_rc.plants.hysteresis import PrandtlIshlinskiiInverse
-
-    PrandtlIshlinskiiInverse(found.model).block(slow / STROKE, inverse)
-    error = (position(inverse * STROKE, linearisation="none") - slow)[-period:]
+    found = identify(Loop(command, position(command, linearisation="none", noise_rms=noise)), STROKE)
+    weights, proportional = found.model.weights, found.model.proportional
+    rest = error(identified_weights=weights.tolist(), identified_proportional=proportional)
     print(
-        f"| {frequency:g} Hz | {noise * 1e9:g} nm | {100 * found.residual:.3f} % | {found.model.proportional:.4f} | "
-        f"{weights.min():.4f} … {weights.max():.4f} | {100 * np.sqrt(np.mean(error**2)) / STROKE:.3f} % |"
+        f"| {frequency:g} Hz | {noise * 1e9:g} nm | {100 * found.residual:.3f} % | {proportional:.4f} | "
+        f"{weights.min():.4f} … {weights.max():.4f} | {percent(rest)} |"
     )
+
+print("\n| ω [rad/s] | " + " | ".join(f"{w:.0f}" for w in TABLE) + " |")
+print("| --- | ---: | ---: | ---: | ---: |")
+for damping in (0.299, 0.292):
+    for ratio in (0.0, 0.1):
+        cells = np.abs(1 - series(ratio, damping).drive.response(TABLE))
+        print(f"| \\|1 − Wpk\\|, m/M = {ratio:g}, ζ2 = {damping:g} | {' | '.join(f'{c:.4f}' for c in cells)} |")
+print(f"| bend of the piezo over x1, m/M = 0.1 | {' | '.join(f'{bend(w):.4f}' for w in TABLE)} |")
+
+parallel = scenario.load(HERE.parent / "config" / "direct_compensation.yaml", ["spindle_encoder.revolutions=60"])
+shared = parallel.shared.model_dump(include=set(SharedParameters.model_fields))
+direct = {"fine_use_command": False, "fine_use_reference": True, "fine_compensates": ["coarse"]}
+print("\n| arrangement | RMS form error in revolution 60 |")
+print("| --- | ---: |")
+for ratio in (None, 0.0, 0.1):
+    nodes, title = dict(parallel.nodes), "parallel (`config/direct_compensation.yaml`)"
+    if ratio is not None:
+        del nodes["electrodynamic_actuator"], nodes["piezo_actuator"]
+        values = {**shared, **direct, "mass_ratio": ratio}
+        nodes["series_drive"] = SeriesDriveParameters.read("series_drive", values)
+        title = f"series, m/M = {ratio:g}"
+    result = harness.run(scenario.Scenario("series", nodes))
+    print(f"| {title} | {result.errors.rms[-1] * 1e9:.2f} nm |")
+
+frequencies = np.geomspace(50.0, 20e3, 400)
+for ratio, style in ((0.0, "-"), (0.03, "-."), (0.1, "--"), (0.3, ":")):
+    rest = np.abs(1 - series(ratio).drive.response(frequencies))
+    coupling.loglog(frequencies, rest, color="#1f6f8b", ls=style, lw=1.2, label=f"m/M = {ratio:g}")
+
+loops.set(xlabel="command [µm]", ylabel="displacement [µm]")
+loops.set_title("loops at 1 Hz", fontsize=10)
+left.set(xlabel="time [s]", ylabel="error [µm]", ylim=(-0.8, 1.25))
+left.set_title("what linearisation leaves", fontsize=10)
+coupling.set(xlabel="frequency [rad/s]", ylabel="|1 − Wpk|")
+coupling.set_title("what is left of a vibration", fontsize=10)
+for axes in (loops, left, coupling):
+    axes.grid(visible=True, which="both", alpha=0.25)
+    axes.legend(fontsize=8, loc="upper left")
+figure.savefig(HERE / "img" / "piezo.png", dpi=130)

@@ -154,7 +154,7 @@ def assert_refused(result, *texts):
         (["tool.harmonic_order=[2.5]"], "tool.harmonic_order = [2.5]; allowed: a list, each an integer"),
         (["learning_controller.feedback_delay=63"], "delayed by 63 samples, block_size = 64"),
         (["learning_controller.feedback_delay=100000"], "at 104.7 rad/s the cycle leaves "),
-        (["learning_controller.lead_time=2e-3"], "learning diverges: sup|Q - Z| = 1.047"),
+        (["learning_controller.lead_time=2e-3"], "learning diverges with electrodynamic_actuator: sup|Q - Z| = 1.047"),
         (["electrodynamic_actuator.stroke=2e-4"], "cannot follow it at 104.7 rad/s: stroke 225 µm; allowed: 200 µm"),
         (["sample_rate=65536"], "allowed nearby: 64000 or 78125 Hz"),
         (["learning_controller.events=['soon: freeze']"], "learning_controller.events = 'soon: freeze'"),

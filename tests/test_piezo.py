@@ -15,13 +15,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.stage import compile_kernels
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuator, PiezoActuatorParameters
 from lathe_rc.errors import InputError
-from lathe_rc.plants.hysteresis import (
-    WEIGHTS,
-    BoucWen,
-    BoucWenInverse,
-    PrandtlIshlinskii,
-    PrandtlIshlinskiiInverse,
-)
+from lathe_rc.plants.hysteresis import WEIGHTS, BoucWen, PrandtlIshlinskii
 from lathe_rc.plants.linear import second_order
 from lathe_rc.plants.piezo import PiezoDrive, Stack
 
@@ -31,8 +25,8 @@ TABLE = np.array([500.0, 1000.0, 1500.0, 2000.0])
 
 PAIRS = {
     None: lambda _: (None, None),
-    "plays": lambda scale: (PrandtlIshlinskii(), PrandtlIshlinskiiInverse(PrandtlIshlinskii().identified(scale))),
-    "bouc_wen": lambda scale: (BoucWen(), BoucWenInverse(BoucWen().identified(scale))),
+    "plays": lambda scale: (PrandtlIshlinskii(), PrandtlIshlinskii().identified(scale).inverse()),
+    "bouc_wen": lambda scale: (BoucWen(), BoucWen().identified(scale).inverse()),
 }
 
 
@@ -282,6 +276,8 @@ def test_stage_reads_what_it_is_asked_for(values, expected):
         ({"play_thresholds": [0.2, 0.1], "play_weights": [0.1, 0.1]}, "^piezo: play thresholds"),
         ({"play_proportional": 0.1, "play_weights": [-0.02] * 10}, "^piezo: play weights: slope .* after 5 plays"),
         ({"hysteresis": "bouc_wen", "bouc_wen_a": 0.8}, "^piezo: Bouc-Wen A = 0.8"),
+        ({"identified_thresholds": [0.1]}, "^piezo: identified_weights = "),
+        ({"identified_weights": [0.1]}, "^piezo: plays: 10 thresholds and 1 weights"),
         ({"amplifier_lag": 1e-12}, "^piezo: lag of 1e-12 s"),
         ({"events": ["revolution 3: freeze"]}, "piezo: event 'freeze'"),
     ],
@@ -348,6 +344,16 @@ def test_drive_is_identified_from_its_own_signals():
     state = advance(stage(linearisation="none"), command)
     found = identify(from_signals({"/fine/command": {"position": command}, "/fine/state": state}), STROKE).model
     assert_allclose(found.weights, WEIGHTS, atol=2e-3)
-    values = {"play_weights": found.weights.tolist(), "play_proportional": found.proportional}
+    values = {"identified_weights": found.weights.tolist(), "identified_proportional": found.proportional}
     position = advance(stage(**values), command)["position"]
     assert_allclose(position, command, atol=1e-3 * STROKE)
+
+
+def test_linearisation_takes_what_was_identified():
+    """Other plays than those of the drive: the chain of both by hand."""
+    command = STROKE * np.sin(2 * np.pi * np.arange(20_000) / 10_000)
+    values = {"identified_thresholds": [0.2, 0.5], "identified_weights": [0.1, 0.1], "identified_proportional": 0.8}
+    state = advance(stage(**values), command)
+    voltage = np.empty_like(command)
+    PrandtlIshlinskii(np.array([0.2, 0.5]), np.array([0.1, 0.1]), 0.8).inverse().block(command / STROKE, voltage)
+    assert_allclose(state["effort"] / VOLTS, voltage.clip(-1, 1), atol=1e-12)

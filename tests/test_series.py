@@ -18,7 +18,7 @@ from lathe_rc.cell.stages.piezo_actuator import PiezoActuator, PiezoActuatorPara
 from lathe_rc.cell.stages.series_drive import SeriesDriveParameters, SeriesDriveStage
 from lathe_rc.errors import InputError
 from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
-from lathe_rc.plants.hysteresis import BoucWen, BoucWenInverse, PrandtlIshlinskii, PrandtlIshlinskiiInverse
+from lathe_rc.plants.hysteresis import BoucWen, PrandtlIshlinskii
 from lathe_rc.plants.piezo import PiezoDrive, Stack
 from lathe_rc.plants.series import SeriesDrive
 
@@ -34,9 +34,9 @@ SLOW, FAST = 2 * np.pi / (PERIOD * STEP), 8 * np.pi / (PERIOD * STEP)
 def make_stack(kind=None, lag=0.0, step=STEP, stroke=STROKE):
     forward, inverse = None, None
     if kind == "plays":
-        forward, inverse = PrandtlIshlinskii(), PrandtlIshlinskiiInverse(PrandtlIshlinskii().identified(0.9))
+        forward, inverse = PrandtlIshlinskii(), PrandtlIshlinskii().identified(0.9).inverse()
     elif kind == "bouc_wen":
-        forward, inverse = BoucWen(), BoucWenInverse(BoucWen())
+        forward, inverse = BoucWen(), BoucWen().inverse()
     return Stack(
         stroke=stroke,
         amplifier_lag=lag,

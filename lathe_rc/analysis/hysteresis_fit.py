@@ -81,7 +81,8 @@ def identify(loop: Loop, stroke: float, thresholds: Array = THRESHOLDS) -> Ident
         thresholds: of the plays, relative to the half-stroke, increasing, shape (n,).
 
     Raises:
-        InputError: thresholds out of order, or a loop that does not return, does not move a play, or has no slope.
+        InputError: thresholds out of order, or a loop that does not return, does not move a play, has too few
+            points or no slope.
     """
     check_thresholds(thresholds)
     command = loop.command / stroke
@@ -105,6 +106,12 @@ def identify(loop: Loop, stroke: float, thresholds: Array = THRESHOLDS) -> Ident
     side = 1.0 if command[0] > (low + high) / 2.0 else -1.0
     known = plays(thresholds, command[0] - side * thresholds, command)
     columns = np.column_stack((np.ones_like(command), command, known))
+    unknown = columns.shape[1]
+    if np.linalg.matrix_rank(columns) < unknown:
+        raise InputError(
+            f"hysteresis loop: its {command.size} points do not determine {unknown} unknowns; record more points or "
+            "give fewer thresholds"
+        )
     bounds = np.append(-np.inf, np.zeros(thresholds.size + 1))
     fit = lsq_linear(columns, displacement, (bounds, np.inf), method="bvls")
     offset, proportional, weights = fit.x[0], fit.x[1], fit.x[2:]

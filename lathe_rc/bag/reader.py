@@ -12,7 +12,7 @@ from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError
 
-DENSE = {messages.ENCODER, messages.COMMAND, messages.STATE, messages.TOOL}
+DENSE = {messages.ENCODER, messages.COMMAND, messages.STATE, messages.TOOL, messages.REFERENCE}
 SPARSE = {messages.LEARNING, messages.EVENT, messages.JOINTS}
 
 

@@ -250,13 +250,12 @@ class CellNode(LifecycleNode):
     def _effective(self) -> NodeParameters:
         """The table with the remapping of the command line written into ``remap``."""
         namespace = self.get_namespace().rstrip("/") + "/"
-        ports = [port.topic for port in self.ports()]
-        rules = [f"{port}:={self.topic(port).removeprefix(namespace)}" for port in ports]
+        rules = [f"{topic}:={self.topic(topic).removeprefix(namespace)}" for topic in self.relative_topics()]
         changed = sorted({rule for rule in rules if rule.split(":=")[0] != rule.split(":=")[1]})
         return self.table.model_copy(update={"remap": changed})
 
-    def ports(self) -> list[Any]:
-        """Ports of the stage that it runs, if it runs one."""
+    def relative_topics(self) -> list[str]:
+        """Signal topics of the stage that it runs, before remapping, if it runs one."""
         return []
 
     def member_names(self) -> list[str]:

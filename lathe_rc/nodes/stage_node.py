@@ -68,9 +68,10 @@ class StageNode(CellNode):
         if self.stage.actions:
             self.create_service(Schedule, "~/schedule", self._on_schedule)
 
-    def ports(self) -> list[Any]:
+    def relative_topics(self) -> list[str]:
         """See `CellNode`."""
-        return [*self.stage.inputs, *self.stage.outputs]
+        inputs, outputs = ([port.topic for port in self.stage.inputs], [port.topic for port in self.stage.outputs])
+        return [*inputs, *outputs, *self.stage.sparse_topics]
 
     def publications(self) -> list[tuple[str, str, bool]]:
         """See `CellNode`."""

@@ -247,6 +247,10 @@ class PrandtlIshlinskii(_Operator):
         """The model of an identification that found the plays' weights ``scale`` times too large; at rest."""
         return PrandtlIshlinskii(self.thresholds, self.weights * scale, self.proportional)
 
+    def inverse(self) -> "PrandtlIshlinskiiInverse":
+        """What undoes it from its present state on."""
+        return PrandtlIshlinskiiInverse(self)
+
 
 class PrandtlIshlinskiiInverse(_Operator):
     """The operator that undoes `PrandtlIshlinskii`; plays as well, in closed form.
@@ -307,6 +311,10 @@ class BoucWen(_Operator):
     def identified(self, scale: float) -> "BoucWen":
         """The model of an identification that found A ``scale`` times too large; at rest."""
         return BoucWen(self.a * scale, self.beta, self.gamma, self.gain)
+
+    def inverse(self) -> "BoucWenInverse":
+        """What undoes it from its present state on."""
+        return BoucWenInverse(self)
 
 
 class BoucWenInverse(_Operator):

@@ -19,10 +19,7 @@ from lathe_rc.plants.hysteresis import (
     THRESHOLDS,
     WEIGHTS,
     BoucWen,
-    BoucWenInverse,
-    Hysteresis,
     PrandtlIshlinskii,
-    PrandtlIshlinskiiInverse,
 )
 from lathe_rc.plants.linear import Discretisation
 from lathe_rc.plants.piezo import PiezoDrive, Stack
@@ -55,6 +52,15 @@ class PiezoActuatorParameters(SetPointParameters):
     identified_scale: Annotated[float, Gt(0)] = parameter(
         1.0, "error of its identification: factor on the weights of the plays, or on A; 0.85 is 15 % low"
     )
+    identified_weights: list[float] = parameter(
+        [], "weights of the plays that an identification found (docs/piezo.md); empty: those of the drive"
+    )
+    identified_thresholds: list[Annotated[float, Gt(0)]] = parameter(
+        [], "thresholds that belong to identified_weights; empty: those of the drive"
+    )
+    identified_proportional: Annotated[float, Ge(0)] = parameter(
+        0.0, "p0 that belongs to identified_weights; 0: that of the drive"
+    )
     creep_per_decade: Annotated[float, Ge(0), Le(1)] = parameter(
         0.0, "creep in each decade of time relative to the displacement; 0: none"
     )
@@ -63,17 +69,32 @@ class PiezoActuatorParameters(SetPointParameters):
     noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
     resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
 
-    def _operators(self) -> tuple[Hysteresis, Hysteresis]:
-        """The hysteresis and the inverse of what was identified."""
+    def _hysteresis(self) -> PrandtlIshlinskii | BoucWen | None:
+        if self.hysteresis == "none":
+            return None
         if self.hysteresis == "bouc_wen":
-            bouc_wen = BoucWen(self.bouc_wen_a, self.bouc_wen_beta, self.bouc_wen_gamma)
-            return bouc_wen, BoucWenInverse(bouc_wen.identified(self.identified_scale))
-        plays = PrandtlIshlinskii(
-            np.array(self.play_thresholds) if self.play_thresholds else THRESHOLDS,
-            np.array(self.play_weights) if self.play_weights else WEIGHTS,
-            self.play_proportional,
+            return BoucWen(self.bouc_wen_a, self.bouc_wen_beta, self.bouc_wen_gamma)
+        return self._plays(self.play_thresholds, self.play_weights, self.play_proportional)
+
+    def _identified(self) -> PrandtlIshlinskii | BoucWen | None:
+        """What the linearisation takes for the hysteresis."""
+        if not self.identified_weights:
+            if self.identified_thresholds or self.identified_proportional:
+                raise InputError("identified_weights = []; allowed: one for each of identified_thresholds")
+            return self._hysteresis()
+        return self._plays(
+            self.identified_thresholds or self.play_thresholds,
+            self.identified_weights,
+            self.identified_proportional or self.play_proportional,
         )
-        return plays, PrandtlIshlinskiiInverse(plays.identified(self.identified_scale))
+
+    @staticmethod
+    def _plays(thresholds: list[float], weights: list[float], proportional: float) -> PrandtlIshlinskii:
+        return PrandtlIshlinskii(
+            np.array(thresholds) if thresholds else THRESHOLDS,
+            np.array(weights) if weights else WEIGHTS,
+            proportional,
+        )
 
     def stack(self, node: str) -> Stack:
         """Amplifier and ceramics of a node, at rest.
@@ -82,12 +103,12 @@ class PiezoActuatorParameters(SetPointParameters):
             InputError: a hysteresis without an inverse, or a lag far shorter than the step.
         """
         try:
-            forward, inverse = self._operators() if self.hysteresis != "none" else (None, None)
+            model = self._identified() if self.linearisation == "inverse" else None
             return Stack(
                 stroke=self.stroke,
                 amplifier_lag=self.amplifier_lag,
-                hysteresis=forward,
-                inverse=inverse if self.linearisation == "inverse" else None,
+                hysteresis=self._hysteresis(),
+                inverse=model.identified(self.identified_scale).inverse() if model else None,
                 creep_per_decade=self.creep_per_decade,
                 creep_times=self.creep_shortest * np.logspace(0, self.creep_decades - 1, self.creep_decades),
                 step=self.step,
