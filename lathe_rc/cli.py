@@ -126,7 +126,7 @@ def _table(result: harness.Result) -> RichTable:
         table.add_column(column, justify="right" if column else "left")
     errors = result.errors
     for label, number in (("first revolution", 0), ("last revolution", -1)):
-        table.add_row(label, f"{errors.rms[number] * 1e6:.3f}", f"{errors.largest[number] * 1e6:.3f}")
+        table.add_row(label, *(f"{values[number] * 1e6:#.4g}" for values in (errors.rms, errors.largest)))
     return table
 
 
@@ -188,27 +188,41 @@ def run(
         console.print(f"bag: {result.bag}", highlight=False, soft_wrap=True)
 
 
+_DEMOS = {
+    "piston": (
+        "An oval-barrel piston at 1000 rpm with a 10 % harmonic speed deviation: five ROS 2 processes, one bag.",
+        "Oval-barrel piston, 1000 rpm, 10 % speed deviation",
+    ),
+    "two_channel": (
+        "An oval-barrel piston, coarse and piezo channel both self-learning: seven ROS 2 processes, one bag.",
+        "Oval-barrel piston, 1000 rpm, self-learning coarse and piezo channel",
+    ),
+}
+
+
 @main.command()
+@click.argument("name", type=click.Choice(list(_DEMOS)), default="piston")
 @click.option("--revolutions", type=click.FloatRange(min=1), default=60.0, show_default=True)
 @click.option("--folder", type=click.Path(path_type=Path), default=Path("bags"), show_default=True, help="for results")
-def demo(revolutions: float, folder: Path) -> None:
-    """Turn an oval-barrel piston: five processes over DDS, learning, everything recorded."""
+def demo(name: str, revolutions: float, folder: Path) -> None:
+    """Turn an oval-barrel piston: processes over DDS, learning, everything recorded.
+
+    NAME is piston (one channel, the default) or two_channel (a piezo channel learns what the coarse one leaves).
+    """
     number = 1
     while (folder / f"demo-{number}").exists():
         number += 1
     place = folder / f"demo-{number}"
-    scenario = _load("piston", [f"spindle_encoder.revolutions={revolutions!r}"])
+    announcement, title = _DEMOS[name]
+    scenario = _load(name, [f"spindle_encoder.revolutions={revolutions!r}"])
     console = Console()
-    console.print(
-        "An oval-barrel piston at 1000 rpm with a 10 % harmonic speed deviation: five ROS 2 processes, one bag.",
-        highlight=False,
-    )
+    console.print(announcement, highlight=False)
     folder.mkdir(parents=True, exist_ok=True)
     result = _run(scenario, mode="processes", groups=[], bag=place)
     from lathe_rc.view import figure
 
     picture = place.with_suffix(".png")
-    figure.save(picture, result.recording, result.errors, "Oval-barrel piston, 1000 rpm, 10 % speed deviation")
+    figure.save(picture, result.recording, result.errors, title)
     console.print(_table(result))
     for fact in _facts(result):
         console.print(fact, highlight=False)
