@@ -15,12 +15,12 @@ STAGES: dict[str, type[Stage]] = {
     stage.kind: stage
     for stage in (
         SpindleEncoder,
-        ProfileStage,
         LearningController,
         ElectrodynamicActuator,
         PiezoActuator,
         SeriesDriveStage,
         Vibration,
+        ProfileStage,
         Tool,
     )
 }
