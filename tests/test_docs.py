@@ -217,7 +217,7 @@ class TestLaunch:
         assert all(node.package == "lathe_rc" and node.executable == node.name for node in nodes)
         (file,) = {parameter for node in nodes for parameter in node.parameters}
         loaded = scenario.load(Path(file))
-        assert set(loaded.nodes["spindle_encoder"].members) == set(TABLES) - {"spindle_encoder"}
+        assert set(loaded.nodes["spindle_encoder"].members) == FIVE - {"spindle_encoder"}
         assert loaded.nodes["recorder"].bag == str(tmp_path / f"bag_{loaded.shared.run_id}")
 
     def test_takes_scenario_and_bag(self, start: Callable[..., Any], tmp_path: Path) -> None:
