@@ -112,6 +112,15 @@ def test_first_harmonic_is_the_describing_function(amplitude):
     assert harmonic / amplitude == pytest.approx(expected, abs=1e-6)
 
 
+@given(st.floats(1e-3, 1e4), st.floats(-0.99, 1.0), st.floats(1e-3, 0.999))
+def test_any_bouc_wen_with_an_inverse_is_taken(beta, ratio, part):
+    gamma = ratio * beta
+    model = BoucWen(part * (beta + gamma) / (2.0 * beta), beta, gamma)
+    assert 1.0 <= model.gain < np.inf
+    path = np.array([0.5, 1.0, -1.0, -0.2, 0.4, -0.9])
+    assert_allclose(run(model.inverse(), run(model, path)), path, atol=1e-9)
+
+
 @given(bouc_wen_models(), paths)
 def test_bouc_wen_obeys_its_differential_equation(model, path):
     """dh = A·du - β·h·|du| - γ·|h|·du in steps of a thousandth of the path's own, by Heun's rule."""

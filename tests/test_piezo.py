@@ -158,6 +158,16 @@ def test_set_point_at_the_stroke_is_no_saturation():
     assert machine.saturated == 0
 
 
+def test_voltage_that_a_wrong_inverse_asks_for_is_counted():
+    """The set point stays within the stroke; at its ends the inverse of too flat a model wants more than there is."""
+    set_point = STROKE * np.sin(2 * np.pi * np.arange(20_000) / 10_000)
+    machine = make_drive("plays", scale=0.85)
+    voltage = drive(machine, set_point)[2]
+    at_limit = np.abs(voltage) == VOLTS
+    assert at_limit.sum() > 1000
+    assert machine.saturated == at_limit.sum()
+
+
 # --- hysteresis
 
 

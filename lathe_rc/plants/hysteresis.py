@@ -300,7 +300,8 @@ class BoucWen(_Operator):
     def _end_of_loop(self) -> float:
         """The hysteretic part at the end of a steady loop over ±1: what a way of 2 turns into its opposite."""
         shape = np.array([self.a, self.beta, self.gamma])
-        bound = self.a / (self.beta + self.gamma)
+        # It stays below A/(β + γ), but for rounding.
+        bound = 2.0 * self.a / (self.beta + self.gamma)
         return float(brentq(lambda h: _move(-h, 2.0, shape) - h, 0.0, bound, xtol=1e-15))
 
     @property
