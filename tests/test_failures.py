@@ -105,7 +105,7 @@ def test_the_nodes_themselves_refuse_a_cell_that_cannot_work(tmp_path):
     """Without the harness's check, as under ros2 launch: the time master checks what its members announce."""
     scenario = load(PISTON, ["learning_controller.q_time=10e-6"])
     cell = harness.with_recorder(scenario, tmp_path / "bag", keep=True)
-    diverges = pytest.raises(InputError, match=r"learning diverges: sup\|Q - Z\|")
+    diverges = pytest.raises(InputError, match=r"learning diverges with electrodynamic_actuator: sup\|Q - Z\|")
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes, diverges:
         processes.wait_for_end()
 

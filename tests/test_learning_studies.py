@@ -84,14 +84,12 @@ def test_table_at_frequencies_that_the_paper_does_not_have(tmp_path):
     np.testing.assert_allclose(found["simulated"], found["analytic"], rtol=0.01)
 
 
-def test_coarse_sampling_errs_as_the_spec_says(tmp_path):
-    """1.3 % at 512 samples per revolution, .07 % at 2048."""
-    worst = []
-    for samples in (512, 2048):
-        found = study(tmp_path, "multichannel", samples_per_revolution=samples)
-        worst.append(np.abs(np.array(found["simulated"]) / found["analytic"] - 1).max())
-    assert 0.005 < worst[0] < 0.025
-    assert worst[1] < 0.002
+@pytest.mark.parametrize(("samples", "low", "high"), [(128, 0.05, 0.13), (512, 1e-4, 0.013), (2048, 1e-6, 7e-4)])
+def test_coarse_sampling_errs_as_the_spec_says(tmp_path, samples, low, high):
+    """No more than 13 % at 128 samples per revolution, 1.3 % at 512, .07 % at 2048."""
+    found = study(tmp_path, "multichannel", samples_per_revolution=samples)
+    worst = np.abs(np.array(found["simulated"]) / found["analytic"] - 1).max()
+    assert low < worst < high
 
 
 def test_piston_in_the_four_structures(tmp_path):

@@ -29,7 +29,7 @@ Complex = npt.NDArray[np.complex128]
 
 SCENARIOS = ("one_channel", "direct_compensation", "two_coarse", "two_channel")  # in the order of the table
 _TUNINGS = {"none": PLAIN, "lead_lag": LEAD_LAG}
-_SLOWEST = 100.0  # [rad/s] about the spindle's speed
+_SLOWEST = 500.0  # [rad/s] about the speed of the spindle: the frequencies of the table are its first four harmonics
 _AMPLITUDE = 10e-6  # [m], which the piezo can reach
 _COLOURS = ("#c0392b", "#e08e0b", "#7d3c98", "#1f6f8b")
 
