@@ -14,7 +14,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _PACKAGE = Path(__file__).parent
-_KERNEL_FOLDERS = ("signals", "plants", "control")
+_KERNEL_FOLDERS = (".", "signals", "plants", "control", "analysis")
 
 
 def _source_hash() -> str:

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Linear systems given by transfer functions: a rational function of p, stepped sample by sample.
+
+Blocks of any length give the same bits. Inner loops that hold other things than one linear system (a limit, a play)
+step a `System` themselves with `step`.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy import signal
+from scipy.linalg import expm, matrix_balance
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+
+Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+Hold = Literal["zoh", "foh", "tustin"]
+
+
+@dataclass(frozen=True)
+class TransferFunction:
+    """numerator(p)/denominator(p).
+
+    Attributes:
+        numerator, denominator: coefficients by falling powers of p, as numpy.polyval takes them.
+
+    Raises:
+        InputError: it is not proper, or a coefficient is not finite.
+    """
+
+    numerator: tuple[float, ...]
+    denominator: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        top, bottom = (
+            np.trim_zeros(np.array(part, dtype=np.float64), "f") for part in (self.numerator, self.denominator)
+        )
+        if not (np.all(np.isfinite(top)) and np.all(np.isfinite(bottom))):
+            raise InputError(f"transfer function {self}; allowed: finite coefficients")
+        if not bottom.size:
+            raise InputError(f"transfer function {self}; allowed: a denominator that is not zero")
+        if top.size > bottom.size:
+            raise InputError(
+                f"transfer function {self} of degrees {top.size - 1} over {bottom.size - 1}; allowed: a numerator "
+                "of no higher degree (add a pole for each zero that is too many)"
+            )
+
+    def __str__(self) -> str:
+        """Coefficients, falling powers of p."""
+        return f"{list(map(float, self.numerator))}/{list(map(float, self.denominator))}"
+
+    def response(self, frequency: npt.ArrayLike) -> Complex:
+        """Response at ``frequency`` [rad/s], any shape."""
+        p = 1j * np.asarray(frequency, dtype=np.float64)
+        return np.asarray(np.polyval(self.numerator, p) / np.polyval(self.denominator, p))
+
+    @property
+    def poles(self) -> Complex:
+        """Poles [rad/s]."""
+        return np.asarray(np.roots(self.denominator), dtype=np.complex128)
+
+    def __mul__(self, other: "TransferFunction") -> "TransferFunction":
+        """Both one after the other; nothing is cancelled."""
+        return TransferFunction(
+            tuple(np.polymul(self.numerator, other.numerator)), tuple(np.polymul(self.denominator, other.denominator))
+        )
+
+
+class System(NamedTuple):
+    """x[n] = Φ·x[n-1] + g0·u[n-1] + g1·u[n], y[n] = c·x[n] + d·u[n].
+
+    Attributes:
+        transition: Φ, shape (m, m).
+        before, now: g0 and g1, shape (m,).
+        output: c, shape (m,).
+        through: d.
+    """
+
+    transition: Array
+    before: Array
+    now: Array
+    output: Array
+    through: float
+
+
+@kernel
+def step(system: System, state: Array, command: float) -> float:
+    """The output after one more sample of the input.
+
+    ``state`` is of shape (2m + 1,): x, then u[n-1], then room for the new x.
+    """
+    order = system.now.size
+    previous = state[order]
+    value = system.through * command
+    for row in range(order):
+        total = system.before[row] * previous + system.now[row] * command
+        for column in range(order):
+            total += system.transition[row, column] * state[column]
+        state[order + 1 + row] = total
+        value += system.output[row] * total
+    for row in range(order):
+        state[row] = state[order + 1 + row]
+    state[order] = command
+    return value
+
+
+@kernel
+def _block(system: System, state: Array, command: Array, output: Array) -> None:
+    for k in range(command.size):
+        output[k] = step(system, state, command[k])
+
+
+def discretise(transfer: TransferFunction, step_s: float, hold: Hold) -> System:
+    """Discretise a transfer function.
+
+    Args:
+        transfer: of the continuous system.
+        step_s: sampling step [s].
+        hold: ``zoh``: exact for an input that is constant from sample to sample; ``foh``: exact for one that is
+            linear between samples; ``tustin``: the bilinear rule.
+    """
+    a, b, c, d = signal.tf2ss(np.atleast_1d(transfer.numerator), np.atleast_1d(transfer.denominator))
+    order = a.shape[0]
+    if order and not np.any(a) and not np.any(b):  # tf2ss gives a gain one idle state
+        a, b, c, order = np.empty((0, 0)), np.empty((0, 1)), np.empty((1, 0)), 0
+    if order:
+        # Poles far apart make a companion matrix of coefficients that differ by many powers of ten.
+        a, (scale, _) = matrix_balance(a, permute=False, separate=True)
+        b, c = b / scale[:, None], c * scale[None, :]
+    column = b[:, 0]
+    if hold == "tustin":
+        left = np.linalg.inv(np.eye(order) - a * step_s / 2.0)
+        transition = left @ (np.eye(order) + a * step_s / 2.0)
+        before = now = left @ column * (step_s / 2.0)
+    else:
+        whole = np.zeros((order + 2, order + 2))
+        whole[:order, :order], whole[:order, order], whole[order, order + 1] = a, column, 1.0 / step_s
+        whole = expm(whole * step_s)
+        transition, held, rising = whole[:order, :order], whole[:order, order], whole[:order, order + 1]
+        before, now = (held, np.zeros(order)) if hold == "zoh" else (held - rising, rising)
+    return System(
+        np.ascontiguousarray(transition), np.ascontiguousarray(before), np.ascontiguousarray(now),
+        np.ascontiguousarray(c[0]), float(d[0, 0]),
+    )  # fmt: skip
+
+
+def rest(system: System) -> Array:
+    """The state for `step` of a system that has rested at 0."""
+    return np.zeros(2 * system.now.size + 1)
+
+
+class LinearSystem:
+    """One linear system that remembers its state.
+
+    Args:
+        transfer: of the continuous system.
+        step_s: sampling step [s].
+        hold: see `discretise`.
+
+    Attributes:
+        system: the difference equation.
+    """
+
+    def __init__(self, transfer: TransferFunction, step_s: float, hold: Hold = "foh") -> None:
+        self.system = discretise(transfer, step_s, hold)
+        self._state = rest(self.system)
+
+    def block(self, command: Array, output: Array) -> None:
+        """Step through a block, shape (n,) each; at rest at 0 before the first."""
+        _block(self.system, self._state, command, output)
