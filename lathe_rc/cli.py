@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from lathe_rc import __version__, harness, resources
+from lathe_rc import __version__, harness, resources, workshop
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
@@ -47,6 +47,7 @@ def main() -> None:
 
 
 main.add_command(study)
+main.add_command(workshop.command)
 
 
 def _load(name: str, overrides: Sequence[str]) -> Scenario:
@@ -122,11 +123,12 @@ class _Watch:
 
 def _table(result: harness.Result) -> RichTable:
     table = RichTable(show_edge=False, header_style="bold", title_justify="left")
-    for column in ("", "RMS [µm]", "maximum [µm]"):
+    columns = {"rms": "RMS [µm]", "max": "maximum [µm]", "peak_to_valley": "peak to valley [µm]", "ront": "RONt [µm]"}
+    for column in ("", *columns.values()):
         table.add_column(column, justify="right" if column else "left")
-    errors = result.errors
-    for label, number in (("first revolution", 0), ("last revolution", -1)):
-        table.add_row(label, *(f"{values[number] * 1e6:#.4g}" for values in (errors.rms, errors.largest)))
+    for label, revolution in (("first revolution", 0), ("last revolution", -1)):
+        told = workshop.numbers(result.part, revolution)
+        table.add_row(label, *(f"{told[name]:#.4g}" for name in columns))
     return table
 
 
@@ -149,6 +151,7 @@ def _run(scenario: Scenario, *, mode: harness.Mode, groups: list[list[str]], bag
 @click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of the run")
 @click.option("--speed-factor", type=click.FloatRange(min=0), help="pace against real time; 0: as fast as possible")
 @click.option("--bag", type=click.Path(path_type=Path), help="folder to record to; must not exist")
+@click.option("--profile", type=click.Path(path_type=Path), help="CSV file to write the last revolution's profile to")
 @click.option("--set", "overrides", multiple=True, metavar="NODE.PARAM=VALUE", help="also PARAM=VALUE if shared")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def run(
@@ -158,6 +161,7 @@ def run(
     revolutions: float | None,
     speed_factor: float | None,
     bag: Path | None,
+    profile: Path | None,
     overrides: tuple[str, ...],
     *,
     as_json: bool,
@@ -176,6 +180,9 @@ def run(
     if split and mode != "processes":
         raise InputError(f"--group with --mode {mode}; allowed: --mode processes")
     result = _run(loaded, mode=mode, groups=split, bag=bag)
+    if profile:
+        found = workshop.part(result.recording)
+        workshop.write_profile(profile, result.recording, found, [found.form.rms.size - 1])
     if as_json:
         click.echo(json.dumps(result.summary()))
         return
@@ -184,8 +191,9 @@ def run(
         console.print(_table(result))
     for fact in _facts(result):
         console.print(fact, highlight=False)
-    if result.bag:
-        console.print(f"bag: {result.bag}", highlight=False, soft_wrap=True)
+    for name, path in (("bag", result.bag), ("profile", profile)):
+        if path:
+            console.print(f"{name}: {path}", highlight=False, soft_wrap=True)
 
 
 _DEMOS = {

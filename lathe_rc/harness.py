@@ -26,7 +26,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
-from lathe_rc.analysis.metrology import FormErrors, form_errors
+from lathe_rc import workshop
+from lathe_rc.analysis.metrology import FormErrors, Measurement, form_errors
 from lathe_rc.bag import reader, repair
 from lathe_rc.bag.record import OfflineRecorder, about
 from lathe_rc.bag.writer import BagWriter, refuse_existing
@@ -101,6 +102,11 @@ class Result:
         return form_errors(angle, self.recording.of_type(messages.TOOL)["error"])
 
     @cached_property
+    def part(self) -> Measurement:
+        """The part as the workshop measures it; see `lathe_rc.workshop.part`."""
+        return workshop.part(self.recording)
+
+    @cached_property
     def digest(self) -> dict[str, str]:
         """Digest of each signal topic."""
         return self.recording.digests()
@@ -109,10 +115,8 @@ class Result:
         """What ``lathe run --json`` prints."""
         errors = self.errors
 
-        def of(revolution: int) -> dict[str, float] | None:
-            if not errors.rms.size:
-                return None
-            return {"rms": errors.rms[revolution] * 1e6, "max": errors.largest[revolution] * 1e6}
+        def of(revolution: int) -> dict[str, Any] | None:
+            return workshop.numbers(self.part, revolution) if errors.rms.size else None
 
         return {
             "scenario": self.scenario.name,
@@ -126,7 +130,9 @@ class Result:
             "error_um": {
                 "first": of(0),
                 "last": of(-1),
-                "per_revolution_rms": [rms * 1e6 for rms in errors.rms],
+                "per_revolution_rms": (errors.rms * 1e6).tolist(),
+                "per_revolution_peak_to_valley": (errors.peak_to_valley * 1e6).tolist(),
+                "per_revolution_ront": (self.part.roundness.peak_to_valley * 1e6).tolist() if errors.rms.size else [],
             },
             "bag": str(self.bag) if self.bag else None,
             "digest": self.digest,

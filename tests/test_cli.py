@@ -23,6 +23,7 @@ CELL = """
 """
 KEYS = ["scenario", "mode", "simulated_s", "wall_s", "real_time_factor", "revolutions", "blocks", "dropped"]
 KEYS += ["error_um", "bag", "digest"]
+PER_REVOLUTION = ["per_revolution_rms", "per_revolution_peak_to_valley", "per_revolution_ront"]
 
 
 @pytest.fixture(autouse=True)
@@ -64,10 +65,15 @@ def test_json_tells_the_run(folder):
     assert (summary["revolutions"], summary["blocks"], summary["dropped"]) == (3, 180, 0)
     assert summary["digest"] == result.digest
     error = summary["error_um"]
-    assert list(error) == ["first", "last", "per_revolution_rms"]
-    assert error["per_revolution_rms"] == pytest.approx(list(errors.rms * 1e6))
-    assert error["first"] == pytest.approx({"rms": errors.rms[0] * 1e6, "max": errors.largest[0] * 1e6})
-    assert error["last"] == pytest.approx({"rms": errors.rms[-1] * 1e6, "max": errors.largest[-1] * 1e6})
+    assert list(error) == ["first", "last", *PER_REVOLUTION]
+    around = result.part.roundness.peak_to_valley
+    for name, values in zip(PER_REVOLUTION, (errors.rms, errors.peak_to_valley, around), strict=True):
+        assert error[name] == pytest.approx(list(values * 1e6))
+    for name, k in (("first", 0), ("last", -1)):
+        expected = {"rms": errors.rms[k], "max": errors.largest[k], "peak_to_valley": errors.peak_to_valley[k]}
+        expected |= {"ront": around[k], "ra": result.part.roughness.ra[k]}
+        assert {key: error[name][key] * 1e-6 for key in expected} == pytest.approx(expected)
+    assert (error["first"]["revolution"], error["last"]["revolution"]) == (1, 3)
 
 
 def test_json_of_a_run_without_a_bag_or_a_revolution():
@@ -75,7 +81,7 @@ def test_json_of_a_run_without_a_bag_or_a_revolution():
         summary = told("cell.yaml", "--revolutions", revolutions)
         assert summary["bag"] is None
         assert summary["revolutions"] == 0
-        assert summary["error_um"] == {"first": None, "last": None, "per_revolution_rms": []}
+        assert summary["error_um"] == {"first": None, "last": None, **{name: [] for name in PER_REVOLUTION}}
 
 
 def test_json_holds_no_numbers_that_json_does_not_know():

@@ -81,7 +81,7 @@ class LearningControllerParameters(SpeedLawParameters):
     )
     memory_file: str = parameter("", "file that the events save and load write and read", path=True)
     allow_unstable: bool = parameter(default=False, doc="start although sup|Q - Z| is not below 1")
-    identify: bool = parameter(default=False, doc="identify the drive from its command and measured position")
+    identify: bool = parameter(default=True, doc="identify the drive from its command and measured position")
     identification_bandwidth: Annotated[float, Gt(0)] = parameter(
         1000.0, "bandwidth of its filters: above the profile's harmonics, below the noise", "rad/s"
     )
