@@ -95,7 +95,8 @@ def test_stage_may_be_put_between_two_others(repeater):
 
 def test_renamed_topic_changes_nothing_else():
     renamed = ["coarse/state:=carriage"]
-    result = run(electrodynamic_actuator={"remap": renamed}, tool={"remap": renamed})
+    names = ("electrodynamic_actuator", "learning_controller", "tool")
+    result = run(**{name: {"remap": renamed} for name in names})
     assert result.digest["/carriage"] == run().digest["/coarse/state"]
 
 
