@@ -17,6 +17,11 @@ NODES = [
     "series_drive",
     "vibration",
     "tool",
+    "feed_drive",
+    "cutting_process",
+    "position_controller",
+    "force_controller",
+    "decoupler",
     "recorder",
 ]
 
@@ -51,7 +56,10 @@ setup(
     python_requires=">=3.10",
     install_requires=requirements(),
     entry_points={
-        "console_scripts": ["lathe = lathe_rc.cli:main"] + [f"{node} = lathe_rc.nodes.{node}:main" for node in NODES],
+        "console_scripts": [
+            "lathe = lathe_rc.cli:main",
+            *(f"{node} = lathe_rc.nodes.{node}:main" for node in [*NODES, "container"]),
+        ],
     },
     zip_safe=False,
 )

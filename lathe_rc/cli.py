@@ -139,15 +139,21 @@ def _facts(result: harness.Result) -> list[str]:
     ]
 
 
-def _run(scenario: Scenario, *, mode: harness.Mode, groups: list[list[str]], bag: Path | None) -> harness.Result:
+def _run(scenario: Scenario, *, mode: harness.Mode, groups: list[list[str]] | None, bag: Path | None) -> harness.Result:
     with _Watch(Console(stderr=True)) as watch:
-        return harness.run(scenario, mode=mode, groups=groups or None, bag=bag, watch=watch)
+        return harness.run(scenario, mode=mode, groups=groups, bag=bag, watch=watch)
 
 
 @main.command()
 @click.argument("scenario")
 @click.option("--mode", type=click.Choice(["offline", "composed", "processes"]), default="offline", show_default=True)
-@click.option("--group", "groups", multiple=True, metavar="NODE+NODE", help="nodes that share a process; repeatable")
+@click.option(
+    "--group",
+    "groups",
+    multiple=True,
+    metavar="NODE+NODE",
+    help="nodes that share a process, instead of those that the scenario names; repeatable; none: one each",
+)
 @click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of the run")
 @click.option("--speed-factor", type=click.FloatRange(min=0), help="pace against real time; 0: as fast as possible")
 @click.option("--bag", type=click.Path(path_type=Path), help="folder to record to; must not exist")
@@ -173,13 +179,10 @@ def run(
     changes = [f"{node}.{n}={v!r}" for node in loaded.of_kind(SpindleEncoder.kind) for n, v in given.items()]
     if changes:
         loaded = _load(scenario, [*overrides, *changes])
-    split = [group.split("+") for group in groups]
-    unknown = [name for group in split for name in group if name not in loaded.nodes]
-    if unknown:
-        raise InputError(f"--group: no node {unknown[0]!r} in the scenario; allowed: {', '.join(loaded.nodes)}")
-    if split and mode != "processes":
+    split = [group.split("+") for group in groups if group != "none"]
+    if groups and mode != "processes":
         raise InputError(f"--group with --mode {mode}; allowed: --mode processes")
-    result = _run(loaded, mode=mode, groups=split, bag=bag)
+    result = _run(loaded, mode=mode, groups=split if groups else None, bag=bag)
     if profile:
         found = workshop.part(result.recording)
         workshop.write_profile(profile, result.recording, found, [found.form.rms.size - 1])
@@ -226,7 +229,7 @@ def demo(name: str, revolutions: float, folder: Path) -> None:
     console = Console()
     console.print(announcement, highlight=False)
     folder.mkdir(parents=True, exist_ok=True)
-    result = _run(scenario, mode="processes", groups=[], bag=place)
+    result = _run(scenario, mode="processes", groups=None, bag=place)
     from lathe_rc.view import figure
 
     picture = place.with_suffix(".png")

@@ -158,7 +158,7 @@ def run(
         scenario: what to run; its spindle must have a number of revolutions.
         mode: ``offline``: a loop in this process; ``composed``: all nodes in one process; ``processes``: each node
             a process.
-        groups: nodes that share a process, for ``processes``; nodes that are not named have their own.
+        groups: nodes that share a process, for ``processes``, the others have their own; None: as the scenario says.
         bag: folder to record to; None: nothing is kept.
         watch: called with every event, from the thread that called `run`. The first is ``checked``, with the
             run's samples and step [s]: from then on nothing is refused.
@@ -183,12 +183,7 @@ def run(
         if place is None:
             place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-"))) / "bag"
         complete = with_recorder(scenario, place, keep=bag is not None)
-        names = list(complete.nodes)
-        if mode == "composed":
-            split: list[list[str]] = [names]
-        else:
-            split = [list(group) for group in groups or []]
-            split += [[name] for name in names if not any(name in group for group in split)]
+        split = [list(complete.nodes)] if mode == "composed" else complete.processes(groups)
         processes = stack.enter_context(Processes(complete, split, domain=domain))
         try:
             events = processes.wait_for_end(watch)
@@ -199,7 +194,7 @@ def run(
             raise
         return Result(
             scenario=scenario,
-            mode=mode if not groups else "grouped",
+            mode="grouped" if mode == "processes" and len(split) < len(complete.nodes) else mode,
             samples=cell.master.samples,
             wall_s=(events["complete"]["monotonic_ns"] - events["block0"]["monotonic_ns"]) * 1e-9,
             bag=bag,
@@ -337,7 +332,7 @@ class Processes:
         name = "+".join(group)
         with (self._folder / f"{group[0]}.log").open("wb") as log:
             child = subprocess.Popen(
-                [sys.executable, "-m", "lathe_rc.nodes", *members, "--ros-args", "--params-file", str(file)],
+                [sys.executable, "-m", "lathe_rc.nodes.container", *members, "--ros-args", "--params-file", str(file)],
                 env=environment,
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,

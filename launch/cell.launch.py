@@ -60,13 +60,13 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     return [
         Node(
             package="lathe_rc",
-            executable=complete.kind(name),
-            name=name,
+            executable="container",
+            arguments=[f"{name}:{complete.kind(name)}" for name in group],
             parameters=[file.name],
             output="screen",
             on_exit=end_with,
         )
-        for name in complete.nodes
+        for group in complete.processes()
     ]
 
 

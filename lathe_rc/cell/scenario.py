@@ -21,7 +21,7 @@ TABLES[RECORDER] = RecorderParameters
 
 _EVERYONE = "/**"
 # What changes neither a sample nor a message of a run, and so not its identity.
-_HOST_PARAMETERS = {"run_id", "speed_factor", "window", "members", "autostart"}
+_HOST_PARAMETERS = {"run_id", "speed_factor", "window", "members", "processes", "autostart"}
 
 
 def kind_of(node: str, values: Mapping[str, object]) -> str:
@@ -79,6 +79,28 @@ class Scenario:
     def of_kind(self, kind: str) -> list[str]:
         """Names of the nodes of a kind."""
         return [name for name in self.nodes if self.kind(name) == kind]
+
+    def processes(self, groups: Iterable[Iterable[str]] | None = None) -> list[list[str]]:
+        """Names of the nodes in each process.
+
+        Args:
+            groups: nodes that share one; None: those of the spindle's ``processes``. The others have one each.
+
+        Raises:
+            InputError: a node that there is not, or one that is named twice.
+        """
+        if groups is None:
+            named = [text for table in self.nodes.values() for text in getattr(table, "processes", [])]
+            groups = [text.split("+") for text in named]
+        split = [[name.strip() for name in group] for group in groups]
+        seen: set[str] = set()
+        for name in (name for group in split for name in group):
+            if name not in self.nodes:
+                raise InputError(f"processes: no node {name!r} in the scenario; allowed: {', '.join(self.nodes)}")
+            if name in seen:
+                raise InputError(f"processes: {name} is named twice; allowed: each node in one process")
+            seen.add(name)
+        return split + [[name] for name in self.nodes if name not in seen]
 
     def to_yaml(self) -> str:
         """The complete parameter file; empty lists are left out, since rcl cannot read them."""

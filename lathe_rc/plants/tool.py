@@ -44,3 +44,26 @@ def desired(
             expected[k] = reference[k]
         else:
             expected[k] = evaluate(angle[k], _height(angle[k], feed, start_height, part), heights, table)
+
+
+@kernel
+def desired_at(
+    heights: Array,
+    table: Array,
+    start_height: float,
+    slide: Array,
+    slide_measured: Array,
+    angle: Array,
+    angle_true: Array,
+    reference: Array,
+    expected: Array,
+    height: Array,
+) -> None:
+    """The same where a longitudinal slide makes the height [m], true and as its sensor reads it."""
+    for k in range(angle.size):
+        height[k] = start_height + slide[k]
+        reference[k] = evaluate(angle_true[k], height[k], heights, table)
+        if angle[k] == angle_true[k] and slide[k] == slide_measured[k]:
+            expected[k] = reference[k]
+        else:
+            expected[k] = evaluate(angle[k], start_height + slide_measured[k], heights, table)

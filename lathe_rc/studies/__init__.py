@@ -3,10 +3,30 @@
 
 from typing import Any
 
-from lathe_rc.studies import angle_domain, drive_models, invariance, multichannel, piston, speed_deviation
+from lathe_rc.studies import (
+    angle_domain,
+    decoupling,
+    drive_models,
+    invariance,
+    multichannel,
+    piston,
+    sampled_servo,
+    saturation,
+    speed_deviation,
+)
 from lathe_rc.studies.study import Study
 
 STUDIES: dict[str, Study[Any]] = {
     module.STUDY.name: module.STUDY
-    for module in (invariance, speed_deviation, multichannel, piston, angle_domain, drive_models)
+    for module in (
+        invariance,
+        speed_deviation,
+        multichannel,
+        piston,
+        angle_domain,
+        drive_models,
+        saturation,
+        sampled_servo,
+        decoupling,
+    )
 }

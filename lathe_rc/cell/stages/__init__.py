@@ -2,9 +2,14 @@
 """The stages of the cell: physics and control laws with their parameters and ports."""
 
 from lathe_rc.cell.stage import Stage
+from lathe_rc.cell.stages.cutting_process import CuttingProcessStage
+from lathe_rc.cell.stages.decoupler import DecouplerStage
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_rc.cell.stages.feed_drive import FeedDriveStage
+from lathe_rc.cell.stages.force_controller import ForceController
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuator
+from lathe_rc.cell.stages.position_controller import PositionController
 from lathe_rc.cell.stages.profile import ProfileStage
 from lathe_rc.cell.stages.series_drive import SeriesDriveStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
@@ -22,5 +27,10 @@ STAGES: dict[str, type[Stage]] = {
         Vibration,
         ProfileStage,
         Tool,
+        FeedDriveStage,
+        CuttingProcessStage,
+        PositionController,
+        ForceController,
+        DecouplerStage,
     )
 }

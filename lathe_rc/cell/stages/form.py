@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The desired form of the part as parameters, and what evaluates it under the tool."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -8,10 +9,12 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc import resources
+from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.stage import Input
 from lathe_rc.errors import InputError
-from lathe_rc.plants.tool import desired
+from lathe_rc.plants.tool import desired, desired_at
 from lathe_rc.signals.profile import Harmonics, Piston, Polygon, Profile, ProfileTable, read_csv
 
 
@@ -35,10 +38,13 @@ class FormParameters(NodeParameters):
     polygon_sides: Annotated[int, Ge(3), Le(64)] = parameter(3, "polygon: number of sides")
     polygon_inscribed_radius: Annotated[float, Gt(0)] = parameter(1e-3, "polygon: radius of the inscribed circle", "m")
     polygon_corner_radius: Annotated[float, Gt(0)] = parameter(0.8e-3, "polygon: radius of the corners", "m")
-    feed: Annotated[float, Ge(0)] = parameter(0.0, "advance along the part", "m/rev")
+    height_from: Literal["feed", "slide"] = parameter(
+        "feed", "what makes the height along the part: the feed below, or the longitudinal slide"
+    )
+    feed: Annotated[float, Ge(0)] = parameter(0.0, "feed: advance along the part", "m/rev")
     start_height: Annotated[float, Ge(0)] = parameter(0.0, "where along the part the run begins", "m")
     part_revolutions: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
-        0, "after so many revolutions the next part begins at start_height; 0: one endless part", "rev"
+        0, "feed: after so many revolutions the next part begins at start_height; 0: one endless part", "rev"
     )
 
     def form(self, node: str) -> Profile:
@@ -77,15 +83,39 @@ class Form:
 
     Attributes:
         profile: its table.
+        inputs: what it reads.
+
+    Raises:
+        InputError: see `FormParameters.form`; or a slide that shall begin anew.
     """
 
     def __init__(self, node: str, parameters: FormParameters) -> None:
         self.profile = ProfileTable(parameters.form(node))
         self._parameters = parameters
+        self.inputs = [Input("encoder", messages.ENCODER, ("angle", "angle_true"))]
+        if parameters.height_from == "slide":
+            self.inputs.append(Input("longitudinal/state", messages.STATE, ("position", "measured_position")))
+            if parameters.part_revolutions:
+                raise InputError(f"{node}.part_revolutions with height_from = slide; allowed: 0, a slide does not jump")
 
-    def block(self, encoder: Signals, reference: Samples, expected: Samples, height: Samples) -> None:
+    def block(self, inputs: Sequence[Signals], reference: Samples, expected: Samples, height: Samples) -> None:
         """Fill the desired displacement and what a controller can know of it, and the height [m], shape (n,)."""
         parameters = self._parameters
+        encoder = inputs[0]
+        if parameters.height_from == "slide":
+            desired_at(
+                self.profile.heights,
+                self.profile.table,
+                parameters.start_height,
+                inputs[1]["position"],
+                inputs[1]["measured_position"],
+                encoder["angle"],
+                encoder["angle_true"],
+                reference,
+                expected,
+                height,
+            )
+            return
         desired(
             self.profile.heights,
             self.profile.table,

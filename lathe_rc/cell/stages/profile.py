@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
-from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
+from lathe_rc.cell.stage import Joint, Output, Sparse, Stage
 from lathe_rc.cell.stages.form import Form, FormParameters
 
 
@@ -25,12 +25,12 @@ class ProfileStage(Stage):
         self.parameters = parameters
         self.form = Form(name, parameters)
         self.declare(
-            inputs=[Input("encoder", messages.ENCODER, ("angle", "angle_true"))],
+            inputs=self.form.inputs,
             outputs=[Output("reference", messages.REFERENCE, Joint("reference"))],
         )
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
-        (encoder,), (part,) = inputs, outputs
-        self.form.block(encoder, part["reference"], part["expected"], part["height"])
+        (part,) = outputs
+        self.form.block(inputs, part["reference"], part["expected"], part["height"])
         return []

@@ -31,6 +31,9 @@ class SpindleEncoderParameters(SpeedLawParameters):
         1.0, "pace of the run against real time; 0: as fast as the members follow", "1"
     )
     members: list[str] = parameter([], "nodes that must be ready before block 0; empty: start alone")
+    processes: list[str] = parameter(
+        [], "nodes that share a process, as 'coarse+tool', for harness and launch; those not named have one each"
+    )
 
 
 class SpindleEncoder(Stage):

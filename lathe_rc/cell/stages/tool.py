@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
-from annotated_types import MinLen
+from annotated_types import Ge, Le, MinLen
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
@@ -23,6 +23,16 @@ class ToolParameters(FormParameters):
     )
     drives: Annotated[list[str], MinLen(1)] = parameter(
         ["coarse"], "what moves the tool against the part, by the first word of its state topic; motions add up"
+    )
+    cross_slide: bool = parameter(
+        default=False,
+        doc="the cross slide, positive into the part, counts in the form error; no drive's sensor sees it",
+    )
+    deflects: bool = parameter(
+        default=False, doc="the deflection by the cutting force is part of the form error; no drive's sensor sees it"
+    )
+    deflection_delay: Annotated[int, Ge(1), Le(2**31 - 1)] = parameter(
+        64, "deflects: delay of the feedback edge from the cut, at least a block", "sample"
     )
 
 
@@ -43,29 +53,39 @@ class Tool(Stage):
         self.form = Form(name, parameters) if parameters.reference == "own" else None
         if len(set(parameters.drives)) < len(parameters.drives):
             raise InputError(f"{name}.drives = {parameters.drives}; allowed: each drive once")
-        what = Input("encoder", messages.ENCODER, ("angle", "angle_true"))
-        if self.form is None:
-            what = Input("reference", messages.REFERENCE, ("reference", "expected", "height"))
-        states = [
+        what = [Input("reference", messages.REFERENCE, ("reference", "expected", "height"))]
+        if self.form is not None:
+            what = self.form.inputs
+        self._drives = slice(len(what), len(what) + len(parameters.drives))
+        inputs = what + [
             Input(f"{drive}/state", messages.STATE, ("position", "measured_position")) for drive in parameters.drives
         ]
-        self.declare(inputs=[what, *states], outputs=[Output("tool", messages.TOOL, Joint("displacement"))])
+        if parameters.cross_slide:
+            inputs.append(Input("cross/state", messages.STATE, ("position",)))
+        if parameters.deflects:
+            inputs.append(Input("cut", messages.CUT, ("deflection",), parameters.deflection_delay))
+        self.declare(inputs=inputs, outputs=[Output("tool", messages.TOOL, Joint("displacement"))])
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """δ = Xd - X at the true spindle angle (paper 000, Fig. 1).
 
         What a controller can know differs: the desired form at the measured angle, less the measured motions.
         """
-        (what, *states), (tool,) = inputs, outputs
+        (tool,), states = outputs, inputs[self._drives]
         known, displacement = tool["measured_error"], tool["displacement"]
         if self.form is None:
+            what = inputs[0]
             tool["reference"][:], known[:], tool["height"][:] = what["reference"], what["expected"], what["height"]
         else:
-            self.form.block(what, tool["reference"], known, tool["height"])
+            self.form.block(inputs, tool["reference"], known, tool["height"])
         displacement[:] = states[0]["position"]
         known -= states[0]["measured_position"]
         for state in states[1:]:
             displacement += state["position"]
             known -= state["measured_position"]
         np.subtract(tool["reference"], displacement, out=tool["error"])
+        if self.parameters.cross_slide:
+            tool["error"] += inputs[self._drives.stop]["position"]
+        if self.parameters.deflects:
+            tool["error"] -= inputs[-1]["deflection"]
         return []

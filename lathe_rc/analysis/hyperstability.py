@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Conditions of hyperstability of the periodic law over the box of drives (paper 002, eqs 1 and 12-15).
+
+A drive is a row K, a1, a2, a3, a4 of eq. 1, so that several have the shape (m, 5). With the filter on y it is
+
+    G(p) = K·(T·p + 1)³/((p⁴ + a4·p³ + a3·p² + a2·p + a1)·(T*·p + 1)³)
+
+and closed by χ* it is G/(1 + χ*·G), the linear part of eq. 13. Its real part has the sign of Re(1/G) + χ*. At any
+frequency Re(1/G) is linear in a1 ... a4 and in 1/K: its least value over the box is at a corner.
+
+The paper neglects T*, which makes G of first order at high frequencies. With T* it is of fourth order.
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import control
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.control.periodic import PeriodicGains
+from lathe_rc.plants.feed import fourth_order
+from lathe_rc.transfer import TransferFunction
+
+Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+NAMES = ("K", "a1", "a2", "a3", "a4")
+NOMINAL = np.array([19.0, 21.5, 48.0, 46.9, 10.2])  #: eq. 19
+BOX = np.array([[18.6, 19.5], [18.4, 23.5], [41.4, 64.0], [45.7, 50.0], [8.5, 16.5]])  #: least and largest, eq. 1
+
+_FREQUENCIES = np.geomspace(1e-2, 1e5, 7001)  # [rad/s]
+_LEVELS = np.linspace(0.0, 1.0, 11)  # of sat(y_F)
+
+
+def corners() -> Array:
+    """The 32 corners of the box, shape (32, 5)."""
+    return np.array(list(itertools.product(*BOX)))
+
+
+def plant(drive: Array) -> TransferFunction:
+    """Eq. 1 for one drive, shape (5,)."""
+    return fourth_order(*map(float, drive))
+
+
+def inverse_response(drives: Array, lead: float, lag: float, frequency: Array) -> Complex:
+    """1/G at ``frequency`` [rad/s], shape (n,), of each drive; shape (m, n). T and T* in s."""
+    p = 1j * frequency
+    gain, a1, a2, a3, a4 = drives.T[:, :, None]
+    return np.asarray(
+        (p**4 + a4 * p**3 + a3 * p**2 + a2 * p + a1) * (1.0 + lag * p) ** 3 / (gain * (1.0 + lead * p) ** 3)
+    )
+
+
+@dataclass(frozen=True)
+class Positivity:
+    """What eq. 14 asks of χ*.
+
+    Attributes:
+        least_gain: χ* from which on Re(1/G) + χ* > 0 for all drives and frequencies [1].
+        drive: that needs it, shape (5,).
+        frequency: at which it does [rad/s]; infinite if only the limit does.
+        hurwitz_gain: χ* up to which A* is Hurwitz for all drives [1].
+    """
+
+    least_gain: float
+    drive: Array
+    frequency: float
+    hurwitz_gain: float
+
+    @property
+    def possible(self) -> bool:
+        """Whether any χ* meets eq. 14."""
+        return self.least_gain < self.hurwitz_gain
+
+
+def _largest_hurwitz_gain(drive: Array, lead: float, lag: float) -> float:
+    """χ* from which on A* has a pole on the right; infinite if none does."""
+    gain, a1, a2, a3, a4 = drive
+    bottom = np.polymul([1.0, a4, a3, a2, a1], np.poly([-1.0 / lag] * 3) * lag**3 if lag else [1.0])
+    loop = control.TransferFunction(gain * lead**3 * np.poly([-1.0 / lead] * 3), bottom)
+    margins, *_ = control.stability_margins(loop, returnall=True)
+    # Above the last crossing nothing changes any more; of first order at high frequencies, all large χ* do.
+    return float(np.max(margins)) if lag and len(margins) else np.inf
+
+
+def positivity(drives: Array, lead: float, lag: float) -> Positivity:
+    """Eq. 14 for several drives, shape (m, 5).
+
+    Args:
+        drives: rows of K, a1 ... a4; the corners stand for the box.
+        lead: T [s].
+        lag: T* [s]; 0 as the paper takes it.
+    """
+    real = inverse_response(drives, lead, lag, _FREQUENCIES).real
+    frequency = _FREQUENCIES
+    if not lag:
+        # p/(K·T³) + (a4 - 3/T)/(K·T³) at high frequencies
+        limit = (drives[:, 4] - 3.0 / lead) / (drives[:, 0] * lead**3)
+        real, frequency = np.column_stack((real, limit)), np.append(frequency, np.inf)
+    which, at = np.unravel_index(np.argmin(real), real.shape)
+    hurwitz = min(_largest_hurwitz_gain(drive, lead, lag) for drive in drives)
+    return Positivity(-float(real[which, at]), drives[which], float(frequency[at]), hurwitz)
+
+
+def required_input(drives: Array, derivatives: Array, disturbance: Array) -> Array:
+    """u°, the input that keeps y at r: (r'''' + a4·r''' + a3·r'' + a2·r' + a1·r)/K - f (eq. 5).
+
+    Args:
+        drives: shape (m, 5).
+        derivatives: r and its first four derivatives, shape (5, n) [1, 1/s, …].
+        disturbance: f, shape (n,).
+
+    Returns:
+        Shape (m, n).
+    """
+    weights = np.column_stack((drives[:, 1:], np.ones(len(drives)))) / drives[:, :1]
+    return np.asarray(weights @ derivatives - disturbance)
+
+
+def popov_bound(gains: PeriodicGains, reference_gain: float, theta: Array, step_s: float) -> float:
+    """-η0 of eq. 15 for a switch that stays at 1 [s].
+
+    With w = u1 - θ the memory gives ∫w·v = (∫w² over the last period - ∫θ² over one)/(2·h0) + h0/2·∫v², and the
+    adaptive gain ∫(h11·I + χ*) dI ≥ -χ*²/(2·h11); the other parts are not negative.
+
+    Args:
+        gains: h0 and h11.
+        reference_gain: χ*.
+        theta: θ = χ*·r̂ + u° over a period, shape (n,).
+        step_s: between its samples [s].
+    """
+    return float(-np.sum(theta**2) * step_s / (2.0 * gains.h0) - reference_gain**2 / (2.0 * gains.h11))
+
+
+def learning_factor(drives: Array, gains: PeriodicGains, level: float, memory_filter: float, frequency: Array) -> Array:
+    """By how much the memory's error changes in a period, |Q·(1 - h0·G/(1 + k·G))|, k = h0 + s²·(h12 + h11/p).
+
+    Linear, for a y_F that stands still and δ̃ = 1; above 1 the memory grows at that frequency.
+
+    Args:
+        drives: shape (m, 5).
+        gains: of the law.
+        level: s = sat(y_F), 0 to 1.
+        memory_filter: σ of Q = exp(-(σω)²/2) [s]; 0 for none.
+        frequency: [rad/s], shape (n,).
+
+    Returns:
+        Shape (m, n).
+    """
+    inner = gains.h0 + level**2 * (gains.h12 + gains.h11 / (1j * frequency))
+    inverse = inverse_response(drives, gains.lead, gains.lag, frequency)
+    q = np.exp(-0.5 * (memory_filter * frequency) ** 2)
+    return np.asarray(q * np.abs(1.0 - gains.h0 / (inverse + inner)))
+
+
+@dataclass(frozen=True)
+class Learning:
+    """Where the memory learns, of all drives and all levels of y_F.
+
+    Attributes:
+        grows_from: least and largest frequency from which on the memory without filter grows [rad/s]; each drive and
+            level has one.
+        largest: factor of a period with the filter [1].
+        drive: that has it, shape (5,).
+        level: sat(y_F) at which it does.
+        frequency: at which it does [rad/s].
+    """
+
+    grows_from: tuple[float, float]
+    largest: float
+    drive: Array
+    level: float
+    frequency: float
+
+
+def learning(drives: Array, gains: PeriodicGains, memory_filter: float) -> Learning:
+    """Where the memory learns; see `learning_factor` for the arguments."""
+    bare = np.stack([learning_factor(drives, gains, level, 0.0, _FREQUENCIES) for level in _LEVELS])
+    # The factor nears 1 from above or below at high frequencies, where rounding would decide.
+    above = bare > 1.0 + 1e-6
+    first = _FREQUENCIES[np.argmax(above, axis=-1)][above.any(axis=-1)]
+    factor = bare * np.exp(-0.5 * (memory_filter * _FREQUENCIES) ** 2)
+    level, which, at = np.unravel_index(np.argmax(factor), factor.shape)
+    return Learning(
+        (float(first.min()), float(first.max())) if first.size else (np.inf, np.inf),
+        float(factor[level, which, at]),
+        drives[which],
+        float(_LEVELS[level]),
+        float(_FREQUENCIES[at]),
+    )

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""PID gains from wanted margins, and what a loop with a PID does.
+
+At the crossover ωc the loop's gain is 1 and its phase is the phase margin above -π. With a plant P that is
+
+    C(jωc) = e^{j(margin - π)}/P(jωc),   C = P + I/p + D·N·p/(p + N)
+
+two equations for the three gains; the third is I/ωc = |C(jωc)|/integral_ratio, which bounds the lag of the integral.
+Paper 004 tuned with Matlab's PID Tuner.
+"""
+
+from dataclasses import dataclass
+
+import control  # type: ignore[import-untyped]  # it has no types
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.analysis.state_space import Lti, Plant, delay, state_space
+from lathe_rc.control.pid import PidGains
+from lathe_rc.errors import InputError
+from lathe_rc.transfer import TransferFunction
+
+Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+_FREQUENCIES = 600  # of a Bode plot, from which margins are read
+_SAMPLES = 4000  # of a step response
+_TRIES = 60  # crossovers that `fastest` looks at
+
+
+def response(plant: Plant, frequency: npt.ArrayLike) -> Complex:
+    """Response of any plant at ``frequency`` [rad/s]."""
+    if isinstance(plant, TransferFunction):
+        return plant.response(frequency)
+    return np.asarray(plant(1j * np.asarray(frequency)), dtype=np.complex128)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """What a closed loop does.
+
+    Attributes:
+        rise: from 10 to 90 % of a step [s].
+        settling: to within 2 % [s].
+        overshoot: relative to the step [1].
+        gain_margin: factor of the gain; infinite where no gain is too much.
+        gain_frequency: where the phase is -π [rad/s]; NaN where there is none.
+        phase_margin: [rad].
+        phase_frequency: crossover [rad/s].
+        stable: whether the closed loop is; if not, the step is not measured (NaN).
+    """
+
+    rise: float
+    settling: float
+    overshoot: float
+    gain_margin: float
+    gain_frequency: float
+    phase_margin: float
+    phase_frequency: float
+    stable: bool
+
+
+def _band(plant: Plant, gains: PidGains, wait: float) -> Array:
+    """Frequencies around everything that a Bode plot of the loop must show [rad/s], increasing."""
+    wide = np.geomspace(1e-5, 1e6, _FREQUENCIES)
+    above = np.abs(response(plant, wide) * gains.transfer.response(wide)) > 1.0
+    crossovers = wide[:-1][above[:-1] != above[1:]]
+    zeros = np.roots(gains.transfer.numerator)
+    corners = np.abs(np.concatenate((state_space(plant).poles(), gains.transfer.poles, zeros)))
+    found = np.concatenate((crossovers, corners[corners > 1e-9], [np.pi / wait] if wait else []))
+    return np.geomspace(found.min() / 10.0, found.max() * 10.0, _FREQUENCIES) if found.size else wide
+
+
+def closed_loop(plant: Plant, gains: PidGains, wait: float = 0.0) -> Lti:
+    """Measurement over set point of a loop with a PID; ``wait`` [s] by Padé."""
+    return control.feedback(state_space(plant) * state_space(gains.transfer) * delay(wait))
+
+
+def evaluate(plant: Plant, gains: PidGains, wait: float = 0.0) -> Loop:
+    """Measure a loop of a PID and a plant.
+
+    Args:
+        plant: of the loop.
+        gains: of the PID.
+        wait: pure delay in the loop [s]; exact in the margins, by Padé in the step.
+    """
+    frequency = _band(plant, gains, wait)
+    loop = response(plant, frequency) * gains.transfer.response(frequency) * np.exp(-1j * frequency * wait)
+    gain, phase, at_gain, at_phase = control.margin(control.frd(loop, frequency))
+    closed = closed_loop(plant, gains, wait)
+    poles = closed.poles()
+    stable = bool(np.all(poles.real < 0.0))
+    rise, settling, overshoot = _step(closed, poles) if stable else (np.nan, np.nan, np.nan)
+    return Loop(
+        rise, settling, overshoot, float(gain), float(at_gain), float(np.radians(phase)), float(at_phase), stable
+    )
+
+
+def _step(closed: Lti, poles: Complex) -> tuple[float, float, float]:
+    """Rise time and settling time [s] and relative overshoot of a stable system."""
+    final = float(np.real(closed.dcgain()))
+    span = 10.0 / np.abs(poles.real).min()
+    for _ in range(2):  # a slow pole that hardly shows makes the first span far too long
+        time, y = control.step_response(closed, np.linspace(0.0, span, _SAMPLES))
+        measured = control.step_info(y, T=time, yfinal=final)
+        span = min(span, 4.0 * measured["SettlingTime"])
+    return float(measured["RiseTime"]), float(measured["SettlingTime"]), float(measured["Overshoot"]) / 100.0
+
+
+def tune(
+    plant: Plant,
+    *,
+    crossover: float,
+    phase_margin: float,
+    integral_ratio: float = 6.0,
+    filter_ratio: float = 100.0,
+    wait: float = 0.0,
+) -> PidGains:
+    """Gains with which a loop crosses over where it shall, with the phase margin that it shall have.
+
+    Where the integral alone would leave more phase than wanted there is no derivative, and I is what the margin allows.
+
+    Args:
+        plant: of the loop.
+        crossover: ωc [rad/s].
+        phase_margin: [rad].
+        integral_ratio: gain of the PID at the crossover over that of its integral there.
+        filter_ratio: N over the crossover.
+        wait: pure delay in the loop [s].
+
+    Raises:
+        InputError: no PID has this phase at the crossover.
+    """
+    if not (crossover > 0.0 and 0.0 < phase_margin < np.pi / 2.0 and integral_ratio > 0.0 and filter_ratio > 0.0):
+        raise InputError(
+            f"tuning: crossover {crossover:g} rad/s, phase margin {np.degrees(phase_margin):.4g}°, ratios "
+            f"{integral_ratio:g} and {filter_ratio:g}; allowed: above 0, the margin below 90°"
+        )
+    there = complex(response(plant, crossover)) * np.exp(-1j * crossover * wait)
+    wanted = complex(np.exp(1j * (phase_margin - np.pi)) / there)
+    filter_ = filter_ratio * crossover
+    lead = 1j * crossover * filter_ / (1j * crossover + filter_)
+    integral = abs(wanted) / integral_ratio
+    derivative = max(0.0, (wanted.imag + integral) / lead.imag)
+    if derivative == 0.0:
+        integral = -wanted.imag
+    proportional = wanted.real - derivative * lead.real
+    if proportional <= 0.0:
+        raise InputError(
+            f"tuning: at {crossover:g} rad/s the plant's phase is {np.degrees(np.angle(there)):.4g}°, which no PID "
+            f"brings to a margin of {np.degrees(phase_margin):.4g}°; allowed: a lower crossover or margin"
+        )
+    return PidGains(proportional, integral * crossover, derivative, filter_)
+
+
+def fastest(
+    plant: Plant, *, band: tuple[float, float], phase_margin: float, gain_margin: float, wait: float = 0.0
+) -> PidGains:
+    """Gains of the highest crossover in ``band`` [rad/s] at which both margins are kept and the loop is stable.
+
+    Args:
+        plant: of the loop.
+        band: lowest and highest crossover [rad/s].
+        phase_margin: [rad].
+        gain_margin: factor.
+        wait: pure delay in the loop [s].
+
+    Raises:
+        InputError: there is none.
+    """
+    for crossover in np.geomspace(*band, _TRIES)[::-1]:
+        try:
+            gains = tune(plant, crossover=float(crossover), phase_margin=phase_margin, wait=wait)
+        except InputError:
+            continue
+        loop = evaluate(plant, gains, wait)
+        if loop.stable and loop.gain_margin >= gain_margin and loop.phase_margin >= phase_margin * (1.0 - 1e-4):
+            return gains
+    raise InputError(
+        f"tuning: no crossover from {band[0]:g} to {band[1]:g} rad/s has margins of "
+        f"{np.degrees(phase_margin):.4g}° and {gain_margin:g}; allowed: a lower band or smaller margins"
+    )

@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A reduced-order model of a channel from its step response, and the model's realisable inverse.
+
+Both stages of paper 004 (Figs 6-9):
+
+    model      (b_m·p^m + … + b0)/((a_n·p^n + … + 1)·p^k), k = 0 or 1, by least squares of the step response
+    inverse    (c_r·p^r + … )/Π(1 + p·τ_i), by nonlinear programming: the input of model and inverse in series is a
+               step, and their output shall be that step again, in the mean square
+
+A model is linear in its numerator, so only the denominator is searched. The poles of the model are kept stable by
+factors of second and first order with positive coefficients. The lags τ_i of the inverse have a least value: without
+it the best inverse is the exact one, which cannot be built.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import Bounds, least_squares, minimize
+
+from lathe_rc.control.decoupler import LAG, inverse
+from lathe_rc.errors import InputError
+from lathe_rc.signals.table import read_table
+from lathe_rc.transfer import Hold, LinearSystem, TransferFunction
+
+Array = npt.NDArray[np.float64]
+
+_SPREADS = (0.02, 0.1, 0.4)  # of the record, where searches for time constants start
+_DAMPINGS = (0.2, 1.2)
+_MOST = 60  # steps of a search; the best of several counts
+_LARGEST_LAG = 100.0  # of the inverse, over the least one
+
+
+@dataclass(frozen=True)
+class ChannelStep:
+    """A measured response to a step of 1 at time 0.
+
+    Args:
+        time: from 0 in even steps [s], shape (n,), n from 16.
+        response: in the unit of the channel, shape (n,).
+
+    Raises:
+        InputError: it is no such response.
+    """
+
+    time: Array
+    response: Array
+
+    def __post_init__(self) -> None:
+        time, response = self.time, self.response
+        if time.size != response.size or time.size < 16:
+            raise InputError(f"channel: {time.size} times, {response.size} values; allowed: 16 or more of each")
+        if not (np.all(np.isfinite(time)) and np.all(np.isfinite(response))):
+            raise InputError("channel: not all numbers are finite; remove those that are not")
+        steps = np.diff(time)
+        if time[0] != 0.0 or steps[0] <= 0.0 or np.abs(steps - steps[0]).max() > 1e-3 * steps[0]:
+            raise InputError(
+                f"channel: times from {time[0]:g} s in steps of {steps.min():g} to {steps.max():g} s; allowed: from 0, "
+                "where the step is, in even steps (resample it)"
+            )
+        if not np.any(response):
+            raise InputError("channel: the response is 0 throughout; allowed: one that answers the step")
+
+    @property
+    def step(self) -> float:
+        """Time between samples [s]."""
+        return float(self.time[-1] / (self.time.size - 1))
+
+
+def read_csv(path: Path) -> ChannelStep:
+    """Read a step response: columns ``time_s`` [s], from the step on, and ``response``, over the height of the step.
+
+    Raises:
+        InputError: the file is missing or malformed, or holds no step response.
+    """
+    _, table = read_table(path, [("time_s", "response")], "step response")
+    return ChannelStep(table[:, 0].copy(), table[:, 1].copy())
+
+
+def _through(transfer: TransferFunction, step: float, signal: Array, hold: Hold) -> Array:
+    output = np.empty(signal.size)
+    LinearSystem(transfer, step, hold).block(signal, output)
+    return output
+
+
+def step_of(transfer: TransferFunction, time: Array) -> Array:
+    """Step response at ``time`` [s], in even steps from 0, shape (n,)."""
+    return _through(transfer, float(time[1] - time[0]), np.ones(time.size), "zoh")
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model or an inverse, and how good it is.
+
+    Attributes:
+        transfer: what was found.
+        time: [s], shape (n,).
+        wanted: what its output shall be, shape (n,).
+        found: what it is, shape (n,).
+    """
+
+    transfer: TransferFunction
+    time: Array
+    wanted: Array
+    found: Array
+
+    @property
+    def rms(self) -> float:
+        """RMS of the difference."""
+        return float(np.sqrt(np.mean((self.found - self.wanted) ** 2)))
+
+
+def _denominator(logarithms: Array, pairs: int) -> Array:
+    """Product of so many factors a·p² + b·p + 1 and of b·p + 1 for each number that is left; falling powers."""
+    values = np.exp(logarithms)
+    whole = np.ones(1)
+    for a, b in values[: 2 * pairs].reshape(-1, 2):
+        whole = np.polymul(whole, np.array([a, b, 1.0]))
+    for b in values[2 * pairs :]:
+        whole = np.polymul(whole, np.array([b, 1.0]))
+    return whole
+
+
+def _starts(poles: int, pairs: int, span: float) -> list[Array]:
+    """Logarithms of the denominator's coefficients from which it is searched."""
+    starts = []
+    for part in _SPREADS:
+        # Factors differ, or they would stay equal.
+        times = part * span / 2.0 ** np.arange(pairs)
+        single = part * span / 3.0 ** np.arange(1, poles - 2 * pairs + 1)
+        for damping in _DAMPINGS if pairs else (1.0,):
+            both = np.stack((times**2, 2.0 * damping * times), axis=1).ravel()
+            starts.append(np.log(np.append(both, single)))
+    return starts
+
+
+def fit(measured: ChannelStep, *, zeros: int, poles: int, integrator: bool = False, oscillating: bool = True) -> Fit:
+    """Fit a model of chosen orders by least squares of the step response.
+
+    Args:
+        measured: the channel.
+        zeros: m, degree of the numerator.
+        poles: n, poles besides the integrator.
+        integrator: whether there is one.
+        oscillating: whether poles may be complex; without it the model is a product of lags, as in paper 004.
+
+    Raises:
+        InputError: orders that make no strictly proper model.
+    """
+    if not (0 <= zeros < poles + integrator and 0 <= poles <= 8):
+        raise InputError(
+            f"reduced order: {zeros} zeros, {poles} poles, {'an' if integrator else 'no'} integrator; allowed: up to 8 "
+            "poles, and fewer zeros than poles and integrator"
+        )
+    time, response = measured.time, measured.response
+    scale = np.abs(response).max()
+    pairs = poles // 2 if oscillating else 0
+
+    def numerator(logarithms: Array) -> tuple[Array, Array, Array]:
+        """Best numerator (falling powers), denominator, and step response."""
+        bottom = np.append(_denominator(logarithms, pairs), np.zeros(int(integrator)))
+        powers = [(1.0, *[0.0] * power) for power in range(zeros, -1, -1)]
+        basis = np.stack([step_of(TransferFunction(power, tuple(bottom)), time) for power in powers], axis=1)
+        size = np.abs(basis).max(axis=0)
+        top = np.linalg.lstsq(basis / size, response, rcond=None)[0] / size
+        return top, bottom, basis @ top
+
+    def residual(logarithms: Array) -> Array:
+        return np.asarray((numerator(logarithms)[2] - response) / scale)
+
+    best = np.empty(0)
+    if poles:
+        low, high = np.log(measured.step / 10.0), np.log(100.0 * time[-1])
+        # Coefficients of p² are times squared.
+        square = np.array([2.0, 1.0] * pairs + [1.0] * (poles - 2 * pairs))
+        found = [
+            least_squares(residual, start, bounds=(low * square, high * square), xtol=1e-10, ftol=1e-10, max_nfev=_MOST)
+            for start in _starts(poles, pairs, float(time[-1]))
+        ]
+        best = min(found, key=lambda one: float(one.cost)).x
+    top, bottom, output = numerator(best)
+    return Fit(TransferFunction(tuple(top), tuple(bottom)), time, response, output)
+
+
+def fit_inverse(model: TransferFunction, measured: ChannelStep, *, least_lag: float = LAG) -> Fit:
+    """Fit the realisable inverse of a channel by nonlinear programming.
+
+    It starts from the inverse of the model with the least lags. Zeros and gain of the inverse and its lags are
+    searched so that the measured response becomes a step again.
+
+    Args:
+        model: of the channel.
+        measured: its step response.
+        least_lag: least value of the lags τ_i [s].
+
+    Raises:
+        InputError: the inverse of the model is not stable, or the record is coarser than the lags.
+    """
+    if measured.step > least_lag:
+        raise InputError(
+            f"inverse: response in steps of {measured.step:g} s, lags from {least_lag:g} s; "
+            "allowed: steps up to the least lag"
+        )
+    start = inverse(model, least_lag)
+    missing = len(model.denominator) - len(model.numerator)
+    fixed = model.numerator
+    live = [place for place, value in enumerate(start.numerator) if value != 0.0]
+    begin = np.array(start.numerator)
+    wanted = np.ones(measured.time.size)
+
+    def build(x: Array) -> TransferFunction:
+        top = begin.copy()
+        top[live] *= x[: len(live)]
+        bottom = np.array(fixed)
+        for lag in least_lag * np.exp(x[len(live) :]):
+            bottom = np.polymul(bottom, (lag, 1.0))
+        return TransferFunction(tuple(top), tuple(bottom))
+
+    def output(x: Array) -> Array:
+        return _through(build(x), measured.step, measured.response, "foh")
+
+    def miss(x: Array) -> float:
+        return float(np.mean((output(x) - wanted) ** 2))
+
+    bounds = Bounds(
+        np.append(np.full(len(live), 0.05), np.zeros(missing)),
+        np.append(np.full(len(live), 20.0), np.full(missing, np.log(_LARGEST_LAG))),
+    )
+    first = np.append(np.ones(len(live)), np.full(missing, np.log(2.0)))
+    best = minimize(miss, first, method="SLSQP", bounds=bounds, options={"maxiter": 200, "ftol": 1e-12})
+    return Fit(build(best.x), measured.time, wanted, output(best.x))

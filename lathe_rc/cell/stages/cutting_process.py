@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cut: from tool, feed and part to the force, and the deflection of the edge by it."""
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
+
+from lathe_rc.analysis.shaft import STEEL_MODULUS, Shaft, Support
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.stage import Input, Output, Sparse, Stage
+from lathe_rc.errors import InputError
+from lathe_rc.plants.cutting import PAPER, REALISTIC, RIGID, CuttingProcess, Elasticity, HardSpot, Part, Wear
+from lathe_rc.plants.cutting_force import SpecificForce
+from lathe_rc.signals.allowance import Allowance, mean_reverting, unbounded
+from lathe_rc.signals.noise import Sensor
+
+_ELASTICITIES = {"rigid": RIGID, "paper": PAPER, "realistic": REALISTIC}
+_READ = {
+    "tool": Input("tool", messages.TOOL, ("displacement", "reference", "height")),
+    "cross": Input("cross/state", messages.STATE, ("position",)),
+    "longitudinal": Input("longitudinal/state", messages.STATE, ("position", "velocity")),
+}
+_HEIGHTS = 201  # places along a shaft between which its compliance is linear
+
+
+class CuttingProcessParameters(NodeParameters):
+    """What moves the edge, the material, the blank, the part, and what gives way."""
+
+    moved_by: list[Literal["tool", "cross", "longitudinal"]] = parameter(
+        ["cross", "longitudinal"], "what moves the edge: the tool drives, the cross feed, the longitudinal feed"
+    )
+    blank: Literal["round", "form"] = parameter(
+        "form",
+        "what the tool drives meet: a round blank, or the form left by the pass before, so that the chip is even",
+    )
+    depth: Annotated[float, Ge(0)] = parameter(0.0, "depth of cut with everything at 0 and an allowance of 0", "m")
+    feed: Annotated[float, Ge(0)] = parameter(71e-6, "feed, unless the longitudinal slide makes it", "m/rev")
+    kc1: Annotated[float, Gt(0)] = parameter(1.7e9, "specific force at a feed of 1 mm; steel", "Pa")
+    mc: Annotated[float, Ge(0), Lt(1)] = parameter(0.25, "exponent of its fall with the feed")
+    wear_factor: Annotated[float, Ge(0)] = parameter(0.0, "relative rise of the force with the wear VB", "1/m")
+    wear: Annotated[float, Ge(0)] = parameter(0.0, "wear VB at sample 0", "m")
+    wear_per_metre: Annotated[float, Ge(0)] = parameter(0.0, "its growth with the cutting path", "1")
+    wear_per_second: Annotated[float, Ge(0)] = parameter(0.0, "its growth with the time in the cut", "m/s")
+    lag: Annotated[float, Ge(0)] = parameter(0.075, "time constant of the force; 0: none", "s")
+    allowance_rms: Annotated[float, Ge(0)] = parameter(
+        0.0, "random allowance: RMS; 20.7e-6 is the 4.83 N RMS of paper 004; 0: none", "m"
+    )
+    allowance_time: Annotated[float, Gt(0)] = parameter(1.0, "its correlation time", "s")
+    allowance_rate: Annotated[float, Ge(0)] = parameter(
+        0.0, "instead: a walk without bounds, RMS after one second; 0: none", "m"
+    )
+    run_out_order: list[Annotated[int, Ge(1), Le(2000)]] = parameter([], "run-out of the blank: waves a revolution")
+    run_out_amplitude: list[float] = parameter([], "their amplitudes", "m")
+    run_out_phase: list[float] = parameter([], "their phases at angle 0; empty: all 0", "rad")
+    radius: Annotated[float, Gt(0)] = parameter(0.05, "of the part, for the cutting path", "m")
+    gap_start: list[float] = parameter([], "interrupted cut: where places without material begin", "rad")
+    gap_width: list[Annotated[float, Gt(0)]] = parameter([], "their widths", "rad")
+    hard_spot_start: list[float] = parameter([], "hard spots: where they begin", "rad")
+    hard_spot_width: list[Annotated[float, Gt(0)]] = parameter([], "their widths", "rad")
+    hard_spot_bottom: list[float] = parameter([], "their lower ends along the part", "m")
+    hard_spot_top: list[float] = parameter([], "their upper ends along the part", "m")
+    hard_spot_factor: list[Annotated[float, Ge(0)]] = parameter([], "factor of the force in them")
+    regeneration: Annotated[float, Ge(0), Le(1)] = parameter(
+        0.0, "overlap µ with the surface of the last revolution; 0: off"
+    )
+    elasticity: Literal["rigid", "paper", "realistic"] = parameter(
+        "realistic", "deflection W3 of the edge by the force; paper: as printed, 2.9 Hz and drawn into the part"
+    )
+    shaft: Literal["none", "centres", "chuck_and_centre", "chuck"] = parameter(
+        "none", "none: the compliance of W3 all along; otherwise that of a shaft and what holds it"
+    )
+    shaft_length: Annotated[float, Gt(0)] = parameter(0.5, "shaft: length", "m")
+    shaft_diameter: Annotated[float, Gt(0)] = parameter(0.03, "shaft: diameter", "m")
+    shaft_head: Annotated[float, Gt(0)] = parameter(1e8, "shaft: stiffness of the head stock", "N/m")
+    shaft_tail: Annotated[float, Gt(0)] = parameter(5e7, "shaft: stiffness of the tail stock", "N/m")
+    shaft_carriage: Annotated[float, Gt(0)] = parameter(1e8, "shaft: stiffness of the carriage", "N/m")
+    shaft_modulus: Annotated[float, Gt(0)] = parameter(STEEL_MODULUS, "shaft: modulus of elasticity", "Pa")
+    noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the force sensor, RMS; 0: none", "N")
+    resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the force sensor; 0: none", "N")
+
+    def allowance(self, node: str) -> Allowance:
+        """The allowance of a node."""
+        if self.allowance_rms and self.allowance_rate:
+            raise InputError(f"{node}: allowance_rms and allowance_rate; give one of them")
+        walk = unbounded(self.allowance_rate, self.step)
+        if not self.allowance_rate:
+            walk = mean_reverting(self.allowance_rms, self.allowance_time, self.step)
+        return Allowance(
+            walk,
+            order=np.array(self.run_out_order, dtype=float),
+            amplitude=np.array(self.run_out_amplitude),
+            phase=np.array(self.run_out_phase or [0.0] * len(self.run_out_order)),
+            seed=self.seed,
+            name=node,
+        )
+
+    def flexible(self) -> Shaft | None:
+        """The shaft, if there is one."""
+        if self.shaft == "none":
+            return None
+        support: Support = self.shaft
+        return Shaft(
+            self.shaft_length,
+            self.shaft_diameter,
+            support,
+            head=self.shaft_head,
+            tail=self.shaft_tail,
+            carriage=self.shaft_carriage,
+            modulus=self.shaft_modulus,
+        )
+
+    def part(self, node: str) -> Part:
+        """The part of a node.
+
+        Raises:
+            InputError: lists of different lengths, or windows that are none.
+        """
+        spots = (
+            self.hard_spot_start,
+            self.hard_spot_width,
+            self.hard_spot_bottom,
+            self.hard_spot_top,
+            self.hard_spot_factor,
+        )
+        if len(self.gap_start) != len(self.gap_width):
+            raise InputError(
+                f"{node}: {len(self.gap_start)} gap_start and {len(self.gap_width)} gap_width; as many each"
+            )
+        if len({len(values) for values in spots}) > 1:
+            raise InputError(f"{node}: hard_spot_... of lengths {[len(v) for v in spots]}; give as many of each")
+        heights = compliances = None
+        shaft = self.flexible()
+        if shaft is not None:
+            heights = np.linspace(0.0, shaft.length, _HEIGHTS)
+            compliances = shaft.compliance(heights)
+        return Part(
+            radius=self.radius,
+            gaps=list(zip(self.gap_start, self.gap_width, strict=True)),
+            hard_spots=[HardSpot(*spot) for spot in zip(*spots, strict=True)],
+            heights=heights,
+            compliances=compliances,
+        )
+
+    def deflecting(self) -> Elasticity:
+        """W3; of a shaft only the dynamics, since its compliance is the shaft's own."""
+        return _ELASTICITIES["realistic" if self.shaft != "none" and self.elasticity == "rigid" else self.elasticity]
+
+
+class CuttingProcessStage(Stage):
+    """See `lathe_rc.plants.cutting`.
+
+    Attributes:
+        parameters: its table.
+        cut: the machine.
+    """
+
+    kind = "cutting_process"
+    Parameters = CuttingProcessParameters
+
+    def __init__(self, name: str, parameters: CuttingProcessParameters) -> None:
+        super().__init__(name, parameters)
+        self.parameters = parameters
+        moved = parameters.moved_by
+        if len(set(moved)) < len(moved):
+            raise InputError(f"{name}.moved_by = {moved}; allowed: each once")
+        self._allowance = parameters.allowance(name)
+        self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
+        self.cut = CuttingProcess(
+            material=SpecificForce(parameters.kc1, parameters.mc, parameters.wear_factor),
+            depth=parameters.depth,
+            lag=parameters.lag,
+            elasticity=parameters.deflecting(),
+            wear=Wear(parameters.wear, parameters.wear_per_metre, parameters.wear_per_second),
+            part=parameters.part(name),
+            overlap=parameters.regeneration,
+            step=parameters.step,
+        )
+        self._movers = moved
+        self.declare(
+            inputs=[Input("encoder", messages.ENCODER, ("angle_true", "speed_true")), *(_READ[name] for name in moved)],
+            outputs=[Output("cut", messages.CUT)],
+        )
+
+    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+        """See `Stage`; the cross feed is positive into the part."""
+        (encoder, *others), (cut,) = inputs, outputs
+        given = dict(zip(self._movers, others, strict=True))
+        still = np.zeros(encoder["angle_true"].size)
+        tool, cross, longitudinal = (given.get(name, {}) for name in ("tool", "cross", "longitudinal"))
+        displacement = tool.get("displacement", still)
+        if tool and self.parameters.blank == "form":
+            displacement = displacement - tool["reference"]
+        angle, speed = encoder["angle_true"], encoder["speed_true"]
+        self._allowance.block(angle, cut["allowance"])
+        self.cut.block(
+            angle=angle,
+            speed=speed,
+            height=longitudinal.get("position", tool.get("height", still)),
+            cross_position=-cross["position"] if cross else still,
+            displacement=displacement,
+            feed_velocity=longitudinal.get("velocity", speed * (self.parameters.feed / (2.0 * np.pi))),
+            allowance=cut["allowance"],
+            force=cut["force"],
+            deflection=cut["deflection"],
+            depth_of_cut=cut["depth_of_cut"],
+            feed=cut["feed"],
+            wear=cut["wear"],
+        )
+        self._sensor.measure(cut["force"], cut["measured_force"])
+        return []

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Feed drive of a slide: cross or longitudinal."""
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
+from lathe_rc.plants import feed
+from lathe_rc.plants.feed import Feedback, FeedDrive
+from lathe_rc.signals.example_002 import fill_disturbance
+from lathe_rc.signals.noise import Sensor
+from lathe_rc.transfer import TransferFunction
+
+Axis = Literal["cross", "longitudinal"]
+
+
+class FeedDriveParameters(NodeParameters):
+    """Model from command to position, limits, backlash, and the position sensor."""
+
+    axis: Axis = parameter("cross", "which slide; the first word of its topics")
+    model: Literal["dc_screw", "fourth_order", "sampled"] = parameter(
+        "dc_screw", "dc_screw: motor and screw of paper 004; fourth_order: paper 002; sampled: paper 003"
+    )
+    velocity_gain: Annotated[float, Gt(0)] = parameter(
+        4.38e-3, "dc_screw: speed at the full command, 1; the cross feed of paper 004", "m/s"
+    )
+    lags: list[Annotated[float, Gt(0)]] = parameter([], "dc_screw: time constants; empty: 0.045 alone", "s")
+    zero: Annotated[float, Ge(0)] = parameter(
+        0.0, "dc_screw: time constant of a zero, which makes room for the lag of the cutting process", "s"
+    )
+    gain: Annotated[float, Gt(0)] = parameter(19.0, "fourth_order: K")
+    a1: float = parameter(21.5, "fourth_order: a1, the coefficient of 1")
+    a2: float = parameter(48.0, "fourth_order: a2, of p")
+    a3: float = parameter(46.9, "fourth_order: a3, of p²")
+    a4: float = parameter(10.2, "fourth_order: a4, of p³")
+    sampled_gain: Annotated[float, Gt(0)] = parameter(6.25, "sampled: K, for a command in m", "1/s")
+    sampled_lag: Annotated[float, Gt(0)] = parameter(0.08, "sampled: T1", "s")
+    divisor: Annotated[int, Ge(1), Le(1_000_000)] = parameter(
+        1, "the command is taken at samples that are multiples of it, and held between", "sample"
+    )
+    command_limit: Annotated[float, Ge(0)] = parameter(
+        1.0, "largest command to each side, in its unit; the full command is 1; 0: none"
+    )
+    speed_limit: Annotated[float, Ge(0)] = parameter(0.0, "greatest speed of the motor; 0: none", "m/s")
+    disturbance: float = parameter(
+        0.0, "amplitude of f(t) = A·sin²(0.04πt s⁻¹), added to the limited command; 0.5 in eq. 18 of paper 002"
+    )
+    backlash: Annotated[float, Ge(0)] = parameter(0.0, "gap between motor and slide", "m")
+    feedback: Feedback = parameter("load", "where the position sensor is: at the motor or at the load")
+    noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
+    resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
+
+    def transfer(self) -> TransferFunction:
+        """Position over command.
+
+        Raises:
+            InputError: see `lathe_rc.plants.feed`.
+        """
+        if self.model == "fourth_order":
+            return feed.fourth_order(self.gain, self.a1, self.a2, self.a3, self.a4)
+        if self.model == "sampled":
+            return feed.sampled(self.sampled_gain, self.sampled_lag)
+        return feed.dc_screw(self.velocity_gain, self.lags or [0.045], self.zero)
+
+
+class FeedDriveStage(Stage):
+    """See `lathe_rc.plants.feed`.
+
+    Attributes:
+        parameters: its table.
+        drive: the machine.
+    """
+
+    kind = "feed_drive"
+    Parameters = FeedDriveParameters
+
+    def __init__(self, name: str, parameters: FeedDriveParameters) -> None:
+        super().__init__(name, parameters)
+        self.parameters = parameters
+        self.drive = FeedDrive(
+            parameters.transfer(),
+            step=parameters.step,
+            divisor=parameters.divisor,
+            command_limit=parameters.command_limit or np.inf,
+            speed_limit=parameters.speed_limit or np.inf,
+            backlash=parameters.backlash,
+            feedback=parameters.feedback,
+        )
+        self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
+        self._motor, self._seen, self._load = (np.empty(messages.MAX_BLOCK) for _ in range(3))
+        axis = parameters.axis
+        self.declare(
+            inputs=[Input(f"{axis}/command", messages.SERVO, ("command",))],
+            outputs=[Output(f"{axis}/state", messages.STATE, Joint("position", "velocity", "effort"))],
+        )
+
+    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+        """See `Stage`."""
+        (command,), (state,) = inputs, outputs
+        size = command["command"].size
+        motor, seen = self._motor[:size], self._seen[:size]
+        load = self._load[: size if self.parameters.disturbance else 0]
+        fill_disturbance(first, self.parameters.step, self.parameters.disturbance, load)
+        self.drive.block(
+            first, command["command"], state["position"], state["velocity"], state["effort"], motor, seen, load
+        )
+        self._sensor.measure(seen, state["measured_position"])
+        return []

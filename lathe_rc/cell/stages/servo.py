@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What servo controllers have in common: a PID, converters, and a feedback edge."""
+
+from typing import Annotated
+
+from annotated_types import Ge, Gt, Le
+
+from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.stages.trajectory import TrajectoryParameters
+from lathe_rc.control.pid import Pid, PidGains
+
+
+class ServoParameters(TrajectoryParameters):
+    """Set point, feedback, converters, limits, and the gains of the PID."""
+
+    feedback_delay: Annotated[int, Ge(1), Le(2**31 - 1)] = parameter(
+        64, "delay of the feedback edge, at least a block", "sample"
+    )
+    divisor: Annotated[int, Ge(1), Le(1_000_000)] = parameter(
+        1, "computes at samples that are multiples of it, and holds the command between", "sample"
+    )
+    command_limit: Annotated[float, Gt(0)] = parameter(
+        1.0, "largest command to each side, in its unit; the full command is 1"
+    )
+    adc_step: Annotated[float, Ge(0)] = parameter(0.0, "step of the converter of the measurement; 0: none", "m")
+    dac_step: Annotated[float, Ge(0)] = parameter(0.0, "step of the converter of the command; 0: none")
+    set_point_ramp: Annotated[float, Ge(0)] = parameter(
+        0.0, "pid: fastest change of the set point, for a smooth engagement; 0: any", "m/s"
+    )
+
+    def pid(self, proportional: float, integral: float, derivative: float, filter_: float) -> Pid:
+        """The PID of a table.
+
+        Raises:
+            InputError: see `lathe_rc.control.pid`.
+        """
+        return Pid(
+            PidGains(proportional, integral, derivative, filter_),
+            low=-self.command_limit,
+            high=self.command_limit,
+            step=self.step,
+            adc=self.adc_step,
+            dac=self.dac_step,
+            ramp=self.set_point_ramp,
+            divisor=self.divisor,
+        )

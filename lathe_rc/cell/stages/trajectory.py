@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a servo controller is told to follow, over time."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from annotated_types import Ge
+
+from lathe_rc import resources
+from lathe_rc.cell.messages import Samples
+from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.errors import InputError
+from lathe_rc.signals.example_002 import fill_reference
+from lathe_rc.signals.table import read_table
+
+_COLUMNS = {"time_s,position_um": 1e-6, "time_s,force_n": 1.0}
+
+
+class TrajectoryParameters(NodeParameters):
+    """Set point over time."""
+
+    trajectory: Literal["steps", "csv", "paper_002"] = parameter(
+        "steps", "steps: set_point; csv: trajectory_file; paper_002: r(t) of its eq. 17"
+    )
+    set_point: list[float] = parameter([], "steps: values, each from its time on; empty: 0", "m")
+    set_point_time: list[Annotated[float, Ge(0)]] = parameter([], "steps: when; empty: a single one at 0", "s")
+    trajectory_file: str = parameter(
+        "", "csv: file with time_s and position_um or force_n, linear between and held at the ends", path=True
+    )
+
+
+class Trajectory:
+    """The set point of a node.
+
+    Args:
+        node: that it is for.
+        parameters: its table.
+
+    Raises:
+        InputError: lists of different lengths, times that do not rise, or a file that cannot be used.
+    """
+
+    def __init__(self, node: str, parameters: TrajectoryParameters) -> None:
+        self._step, self._kind = parameters.step, parameters.trajectory
+        values = parameters.set_point or [0.0]
+        times = parameters.set_point_time or [0.0] * min(len(values), 1)
+        if self._kind == "csv":
+            if not parameters.trajectory_file:
+                raise InputError(f"{node}.trajectory_file is empty; name the CSV file of the trajectory")
+            path = resources.find(Path(parameters.trajectory_file))
+            header, rows = read_table(path, [name.split(",") for name in _COLUMNS], "trajectory")
+            times, values = rows[:, 0].tolist(), (rows[:, 1] * _COLUMNS[",".join(header)]).tolist()
+        if len(values) != len(times):
+            raise InputError(
+                f"{node}: {len(values)} values of set_point and {len(times)} of set_point_time; give as many of each"
+            )
+        self._times, self._values = np.array(times), np.array(values)
+        if not self._times.size or np.any(np.diff(self._times) <= 0.0):
+            raise InputError(f"{node}: set point at {times[:5]} s; allowed: one time or more, each later than the last")
+
+    def block(self, first: int, set_point: Samples) -> None:
+        """Fill the set point from sample ``first`` on, shape (n,)."""
+        if self._kind == "paper_002":
+            fill_reference(first, self._step, set_point)
+            return
+        time = self._step * np.arange(first, first + set_point.size)
+        if self._kind == "csv":
+            set_point[:] = np.interp(time, self._times, self._values)
+            return
+        place = np.searchsorted(self._times, time * (1 + 1e-12), side="right")
+        set_point[:] = np.where(place > 0, self._values[place - 1], 0.0)

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Decoupler of the force and the position loop (paper 004, Figs 5 and 10).
+
+    F = W1·v1 + W4·x,  x = W2·v2,  y = x + W3·F
+    v1 = u1 - K1·u2,   v2 = u2 - K2·u1
+
+Longitudinal feed makes force through W1, cross feed moves the tool by W2. The depth of cut makes force through W4,
+the force deflects tool and part by W3. K1 = W2·W4/W1 takes the effect of u2 off the force, K2 = W1·W3/W2 that of u1 off
+the position. An inverse has more zeros than poles: it gets one lag for each order that is missing. An integrator in K1
+or K2 would keep for ever what a wrong model lets through: 1/p becomes 1/(p + leak).
+
+The paper has mm, N and % of the full command; the channels here are in m, N and 1, converted once below.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+from lathe_rc.transfer import System, TransferFunction, discretise, rest, step
+
+Array = npt.NDArray[np.float64]
+
+LAG = 1e-3  #: for each missing order of an inverse [s] (paper 004)
+LEAK = 0.05  #: of the integrators [rad/s]
+_OFF = System(np.empty((0, 0)), np.empty(0), np.empty(0), np.empty(0), 0.0)
+
+
+def lags(*times: float) -> TransferFunction:
+    """1/Π(1 + p·T), times in s."""
+    whole = gain(1.0)
+    for time in times:
+        whole *= TransferFunction((1.0,), (time, 1.0))
+    return whole
+
+
+def gain(value: float) -> TransferFunction:
+    """A constant, to multiply others by."""
+    return TransferFunction((value,), (1.0,))
+
+
+@dataclass(frozen=True)
+class Channels:
+    """The plant of both loops.
+
+    Attributes:
+        w1: force over the command of the longitudinal feed [N].
+        w2: position of the tool over the command of the cross feed [m].
+        w3: displacement that adds to the position over force [m/N]; negative where force pushes the tool away.
+        w4: force over the position of the tool [N/m].
+    """
+
+    w1: TransferFunction
+    w2: TransferFunction
+    w3: TransferFunction
+    w4: TransferFunction
+
+
+_W1 = gain(1179.0) * lags(0.17, 0.22)  # 11.79 N/%
+_W2 = TransferFunction((4.38e-3,), (0.045, 1.0, 0.0))  # 0.0438 mm/s/%
+_W4 = gain(233.3e3) * lags(0.075)  # 233.3 N/mm
+
+FULL_W1 = gain(1188.9) * lags(0.11304, 0.2679, 0.01659, 0.01659)  #: meets the paper's Fig. 12, which W1 does not
+PAPER = Channels(_W1, _W2, TransferFunction((0.385e-6,), (0.003, 0.0005, 1.0)), _W4)  #: as printed: W3 at 2.9 Hz
+REALISTIC = Channels(_W1, _W2, TransferFunction((-0.385e-6,), (0.003**2, 0.0005, 1.0)), _W4)  #: W3 at 53 Hz
+PRESETS: Mapping[str, Channels] = MappingProxyType({"paper": PAPER, "realistic": REALISTIC})
+
+
+def inverse(transfer: TransferFunction, lag: float = LAG) -> TransferFunction:
+    """1/transfer with 1/(1 + p·lag) for each order that is missing (paper 004, the second stage).
+
+    Raises:
+        InputError: the inverse would not be stable, or ``lag`` [s] is not positive.
+    """
+    if lag <= 0.0:
+        raise InputError(f"inverse of {transfer}: lag {lag:g} s; allowed: above 0")
+    top, bottom = (np.trim_zeros(np.array(part), "f") for part in (transfer.numerator, transfer.denominator))
+    if not top.size or np.any(np.roots(top).real >= 0.0):
+        raise InputError(
+            f"inverse of {transfer}: 0, or a zero that is not stable; allowed: zeros left of the imaginary axis "
+            "(use a reduced-order model without it)"
+        )
+    missing = lags(*[lag] * (bottom.size - top.size))
+    return TransferFunction(tuple(bottom), tuple(np.polymul(top, missing.denominator)))
+
+
+def _leaking(transfer: TransferFunction, leak: float) -> TransferFunction:
+    """Integrators replaced by 1/(p + leak), after zeros at 0 have cancelled as many."""
+    top, bottom = np.array(transfer.numerator), np.array(transfer.denominator)
+    zeros, poles = (part.size - np.trim_zeros(part, "b").size for part in (top, bottom))
+    both = min(zeros, poles)
+    top, bottom = top[: top.size - both], bottom[: bottom.size - poles]
+    for _ in range(poles - both):
+        bottom = np.polymul(bottom, (1.0, leak))
+    return TransferFunction(tuple(top), tuple(bottom))
+
+
+def compensators(channels: Channels, lag: float = LAG, leak: float = LEAK) -> tuple[TransferFunction, TransferFunction]:
+    """K1 and K2 of a model of the plant.
+
+    Args:
+        channels: the model; that of paper 004 has reduced order.
+        lag: of the inverses [s].
+        leak: of the integrators [rad/s].
+
+    Raises:
+        InputError: W1 or W2 has no stable inverse, ``lag`` is not positive or ``leak`` negative.
+    """
+    if leak < 0.0:
+        raise InputError(f"decoupler: leak {leak:g} rad/s; allowed: 0 for none, or above")
+    k1 = channels.w2 * channels.w4 * inverse(channels.w1, lag)
+    k2 = channels.w1 * channels.w3 * inverse(channels.w2, lag)
+    return _leaking(k1, leak), _leaking(k2, leak)
+
+
+@kernel
+def decouple(k1: System, state1: Array, k2: System, state2: Array, u1: float, u2: float) -> tuple[float, float]:
+    """v1 and v2 of one sample; the states are those of `lathe_rc.transfer.step`."""
+    return u1 - step(k1, state1, u2), u2 - step(k2, state2, u1)
+
+
+@kernel
+def _block(k1: System, state1: Array, k2: System, state2: Array, u1: Array, u2: Array, v1: Array, v2: Array) -> None:
+    for k in range(u1.size):
+        v1[k], v2[k] = decouple(k1, state1, k2, state2, u1[k], u2[k])
+
+
+class Decoupler:
+    """K1 and K2 across both loops; at rest at 0 before the first sample.
+
+    v1 and v2 are not limited: the drives do that.
+
+    Args:
+        k1, k2: the compensators, see `compensators`; None for one that is off.
+        step_s: sampling step [s].
+
+    Attributes:
+        k1, k2: the difference equations, exact for commands that are linear between samples.
+        state1, state2: their memories for `decouple`.
+    """
+
+    def __init__(self, k1: TransferFunction | None, k2: TransferFunction | None, step_s: float) -> None:
+        self.k1, self.k2 = (discretise(k, step_s, "foh") if k else _OFF for k in (k1, k2))
+        self.state1, self.state2 = rest(self.k1), rest(self.k2)
+
+    def block(self, u1: Array, u2: Array, v1: Array, v2: Array) -> None:
+        """Step through a block of commands, shape (n,) each; the last two are filled.
+
+        Args:
+            u1: of the force controller [1].
+            u2: of the position controller [1].
+            v1: to the longitudinal feed [1].
+            v2: to the cross feed [1].
+        """
+        _block(self.k1, self.state1, self.k2, self.state2, u1, u2, v1, v2)

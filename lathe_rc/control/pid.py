@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parallel PID controller of sampled signals.
+
+    u = P·e + I·∫e dt + D·N·p/(p + N)·e,   e = set point - measurement
+
+Integral and derivative are exact for an error that is linear between the samples at which the controller computes.
+Where the command is at a limit and the error drives it further out, the integral stands still (clamping). Converters
+round: the measurement to the step of the ADC, the command to that of the DAC. A set point that may change only so
+fast, and that is approached in the end as 1 - e^{-t/T}, enters the cut without overshoot of the force.
+
+Source: paper 004, Figs 11 and 12. The paper has mm, N and % of the full command; here they are m, N and 1.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+from lathe_rc.transfer import TransferFunction
+
+Array = npt.NDArray[np.float64]
+
+# Places in the state of a controller.
+_INTEGRAL, _SLOPE, _ERROR, _SET_POINT, _COMMAND, SATURATED, CLAMPED, SLOWED, _SIZE = range(9)
+
+
+@dataclass(frozen=True)
+class PidGains:
+    """Gains of a parallel PID, in units of the command over that of the error.
+
+    Args:
+        proportional: P.
+        integral: I [1/s].
+        derivative: D [s].
+        filter: N, where the derivative ends [rad/s].
+
+    Raises:
+        InputError: a gain is not finite, or N is not above 0.
+    """
+
+    proportional: float
+    integral: float
+    derivative: float
+    filter: float
+
+    def __post_init__(self) -> None:
+        values = (self.proportional, self.integral, self.derivative, self.filter)
+        if not np.all(np.isfinite(values)) or self.filter <= 0.0:
+            raise InputError(
+                f"PID gains P {values[0]:g}, I {values[1]:g}, D {values[2]:g}, N {values[3]:g}; "
+                "allowed: finite gains and N above 0"
+            )
+
+    @property
+    def transfer(self) -> TransferFunction:
+        """Command over error; without the poles of parts that are off."""
+        whole = TransferFunction((self.proportional,), (1.0,))
+        if self.derivative:
+            kick = self.proportional + self.derivative * self.filter
+            whole = TransferFunction((kick, self.proportional * self.filter), (1.0, self.filter))
+        if self.integral:
+            top = np.polyadd((*whole.numerator, 0.0), np.multiply(self.integral, whole.denominator))
+            whole = TransferFunction(tuple(np.trim_zeros(top, "f")), (*whole.denominator, 0.0))
+        return whole
+
+
+FORCE = PidGains(0.52733e-2, 1.4848e-2, 0.046435e-2, 1874.8107)  #: of the force loop [1/N] (paper 004, Fig. 12)
+POSITION = PidGains(13510.2, 110691.7, 452.539, 4147.9572)  #: of the position loop [1/m] (paper 004, Fig. 11)
+
+
+class PidTable(NamedTuple):
+    """Constants of a `Pid` for kernels.
+
+    Attributes:
+        proportional: P.
+        integral: weight of the sum of two errors in the integral.
+        derivative: weight of the difference of two errors in the derivative.
+        decay: what the derivative keeps of its last value.
+        low, high: limits of the command.
+        adc, dac: steps of the converters; 0 for none.
+        ramp: largest change of the set point from one computation to the next; 0 for any.
+        approach: part of the way to the set point that is gone in a computation; 1 for all of it.
+        divisor: computes every so many samples.
+    """
+
+    proportional: float
+    integral: float
+    derivative: float
+    decay: float
+    low: float
+    high: float
+    adc: float
+    dac: float
+    ramp: float
+    approach: float
+    divisor: int
+
+
+@kernel
+def control(pid: PidTable, state: Array, n: int, set_point: float, measurement: float) -> float:
+    """The command of sample ``n``; ``state`` is changed, and counts samples at a limit."""
+    if n % pid.divisor:
+        return float(state[_COMMAND])
+    way = set_point - state[_SET_POINT]
+    move = pid.approach * way
+    if pid.ramp > 0.0:
+        move = min(max(move, -pid.ramp), pid.ramp)
+    wanted = set_point if move == way else state[_SET_POINT] + move
+    state[SLOWED] += wanted != set_point
+    state[_SET_POINT] = wanted
+    read = np.rint(measurement / pid.adc) * pid.adc if pid.adc > 0.0 else measurement
+    error = wanted - read
+    slope = pid.decay * state[_SLOPE] + pid.derivative * (error - state[_ERROR])
+    more = pid.integral * (error + state[_ERROR])
+    rest = pid.proportional * error + slope
+    demand = rest + state[_INTEGRAL] + more
+    if (demand > pid.high and more > 0.0) or (demand < pid.low and more < 0.0):
+        state[CLAMPED] += 1.0
+    else:
+        state[_INTEGRAL] += more
+    command = float(min(max(demand, pid.low), pid.high))
+    state[SATURATED] += command != demand
+    if pid.dac > 0.0:
+        # A limit between two steps of the DAC stays a limit.
+        command = float(min(max(np.rint(command / pid.dac) * pid.dac, pid.low), pid.high))
+    state[_SLOPE], state[_ERROR], state[_COMMAND] = slope, error, command
+    return command
+
+
+@kernel
+def _block(pid: PidTable, state: Array, first: int, set_point: Array, measurement: Array, command: Array) -> None:
+    for k in range(command.size):
+        command[k] = control(pid, state, first + k, set_point[k], measurement[k])
+
+
+class Pid:
+    """The controller: set point and measurement in, command out; at rest at 0 before sample 0.
+
+    Args:
+        gains: of the parts.
+        low, high: limits of the command, in its unit.
+        step: sampling step [s].
+        adc: step of the converter of the measurement, in its unit; 0 for none.
+        dac: step of the converter of the command, in its unit; 0 for none.
+        ramp: fastest change of the set point, in its unit per s; 0 for any.
+        smoothing: time constant with which the set point is approached [s]; 0 for at once.
+        divisor: computes at samples that are multiples of it and holds the command between them.
+
+    Attributes:
+        table: its constants for `control`.
+        state: its memory for `control`.
+
+    Raises:
+        InputError: limits that leave no room, a negative converter step, ramp or smoothing, or a divisor below 1.
+    """
+
+    def __init__(
+        self,
+        gains: PidGains,
+        *,
+        low: float,
+        high: float,
+        step: float,
+        adc: float = 0.0,
+        dac: float = 0.0,
+        ramp: float = 0.0,
+        smoothing: float = 0.0,
+        divisor: int = 1,
+    ) -> None:
+        if not low < high:
+            raise InputError(f"PID: limits {low:g} to {high:g}; allowed: a lower one below the upper one")
+        if divisor < 1:
+            raise InputError(f"PID: divisor {divisor}; allowed: 1 or more")
+        for name, value in (("ADC step", adc), ("DAC step", dac), ("ramp", ramp), ("smoothing", smoothing)):
+            if not 0.0 <= value < np.inf:
+                raise InputError(f"PID: {name} {value:g}; allowed: 0 for none, or a finite positive number")
+        period = step * divisor
+        self.table = PidTable(
+            proportional=gains.proportional,
+            integral=gains.integral * period / 2.0,
+            derivative=gains.derivative * float(-np.expm1(-gains.filter * period)) / period,
+            decay=float(np.exp(-gains.filter * period)),
+            low=float(low),
+            high=float(high),
+            adc=float(adc),
+            dac=float(dac),
+            ramp=float(ramp) * period,
+            approach=float(-np.expm1(-period / smoothing)) if smoothing else 1.0,
+            divisor=divisor,
+        )
+        self.state = np.zeros(_SIZE)
+
+    @property
+    def saturated(self) -> int:
+        """Computations so far whose command was cut off."""
+        return int(self.state[SATURATED])
+
+    @property
+    def clamped(self) -> int:
+        """Computations so far in which the integral stood still."""
+        return int(self.state[CLAMPED])
+
+    @property
+    def slowed(self) -> int:
+        """Computations so far whose set point was held back by ramp or smoothing."""
+        return int(self.state[SLOWED])
+
+    def block(self, first: int, set_point: Array, measurement: Array, command: Array) -> None:
+        """Step from sample ``first`` on; arrays of shape (n,), the last is filled."""
+        _block(self.table, self.state, first, set_point, measurement, command)

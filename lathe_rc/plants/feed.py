@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Feed drive of a slide, cross or longitudinal: a linear model with limits, and a screw with backlash.
+
+    command → sampling → ± limit, held → model with a limited speed → backlash → slide
+
+Models, each the position over the command:
+
+    fourth_order   K/(p⁴ + a4·p³ + a3·p² + a2·p + a1)                (paper 002, eq. 1)
+    dc_screw       k·(1 + Tz·p)/(p·(1 + T_1·p)·(1 + T_2·p)·…)        (paper 004: W2; the screw of W1)
+    sampled        K/(p·(1 + T1·p)) behind a zero-order hold         (paper 003, eq. 2)
+
+The command is in the unit of the model: [m] where it is a wanted position, [V], or a part of full scale. It is held
+from sample to sample, as a power converter holds it, and for that the difference equation is exact. The position of a
+sample does not depend on the command of the same sample.
+
+The states are the position of the motor and its derivatives, so that a limit of the speed can hold them: a motor that
+would go beyond its greatest speed stays at it without acceleration, as if its command were no larger than what that
+speed needs. Nothing is left to unwind when the command falls.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import lfilter
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+from lathe_rc.plants.backlash import follow
+from lathe_rc.plants.linear import discretise
+from lathe_rc.transfer import TransferFunction
+
+Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+Feedback = Literal["motor", "load"]
+
+# Places in a drive's state, from the end; before them the motor's position, speed, … and room for their next values.
+_DISTURBANCE, _EFFORT, _LOAD = -3, -2, -1
+
+_UNDISTURBED = np.empty(0)
+
+APPROXIMATE_LAGS = (0.17, 0.22)  #: [s] of W1, 11.79/((0.17p+1)(0.22p+1)) (paper 004)
+FULL_LAGS = (0.11304, 0.2679, 0.01659, 0.01659)  #: [s] of the W1 that meets the step data printed in paper 004
+
+
+def fourth_order(
+    gain: float = 19.0, a1: float = 21.5, a2: float = 48.0, a3: float = 46.9, a4: float = 10.2
+) -> TransferFunction:
+    """K/(p⁴ + a4·p³ + a3·p² + a2·p + a1); by default the nominal drive of paper 002.
+
+    The state matrix of eq. 3 has these coefficients with the opposite sign of what is printed.
+    """
+    return TransferFunction((gain,), (1.0, a4, a3, a2, a1))
+
+
+def dc_screw(velocity_gain: float, lags: Sequence[float], zero: float = 0.0) -> TransferFunction:
+    """Motor and screw, k·(1 + Tz·p)/(p·(1 + T_1·p)·…).
+
+    The zero makes room for a lag that another part has: with that of the cutting process, a drive of the lags of W1
+    gives W1 from the command to the force.
+
+    Args:
+        velocity_gain: k [m/s per unit of the command].
+        lags: T_i [s], at least one, and at least two with a zero.
+        zero: Tz [s]; 0 for none.
+
+    Raises:
+        InputError: a lag that is not positive.
+    """
+    if not all(lag > 0.0 for lag in lags):
+        raise InputError(f"lags of the feed drive = {list(lags)} s; allowed: above 0 (leave out what is not there)")
+    bottom = np.array([1.0, 0.0])
+    for lag in lags:
+        bottom = np.polymul(bottom, [lag, 1.0])
+    return TransferFunction((velocity_gain * zero, velocity_gain), tuple(bottom))
+
+
+def sampled(gain: float = 6.25, lag: float = 0.08) -> TransferFunction:
+    """K/(p·(1 + T1·p)), by default the drive of paper 003; its hold is the ``divisor`` of `FeedDrive`.
+
+    Args:
+        gain: K [1/s], with the command in the unit of the position.
+        lag: T1 [s].
+    """
+    return dc_screw(gain, (lag,))
+
+
+class DriveTable(NamedTuple):
+    """Constants of a `FeedDrive` for kernels.
+
+    Attributes:
+        transition, weights: x[n] = Φ·x[n-1] + g·u[n-1], shapes (m, m) and (m,); x is position, speed, ….
+        jumps: what the command adds at once to speed, acceleration, …, shape (m,).
+        command_limit: to each side, in the unit of the command.
+        speed_limit: to each side [m/s].
+        needed: command that keeps that speed; infinite where none does.
+        furthest: travel in a step at that speed [m].
+        half: half the backlash [m].
+    """
+
+    transition: Array
+    weights: Array
+    jumps: Array
+    command_limit: float
+    speed_limit: float
+    needed: float
+    furthest: float
+    half: float
+
+
+@kernel
+def motor_of(state: Array) -> float:
+    """Position of the motor [m], in a drive's state."""
+    return float(state[0])
+
+
+@kernel
+def load_of(state: Array) -> float:
+    """Position of the slide [m], in a drive's state."""
+    return float(state[_LOAD])
+
+
+@kernel
+def move(table: DriveTable, state: Array) -> bool:
+    """Step a drive with the command that it holds; returns whether it is at its greatest speed."""
+    order = table.weights.size
+    effort, before = state[_EFFORT] + state[_DISTURBANCE], state[0]
+    for row in range(order):
+        total = table.weights[row] * effort
+        for column in range(order):
+            total += table.transition[row, column] * state[column]
+        state[order + row] = total
+    for row in range(order):
+        state[row] = state[order + row]
+    travel, speed = state[0] - before, state[1]
+    limited = bool(abs(speed) >= table.speed_limit or abs(travel) > table.furthest)
+    if limited:
+        state[0] = before + min(max(travel, -table.furthest), table.furthest)
+        state[1] = min(max(speed, -table.speed_limit), table.speed_limit)
+        if order > 2 and (state[2] + table.jumps[1] * effort) * speed > 0.0:
+            enough = min(max(effort, -table.needed), table.needed)
+            for row in range(2, order):
+                state[row] = -table.jumps[row - 1] * enough
+    state[_LOAD] = follow(state[_LOAD], table.half, state[0])
+    return limited
+
+
+@kernel
+def hold(table: DriveTable, state: Array, command: float) -> bool:
+    """Give a drive the command to hold from now on; returns whether it was cut off."""
+    state[_EFFORT] = min(max(command, -table.command_limit), table.command_limit)
+    return abs(command) > table.command_limit
+
+
+@kernel
+def _advance(
+    table: DriveTable,
+    state: Array,
+    divisor: int,
+    resolution: float,
+    from_load: bool,  # noqa: FBT001 - kernels take everything by position
+    first: int,
+    command: Array,
+    disturbance: Array,
+    position: Array,
+    velocity: Array,
+    effort: Array,
+    motor: Array,
+    measured: Array,
+) -> tuple[int, int]:
+    """Step through a block; returns the commands that were cut off and the samples at the greatest speed."""
+    saturated = limited = 0
+    for k in range(command.size):
+        before = state[_LOAD]
+        limited += move(table, state)
+        if (first + k) % divisor == 0:
+            saturated += hold(table, state, command[k])
+        state[_DISTURBANCE] = disturbance[k] if disturbance.size else 0.0
+        motor[k], position[k], effort[k] = state[0], state[_LOAD], state[_EFFORT]
+        # Within the gap the slide stands.
+        velocity[k] = state[1] if table.half == 0.0 or state[_LOAD] != before else 0.0
+        seen = state[_LOAD] if from_load else state[0]
+        measured[k] = np.rint(seen / resolution) * resolution if resolution > 0.0 else seen
+    return saturated, limited
+
+
+def _realise(model: TransferFunction) -> tuple[Array, Array]:
+    """Matrices a and b of a model, with position and speed as first states.
+
+    The others are the further derivatives, each less what the command adds to it at once (the observability form);
+    a zero that cancels a lag is no obstacle.
+    """
+    top, bottom = (np.trim_zeros(np.array(part), "f") for part in (model.numerator, model.denominator))
+    order = bottom.size - 1
+    if bottom.size - top.size < 2:
+        raise InputError(
+            f"feed drive {model} of degrees {top.size - 1} over {order}; allowed: a numerator lower by two or more, "
+            "since a speed cannot jump (add a lag, or leave out the zero)"
+        )
+    a = np.diag(np.ones(order - 1), 1)
+    a[-1] = -bottom[:0:-1] / bottom[0]
+    impulse = np.eye(1, order + 1)[0]
+    markov = lfilter(np.concatenate((np.zeros(bottom.size - top.size), top)), bottom, impulse)
+    return a, np.asarray(markov[1:])
+
+
+class FeedDrive:
+    """The drive as a machine: command in, motion of the slide and of the motor out.
+
+    Args:
+        model: position over command, see `fourth_order`, `dc_screw`, `sampled`.
+        step: sampling step [s].
+        divisor: the command is taken at samples that are multiples of it, and held between.
+        command_limit: the command is cut off at ± this, in its unit.
+        speed_limit: of the motor, to each side [m/s].
+        backlash: width of the gap between motor and slide [m].
+        resolution: of the position sensor [m]; 0 for none.
+        feedback: where the position sensor is.
+
+    Attributes:
+        table: its constants for `move` and `hold`.
+        state: its memory for them.
+        saturated: commands so far that were cut off.
+        limited: samples so far at the greatest speed.
+
+    Raises:
+        InputError: a model whose speed would jump with the command, or a value that is out of range.
+    """
+
+    def __init__(
+        self,
+        model: TransferFunction,
+        *,
+        step: float,
+        divisor: int = 1,
+        command_limit: float = np.inf,
+        speed_limit: float = np.inf,
+        backlash: float = 0.0,
+        resolution: float = 0.0,
+        feedback: Feedback = "load",
+    ) -> None:
+        for name, value, allowed in (
+            ("divisor", divisor, divisor >= 1),
+            ("command limit", command_limit, command_limit > 0.0),
+            ("speed limit", speed_limit, speed_limit > 0.0),
+        ):
+            if not allowed:
+                raise InputError(f"feed drive: {name} = {value:g}; allowed: above 0")
+        for name, value in (("backlash", backlash), ("resolution", resolution)):
+            if not 0.0 <= value < np.inf:
+                raise InputError(f"feed drive: {name} = {value:g} m; allowed: 0 for none, or above 0")
+        a, b = _realise(model)
+        linear = discretise(a, b, 0.0, step, "foh")
+        # What is exact for a command that is linear over a step is so for one that does not change in it.
+        held = linear.weights[:, 0] + linear.weights[:, 1]
+        # A model that integrates needs a certain command for a certain speed.
+        gain = abs(model.numerator[-1] / model.denominator[-2]) if model.denominator[-1] == 0.0 else 0.0
+        needed = speed_limit / gain if gain > 0.0 else np.inf
+        self.table = DriveTable(
+            transition=np.ascontiguousarray(linear.transition),
+            weights=held,
+            jumps=b,
+            command_limit=float(command_limit),
+            speed_limit=float(speed_limit),
+            needed=float(needed),
+            furthest=float(speed_limit * step),
+            half=backlash / 2.0,
+        )
+        self.state = np.zeros(2 * held.size + 3)
+        self.saturated = self.limited = 0
+        self._step, self._sampling = step, (divisor, float(resolution), feedback == "load")
+
+    def response(self, frequency: npt.ArrayLike) -> Complex:
+        """Motor over command, as the difference equation has it, at ``frequency`` [rad/s]; limits and divisor apart."""
+        z = np.exp(1j * np.asarray(frequency, dtype=np.float64) * self._step)
+        weights = self.table.weights
+        whole = z[..., None, None] * np.eye(weights.size) - self.table.transition
+        states = np.linalg.solve(whole, np.broadcast_to(weights[:, None], (*z.shape, weights.size, 1)))
+        return np.asarray(states[..., 0, 0])
+
+    def block(
+        self,
+        first: int,
+        command: Array,
+        position: Array,
+        velocity: Array,
+        effort: Array,
+        motor: Array,
+        measured: Array,
+        disturbance: Array = _UNDISTURBED,
+    ) -> None:
+        """Step from sample ``first`` on; at rest at 0 before sample 0. Arrays of shape (n,), the last five filled.
+
+        Args:
+            first: index of the first sample.
+            command: in the unit of the model.
+            position: of the slide [m].
+            velocity: of the slide [m/s].
+            effort: what the motor is given from this sample on: the command, sampled and cut off.
+            motor: position of the motor, on the slide's scale [m].
+            measured: that of the two which the sensor sees, as it reads it [m].
+            disturbance: adds to the limited command, in its unit (f of paper 002, eq. 2); none if empty.
+        """
+        saturated, limited = _advance(
+            self.table,
+            self.state,
+            *self._sampling,
+            first,
+            command,
+            disturbance,
+            position,
+            velocity,
+            effort,
+            motor,
+            measured,
+        )
+        self.saturated += saturated
+        self.limited += limited

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Allowance: how far the blank's surface lies beyond where it is taken to be.
+
+    d(t) = w(t) + Σ a_i·sin(n_i·φ(t) + ψ_i)
+
+w is a slow random walk, the sum the run-out of the blank, which turns with the spindle: order 1 is eccentricity, the
+others are its form. Sources: paper 004, whose disturbance of the force is 4.83 N RMS; spec/feed-and-force.md, by which
+that is an allowance of 20.7 µm RMS at 233.3 N/mm.
+"""
+
+import zlib
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+
+Array = npt.NDArray[np.float64]
+
+PAPER_RMS = 20.7e-6  #: [m]
+
+
+class Walk(NamedTuple):
+    """w[n] = keep·w[n-1] + kick·ξ[n], ξ normal with mean 0 and RMS 1.
+
+    Attributes:
+        keep: 1 for a walk without bounds.
+        kick: [m].
+        start: RMS of the first value [m].
+    """
+
+    keep: float
+    kick: float
+    start: float
+
+
+def mean_reverting(rms: float, correlation_time: float, step: float) -> Walk:
+    """A walk that is drawn back to 0, stationary from its first sample on (Ornstein-Uhlenbeck).
+
+    Its autocorrelation is rms²·e^{-|t|/correlation_time}, at any sampling step.
+
+    Args:
+        rms: [m].
+        correlation_time: [s].
+        step: sampling step [s].
+
+    Raises:
+        InputError: a negative RMS, or a time that is not above 0.
+    """
+    if not 0.0 <= rms < np.inf:
+        raise InputError(f"allowance: RMS {rms:g} m; allowed: 0 or more")
+    if not 0.0 < correlation_time < np.inf:
+        raise InputError(
+            f"allowance: correlation time {correlation_time:g} s; allowed: above 0 and finite (a walk without bounds "
+            "has a rate instead)"
+        )
+    return Walk(
+        float(np.exp(-step / correlation_time)), rms * float(np.sqrt(-np.expm1(-2.0 * step / correlation_time))), rms
+    )
+
+
+def unbounded(rate: float, step: float) -> Walk:
+    """A walk from 0 whose RMS after t seconds is rate·√t; ``rate`` in m/√s, ``step`` in s.
+
+    Raises:
+        InputError: a negative rate.
+    """
+    if not 0.0 <= rate < np.inf:
+        raise InputError(f"allowance: rate {rate:g} m/√s of the walk; allowed: 0 or more")
+    return Walk(1.0, rate * float(np.sqrt(step)), 0.0)
+
+
+@kernel
+def _advance(walk: Walk, run_out: Array, state: Array, angle: Array, allowance: Array) -> None:
+    """Turn the normal numbers in ``allowance`` into the allowance; ``state`` is w and whether there was a sample."""
+    w, begun = state[0], state[1]
+    for k in range(angle.size):
+        normal = allowance[k]
+        w = walk.keep * w + walk.kick * normal if begun else walk.start * normal
+        begun = 1.0
+        total = w
+        for i in range(run_out.shape[1]):
+            total += run_out[1, i] * np.sin(run_out[0, i] * angle[k] + run_out[2, i])
+        allowance[k] = total
+    state[0], state[1] = w, begun
+
+
+class Allowance:
+    """Random walk and run-out.
+
+    Args:
+        walk: see `mean_reverting` and `unbounded`.
+        order: n_i of the run-out, whole numbers from 1, shape (m,).
+        amplitude: a_i [m], shape (m,).
+        phase: ψ_i [rad], shape (m,).
+        seed: the scenario's seed.
+        name: of the node; makes the walk its own.
+
+    Raises:
+        InputError: arrays of different lengths, or an order that is no whole number from 1.
+    """
+
+    def __init__(
+        self, walk: Walk, *, order: Array, amplitude: Array, phase: Array, seed: int, name: str = "allowance"
+    ) -> None:
+        if not order.size == amplitude.size == phase.size:
+            raise InputError(
+                f"run-out: {order.size} orders, {amplitude.size} amplitudes and {phase.size} phases; "
+                "give as many of each"
+            )
+        wrong = order[(order < 1.0) | (order != np.rint(order))]
+        if wrong.size:
+            raise InputError(f"run-out: order {wrong[0]:g}; allowed: whole numbers from 1")
+        self._walk, self._run_out = walk, np.stack((order, amplitude, phase)).astype(np.float64)
+        # A stream of normal numbers does not depend on the lengths in which it is drawn.
+        self._random = np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
+        self._state = np.zeros(2)
+
+    def block(self, angle: Array, allowance: Array) -> None:
+        """Fill ``allowance`` [m] at the true spindle ``angle`` [rad]; both of shape (n,)."""
+        allowance[:] = self._random.standard_normal(angle.size)
+        _advance(self._walk, self._run_out, self._state, angle, allowance)

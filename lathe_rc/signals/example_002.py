@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The example of paper 002: what its drive shall follow and what disturbs it.
+
+    r(t) = 1.1 - 0.1·e^{-t} - |cos 0.04πt|³      (17)
+    f(t) = 0.5·(sin 0.04πt)²                     (18)
+
+Both have the period of 25 s but for the term that decays.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.jit import kernel
+
+Array = npt.NDArray[np.float64]
+
+PERIOD = 25.0  #: [s]
+OMEGA = 0.04 * np.pi  #: [rad/s]
+
+
+@kernel
+def fill_reference(first: int, step: float, reference: Array) -> None:
+    """Eq. 17 from sample ``first`` on, shape (n,); ``step`` in s."""
+    for k in range(reference.size):
+        time = (first + k) * step
+        reference[k] = 1.1 - 0.1 * np.exp(-time) - np.abs(np.cos(OMEGA * time)) ** 3
+
+
+@kernel
+def fill_disturbance(first: int, step: float, amplitude: float, disturbance: Array) -> None:
+    """Eq. 18, with ``amplitude`` for 0.5, from sample ``first`` on, shape (n,); ``step`` in s."""
+    for k in range(disturbance.size):
+        disturbance[k] = amplitude * np.sin(OMEGA * ((first + k) * step)) ** 2

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Allowance: the walk's statistics, the run-out over the angle, seeds, blocks."""
+
+import numpy as np
+import pytest
+from cells import cuts, in_blocks
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from lathe_rc.errors import InputError
+from lathe_rc.signals import speed
+from lathe_rc.signals.allowance import PAPER_RMS, Allowance, Walk, mean_reverting, unbounded
+
+STEP = 1 / 64000
+STILL = Walk(1.0, 0.0, 0.0)
+
+
+def make(walk=STILL, order=(), amplitude=(), phase=(), seed=1, name="allowance"):
+    return Allowance(
+        walk, order=np.array(order), amplitude=np.array(amplitude), phase=np.array(phase), seed=seed, name=name
+    )
+
+
+def draw(allowance, angle, lengths=None):
+    values = np.full(angle.size, np.nan)
+    in_blocks(lengths or [angle.size], lambda _, *parts: allowance.block(*parts), angle, values)
+    return values
+
+
+def test_mean_reverting_walk_has_its_rms_and_autocorrelation():
+    """4000 correlation times; the estimate of the RMS has a standard deviation of 1.6 %."""
+    step, time = 0.02, 1.0
+    walk = draw(make(mean_reverting(PAPER_RMS, time, step)), np.zeros(200_000))
+    assert walk.std() == pytest.approx(PAPER_RMS, rel=0.04)
+    for lag in (10, 50, 100):
+        assert np.mean(walk[lag:] * walk[:-lag]) / PAPER_RMS**2 == pytest.approx(np.exp(-lag * step / time), abs=0.06)
+
+
+@pytest.mark.parametrize("step", [STEP, 0.05, 3.0])
+def test_walk_is_stationary_from_the_first_sample_on_whatever_the_step(step):
+    """Over many seeds the first and a later sample have the same RMS: 2000 draws, standard deviation 1.6 %."""
+    walks = np.array([draw(make(mean_reverting(1.0, 0.5, step), seed=seed), np.zeros(4)) for seed in range(2000)])
+    assert_allclose(walks.std(axis=0), 1.0, rtol=0.06)
+    assert_allclose(np.mean(walks[:, 0] * walks[:, 3]), np.exp(-3 * step / 0.5), atol=0.08)
+
+
+def test_innovations_are_white_and_normal():
+    walk = mean_reverting(1.0, 0.5, 0.01)
+    values = draw(make(walk), np.zeros(100_000))
+    kicks = (values[1:] - walk.keep * values[:-1]) / walk.kick
+    assert kicks.std() == pytest.approx(1.0, rel=0.01)
+    assert abs(np.corrcoef(kicks[1:], kicks[:-1])[0, 1]) < 0.015
+    assert np.mean(np.abs(kicks) < 1.0) == pytest.approx(0.6827, abs=0.01)
+
+
+def test_unbounded_walk_grows_with_the_root_of_time():
+    rate, step = 2e-6, 0.01
+    ends = [draw(make(unbounded(rate, step), seed=seed), np.zeros(401))[[0, 100, 400]] for seed in range(2000)]
+    assert_allclose(np.std(ends, axis=0), rate * np.sqrt([0.0, 1.0, 4.0]), rtol=0.06)
+
+
+def test_run_out_turns_with_the_spindle():
+    law = speed.harmonic(105.0, np.array([0.1]), np.array([30.0]), np.zeros(1))
+    angle = law.at(np.arange(20_000) * STEP)[0]
+    values = draw(make(order=[1, 3], amplitude=[30e-6, 5e-6], phase=[0.4, -1.0]), angle)
+    assert_allclose(values, 30e-6 * np.sin(angle + 0.4) + 5e-6 * np.sin(3 * angle - 1.0), atol=1e-18)
+
+
+def test_walk_and_run_out_add():
+    angle = np.linspace(0.0, 30.0, 1000)
+    walk = mean_reverting(PAPER_RMS, 0.1, STEP)
+    both = draw(make(walk, [2], [1e-5], [0.0]), angle)
+    assert_allclose(both, draw(make(walk), angle) + draw(make(order=[2], amplitude=[1e-5], phase=[0.0]), angle))
+
+
+@given(cuts, st.integers(0, 2**31))
+def test_cuts_change_nothing(lengths, seed):
+    angle = np.arange(sum(lengths)) * 1e-3
+    one, other = (make(mean_reverting(1e-5, 0.1, STEP), [1], [1e-5], [0.3], seed=seed) for _ in range(2))
+    assert np.array_equal(draw(one, angle, lengths), draw(other, angle))
+
+
+def test_each_seed_and_name_has_its_own_walk():
+    streams = [
+        draw(make(mean_reverting(1.0, 1e-9, STEP), seed=seed, name=name), np.zeros(1000))
+        for name in ("a", "b")
+        for seed in (0, 1)
+    ]
+    assert np.abs(np.corrcoef(streams) - np.eye(4)).max() < 0.15
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: mean_reverting(-1e-6, 1.0, STEP), r"allowance: RMS -1e-06 m; allowed: 0 or more"),
+        (lambda: mean_reverting(1e-6, 0.0, STEP), r"allowance: correlation time 0 s"),
+        (lambda: mean_reverting(1e-6, np.inf, STEP), r"allowance: correlation time inf s; .* has a rate instead"),
+        (lambda: unbounded(-1.0, STEP), r"allowance: rate -1 m/√s"),
+        (lambda: make(order=[1.0], amplitude=[1e-6, 1e-6], phase=[0.0]), r"run-out: 1 orders, 2 amplitudes"),
+        (lambda: make(order=[1.5], amplitude=[1e-6], phase=[0.0]), r"run-out: order 1.5; allowed: whole"),
+    ],
+)
+def test_what_cannot_be_is_refused(wrong, message):
+    with pytest.raises(InputError, match=message) as refusal:
+        wrong()
+    assert len(str(refusal.value).splitlines()) == 1

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``lathe study decoupling``: what it promises, and numbers of paper 004 that can be reproduced."""
+
+import json
+from dataclasses import FrozenInstanceError
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lathe_rc.cli import main
+from lathe_rc.studies.decoupling import STUDY
+from lathe_rc.studies.decoupling_runs import disturbance
+
+SHORT = {"seconds": 4.0}
+
+
+@pytest.fixture(scope="module", params=["paper", "realistic"])
+def told(request):
+    """The result of a preset with the full plant, and its JSON."""
+    result = STUDY.run(STUDY.parameters(preset=request.param, plant="full", **SHORT))
+    return result, json.loads(json.dumps(result.to_json(), allow_nan=False))
+
+
+def test_json_has_the_promised_keys(told):
+    found = told[1]
+    assert set(found) >= {"stability", "single_loop", "cross", "noise"}
+    assert list(found["stability"]) == ["none", "k1", "k2", "both"]
+    assert {"force", "position"} <= set(found["single_loop"])
+    for name in ("position_step_to_force", "force_step_to_position"):
+        assert list(found["cross"][name]) == ["uncompensated", "compensated"]
+
+
+def test_signs_of_the_growth_are_those_of_the_spec(told):
+    found = told[1]
+    signs = [value < 0.0 for value in found["stability"].values()]
+    assert signs == ([False, True, False, True] if found["preset"] == "paper" else [True] * 4)
+    assert max(found["robustness"].values()) < 0.0
+
+
+def test_force_loop_is_as_printed(told):
+    loop, printed = told[1]["single_loop"]["force"], told[1]["single_loop"]["printed"]["force"]
+    for name in ("rise_s", "settling_s", "overshoot_pct", "gain_margin_db", "gain_margin_rad_s", "crossover_rad_s"):
+        assert loop[name] == pytest.approx(printed[name], rel=0.03), name
+
+
+def test_compensators_and_smooth_entry_help(told):
+    found = told[1]
+    for pair in (found["cross"]["position_step_to_force"], found["cross"]["force_step_to_position"]):
+        assert pair["compensated"] < pair["uncompensated"] / 1.5
+    entry = found["engagement"]
+    assert entry["smooth"]["force_overshoot_pct"] < 0.2
+    assert entry["step"]["force_overshoot_pct"] > 5.0
+
+
+def test_efficiencies_follow_from_their_rms(told):
+    noise = told[1]["noise"]
+    for loop, unit in (("force", "n"), ("position", "mm")):
+        ratio = noise[f"{loop}_disturbance_rms_{unit}"] / noise[f"{loop}_error_rms_{unit}"]
+        assert noise[f"{loop}_efficiency"] == pytest.approx(ratio)
+    assert noise["force_efficiency"] > 1.88
+    # Most of the paper's k = 7 is the deflection under the mean force, 150 N · 0.385 µm/N.
+    assert noise["position_static_deflection_mm"] == pytest.approx(0.05775, rel=0.02)
+
+
+def test_delay_costs_little(told):
+    prompt, late = told[1]["single_loop"]["force"], told[1]["delay"]["single_loop"]["force"]
+    lost = np.degrees(prompt["crossover_rad_s"] * 1e-3)
+    assert prompt["phase_margin_deg"] - late["phase_margin_deg"] == pytest.approx(lost, rel=1e-3)
+    assert late["gain_margin_db"] < prompt["gain_margin_db"]
+
+
+def test_result_is_frozen(told):
+    with pytest.raises(FrozenInstanceError):
+        told[0].parameters = None
+
+
+@pytest.mark.parametrize("told", ["paper"], indirect=True)
+def test_result_is_the_same_again(told):
+    seen = []
+
+    def track(items):
+        for item in items:
+            seen.append(item)
+            yield item
+
+    assert STUDY.run(told[0].parameters, track).to_json() == told[1]
+    assert seen == [0.0, 1e-3]
+
+
+def test_disturbance_is_that_of_the_paper_in_the_mean():
+    """4.83 N RMS of 0.0207 mm, over many correlation times; the lag of W4 takes a little."""
+    found = disturbance(STUDY.parameters(seconds=200.0))
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(4.83, rel=0.12)
+    assert np.array_equal(found, disturbance(STUDY.parameters(seconds=200.0)))
+    assert not np.array_equal(found, disturbance(STUDY.parameters(seconds=200.0, seed=1)))
+
+
+def test_people_get_a_table_of_80_columns_and_a_figure(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner(env={"COLUMNS": "80"}).invoke(main, ["study", "decoupling", "--set", "seconds=4"])
+    assert result.exit_code == 0, result.stderr
+    assert max(map(len, result.stdout.splitlines())) <= 80
+    assert "…" not in result.stdout
+    assert result.stdout.splitlines()[-1] == "figure: study-decoupling.png"
+    assert (tmp_path / "study-decoupling.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_delay_between_samples_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(main, ["study", "decoupling", "--set", "delay_ms=0.12", "--set", "seconds=4"])
+    assert result.exit_code == 2
+    assert "allowed: a whole number of samples" in result.stderr
+    assert result.stderr.count("\n") == 1

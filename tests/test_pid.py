@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The PID controller against its transfer function, its limits, converters, set point and divisor."""
+
+import numpy as np
+import pytest
+from cells import cuts, in_blocks
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from lathe_rc.control.pid import FORCE, POSITION, Pid, PidGains
+from lathe_rc.errors import InputError
+from lathe_rc.transfer import LinearSystem
+
+STEP = 1 / 64000
+GAINS = PidGains(0.8, 5.0, 0.02, 900.0)
+
+
+def make(gains=GAINS, **options):
+    return Pid(gains, **{"low": -1e9, "high": 1e9, "step": STEP, **options})
+
+
+def drive(pid, set_point, measurement=None, lengths=None):
+    measurement = np.zeros_like(set_point) if measurement is None else measurement
+    command = np.empty_like(set_point)
+    in_blocks(lengths or [set_point.size], pid.block, set_point, measurement, command)
+    return command
+
+
+@pytest.mark.parametrize(
+    "gains",
+    [GAINS, FORCE, POSITION, PidGains(2.0, 0.0, 0.0, 1.0), PidGains(0.0, 3.0, 0.0, 1.0), PidGains(1.0, 0.0, 0.1, 50.0)],
+)
+def test_without_limits_it_is_its_transfer_function(gains):
+    error = np.random.default_rng(1).normal(size=2000)
+    expected = np.empty_like(error)
+    LinearSystem(gains.transfer, STEP, "foh").block(error, expected)
+    assert_allclose(drive(make(gains), error), expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
+
+
+def test_transfer_function_is_the_sum_of_its_parts():
+    p = 1j * np.array([0.3, 20.0, 900.0, 1e5])
+    expected = 0.8 + 5.0 / p + 0.02 * 900.0 * p / (p + 900.0)
+    assert_allclose(GAINS.transfer.response(p.imag), expected, rtol=1e-12)
+
+
+def test_gains_of_the_paper_are_converted():
+    """0.52733 %/N and 1351.02 %/mm."""
+    assert FORCE.proportional * 1.0 * 100 == pytest.approx(0.52733)
+    assert POSITION.proportional * 1e-3 * 100 == pytest.approx(1351.02)
+    assert POSITION.integral * 1e-3 * 100 == pytest.approx(11069.17)
+    assert POSITION.derivative * 1e-3 * 100 == pytest.approx(45.2539)
+    assert (FORCE.integral * 100, FORCE.derivative * 100) == pytest.approx((1.4848, 0.046435))
+
+
+def test_ramp_of_the_error_is_answered_exactly():
+    """P·t + I·t²/2 + D·(1 - e^{-Nt}), from sample -1 on."""
+    time = np.arange(1, 400) * STEP
+    expected = 0.8 * time + 2.5 * time**2 - 0.02 * np.expm1(-900.0 * time)
+    assert_allclose(drive(make(), time), expected, rtol=1e-10)
+
+
+def test_clamping_stops_the_integral_at_a_limit():
+    gains = PidGains(1.0, 100.0, 0.0, 1.0)
+    up = 6400
+    error = np.concatenate((np.full(up, 0.6), np.full(up, -0.6)))
+    pid = make(gains, low=-1.0, high=1.0)
+    command = drive(pid, error)
+    assert command.max() == 1.0
+    held = np.count_nonzero(command[:up] == 1.0)
+    # The integral stopped where the sum reached the limit: 0.4, and a turn of the error is answered at once.
+    assert command[up] == pytest.approx(0.4 - 0.6, abs=2 * 100 * 0.6 * STEP)
+    lower = np.count_nonzero(command == -1.0)
+    assert held > 5000
+    assert pid.clamped == pid.saturated == held + lower
+
+
+def test_integral_leaves_a_limit():
+    """The error drives back: the integral runs though the command is at the limit."""
+    gains = PidGains(0.1, 100.0, 0.0, 1.0)
+    pid = make(gains, low=-1.0, high=1.0)
+    drive(pid, np.full(3000, 0.5))
+    before = pid.state[0]
+    drive(pid, np.full(10, -0.5))
+    assert pid.state[0] < before
+
+
+@given(st.floats(0.1, 2.0), st.integers(0, 5))
+def test_command_stays_within_its_limits_and_cuts_are_counted(limit, seed):
+    error = np.random.default_rng(seed).normal(size=500)
+    pid = make(low=-limit, high=0.5 * limit, dac=0.07)
+    command = drive(pid, error)
+    assert command.min() >= -limit
+    assert command.max() <= 0.5 * limit
+    assert 0 < pid.saturated <= 500
+
+
+def test_no_cut_is_counted_where_there_is_room():
+    pid = make()
+    drive(pid, np.random.default_rng(2).normal(size=500))
+    assert (pid.saturated, pid.clamped, pid.slowed) == (0, 0, 0)
+
+
+@given(st.floats(1e-3, 0.3), st.floats(1e-3, 0.3))
+def test_converters_round_to_the_nearest_step(adc, dac):
+    random = np.random.default_rng(3)
+    measurement = random.normal(size=300)
+    only_gain = PidGains(1.0, 0.0, 0.0, 1.0)
+    read = -drive(make(only_gain, adc=adc), np.zeros(300), measurement)
+    assert np.abs(read - measurement).max() <= adc / 2 * (1 + 1e-9)
+    assert_allclose(read / adc, np.rint(read / adc), atol=1e-9 / adc)
+    command = drive(make(only_gain, dac=dac), measurement)
+    assert np.abs(command - measurement).max() <= dac / 2 * (1 + 1e-9)
+    assert_allclose(command / dac, np.rint(command / dac), atol=1e-9 / dac)
+
+
+def test_ramp_limits_the_rate_of_the_set_point():
+    only_gain = PidGains(1.0, 0.0, 0.0, 1.0)
+    pid = make(only_gain, ramp=10.0)
+    command = drive(pid, np.full(10_000, 1.0))
+    assert_allclose(np.diff(command[:6000]), 10.0 * STEP, rtol=1e-9)
+    assert np.all(command[6400:] == 1.0)
+    assert pid.slowed == pytest.approx(6400, abs=2)
+
+
+def test_smoothing_ends_a_ramp_as_an_exponential():
+    only_gain = PidGains(1.0, 0.0, 0.0, 1.0)
+    tau = 0.02
+    command = drive(make(only_gain, smoothing=tau), np.ones(6400))
+    assert_allclose(command, -np.expm1(-np.arange(1, 6401) * STEP / tau), rtol=1e-9)
+    both = drive(make(only_gain, smoothing=tau, ramp=10.0), np.ones(6400))
+    assert np.diff(both).max() == pytest.approx(10.0 * STEP)
+    assert both.max() < 1.0
+
+
+@given(cuts, st.integers(2, 9))
+def test_divisor_computes_at_absolute_samples_and_holds(lengths, divisor):
+    random = np.random.default_rng(4)
+    set_point, measurement = random.normal(size=(2, sum(lengths)))
+    command = drive(make(divisor=divisor), set_point, measurement, lengths)
+    slow = drive(make(step=STEP * divisor), set_point[::divisor].copy(), measurement[::divisor].copy())
+    assert np.array_equal(command, np.repeat(slow, divisor)[: command.size])
+
+
+@given(cuts)
+def test_cuts_change_nothing(lengths):
+    random = np.random.default_rng(5)
+    set_point, measurement = random.normal(size=(2, sum(lengths)))
+    options = {"low": -1.0, "high": 1.0, "adc": 0.01, "dac": 0.02, "ramp": 300.0, "smoothing": 1e-3, "divisor": 3}
+    whole, cut = make(**options), make(**options)
+    assert np.array_equal(drive(cut, set_point, measurement, lengths), drive(whole, set_point, measurement))
+    assert np.array_equal(whole.state, cut.state)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"low": 1.0, "high": 1.0}, "PID: limits 1 to 1; allowed: a lower one below"),
+        ({"divisor": 0}, "PID: divisor 0; allowed: 1 or more"),
+        ({"adc": -1.0}, "PID: ADC step -1; allowed: 0 for none"),
+        ({"dac": np.inf}, "PID: DAC step inf"),
+        ({"ramp": np.nan}, "PID: ramp nan"),
+        ({"smoothing": -0.1}, "PID: smoothing -0.1"),
+    ],
+)
+def test_what_cannot_work_is_refused(options, message):
+    with pytest.raises(InputError, match=message) as refusal:
+        make(**options)
+    assert len(str(refusal.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("gains", [(np.nan, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), (1.0, np.inf, 0.0, 1.0)])
+def test_gains_that_are_none_are_refused(gains):
+    with pytest.raises(InputError, match="allowed: finite gains and N above 0"):
+        PidGains(*gains)

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The saturation study and the numbers of spec/feed-and-force.md for paper 002."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from lathe_rc import cli
+from lathe_rc.analysis.hyperstability import NOMINAL, corners
+from lathe_rc.analysis.periodic_example import Case, limited_ideal_error, simulate
+from lathe_rc.control.periodic import PRESETS
+from lathe_rc.errors import InputError
+from lathe_rc.studies import STUDIES
+
+STEP, COARSEST = 0.005, 0.01  # [s]
+STUDY = STUDIES["saturation"]
+
+
+@pytest.fixture(scope="module")
+def result():
+    return STUDY.run(STUDY.parameters())
+
+
+@pytest.mark.parametrize("step", [0.001, 0.005])
+def test_error_falls_as_the_spec_says(step):
+    errors = simulate(Case(periods=8, step=step), NOMINAL).period_max_error
+    assert errors[[0, 1, 3, 7]] == pytest.approx([0.105, 5.4e-3, 2.2e-3, 1.2e-3], rel=0.03)
+
+
+@pytest.mark.parametrize(("step", "within"), [(STEP, 3e-3), (COARSEST, 6e-3)])
+def test_coarse_steps_agree_with_fine_ones(step, within):
+    coarse, fine = (simulate(Case(periods=4, step=size), NOMINAL).period_max_error for size in (step, 2e-4))
+    assert coarse == pytest.approx(fine, rel=within)
+
+
+def test_published_law_diverges_slowly():
+    """The spec has 5e-4, 1.1e-2, 0.45: how soon depends on the first rounding of r at time 0, that it does does not."""
+    for step in (0.001, STEP):
+        errors = simulate(
+            Case(periods=200, step=step, memory_filter=0.0, anti_windup=False), NOMINAL
+        ).period_max_error  # fmt: skip
+        assert errors.argmin() < 20
+        assert 4e-4 < errors[19] < 4e-3
+        assert errors[39] == pytest.approx(1.85e-2, rel=0.05)
+        assert 0.3 < errors[199] < 0.8
+
+
+def test_eq_15_tells_the_divergence():
+    published = simulate(Case(periods=200, step=STEP, memory_filter=0.0, anti_windup=False), NOMINAL)
+    filtered = simulate(Case(periods=200, step=STEP), NOMINAL)
+    assert not published.controller.popov_holds
+    assert filtered.controller.popov_holds
+    assert filtered.period_integral[-1] == pytest.approx(filtered.period_integral[0], rel=0.01)
+
+
+def test_filter_keeps_the_error_small_at_every_corner():
+    """Below 1e-4 from period 100 to 400, on all 32."""
+    for drive in corners():
+        outcome = simulate(Case(periods=400, step=COARSEST), drive)
+        assert outcome.period_max_error[99:].max() < 1e-4
+        assert outcome.controller.saturated == 0
+
+
+def test_short_limit_with_and_without_anti_windup():
+    limit = 0.8 * 0.891
+    real, paper = (
+        simulate(Case(periods=40, step=STEP, s0=limit, anti_windup=anti_windup), NOMINAL)
+        for anti_windup in (True, False)
+    )
+    bound = limited_ideal_error(NOMINAL, limit, STEP)
+    assert bound == pytest.approx(0.140, abs=1e-3)
+    assert real.period_max_error[-1] == pytest.approx(bound, rel=0.01)
+    assert real.controller.largest_memory < limit
+    # It goes up and down from period to period, between 0.2 and 0.5.
+    assert paper.period_max_error[30:].mean() == pytest.approx(0.33, abs=0.05)
+    assert paper.controller.largest_memory == pytest.approx(153, rel=0.02)
+    assert real.controller.saturated > 0
+
+
+def test_quantisation_and_its_gains():
+    published = simulate(Case(periods=100, step=STEP, quantisation=1e-4), NOMINAL).period_max_error
+    assert 0.08 < published[50:].max() < 0.15
+    for drive in corners():
+        case = Case(periods=60, step=COARSEST, quantisation=1e-4, gains=PRESETS["quantised"])
+        assert simulate(case, drive).period_max_error[30:].max() < 4e-4
+
+
+def test_quantised_gains_at_a_finer_step():
+    case = Case(periods=40, step=0.001, quantisation=1e-4, gains=PRESETS["quantised"])
+    assert simulate(case, NOMINAL).period_max_error[20:].max() < 3e-4
+
+
+def test_json_has_what_was_asked_for(result):
+    found = json.loads(json.dumps(result.to_json(), allow_nan=False))
+    assert len(found["period_max_error"]) == 8
+    assert found["u_max"] == pytest.approx(0.892, abs=1e-3)
+    assert found["memory_max"] == pytest.approx(0.54, abs=0.01)
+    assert found["corners"] == []
+    assert found["eq_14"]["lag_neglected"]["possible"]
+    assert not found["eq_14"]["with_lag"]["possible"]
+    assert found["eq_15"]["holds"]
+    assert {len(curve) for curve in found["curves"].values()} == {750}
+
+
+def test_corners_are_named_and_the_worst_is_told():
+    result = STUDY.run(STUDY.parameters(corners=True, periods=2, quantisation=1e-4, preset="quantised"))
+    rows = result.to_json()["corners"]
+    assert np.array_equal([[row[name] for name in ("K", "a1", "a2", "a3", "a4")] for row in rows], corners())
+    assert all(len(row["period_max_error"]) == 2 for row in rows)
+    text = printed(result)
+    worst = max(row["period_max_error"][-1] for row in rows)
+    assert "worst of 32 corners" in text
+    assert f"{worst:.3g}" in text
+
+
+def printed(result):
+    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
+    console.print(result.table())
+    return console.export_text()
+
+
+def test_table_shows_each_number_beside_the_expected(result):
+    text = printed(result)
+    assert len(text.splitlines()) < 50
+    for check in result.checks:
+        (line,) = [line for line in text.splitlines() if line.startswith(f" {check.name} ")]
+        assert check.expected in line
+        assert f"{check.computed:.3g}" in line
+
+
+def test_figure_has_the_figures_of_the_paper(result):
+    figure = Figure()
+    result.draw(figure)
+    titles = [axes.get_title() for axes in figure.axes]
+    assert [title.split(":")[0] for title in titles[:3]] == ["Fig. 2", "Fig. 3", "Fig. 4"]
+    assert all(axes.lines for axes in figure.axes)
+
+
+def test_step_must_divide_the_period():
+    with pytest.raises(InputError, match=r"period of 25 s is 3571\.43 steps of 0\.007 s"):
+        STUDY.run(STUDY.parameters(step_ms=7.0))
+
+
+def test_command_takes_the_parameters_of_the_issue(tmp_path):
+    figure = tmp_path / "out.png"
+    words = ["periods=2", "s0=1.5", "memory_filter_s=0", "antiwindup=false", "quantisation=0", "corners=false"]
+    call = ["study", "saturation", "--json", "--figure", str(figure)]
+    done = CliRunner().invoke(cli.main, call + [part for word in words for part in ("--set", word)])
+    assert done.exit_code == 0, done.output
+    assert len(json.loads(done.output)["period_max_error"]) == 2
+    assert figure.stat().st_size > 10_000
