@@ -213,8 +213,8 @@ class TestLaunch:
 
     def test_starts_the_five_nodes_with_one_file(self, start: Callable[..., Any], tmp_path: Path) -> None:
         nodes = start()
-        assert {node.name for node in nodes} == FIVE
-        assert all(node.package == "lathe_rc" and node.executable == node.name for node in nodes)
+        assert {tuple(node.arguments) for node in nodes} == {(f"{name}:{name}",) for name in FIVE}
+        assert all((node.package, node.executable) == ("lathe_rc", "container") for node in nodes)
         (file,) = {parameter for node in nodes for parameter in node.parameters}
         loaded = scenario.load(Path(file))
         assert set(loaded.nodes["spindle_encoder"].members) == FIVE - {"spindle_encoder"}
@@ -228,10 +228,15 @@ class TestLaunch:
             + "/electrodynamic_actuator: {ros__parameters: {delay: 0.36e-3}}\n",
             encoding="utf-8",
         )
-        nodes = {node.name: node for node in start(scenario=str(path), bag=str(tmp_path / "elsewhere"))}
-        assert nodes["spindle"].executable == "spindle_encoder"
-        values = ros_yaml.read(Path(nodes["recorder"].parameters[0]))
+        nodes = start(scenario=str(path), bag=str(tmp_path / "elsewhere"))
+        assert ["spindle:spindle_encoder"] in [node.arguments for node in nodes]
+        values = ros_yaml.read(Path(nodes[0].parameters[0]))
         assert values["recorder"]["bag"] == str(tmp_path / "elsewhere")
+
+    def test_groups_nodes_as_the_scenario_says(self, start: Callable[..., Any]) -> None:
+        nodes = start(scenario="full_cell.yaml")
+        assert [len(node.arguments) for node in nodes] == [3, 3, 6, 1]
+        assert nodes[1].arguments == ["fine_controller:learning_controller", "piezo_actuator:piezo_actuator", "tool:tool"]
 
     def test_refuses_a_bag_that_exists(self, start: Callable[..., Any], tmp_path: Path) -> None:
         with pytest.raises(InputError, match="exists"):

@@ -38,7 +38,7 @@ def test_coarse_steps_agree_with_fine_ones(step, within):
 
 
 def test_published_law_diverges_slowly():
-    """The spec has 5e-4, 1.1e-2, 0.45: how soon depends on the first rounding of r at time 0, that it does does not."""
+    """The spec has 5e-4, 1.1e-2, 0.45; how soon it shows depends on the high frequencies of the first period."""
     for step in (0.001, STEP):
         errors = simulate(
             Case(periods=200, step=step, memory_filter=0.0, anti_windup=False), NOMINAL

@@ -11,7 +11,7 @@ Its poles say whether the loops are stable together; a limit or a converter is n
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import control  # type: ignore[import-untyped]  # it has no types
+import control
 import numpy as np
 import numpy.typing as npt
 

@@ -9,7 +9,7 @@ between samples.
 
 from typing import NamedTuple
 
-import control  # type: ignore[import-untyped]  # it has no types
+import control
 import numpy as np
 import numpy.typing as npt
 

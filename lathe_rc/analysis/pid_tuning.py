@@ -11,7 +11,7 @@ Paper 004 tuned with Matlab's PID Tuner.
 
 from dataclasses import dataclass
 
-import control  # type: ignore[import-untyped]  # it has no types
+import control
 import numpy as np
 import numpy.typing as npt
 

@@ -7,7 +7,7 @@ out wrong by several rad/s. Each system is balanced by itself before it is conne
 
 from typing import Any, TypeAlias
 
-import control  # type: ignore[import-untyped]  # it has no types
+import control
 import numpy as np
 from scipy import signal
 from scipy.linalg import matrix_balance

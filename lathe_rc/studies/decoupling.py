@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import control  # type: ignore[import-untyped]  # it has no types
+import control
 import numpy as np
 from rich.console import Group
 

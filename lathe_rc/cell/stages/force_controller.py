@@ -24,9 +24,9 @@ class ForceControllerParameters(ServoParameters):
     set_point_ramp: Annotated[float, Ge(0)] = parameter(
         0.0, "fastest change of the set point, for a smooth engagement; 0: any", "N/s"
     )
-    proportional: float = parameter(FORCE.proportional, "P", "1/N")
-    integral: float = parameter(FORCE.integral, "I", "1/(N*s)")
-    derivative: float = parameter(FORCE.derivative, "D", "s/N")
+    proportional: float = parameter(FORCE.proportional, "proportional gain P", "1/N")
+    integral: float = parameter(FORCE.integral, "integral gain I", "1/(N*s)")
+    derivative: float = parameter(FORCE.derivative, "derivative gain D", "s/N")
     derivative_filter: Annotated[float, Gt(0)] = parameter(FORCE.filter, "N, where the derivative ends", "rad/s")
 
 

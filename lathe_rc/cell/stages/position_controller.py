@@ -39,9 +39,9 @@ class PositionControllerParameters(ServoParameters):
         "CSV file with height_mm,offset_um, added to the set point at the height of the longitudinal slide",
         path=True,
     )
-    proportional: float = parameter(POSITION.proportional, "pid: P", "1/m")
-    integral: float = parameter(POSITION.integral, "pid: I", "1/(m*s)")
-    derivative: float = parameter(POSITION.derivative, "pid: D", "s/m")
+    proportional: float = parameter(POSITION.proportional, "pid: proportional gain P", "1/m")
+    integral: float = parameter(POSITION.integral, "pid: integral gain I", "1/(m*s)")
+    derivative: float = parameter(POSITION.derivative, "pid: derivative gain D", "s/m")
     derivative_filter: Annotated[float, Gt(0)] = parameter(POSITION.filter, "pid: N, where D ends", "rad/s")
     link: Literal["ripple_free", "paper"] = parameter(
         "ripple_free", "sampled_link: ripple_free, or the paper's, which rings between the samples"
@@ -53,6 +53,9 @@ class PositionControllerParameters(ServoParameters):
     )
     periodic_gains: Literal["published", "quantised"] = parameter(
         "published", "periodic_hyperstable: gains of eqs 20 and 21, or those that survive a quantised measurement"
+    )
+    periodic_unit: Annotated[float, Gt(0)] = parameter(
+        1.0, "periodic_hyperstable: displacement that the law takes for 1; it has numbers without a unit", "m"
     )
     period: Annotated[float, Gt(0)] = parameter(PERIOD, "periodic_hyperstable: of set point and disturbance", "s")
     memory_filter: Annotated[float, Ge(0)] = parameter(
@@ -99,7 +102,7 @@ class PositionController(Stage):
             self._path = Predistortion.load(resources.find(Path(parameters.predistortion_file)))
             inputs.append(Input("longitudinal/state", messages.STATE, ("measured_position",), delay))
         self._offset = np.empty(messages.MAX_BLOCK)
-        self._largest = 0.0
+        self._largest, self._held = 0.0, 0.0
         self.declare(inputs=inputs, outputs=[Output(f"{axis}/command", messages.SERVO)])
         if parameters.law == "periodic_hyperstable":
             self.sparse_topics[f"{axis}/periodic"] = messages.PERIODIC
@@ -125,10 +128,10 @@ class PositionController(Stage):
             periodic.PRESETS[parameters.periodic_gains],
             period=parameters.period,
             limit=parameters.command_limit,
-            step_s=parameters.step,
+            step_s=parameters.step * parameters.divisor,
             memory_filter=parameters.memory_filter,
             anti_windup=parameters.anti_windup,
-            measurement_step=parameters.adc_step,
+            measurement_step=parameters.adc_step / parameters.periodic_unit,
             command_step=parameters.dac_step,
         )
 
@@ -155,20 +158,27 @@ class PositionController(Stage):
     ) -> list[Sparse]:
         """Run the law, and tell what it achieved where a period ends."""
         sparse, start, stop = [], 0, wanted.size
+        divisor, unit = self.parameters.divisor, self.parameters.periodic_unit
+        period = law.law.samples * divisor
         while start < stop:
-            end = min(stop, start + law.law.samples - (first + start) % law.law.samples)
-            part = slice(start, end)
-            law.block(first + start, wanted[part], position[part], servo["command"][part])
-            self._largest = max(self._largest, float(np.abs(servo["error"][part]).max()))
+            end = min(stop, start + period - (first + start) % period)
+            due = slice(start + -(first + start) % divisor, end, divisor)
+            computed = np.empty(len(range(*due.indices(stop))))
+            law.block((first + due.start) // divisor, wanted[due] / unit, position[due] / unit, computed)
+            # What is due holds until the next; what stands before the first of the block was due earlier.
+            place = (first + np.arange(start, end)) // divisor - (first + start - 1) // divisor
+            servo["command"][start:end] = np.concatenate(([self._held], computed))[place]
+            self._held = servo["command"][end - 1]
+            self._largest = max(self._largest, float(np.abs(servo["error"][start:end]).max()))
             start = end
-            if (first + end) % law.law.samples == 0:
-                sparse.append(self._status(first + end, law))
+            if (first + end) % period == 0:
+                sparse.append(self._status(first + end, period, law))
                 self._largest = 0.0
         return sparse
 
-    def _status(self, index: int, law: PeriodicController) -> Sparse:
+    def _status(self, index: int, period: int, law: PeriodicController) -> Sparse:
         status = {
-            "period": index // law.law.samples,
+            "period": index // period,
             "max_error": self._largest,
             "largest_demand": law.largest_demand,
             "largest_memory": law.largest_memory,

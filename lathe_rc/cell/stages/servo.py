@@ -28,6 +28,10 @@ class ServoParameters(TrajectoryParameters):
         0.0, "pid: fastest change of the set point, for a smooth engagement; 0: any", "m/s"
     )
 
+    set_point_smoothing: Annotated[float, Ge(0)] = parameter(
+        0.0, "pid: time constant with which the set point is approached; 0: at once", "s"
+    )
+
     def pid(self, proportional: float, integral: float, derivative: float, filter_: float) -> Pid:
         """The PID of a table.
 
@@ -42,5 +46,6 @@ class ServoParameters(TrajectoryParameters):
             adc=self.adc_step,
             dac=self.dac_step,
             ramp=self.set_point_ramp,
+            smoothing=self.set_point_smoothing,
             divisor=self.divisor,
         )
