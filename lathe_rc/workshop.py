@@ -107,9 +107,7 @@ def _chosen(text: str, whole: int) -> list[int]:
             raise InputError(f"--revolutions {text!r}; allowed: numbers and ranges from 1 to {whole}, like 1,4,10-12")
         chosen += range(int(span[1]) - 1, int(span[2] or span[1]))
     if not chosen or min(chosen) < 0 or max(chosen) >= whole:
-        raise InputError(
-            f"--revolutions {text!r}; allowed: from 1 to {whole}, the recording's complete revolutions"
-        )
+        raise InputError(f"--revolutions {text!r}; allowed: from 1 to {whole}, the recording's complete revolutions")
     return chosen
 
 

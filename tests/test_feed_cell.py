@@ -74,7 +74,12 @@ class TestForce:
 def held_open():
     """The cut at the feed of the paper, with nothing controlled."""
     cross = ("longitudinal.axis=cross", "force_controller.remap=['longitudinal/command:=cross/command']")
-    return (*cross, "force_controller.set_point=[0.0]", "force_controller.integral=0.0", "longitudinal.velocity_gain=1e-12")
+    return (
+        *cross,
+        "force_controller.set_point=[0.0]",
+        "force_controller.integral=0.0",
+        "longitudinal.velocity_gain=1e-12",
+    )
 
 
 def drift(force):
@@ -96,7 +101,9 @@ class TestApproach:
         assert_allclose(5e-3 - dense(result, "cross/state")["position"][-1], 10e-6, atol=1e-9)
 
     def test_link_of_the_paper_swings_between_the_samples(self):
-        result = harness.run(load("approach", "position_controller.link=paper", "position_controller.feedback_delay=64"))
+        result = harness.run(
+            load("approach", "position_controller.link=paper", "position_controller.feedback_delay=64")
+        )
         assert dense(result, "cross/state")["position"].max() > 1.2 * 5e-3
 
 
@@ -113,7 +120,9 @@ class TestPeriodicLaw:
 
     def test_is_told_to_be_hyperstable(self, status):
         assert all(status["hyperstable"])
-        assert all(integral > bound for integral, bound in zip(status["popov_integral"], status["popov_bound"], strict=True))
+        assert all(
+            integral > bound for integral, bound in zip(status["popov_integral"], status["popov_bound"], strict=True)
+        )
         assert status["saturated"][-1] == 0
         assert max(status["largest_demand"]) == pytest.approx(0.891, rel=0.01)
 
@@ -138,7 +147,7 @@ class TestFullCell:
     @pytest.fixture(scope="class")
     @classmethod
     def offline(cls):
-        return harness.run(load("full_cell", *self.SHORT))
+        return harness.run(load("full_cell", *cls.SHORT))
 
     def test_grouped_processes_give_its_digests(self, offline):
         grouped = harness.run(load("full_cell", *self.SHORT), mode="processes")
@@ -162,7 +171,9 @@ class TestFullCell:
         assert np.abs(dense(result, "cross/state")["position"][settled] - deflection).max() < 1e-6
 
     def test_a_block_longer_than_the_delay_is_refused_with_the_reason(self):
-        with pytest.raises(InputError, match="is delayed by 64 samples, block_size = 128; allowed: a block no longer than"):
+        with pytest.raises(
+            InputError, match="is delayed by 64 samples, block_size = 128; allowed: a block no longer than"
+        ):
             harness.run(load("full_cell", "block_size=128"))
 
 
@@ -182,7 +193,10 @@ def test_slow_controllers_compute_at_multiples_of_their_divisor():
     [
         (["position_controller.trajectory=csv"], "trajectory_file is empty"),
         (["position_controller.set_point=[1.0, 2.0]"], "2 values of set_point and 1 of set_point_time"),
-        (["position_controller.set_point_time=[1.0, 1.0]", "position_controller.set_point=[1.0, 2.0]"], "each later than"),
+        (
+            ["position_controller.set_point_time=[1.0, 1.0]", "position_controller.set_point=[1.0, 2.0]"],
+            "each later than",
+        ),
         (["feed_drive.model=dc_screw", "feed_drive.zero=0.1"], "feed drive"),
         (["position_controller.link_gain=-1.0"], "position_controller.link_gain = -1.0; allowed:"),
         (["position_controller.law=periodic_hyperstable", "position_controller.period=0.0001"], "period"),
@@ -226,7 +240,9 @@ def test_predistorted_shaft_comes_out_straight(tmp_path):
     path = cancelling(shaft.compliance(heights), proportional(stiffness), 0.643e-3)
     Predistortion(heights, path).save(tmp_path / "path.csv")
     followed = harness.run(
-        scenario.load(tmp_path / "shaft.yaml", [*straight, f"position_controller.predistortion_file={tmp_path}/path.csv"])
+        scenario.load(
+            tmp_path / "shaft.yaml", [*straight, f"position_controller.predistortion_file={tmp_path}/path.csv"]
+        )
     )
     first, second = (edge(result) for result in (bent, followed))
     assert np.ptp(first) > 20e-6

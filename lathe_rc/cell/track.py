@@ -21,9 +21,13 @@ class Track:
         fields: those to keep.
         delay: longest delay at which they are read [sample].
         block: longest block that is added [sample].
+
+    Attributes:
+        delay: see above.
     """
 
     def __init__(self, msgtype: str, fields: Iterable[str], delay: int, block: int) -> None:
+        self.delay = delay
         self._past = delay + block
         self._capacity = self._past + _BLOCKS_BETWEEN_MOVES * max(block, delay)
         types = messages.sample_fields(msgtype)

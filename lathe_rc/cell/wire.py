@@ -8,6 +8,7 @@ does not match the layout is decoded by rosbags and learned anew: CDR itself is 
 """
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,8 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import MAX_BLOCK, START_NS, Samples, Signals
 
 _BILLION = 1_000_000_000
-_ZEROS = np.zeros(MAX_BLOCK)
+_MOST_FIELDS = 16
+_ZEROS = np.zeros(_MOST_FIELDS * MAX_BLOCK)
 # Number in the message: struct format and a value that differs from 0 in every byte.
 _NUMBERS = {
     "sec": ("<i", 0x01010101),
@@ -78,6 +80,10 @@ class _Layout:
         return True
 
 
+# How a block of one length is made: numbers and their places, the message, its arrays.
+_Made = tuple[list[tuple[Callable[..., None], int]], Samples, list[tuple[str, Samples]]]
+
+
 @dataclass(slots=True)
 class Block:
     """A block as it came; the samples are views of its bytes.
@@ -106,13 +112,25 @@ class Block:
         """
         for name, array in signals.items():
             array[:] = self.signals[name]
-            # 0 times anything finite is 0, and NaN otherwise: one product tells for the whole block.
-            if array.dtype == np.float64 and np.dot(array, _ZEROS[: self.samples]) != 0.0:
-                bad = int(np.flatnonzero(~np.isfinite(array))[0])
-                raise ValueError(
-                    f"{self.source} sends {name} = {array[bad]} at sample {self.first_index + bad}; "
-                    "allowed: finite numbers"
-                )
+            self._check(name, array)
+
+    def check(self, together: Samples) -> None:
+        """Refuse samples that no reader could use; ``together`` are all float64 arrays, shape (m, samples).
+
+        Raises:
+            ValueError: a sample is NaN or infinite.
+        """
+        if np.dot(together.ravel(), _ZEROS[: together.size]) != 0.0:
+            for name, array in self.signals.items():
+                self._check(name, array)
+
+    def _check(self, name: str, array: Samples) -> None:
+        # 0 times anything finite is 0, and NaN otherwise: one product tells for the whole block.
+        if array.dtype == np.float64 and np.dot(array, _ZEROS[: self.samples]) != 0.0:
+            bad = int(np.flatnonzero(~np.isfinite(array))[0])
+            raise ValueError(
+                f"{self.source} sends {name} = {array[bad]} at sample {self.first_index + bad}; allowed: finite numbers"
+            )
 
 
 class Encoder:
@@ -127,20 +145,30 @@ class Encoder:
 
     def __init__(self, msgtype: str, run_id: str, source: str, step_ns: int) -> None:
         self._type, self._run_id, self._source, self._step_ns = msgtype, run_id, source, step_ns
-        self._made: dict[int, tuple[_Layout, Samples, list[tuple[str, Samples]]]] = {}
+        self._made: dict[int, _Made] = {}
 
     def prepare(self, samples: int) -> None:
         """Learn the layout for a length ahead of its first block."""
         self._layout(samples)
 
-    def _layout(self, samples: int) -> tuple[_Layout, Samples, list[tuple[str, Samples]]]:
+    def _layout(self, samples: int) -> _Made:
         layout = _Layout(self._type, self._run_id, self._source, samples)
         buffer = np.frombuffer(layout.template, np.uint8).copy()
+        code, place = layout.places["step_ns"]
+        code.pack_into(buffer.data, place, self._step_ns)  # in all blocks the same
+        varying = [layout.places[name] for name in ("sec", "nanosec", "first_index", "last", "companions")]
+        numbers = [(code.pack_into, place) for code, place in varying]
         views = [
             (name, np.frombuffer(buffer.data, dtype, samples, place)) for name, (dtype, place) in layout.fields.items()
         ]
-        self._made[samples] = layout, buffer, views
+        self._made[samples] = numbers, buffer, views
         return self._made[samples]
+
+    def block(self, first: int, signals: Signals, *, last: bool, companions: int) -> Block:
+        """The same block as readers find it who need no bytes; it holds ``signals`` themselves."""
+        samples = next(iter(signals.values())).size
+        log_ns = START_NS + (first + samples - 1) * self._step_ns
+        return Block(self._run_id, self._source, first, self._step_ns, last, companions, samples, log_ns, signals)
 
     def encode(self, first: int, signals: Signals, *, last: bool, companions: int) -> tuple[int, bytes]:
         """A block from sample ``first`` on, stamped with the time of its last sample.
@@ -149,19 +177,12 @@ class Encoder:
             The stamp [ns] and the bytes.
         """
         samples = next(iter(signals.values())).size
-        layout, buffer, views = self._made.get(samples) or self._layout(samples)
+        numbers, buffer, views = self._made.get(samples) or self._layout(samples)
         log_ns = START_NS + (first + samples - 1) * self._step_ns
         seconds, nanoseconds = divmod(log_ns, _BILLION)
-        for name, number in (
-            ("sec", seconds),
-            ("nanosec", nanoseconds),
-            ("first_index", first),
-            ("step_ns", self._step_ns),
-            ("last", last),
-            ("companions", companions),
-        ):
-            code, place = layout.places[name]
-            code.pack_into(buffer.data, place, number)
+        data = buffer.data
+        for (pack_into, place), number in zip(numbers, (seconds, nanoseconds, first, last, companions), strict=True):
+            pack_into(data, place, number)
         for name, view in views:
             view[:] = signals[name]
         return log_ns, buffer.tobytes()

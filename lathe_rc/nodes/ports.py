@@ -13,6 +13,7 @@ from lathe_rc.bag.record import signal_depth
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import LatheError
+from lathe_rc.nodes.exchange import Delivery
 
 
 def message_class(msgtype: str) -> Any:
@@ -50,6 +51,8 @@ class BlockQueue:
     Attributes:
         blocks: checked blocks that wait to be used.
         source: the only node whose blocks are accepted; empty until the first block of a node alone.
+        inside: its blocks are handed over in this process.
+        received: blocks so far, those that were lost included.
         lost: blocks that never came; always 0 unless the cell is free-running.
     """
 
@@ -57,7 +60,8 @@ class BlockQueue:
         self.topic, self.type = topic, msgtype
         self.blocks: deque[Block] = deque()
         self.source = ""
-        self.lost = 0
+        self.inside = False
+        self.received = self.lost = 0
         self._decoder = Decoder(msgtype, fields)
         self._decoder.prepare()
         self._run_id, self._step_ns, self._size = parameters.run_id, parameters.step_ns, parameters.block_size
@@ -81,6 +85,18 @@ class BlockQueue:
             block = self._decoder.decode(data)
         except ValueError as error:
             raise LatheError(f"{self.topic}: {error}") from None
+        return self.accept(block)
+
+    def take(self, delivery: Delivery) -> Block:
+        """Queue a block that was handed over in this process.
+
+        Raises:
+            LatheError: see `add`.
+        """
+        return self.accept(delivery.of_block())
+
+    def accept(self, block: Block) -> Block:
+        """Check a block and queue it; see `add`."""
         if self._run_id and block.run_id != self._run_id:
             raise LatheError(
                 f"{self.topic}: block of run {block.run_id!r} from {block.source}; expected {self._run_id!r}"
@@ -99,6 +115,7 @@ class BlockQueue:
             self._gap(block, self._expected)
         self._expected = block.first_index + block.samples
         self._newest = block
+        self.received += 1
         self.blocks.append(block)
         if len(self.blocks) > self._limit:
             raise LatheError(f"{self.topic}: {len(self.blocks)} blocks wait; the node cannot keep up")
@@ -116,4 +133,5 @@ class BlockQueue:
             samples = min(self._size, block.first_index - first)
             held = {name: np.repeat(array[-1:], samples) for name, array in self._newest.signals.items()}
             self.blocks.append(replace(self._newest, first_index=first, samples=samples, signals=held, last=False))
+            self.received += 1
             self.lost += 1

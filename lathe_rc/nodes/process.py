@@ -20,6 +20,7 @@ from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.recorder_node import RecorderNode
 from lathe_rc.nodes.report import THROUGHPUT, Reporter
 from lathe_rc.nodes.shell import CellNode
@@ -30,11 +31,11 @@ _PR_SET_TIMERSLACK = 29  # from <linux/prctl.h>
 _LONGEST_WAIT = 0.1  # [s] until signals and the harness are looked at again
 
 
-def _make(name: str, kind: str, reporter: Reporter) -> CellNode:
+def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellNode:
     if kind not in TABLES:
         raise InputError(f"{name}: no stage {kind!r}; allowed: {', '.join(TABLES)}")
     classes: dict[str, type[CellNode]] = {RECORDER: RecorderNode, SpindleEncoder.kind: SpindleNode}
-    return classes.get(kind, StageNode)(name, kind, reporter)
+    return classes.get(kind, StageNode)(name, kind, reporter, exchange)
 
 
 class _Stop:
@@ -49,11 +50,15 @@ class _Stop:
         self.signal = number
 
 
-def _start(node: CellNode) -> None:
-    """Configure and activate a node that starts by itself; what it refuses is in its ``failure``."""
-    if not node.autostart:
-        return
-    if node.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+def _start(nodes: Sequence[CellNode], exchange: Exchange) -> None:
+    """Configure and activate the nodes that start by themselves; what one refuses is in its ``failure``.
+
+    All are configured before any is activated: then it is known what they hand over to each other.
+    """
+    ready = [node for node in nodes if node.autostart and node.trigger_configure() == TransitionCallbackReturn.SUCCESS]
+    for node in ready:
+        exchange.join(node.full_name, (topic for topic, _, _ in node.publications()))
+    for node in ready:
         node.trigger_activate()
 
 
@@ -82,8 +87,11 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
         handled = -1
         while handled < (handled := sum(node.handled for node in nodes)) and not stop.signal:
             executor.spin_once(timeout_sec=0.0)
-        for node in nodes:
-            node.work()
+        # What a node hands over inside is work for its neighbours.
+        while (waiting := [node for node in nodes if node.due]) and not stop.signal:
+            for node in waiting:
+                node.due = False
+                node.work()
 
 
 def _tune() -> None:
@@ -117,10 +125,11 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
         return InputError.exit_code
     stop = _Stop()
     nodes: list[CellNode] = []
+    exchange = Exchange()
     try:
         for name, kind in members:
-            nodes.append(_make(name, kind, reporter))
-            _start(nodes[-1])
+            nodes.append(_make(name, kind, reporter, exchange))
+        _start(nodes, exchange)
         # What is there now stays: the collector need not walk through it again and again between blocks.
         gc.collect()
         gc.freeze()

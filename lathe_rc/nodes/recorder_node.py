@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recorder: every signal topic of the cell into one bag, sorted, complete, and closed whatever happens."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
 from lathe_rc_msgs.msg import CellState
@@ -18,6 +19,8 @@ from lathe_rc.cell.wire import Block
 from lathe_rc.errors import LatheError, LossyRunError
 from lathe_rc.nodes.ports import BlockQueue, latched_qos
 from lathe_rc.nodes.shell import CellNode
+
+T = TypeVar("T")
 
 _HOST_TOPICS = {
     "/diagnostics": (DiagnosticArray, QoSProfile(depth=100)),
@@ -107,12 +110,24 @@ class RecorderNode(CellNode):
         self._open.add_topic(topic, msgtype, offered_qos(self._depth, "transient_local"))
         if sparse:
             self._sparse[topic] = source
-            self.listen(topic, msgtype, lambda data: self._on_sparse(topic, data))
+            self.listen(
+                topic,
+                msgtype,
+                lambda data: self._on_sparse(topic, data),
+                lambda delivery: self._on_sparse(topic, delivery.data),
+                data=True,
+            )
             return
         queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
         if in_cell:
             queue.expect(source)
-        self.listen(topic, msgtype, lambda data: self._on_block(queue, data))
+        self.listen(
+            topic,
+            msgtype,
+            lambda data: self._on_block(queue, queue.add, data, data),
+            lambda delivery: self._on_block(queue, queue.take, delivery, delivery.data),
+            data=True,
+        )
 
     # ---- data ---------------------------------------------------------------------------------------
 
@@ -126,10 +141,10 @@ class RecorderNode(CellNode):
             self._merger.add_sparse(topic, stamp, data)
             self._drain()
 
-    def _on_block(self, queue: BlockQueue, data: bytes) -> None:
+    def _on_block(self, queue: BlockQueue, accept: Callable[[T], Block], given: T, data: bytes) -> None:
         if self.done:
             return
-        block = queue.add(data)
+        block = accept(given)
         queue.blocks.clear()
         if self._merger is None:
             self._write_unsorted(queue, block, data)

@@ -20,6 +20,7 @@ from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.wiring import remapped
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import declare
+from lathe_rc.nodes.exchange import Delivery, Exchange
 from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
 from lathe_rc.nodes.report import Reporter
 
@@ -35,17 +36,19 @@ class CellNode(LifecycleNode):
         name: default name.
         kind: what it is.
         reporter: line to the harness.
+        exchange: what the nodes of this process hand over in memory.
 
     Attributes:
         table: its parameters, once configured.
         done: it has finished its part of the run.
         failure: why it gave up.
+        due: messages have come since it last worked.
         handled: messages received so far.
         outlets, inlets: publisher and subscription of each signal topic, by fully qualified name.
         next_tick: monotonic time [s] at which it wants `tick` to be called.
     """
 
-    def __init__(self, name: str, kind: str, reporter: Reporter) -> None:
+    def __init__(self, name: str, kind: str, reporter: Reporter, exchange: Exchange) -> None:
         super().__init__(
             name,
             automatically_declare_parameters_from_overrides=True,
@@ -56,11 +59,12 @@ class CellNode(LifecycleNode):
         self.autostart = bool(given.get("autostart", True))
         self.table: NodeParameters = TABLES[self.kind]()
         self.reporter = reporter
+        self.exchange = exchange
         self.done = False
         self.failure: LatheError | None = None
         self.next_tick = time.monotonic()
         self.active = False
-        self.handled = 0
+        self.handled, self.due = 0, False
         self.full_name = self.get_fully_qualified_name()
         self.members: dict[str, Member] = {}
         self.master: Member | None = None
@@ -160,6 +164,7 @@ class CellNode(LifecycleNode):
 
         def call(message: Any) -> None:
             self.handled += 1
+            self.due = True
             if not self.active or self.failure:
                 return
             try:
@@ -179,8 +184,27 @@ class CellNode(LifecycleNode):
     def work(self) -> None:
         """Do what the messages since the last call allow."""
 
-    def listen(self, topic: str, msgtype: str, callback: Callable[[bytes], object]) -> None:
-        """Subscribe to a signal topic; the callback gets the encoded message."""
+    def listen(
+        self,
+        topic: str,
+        msgtype: str,
+        callback: Callable[[bytes], object],
+        inside: Callable[[Delivery], object],
+        *,
+        data: bool = False,
+    ) -> None:
+        """Read a signal topic.
+
+        Args:
+            topic: fully qualified.
+            msgtype: message type.
+            callback: gets the encoded message from DDS.
+            inside: gets what a node of this process hands over instead.
+            data: whether ``inside`` wants the bytes too.
+        """
+        if self.exchange.has(topic):
+            self.exchange.listen(topic, self.guarded(inside), data=data)
+            return
         self.inlets[topic] = self.create_subscription(
             message_class(msgtype),
             topic,
@@ -306,7 +330,7 @@ class CellNode(LifecycleNode):
             if not expected or not expected <= found or inlet.get_publisher_count() < len(expected):
                 return False
         for topic, outlet in self.outlets.items():
-            expected = {peer.name for peer in peers if topic in peer.subscribes}
+            expected = {peer.name for peer in peers if topic in peer.subscribes} - self.exchange.members
             found = _names(self.get_subscriptions_info_by_topic(topic))
             if not expected <= found or outlet.get_subscription_count() < len(expected):
                 return False
@@ -318,9 +342,11 @@ class CellNode(LifecycleNode):
         """Tell the time master, now and then and at the end."""
         if last or blocks - self._reported_blocks >= self._progress_step:
             self._reported_blocks = blocks
-            self._host["progress"].publish(
-                Progress(run_id=self.table.run_id, name=self.full_name, blocks=blocks, samples=samples)
-            )
+            progress = Progress(run_id=self.table.run_id, name=self.full_name, blocks=blocks, samples=samples)
+            if self.exchange.master:
+                self.exchange.master(progress)
+            if not self.exchange.master or self._host["progress"].get_subscription_count() > 1:
+                self._host["progress"].publish(progress)
 
     def end(self, acknowledged: list[Publisher]) -> None:
         """The node's part is over; wait until everybody has its last messages."""

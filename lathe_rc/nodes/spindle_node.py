@@ -56,7 +56,10 @@ class SpindleNode(StageNode):
         super().activate_part()
         self._state = self.create_publisher(CellState, "cell_state", latched_qos(1))
         self._clock_publisher = self.create_publisher(Clock, "/clock", QoSProfile(depth=10))
-        self.create_subscription(Progress, "progress", self.guarded(self._on_progress), QoSProfile(depth=1000))
+        take = self.guarded(self._on_progress)
+        self.create_subscription(Progress, "progress", take, QoSProfile(depth=1000))
+        if self.full_name in self.exchange.members:
+            self.exchange.master = take
         self._say(CellState.WAITING, 0)
 
     def member_names(self) -> list[str]:

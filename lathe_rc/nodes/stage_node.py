@@ -8,14 +8,17 @@ from lathe_rc_msgs.srv import Schedule
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.framing import Framer
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.stage import Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.track import Track
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.nodes.exchange import Delivery
 from lathe_rc.nodes.ports import BlockQueue, message_class, signal_qos
 from lathe_rc.nodes.shell import CellNode
+
+_OUTSIDE_PERIOD = 0.1  # [s] between looks at who reads what in other processes
 
 
 class StageNode(CellNode):
@@ -35,7 +38,7 @@ class StageNode(CellNode):
         compile_kernels(self.stage)
         self.blocks = 0
         self.samples = 0
-        self._started = False
+        self._started = self._last = False
         self._framer = Framer(self.table.run_id, self.full_name, self.table.step_ns)
         self._encoders = [
             (
@@ -46,7 +49,7 @@ class StageNode(CellNode):
         ]
         for _, encoder in self._encoders:
             encoder.prepare(self.table.block_size)
-        self._buffers: dict[int, list[Signals]] = {}
+        self._buffers: dict[int, list[tuple[Signals, Samples]]] = {}
         self._sparse_topics = {topic: self.topic(topic) for topic in self.stage.sparse_topics}
         self._queues: dict[str, BlockQueue] = {}
         self._tracks: dict[str, Track] = {}
@@ -57,6 +60,8 @@ class StageNode(CellNode):
             self._queues[topic] = BlockQueue(topic, port.type, self.table, fields)
             self._tracks[topic] = Track(port.type, fields, delay, self.table.block_size)
         self._inputs = [(self._queues[topic], self._tracks[topic], port.delay) for topic, port in ports]
+        self._delayed = [port for port in self._inputs if port[2]]
+        self._feedback = [self._queues[topic] for topic in dict.fromkeys(t for t, p in ports if p.delay)]
         self._forward = [self._queues[topic] for topic in dict.fromkeys(t for t, p in ports if p.delay == 0)]
 
     def activate_part(self) -> None:
@@ -64,9 +69,21 @@ class StageNode(CellNode):
         for topic, msgtype, _ in self.publications():
             self.outlets[topic] = self.create_publisher(message_class(msgtype), topic, signal_qos(self.table))
         for topic, queue in self._queues.items():
-            self.listen(topic, queue.type, queue.add)
+            queue.inside = self.exchange.has(topic)
+            self.listen(topic, queue.type, queue.add, queue.take)
+        self._outside, self._outside_due = set(self.outlets), 0.0
+        # Computed in this process for readers to share, and nothing of their past is wanted: no need to copy.
+        self._shared = [q for topic, q in self._queues.items() if q.inside and not self._tracks[topic].delay]
         if self.stage.actions:
             self.create_service(Schedule, "~/schedule", self._on_schedule)
+
+    def tick(self, now: float) -> None:
+        """See `CellNode`."""
+        super().tick(now)
+        # To ask for every message would cost as much as a small stage. Once ready, the cell's own readers are there.
+        if self._ready and now >= self._outside_due:
+            self._outside_due = now + _OUTSIDE_PERIOD
+            self._outside = {topic for topic, outlet in self.outlets.items() if outlet.get_subscription_count()}
 
     def relative_topics(self) -> list[str]:
         """See `CellNode`."""
@@ -123,6 +140,8 @@ class StageNode(CellNode):
         """Compute what the blocks that came allow."""
         if self.active and not self.failure:
             self.attempt(self.advance)
+        if self.active and self._feedback and not (self.failure or self.done):
+            self._account()
 
     @staticmethod
     def _load(queue: BlockQueue, track: Track, until: int) -> bool:
@@ -137,8 +156,9 @@ class StageNode(CellNode):
 
     def _next(self) -> tuple[int, bool] | None:
         """Length of the next block and whether it is the last; None while an input is missing."""
-        if not all(queue.blocks for queue in self._forward):
-            return None
+        for queue in self._forward:
+            if not queue.blocks:
+                return None
         heads = [queue.blocks[0] for queue in self._forward]
         head = heads[0]
         if not self._started:
@@ -148,8 +168,8 @@ class StageNode(CellNode):
             if other.first_index != self.samples or other.samples != head.samples:
                 spans = ", ".join(f"{b.source} {b.first_index}+{b.samples}" for b in heads)
                 raise LatheError(f"inputs are not cut into the same blocks at sample {self.samples}: {spans}")
-        for queue, track, delay in self._inputs:
-            if delay and not self._load(queue, track, self.samples + head.samples - delay):
+        for queue, track, delay in self._delayed:
+            if not self._load(queue, track, self.samples + head.samples - delay):
                 return None
         return head.samples, head.last
 
@@ -166,32 +186,80 @@ class StageNode(CellNode):
             if ready is None:
                 return
             samples, last = ready
+            inputs: list[Signals] = []
             for queue, track, delay in self._inputs:
+                if queue in self._shared:
+                    inputs.append(queue.blocks[0].signals)
+                    continue
                 if not delay:
                     self._load(queue, track, self.samples + samples)
-            inputs = [track.view(self.samples - delay, samples) for _, track, delay in self._inputs]
+                inputs.append(track.view(self.samples - delay, samples))
+            for queue in self._shared:
+                queue.blocks.popleft()
             self.compute(samples, inputs, last=last)
+
+    def _room(self, samples: int) -> list[tuple[Signals, Samples]]:
+        """Arrays for a block's results, see `messages.allocate_together`: new ones where others here read them."""
+        outputs = self._buffers.get(samples)
+        if outputs is None:
+            outputs = [messages.allocate_together(port.type, samples) for port in self.stage.outputs]
+            if not any(self.exchange.read(topic) for topic, _ in self._encoders):
+                self._buffers[samples] = outputs
+        return outputs
+
+    def _send(self, topic: str, data: bytes) -> None:
+        """Publish, unless all who read the topic are in this process."""
+        if topic in self._outside or not self.exchange.read(topic):
+            self.outlets[topic].publish(data)
 
     def compute(self, samples: int, inputs: Sequence[Signals], *, last: bool) -> None:
         """Compute and publish one block."""
-        outputs = self._buffers.get(samples)
-        if outputs is None:
-            outputs = [messages.allocate(port.type, samples) for port in self.stage.outputs]
-            self._buffers[samples] = outputs
-        for sparse in self.stage.advance(self.samples, inputs, outputs):
+        room = self._room(samples)
+        for sparse in self.stage.advance(self.samples, inputs, [signals for signals, _ in room]):
             framed = self._framer.sparse(sparse)
-            self.outlets[self._sparse_topics[sparse.topic]].publish(messages.encode(sparse.type, framed))
+            topic, data = self._sparse_topics[sparse.topic], messages.encode(sparse.type, framed)
+            self._send(topic, data)
+            self.exchange.hand_over(topic, Delivery(None, data))
             if sparse.type == messages.LEARNING:
                 values = {key: float(value) for key, value in sparse.values.items()}
                 self.reporter("cycle", self.get_name(), sample=sparse.index, **values)
-        for (topic, encoder), signals in zip(self._encoders, outputs, strict=True):
-            _, data = encoder.encode(self.samples, signals, last=last, companions=self._framer.companions)
-            self.outlets[topic].publish(data)
+        companions = self._framer.companions
+        for (topic, encoder), signals in zip(self._encoders, room, strict=True):
+            self._publish(topic, encoder, *signals, last=last, companions=companions)
         self.blocks += 1
         self.samples += samples
-        self.progressed(self.blocks, self.samples, last=last)
-        if last:
+        self._last = last
+        self._account()
+
+    def _account(self) -> None:
+        """Tell what is complete: blocks that were computed, and received on the feedback edges as well.
+
+        These are not needed at once. But what the window does not count may pile up until DDS gives up the oldest.
+        """
+        completed = self.blocks
+        if self.master is not None:
+            for queue in self._feedback:
+                completed = min(completed, queue.received)
+        ended = self._last and completed == self.blocks
+        self.progressed(completed, min(completed * self.table.block_size, self.samples), last=ended)
+        if ended and not self.done:
             self.ended()
+
+    def _publish(
+        self, topic: str, encoder: Encoder, signals: Signals, together: Samples, *, last: bool, companions: int
+    ) -> None:
+        """A block to those who read it, here and elsewhere."""
+        inside, data = self.exchange.read(topic), b""
+        if not inside or topic in self._outside or self.exchange.wants_bytes(topic):
+            _, data = encoder.encode(self.samples, signals, last=last, companions=companions)
+            self._send(topic, data)
+        if inside:
+            block = encoder.block(self.samples, signals, last=last, companions=companions)
+            try:
+                block.check(together)
+            except ValueError as error:
+                raise LatheError(f"{topic}: {error}") from None
+            self.exchange.hand_over(topic, Delivery(block, data))
 
     def ended(self) -> None:
         """The last block has been computed."""

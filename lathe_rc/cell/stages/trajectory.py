@@ -64,6 +64,9 @@ class Trajectory:
         if self._kind == "paper_002":
             fill_reference(first, self._step, set_point)
             return
+        if self._kind == "steps" and first * self._step >= self._times[-1]:
+            set_point.fill(self._values[-1])  # the last step, for the rest of the run
+            return
         time = self._step * np.arange(first, first + set_point.size)
         if self._kind == "csv":
             set_point[:] = np.interp(time, self._times, self._values)

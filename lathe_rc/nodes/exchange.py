@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals between the nodes of one process: handed over in memory, not through DDS.
+
+Which topics stay inside is settled once, when the nodes of a process have been configured and before any of them is
+activated. Nodes that are configured later, and those in other processes, use DDS. What is handed over is the same:
+the arrays that the publisher computed, which nobody writes to afterwards, and for a recorder the bytes of the message.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+from lathe_rc.cell.wire import Block
+
+
+class Delivery(NamedTuple):
+    """A message of a topic.
+
+    Attributes:
+        block: its content; None for a message at a chosen sample.
+        data: its bytes; empty if no reader in this process wants them.
+    """
+
+    block: Block | None
+    data: bytes
+
+    def of_block(self) -> Block:
+        """The block of a topic that carries one."""
+        assert self.block is not None, "a topic of blocks carries nothing else"
+        return self.block
+
+
+class Exchange:
+    """What a process hands over inside.
+
+    Attributes:
+        members: fully qualified names of the nodes that take part.
+        master: takes the Progress of a node, if the time master is in this process.
+    """
+
+    def __init__(self) -> None:
+        self.members: set[str] = set()
+        self.master: Callable[[Any], None] | None = None
+        self._inside: set[str] = set()
+        self._readers: dict[str, list[Callable[[Delivery], None]]] = defaultdict(list)
+        self._wants_bytes: set[str] = set()
+
+    def join(self, member: str, published: Iterable[str]) -> None:
+        """Take in a configured node and the fully qualified topics that it publishes."""
+        self.members.add(member)
+        self._inside.update(published)
+
+    def has(self, topic: str) -> bool:
+        """Whether a node of this process publishes a topic."""
+        return topic in self._inside
+
+    def listen(self, topic: str, callback: Callable[[Delivery], None], *, data: bool) -> None:
+        """Read a topic that `has`; ``data`` says whether the reader wants the bytes too."""
+        self._readers[topic].append(callback)
+        if data:
+            self._wants_bytes.add(topic)
+
+    def read(self, topic: str) -> bool:
+        """Whether anybody in this process reads a topic."""
+        return topic in self._readers
+
+    def wants_bytes(self, topic: str) -> bool:
+        """Whether anybody in this process wants the bytes of a topic."""
+        return topic in self._wants_bytes
+
+    def hand_over(self, topic: str, delivery: Delivery) -> None:
+        """Give a message to the readers in this process."""
+        for callback in self._readers.get(topic, ()):
+            callback(delivery)
