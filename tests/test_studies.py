@@ -34,12 +34,24 @@ KEYS = {
         "good_to_exact", "good_to_quasi_static", "good_to_linearised", "figure",
     ],
     "drive-models": ["file", "time_s", "measured", "harmonic_rad_s", "models", "figure"],
+    "sampled-servo": ["table", "links", "series", "uncorrected", "analog", "figure"],
+    "saturation": [
+        "period_max_error", "u_max", "memory_max", "corners", "saturated_samples", "integrator", "eq_15", "eq_14",
+        "learning", "required_u", "checks", "curves", "figure",
+    ],
+    "decoupling": [
+        "preset", "plant", "stability", "robustness", "single_loop", "cross", "noise", "delay", "engagement",
+        "reduced_order", "figure",
+    ],
 }  # fmt: skip
 #: settings with which a study takes a moment only
 QUICK = {
     "invariance": ["deviation_frequencies=213"],
     "angle-domain": ["amplitudes=0.05,0.1", "frequencies=50,200"],
     "drive-models": [],
+    "sampled-servo": ["t=0.16"],
+    "saturation": ["periods=2", "step_ms=10"],
+    "decoupling": [],
 }
 
 
