@@ -180,6 +180,7 @@ def run(
     if changes:
         loaded = _load(scenario, [*overrides, *changes])
     split = [group.split("+") for group in groups if group != "none"]
+    loaded.processes(split, "--group")
     if groups and mode != "processes":
         raise InputError(f"--group with --mode {mode}; allowed: --mode processes")
     result = _run(loaded, mode=mode, groups=split if groups else None, bag=bag)

@@ -69,6 +69,7 @@ class TestReference:
 def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     rclpy = pytest.importorskip("rclpy")
     from lathe_rc.harness import free_domain
+    from lathe_rc.nodes.exchange import Exchange
     from lathe_rc.nodes.recorder_node import RecorderNode
     from lathe_rc.nodes.report import Reporter
     from lathe_rc.nodes.spindle_node import SpindleNode
@@ -82,7 +83,7 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
         made = {}
         try:
             for kind, node in kinds.items():
-                made[kind] = node(kind, kind, Reporter())
+                made[kind] = node(kind, kind, Reporter(), Exchange())
                 made[kind].trigger_configure()
                 made[kind].trigger_activate()
                 assert made[kind].failure is None

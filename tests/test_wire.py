@@ -6,11 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lathe_rc.bag.reader import DENSE
 from lathe_rc.cell import messages
 from lathe_rc.cell.wire import Decoder, Encoder
 
-types = st.sampled_from(sorted(DENSE))
+types = st.sampled_from(sorted(messages.block_types()))
 lengths = st.one_of(st.integers(1, 70), st.just(messages.MAX_BLOCK))
 names = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=60)
 steps = st.sampled_from([1000, 15_625, 1_000_000])
@@ -116,7 +115,7 @@ def test_number_that_is_not_finite_is_refused_with_its_field(place, number):
 
 
 def test_fields_and_bounds_are_those_of_the_message_files():
-    for msgtype in DENSE:
+    for msgtype in messages.block_types():
         fields = messages.sample_fields(msgtype)
         assert fields
         assert {dtype.str for dtype in fields.values()} <= {"<f8", "|u1"}

@@ -12,9 +12,6 @@ from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError
 
-DENSE = {messages.ENCODER, messages.COMMAND, messages.STATE, messages.TOOL, messages.REFERENCE}
-SPARSE = {messages.LEARNING, messages.EVENT, messages.JOINTS}
-
 
 def read(path: Path) -> Recording:
     """All signal topics of a bag.
@@ -30,10 +27,11 @@ def read(path: Path) -> Recording:
     types: dict[str, str] = {}
     try:
         with Reader(path) as reader:
-            wanted = [connection for connection in reader.connections if connection.msgtype in DENSE | SPARSE]
+            known = messages.block_types() | messages.sparse_types()
+            wanted = [connection for connection in reader.connections if connection.msgtype in known]
             for connection in wanted:
                 types[connection.topic] = connection.msgtype
-                if connection.msgtype in DENSE:
+                if connection.msgtype in messages.block_types():
                     decoders[connection.topic] = Decoder(connection.msgtype)
                     parts[connection.topic] = {name: [] for name in messages.sample_fields(connection.msgtype)}
                     expected[connection.topic] = 0

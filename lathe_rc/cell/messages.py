@@ -47,6 +47,24 @@ def store() -> Typestore:
     return types
 
 
+def _with(field: str) -> frozenset[str]:
+    """The types of lathe_rc that have a field."""
+    own = (name for name in store().fielddefs if name.startswith(f"{PACKAGE}/msg/"))
+    return frozenset(name for name in own if any(field == given for given, _ in store().fielddefs[name][1]))
+
+
+@cache
+def block_types() -> frozenset[str]:
+    """Message types of topics that carry a block a block."""
+    return _with("block")
+
+
+@cache
+def sparse_types() -> frozenset[str]:
+    """Message types of topics that carry messages at chosen samples."""
+    return _with("sample_index") | {JOINTS}
+
+
 @cache
 def sample_fields(msgtype: str) -> dict[str, np.dtype[Any]]:
     """The array fields of a block type, in order, with their element types."""

@@ -80,11 +80,12 @@ class Scenario:
         """Names of the nodes of a kind."""
         return [name for name in self.nodes if self.kind(name) == kind]
 
-    def processes(self, groups: Iterable[Iterable[str]] | None = None) -> list[list[str]]:
+    def processes(self, groups: Iterable[Iterable[str]] | None = None, what: str = "processes") -> list[list[str]]:
         """Names of the nodes in each process.
 
         Args:
             groups: nodes that share one; None: those of the spindle's ``processes``. The others have one each.
+            what: names them, for messages.
 
         Raises:
             InputError: a node that there is not, or one that is named twice.
@@ -96,9 +97,9 @@ class Scenario:
         seen: set[str] = set()
         for name in (name for group in split for name in group):
             if name not in self.nodes:
-                raise InputError(f"processes: no node {name!r} in the scenario; allowed: {', '.join(self.nodes)}")
+                raise InputError(f"{what}: no node {name!r} in the scenario; allowed: {', '.join(self.nodes)}")
             if name in seen:
-                raise InputError(f"processes: {name} is named twice; allowed: each node in one process")
+                raise InputError(f"{what}: {name} is named twice; allowed: each node in one process")
             seen.add(name)
         return split + [[name] for name in self.nodes if name not in seen]
 
