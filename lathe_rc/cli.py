@@ -20,6 +20,7 @@ from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.fitting import fit
 from lathe_rc.studies.command import study
 
 _REFRESH = 0.1  # [s] between updates of the progress line
@@ -47,6 +48,7 @@ def main() -> None:
 
 
 main.add_command(study)
+main.add_command(fit)
 main.add_command(workshop.command)
 
 

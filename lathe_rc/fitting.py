@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command group ``lathe fit``: models from measurements, with the parameters to set."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from rich.console import Console
+
+from lathe_rc.analysis import hysteresis_fit, pid_tuning, reduced_order
+from lathe_rc.bag import reader
+from lathe_rc.errors import InputError
+from lathe_rc.transfer import TransferFunction
+
+_POSITIVE = click.FloatRange(min=0, min_open=True)
+
+
+def _json(command: Callable[..., Any]) -> Callable[..., Any]:
+    return click.option("--json", "as_json", is_flag=True, help="print one JSON object")(command)
+
+
+@click.group()
+def fit() -> None:
+    """Fit models to measurements: a hysteresis loop, the step response of a channel."""
+
+
+@fit.command()
+@click.argument("measured", type=click.Path(path_type=Path))
+@click.option("--stroke", type=_POSITIVE, default=15e-6, show_default=True, help="half-stroke of the drive [m]")
+@click.option("--command", "command_topic", default="/fine/command", show_default=True, help="of a bag: topic")
+@click.option("--state", "state_topic", default="/fine/state", show_default=True, help="of a bag: topic")
+@_json
+def hysteresis(measured: Path, stroke: float, command_topic: str, state_topic: str, *, as_json: bool) -> None:
+    """Plays of Prandtl and Ishlinskii by least squares (docs/piezo.md).
+
+    MEASURED is a CSV file with command_um,displacement_um, or a bag of a drive that ran with linearisation: none.
+    """
+    if measured.is_dir():
+        loop = hysteresis_fit.from_signals(reader.read(measured).dense, command_topic, state_topic)
+    else:
+        loop = hysteresis_fit.read_csv(measured)
+    found = hysteresis_fit.identify(loop, stroke)
+    told = {
+        "identified_proportional": found.model.proportional,
+        "identified_thresholds": found.model.thresholds.tolist(),
+        "identified_weights": found.model.weights.tolist(),
+        "offset_m": found.offset,
+        "residual": found.residual,
+    }
+    if as_json:
+        click.echo(json.dumps(told))
+        return
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(f"left by the fit: {100 * found.residual:.3g} % RMS; parameters of piezo_actuator:")
+    for name in ("identified_proportional", "identified_thresholds", "identified_weights"):
+        values = np.atleast_1d(told[name])
+        text = ", ".join(f"{value:.6g}" for value in values)
+        console.print(f"{name}: {text if np.ndim(told[name]) == 0 else f'[{text}]'}", markup=False)
+
+
+def _coefficients(transfer: TransferFunction) -> dict[str, list[float]]:
+    return {"numerator": list(map(float, transfer.numerator)), "denominator": list(map(float, transfer.denominator))}
+
+
+def _draw(path: Path, model: reduced_order.Fit, inverse: reduced_order.Fit) -> None:
+    """Both stages of paper 004: the model over the measurement, and model and inverse in series over the step."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 3.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, found, title, wanted in zip(
+        figure.subplots(1, 2),
+        (model, inverse),
+        ("model", "channel and inverse in series"),
+        ("measured", "step"),
+        strict=True,
+    ):
+        axes.plot(found.time, found.wanted, color="#7f7f7f", lw=3.0, label=wanted)
+        axes.plot(found.time, found.found, color="#c0392b", lw=1.2, label=title)
+        axes.set(xlabel="time [s]", title=f"{title}: RMS {found.rms:.3g}")
+        axes.grid(visible=True, alpha=0.3)
+        axes.legend(fontsize=8)
+    try:
+        figure.savefig(path, dpi=130)
+    except OSError as error:
+        raise InputError(f"--figure {path}: cannot be written ({error.strerror})") from None
+
+
+@fit.command()
+@click.argument("measured", type=click.Path(path_type=Path))
+@click.option("--zeros", type=click.IntRange(0, 8), default=0, show_default=True, help="degree of the numerator")
+@click.option("--poles", type=click.IntRange(1, 8), default=2, show_default=True, help="beside an integrator")
+@click.option("--integrator", is_flag=True, help="the channel integrates")
+@click.option("--lags", is_flag=True, help="no complex poles, as in paper 004")
+@click.option("--phase-margin", type=click.FloatRange(1, 89), default=60.0, show_default=True, help="of the PID [°]")
+@click.option("--gain-margin", type=click.FloatRange(min=1), default=3.0, show_default=True, help="of the PID [1]")
+@click.option("--delay", type=click.FloatRange(min=0), default=1e-3, show_default=True, help="in the loop [s]")
+@click.option("--figure", type=click.Path(path_type=Path), default=Path("fit-channel.png"), show_default=True)
+@_json
+def channel(
+    measured: Path,
+    zeros: int,
+    poles: int,
+    phase_margin: float,
+    gain_margin: float,
+    delay: float,
+    figure: Path,
+    *,
+    integrator: bool,
+    lags: bool,
+    as_json: bool,
+) -> None:
+    """Reduced-order model, realisable inverse, and the fastest PID with the margins asked for (docs/decoupling.md).
+
+    MEASURED is a CSV file with time_s,response: the response to a step of 1 at time 0, in even steps.
+    """
+    given = reduced_order.read_csv(measured)
+    model = reduced_order.fit(given, zeros=zeros, poles=poles, integrator=integrator, oscillating=not lags)
+    inverse = reduced_order.fit_inverse(model.transfer, given)
+    corners = np.abs(model.transfer.poles)
+    corners = corners[corners > 0.0]
+    band = (float(corners.min()) / 10.0, float(corners.max()) * 10.0)
+    wanted = np.radians(phase_margin)
+    gains = pid_tuning.fastest(model.transfer, band=band, phase_margin=wanted, gain_margin=gain_margin, wait=delay)
+    loop = pid_tuning.evaluate(model.transfer, gains, delay)
+    _draw(figure, model, inverse)
+    told = {
+        "model": _coefficients(model.transfer) | {"rms": model.rms},
+        "inverse": _coefficients(inverse.transfer) | {"rms": inverse.rms},
+        "pid": {
+            "proportional": gains.proportional,
+            "integral": gains.integral,
+            "derivative": gains.derivative,
+            "derivative_filter": gains.filter,
+        },
+        "loop": {
+            "rise_s": loop.rise,
+            "settling_s": loop.settling,
+            "overshoot_pct": 100.0 * loop.overshoot,
+            "gain_margin": loop.gain_margin if np.isfinite(loop.gain_margin) else None,
+            "phase_margin_deg": float(np.degrees(loop.phase_margin)),
+            "crossover_rad_s": loop.phase_frequency,
+        },
+        "figure": str(figure),
+    }
+    if as_json:
+        click.echo(json.dumps(told))
+        return
+    console = Console(highlight=False, soft_wrap=True)
+
+    def polynomials(transfer: TransferFunction) -> str:
+        return " / ".join(
+            "[" + ", ".join(f"{value:.5g}" for value in part) + "]"
+            for part in (transfer.numerator, transfer.denominator)
+        )
+
+    for name, found in (("model", model), ("inverse", inverse)):
+        console.print(f"{name:8} {polynomials(found.transfer)}, RMS {found.rms:.3g}", markup=False)
+    console.print("pid      " + ", ".join(f"{name} {value:.5g}" for name, value in told["pid"].items()))  # type: ignore[attr-defined]
+    margin = f"{loop.gain_margin:.3g}" if np.isfinite(loop.gain_margin) else "any"
+    console.print(
+        f"loop     rise {loop.rise:.3g} s, settling {loop.settling:.3g} s, overshoot {100 * loop.overshoot:.3g} %, "
+        f"margins {margin} and {np.degrees(loop.phase_margin):.3g}° with a delay of {delay * 1e3:g} ms"
+    )
+    console.print(f"figure:  {figure}")
