@@ -123,14 +123,15 @@ def discretise(transfer: TransferFunction, step_s: float, hold: Hold) -> System:
         hold: ``zoh``: exact for an input that is constant from sample to sample; ``foh``: exact for one that is
             linear between samples; ``tustin``: the bilinear rule.
     """
-    a, b, c, d = signal.tf2ss(np.atleast_1d(transfer.numerator), np.atleast_1d(transfer.denominator))
+    top, bottom = (np.trim_zeros(np.array(part), "f") for part in (transfer.numerator, transfer.denominator))
+    if bottom.size == 1 or not top.size:  # a gain alone, for which tf2ss has an idle state or a warning
+        through = float(top[0] / bottom[0]) if top.size else 0.0
+        return System(np.empty((0, 0)), np.empty(0), np.empty(0), np.empty(0), through)
+    a, b, c, d = signal.tf2ss(top, bottom)
     order = a.shape[0]
-    if order and not np.any(a) and not np.any(b):  # tf2ss gives a gain one idle state
-        a, b, c, order = np.empty((0, 0)), np.empty((0, 1)), np.empty((1, 0)), 0
-    if order:
-        # Poles far apart make a companion matrix of coefficients that differ by many powers of ten.
-        a, (scale, _) = matrix_balance(a, permute=False, separate=True)
-        b, c = b / scale[:, None], c * scale[None, :]
+    # Poles far apart make a companion matrix of coefficients that differ by many powers of ten.
+    a, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    b, c = b / scale[:, None], c * scale[None, :]
     column = b[:, 0]
     if hold == "tustin":
         left = np.linalg.inv(np.eye(order) - a * step_s / 2.0)
