@@ -18,8 +18,11 @@ _SPARE, _FREE_RUNNING = 32, 1024  # messages
 
 
 def signal_depth(shared: SharedParameters) -> int:
-    """Queue length of signal topics: all blocks in flight and some more; many where nothing holds the spindle back."""
-    return (shared.window or _FREE_RUNNING) + _SPARE
+    """Queue length of signal topics: all blocks in flight and some more; many where nothing holds the spindle back.
+
+    A reader of a feedback edge may be a window behind itself, and the publisher a window ahead of it.
+    """
+    return 2 * (shared.window or _FREE_RUNNING) + _SPARE
 
 
 def about(shared: SharedParameters, host_topics: list[str]) -> dict[str, str]:

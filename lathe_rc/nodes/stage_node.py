@@ -38,7 +38,7 @@ class StageNode(CellNode):
         compile_kernels(self.stage)
         self.blocks = 0
         self.samples = 0
-        self._started = self._last = False
+        self._started = False
         self._framer = Framer(self.table.run_id, self.full_name, self.table.step_ns)
         self._encoders = [
             (
@@ -140,8 +140,6 @@ class StageNode(CellNode):
         """Compute what the blocks that came allow."""
         if self.active and not self.failure:
             self.attempt(self.advance)
-        if self.active and self._feedback and not (self.failure or self.done):
-            self._account()
 
     @staticmethod
     def _load(queue: BlockQueue, track: Track, until: int) -> bool:
@@ -168,6 +166,10 @@ class StageNode(CellNode):
             if other.first_index != self.samples or other.samples != head.samples:
                 spans = ", ".join(f"{b.source} {b.first_index}+{b.samples}" for b in heads)
                 raise LatheError(f"inputs are not cut into the same blocks at sample {self.samples}: {spans}")
+        for queue in self._feedback:
+            # It may not be needed for a long time yet, but what piles up unread DDS gives up some day.
+            if queue.received + self.table.window < self.blocks and self.master is not None and self.table.window:
+                return None
         for queue, track, delay in self._delayed:
             if not self._load(queue, track, self.samples + head.samples - delay):
                 return None
@@ -228,21 +230,8 @@ class StageNode(CellNode):
             self._publish(topic, encoder, *signals, last=last, companions=companions)
         self.blocks += 1
         self.samples += samples
-        self._last = last
-        self._account()
-
-    def _account(self) -> None:
-        """Tell what is complete: blocks that were computed, and received on the feedback edges as well.
-
-        These are not needed at once. But what the window does not count may pile up until DDS gives up the oldest.
-        """
-        completed = self.blocks
-        if self.master is not None:
-            for queue in self._feedback:
-                completed = min(completed, queue.received)
-        ended = self._last and completed == self.blocks
-        self.progressed(completed, min(completed * self.table.block_size, self.samples), last=ended)
-        if ended and not self.done:
+        self.progressed(self.blocks, self.samples, last=last)
+        if last:
             self.ended()
 
     def _publish(
