@@ -308,7 +308,7 @@ def test_profile_is_written_whole_or_not_at_all(tmp_path, monkeypatch, fault):
     path.write_text("before")
 
     def fail(file, *_, **__):
-        file.write("angle_deg,rad")
+        file.write(b"angle_deg,rad")
         raise fault
 
     monkeypatch.setattr(np, "savetxt", fail)

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Profiles as CSV files, in the columns that `lathe_rc.signals.profile.read_csv` reads."""
 
-import contextlib
-import os
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.errors import InputError
+from lathe_rc.files import replacing
 
 Array = npt.NDArray[np.float64]
 
@@ -57,15 +56,8 @@ def write(path: Path, radius: Array, *, heights: Array | None = None, comment: s
     header, rows = _columns(radius, heights)
     if comment:
         header = f"# {' '.join(comment.split())}\n{header}"
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with unfinished.open("w", encoding="utf-8") as file:
-            np.savetxt(file, rows, fmt="%.12g", delimiter=",", header=header, comments="")
-            file.flush()
-            os.fsync(file.fileno())
-        unfinished.replace(path)
+        with replacing(path) as file:
+            np.savetxt(file, rows, fmt="%.12g", delimiter=",", header=header, comments="", encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
-    finally:
-        with contextlib.suppress(OSError):  # gone, unless writing failed
-            unfinished.unlink()

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a controller has learned, in a file that survives a crash."""
 
-import os
-import tempfile
 import zipfile
 from pathlib import Path
 
@@ -10,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.files import replacing
 
 Array = npt.NDArray[np.float64]
 
@@ -29,22 +28,10 @@ def save(path: Path, points: Array, grid: int) -> None:
     Raises:
         LatheError: the file cannot be written.
     """
-    beside = None
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-            beside = Path(file.name)
+        with replacing(path) as file:
             np.savez(file, format=np.int64(_FORMAT), grid=np.int64(grid), points=points)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # the new name itself
-        finally:
-            os.close(folder)
     except OSError as error:
-        if beside:
-            beside.unlink(missing_ok=True)
         raise LatheError(f"{path}: the memory cannot be saved ({error.strerror or error})") from None
 
 

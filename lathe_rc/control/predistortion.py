@@ -20,8 +20,6 @@ Source: paper 004, whose upper level gives the path by a model of the deformatio
 the profile; neither is printed there.
 """
 
-import contextlib
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.errors import InputError
+from lathe_rc.files import replacing
 from lathe_rc.jit import kernel
 from lathe_rc.signals.table import read_table
 
@@ -164,19 +163,12 @@ class Predistortion:
         header = ",".join(_COLUMNS)
         if comment:
             header = f"# {' '.join(comment.split())}\n{header}"
-        unfinished = path.with_name(f".{path.name}.{os.getpid()}")
         try:
-            with unfinished.open("w", encoding="utf-8") as file:
+            with replacing(path) as file:
                 rows = np.stack((self.heights * 1e3, self.offsets * 1e6), axis=1)
-                np.savetxt(file, rows, fmt="%.15g", delimiter=",", header=header, comments="")
-                file.flush()
-                os.fsync(file.fileno())
-            unfinished.replace(path)
+                np.savetxt(file, rows, fmt="%.15g", delimiter=",", header=header, comments="", encoding="utf-8")
         except OSError as error:
             raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
-        finally:
-            with contextlib.suppress(OSError):  # gone, unless writing failed
-                unfinished.unlink()
 
     @classmethod
     def load(cls, path: Path) -> "Predistortion":
