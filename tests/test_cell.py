@@ -34,8 +34,14 @@ def test_every_host_and_block_size_gives_the_same_bits(offline, mode, block_size
     assert harness.run(piston(f"block_size={block_size}"), mode=mode).digest == offline
 
 
-def test_grouping_changes_no_bit(offline):
-    groups = [["spindle_encoder", "tool"], ["learning_controller", "electrodynamic_actuator"]]
+@pytest.mark.parametrize(
+    "groups",
+    [
+        [["spindle_encoder", "tool"], ["learning_controller", "electrodynamic_actuator"]],
+        [["recorder", "spindle_encoder", "tool"]],
+    ],
+)
+def test_grouping_changes_no_bit(offline, groups):
     assert harness.run(piston(), mode="processes", groups=groups).digest == offline
 
 

@@ -20,6 +20,7 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.signals import speed
 from lathe_rc.studies import STUDIES, angle_domain, drive_models, invariance
 from lathe_rc.studies.angle_domain import AngleDomainParameters
+from lathe_rc.studies.command import read
 from lathe_rc.studies.drive_models import DriveModelsParameters
 from lathe_rc.studies.invariance import InvarianceParameters
 
@@ -126,9 +127,8 @@ def test_people_get_a_table_of_80_columns_and_the_place_of_the_figure(folder, na
 
 @pytest.mark.parametrize("name", KEYS)
 def test_result_is_frozen_and_the_same_again(name):
-    table = {s.partition("=")[0]: json.loads(f"[{s.partition('=')[2]}]") for s in QUICK[name]}
     subject = STUDIES[name]
-    given_ = subject.parameters(**table)
+    given_ = read(subject, QUICK[name])
     seen = []
 
     def track(items):

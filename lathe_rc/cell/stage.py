@@ -225,6 +225,8 @@ class Stage(ABC):
         period = self.shared.joint_state_period
         samples = signals[joint.position].size
         start = -first % period
+        if start >= samples:
+            return []
 
         def value(name: str | None, k: int) -> Any:
             return np.array([signals[name][k]]) if name else np.empty(0)

@@ -80,8 +80,8 @@ class _Layout:
         return True
 
 
-# How a block of one length is made: numbers and their places, the message, its arrays.
-_Made = tuple[list[tuple[Callable[..., None], int]], Samples, list[tuple[str, Samples]]]
+# How a block of one length is made: numbers and their places, the message, its arrays, and all of them as one.
+_Made = tuple[list[tuple[Callable[..., None], int]], Samples, list[tuple[str, Samples]], Samples | None]
 
 
 @dataclass(slots=True)
@@ -161,7 +161,12 @@ class Encoder:
         views = [
             (name, np.frombuffer(buffer.data, dtype, samples, place)) for name, (dtype, place) in layout.fields.items()
         ]
-        self._made[samples] = numbers, buffer, views
+        together = None
+        places = [place for dtype, place in layout.fields.values() if dtype == np.float64]
+        if len(places) == len(views) > 1 and len(set(np.diff(places))) == 1:
+            # Evenly spaced, the arrays are one: filled by one copy.
+            together = np.ndarray((len(places), samples), np.float64, buffer, places[0], (places[1] - places[0], 8))
+        self._made[samples] = numbers, buffer, views, together
         return self._made[samples]
 
     def block(self, first: int, signals: Signals, *, last: bool, companions: int) -> Block:
@@ -170,21 +175,33 @@ class Encoder:
         log_ns = START_NS + (first + samples - 1) * self._step_ns
         return Block(self._run_id, self._source, first, self._step_ns, last, companions, samples, log_ns, signals)
 
-    def encode(self, first: int, signals: Signals, *, last: bool, companions: int) -> tuple[int, bytes]:
+    def encode(
+        self, first: int, signals: Signals, *, last: bool, companions: int, together: Samples | None = None
+    ) -> tuple[int, bytes]:
         """A block from sample ``first`` on, stamped with the time of its last sample.
+
+        Args:
+            first: index of its first sample.
+            signals: its arrays.
+            last: the run ends with it.
+            companions: see BlockInfo.msg.
+            together: the float64 ones among the arrays as one, if they are; see `messages.allocate_together`.
 
         Returns:
             The stamp [ns] and the bytes.
         """
         samples = next(iter(signals.values())).size
-        numbers, buffer, views = self._made.get(samples) or self._layout(samples)
+        numbers, buffer, views, whole = self._made.get(samples) or self._layout(samples)
         log_ns = START_NS + (first + samples - 1) * self._step_ns
         seconds, nanoseconds = divmod(log_ns, _BILLION)
         data = buffer.data
         for (pack_into, place), number in zip(numbers, (seconds, nanoseconds, first, last, companions), strict=True):
             pack_into(data, place, number)
-        for name, view in views:
-            view[:] = signals[name]
+        if whole is not None and together is not None:
+            whole[:] = together
+        else:
+            for name, view in views:
+                view[:] = signals[name]
         return log_ns, buffer.tobytes()
 
 

@@ -3,6 +3,7 @@
 
 import json
 import time
+from collections import deque
 
 from lathe_rc_msgs.msg import CellState, Progress
 from rclpy.qos import QoSProfile
@@ -44,6 +45,7 @@ class SpindleNode(StageNode):
         self._member_names = [name if name.startswith("/") else f"{namespace}/{name}" for name in self.table.members]
         self._completed = dict.fromkeys(self._member_names, 0)
         self._blocks_in_run = None if self.stage.samples is None else -(-self.stage.samples // self.table.block_size)
+        self._told: deque[Progress] = deque()
         self._running = False
         self._schedule = 0.0  # monotonic time at which sample 0 would have been, were there no slips
         self._heard = time.monotonic()
@@ -56,10 +58,9 @@ class SpindleNode(StageNode):
         super().activate_part()
         self._state = self.create_publisher(CellState, "cell_state", latched_qos(1))
         self._clock_publisher = self.create_publisher(Clock, "/clock", QoSProfile(depth=10))
-        take = self.guarded(self._on_progress)
-        self.create_subscription(Progress, "progress", take, QoSProfile(depth=1000))
+        self.create_subscription(Progress, "progress", self.guarded(self._on_progress), QoSProfile(depth=1000))
         if self.full_name in self.exchange.members:
-            self.exchange.master = take
+            self.exchange.master = self.guarded(self._told.append)
         self._say(CellState.WAITING, 0)
 
     def member_names(self) -> list[str]:
@@ -173,7 +174,9 @@ class SpindleNode(StageNode):
         self.next_tick = time.monotonic()
 
     def advance(self) -> None:
-        """Nothing comes in."""
+        """Take what members in this process have told: not at once, for the block that they tell of may be under way."""
+        while self._told:
+            self._on_progress(self._told.popleft())
 
     def ended(self) -> None:
         """Its last block is out; the run ends when all members have completed it."""

@@ -183,6 +183,7 @@ class StageNode(CellNode):
 
     def advance(self) -> None:
         """Compute every block whose inputs are there."""
+        shared = self._shared
         while not self.done and not self.failure:
             ready = self._next()
             if ready is None:
@@ -190,13 +191,13 @@ class StageNode(CellNode):
             samples, last = ready
             inputs: list[Signals] = []
             for queue, track, delay in self._inputs:
-                if queue in self._shared:
+                if not delay and queue in shared:
                     inputs.append(queue.blocks[0].signals)
                     continue
                 if not delay:
                     self._load(queue, track, self.samples + samples)
                 inputs.append(track.view(self.samples - delay, samples))
-            for queue in self._shared:
+            for queue in shared:
                 queue.blocks.popleft()
             self.compute(samples, inputs, last=last)
 
@@ -240,7 +241,7 @@ class StageNode(CellNode):
         """A block to those who read it, here and elsewhere."""
         inside, data = self.exchange.read(topic), b""
         if not inside or topic in self._outside or self.exchange.wants_bytes(topic):
-            _, data = encoder.encode(self.samples, signals, last=last, companions=companions)
+            _, data = encoder.encode(self.samples, signals, last=last, companions=companions, together=together)
             self._send(topic, data)
         if inside:
             block = encoder.block(self.samples, signals, last=last, companions=companions)

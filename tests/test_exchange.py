@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the nodes of one process hand over to each other."""
+
+import numpy as np
+import pytest
+
+from lathe_rc.cell import messages
+from lathe_rc.errors import LatheError
+
+rclpy = pytest.importorskip("rclpy")
+
+from lathe_rc_msgs.msg import Progress  # noqa: E402 - only where there is ROS 2
+
+from lathe_rc.harness import free_domain  # noqa: E402
+from lathe_rc.nodes.exchange import Exchange  # noqa: E402
+from lathe_rc.nodes.report import Reporter  # noqa: E402
+from lathe_rc.nodes.spindle_node import SpindleNode  # noqa: E402
+
+
+@pytest.fixture
+def spindle(monkeypatch):
+    """A spindle of a short run with one member, in a process with an exchange; not yet running."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    given = ["members:=['eager']", "window:=3", "speed_factor:=0.0", "revolutions:=0.3"]
+    with free_domain() as domain:
+        rclpy.init(args=["test", "--ros-args", *(part for text in given for part in ("-p", text))], domain_id=domain)
+        try:
+            node = SpindleNode("spindle_encoder", "spindle_encoder", Reporter(), Exchange())
+            node.trigger_configure()
+            node.exchange.join("/spindle_encoder", [topic for topic, _, _ in node.publications()])
+            yield node
+        finally:
+            rclpy.shutdown()
+
+
+def test_a_member_that_completes_a_block_at_once_does_not_get_it_twice(spindle):
+    """It tells the spindle while the spindle is still at that very block."""
+    seen = []
+
+    def complete(delivery):
+        seen.append(delivery.block.first_index)
+        spindle.exchange.master(Progress(name="/eager", blocks=len(seen), samples=64 * len(seen)))
+
+    spindle.exchange.listen("/encoder", complete, data=False)
+    spindle.trigger_activate()
+    spindle._begin()
+    spindle.work()
+    assert spindle.done
+    assert seen == list(range(0, 64 * len(seen), 64))
+
+
+def test_what_is_handed_over_is_not_written_to_again(spindle):
+    blocks = []
+    spindle.exchange.listen("/encoder", lambda delivery: blocks.append(delivery.block), data=True)
+    spindle.trigger_activate()
+    spindle._begin()
+    angle = np.concatenate([block.signals["angle_true"] for block in blocks])
+    assert len(blocks) == 3  # the window
+    assert np.all(np.diff(angle) > 0.0)
+
+
+def test_bytes_are_made_for_those_who_want_them(spindle):
+    given = []
+    spindle.exchange.listen("/encoder", given.append, data=True)
+    spindle.trigger_activate()
+    spindle._begin()
+    decoded = messages.decode(messages.ENCODER, given[1].data)
+    assert decoded.block.first_index == 64
+    assert np.array_equal(decoded.angle_true, given[1].block.signals["angle_true"])
+
+
+def test_a_sample_that_is_not_finite_is_refused_where_it_is_made(spindle, monkeypatch):
+    spindle.exchange.listen("/encoder", list, data=False)
+    spindle.trigger_activate()
+
+    def spoil(first, inputs, outputs):
+        outputs[0]["speed"][:] = 1.0
+        for name in ("angle", "angle_true", "speed_true"):
+            outputs[0][name][:] = 1.0
+        outputs[0]["speed"][5] = np.nan
+        return []
+
+    monkeypatch.setattr(spindle.stage, "process", spoil)
+    with pytest.raises(LatheError, match="/encoder: /spindle_encoder sends speed = nan at sample 5; allowed: finite"):
+        spindle._begin()
