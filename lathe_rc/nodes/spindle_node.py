@@ -174,7 +174,7 @@ class SpindleNode(StageNode):
         self.next_tick = time.monotonic()
 
     def advance(self) -> None:
-        """Take what members in this process have told: not at once, for the block that they tell of may be under way."""
+        """Take what members in this process have told: not at once, the block that they tell of may be under way."""
         while self._told:
             self._on_progress(self._told.popleft())
 
