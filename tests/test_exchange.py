@@ -29,6 +29,8 @@ def spindle(monkeypatch):
             node.trigger_configure()
             node.exchange.join("/spindle_encoder", [topic for topic, _, _ in node.publications()])
             yield node
+            # Left alive, it would hand its blocks to whoever comes to this domain next.
+            node.destroy_node()
         finally:
             rclpy.shutdown()
 
