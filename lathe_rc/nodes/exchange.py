@@ -42,7 +42,7 @@ class Exchange:
         self.members: set[str] = set()
         self.master: Callable[[Any], None] | None = None
         self._inside: set[str] = set()
-        self._readers: dict[str, list[Callable[[Delivery], None]]] = defaultdict(list)
+        self._readers: dict[str, dict[str, Callable[[Delivery], None]]] = defaultdict(dict)
         self._wants_bytes: set[str] = set()
 
     def join(self, member: str, published: Iterable[str]) -> None:
@@ -54,9 +54,9 @@ class Exchange:
         """Whether a node of this process publishes a topic."""
         return topic in self._inside
 
-    def listen(self, topic: str, callback: Callable[[Delivery], None], *, data: bool) -> None:
-        """Read a topic that `has`; ``data`` says whether the reader wants the bytes too."""
-        self._readers[topic].append(callback)
+    def listen(self, topic: str, member: str, callback: Callable[[Delivery], None], *, data: bool) -> None:
+        """Let a node read a topic that `has`; ``data`` says whether it wants the bytes too."""
+        self._readers[topic][member] = callback
         if data:
             self._wants_bytes.add(topic)
 
@@ -64,11 +64,15 @@ class Exchange:
         """Whether anybody in this process reads a topic."""
         return topic in self._readers
 
+    def readers(self, topic: str) -> set[str]:
+        """Fully qualified names of the nodes that read a topic here, and not through DDS."""
+        return set(self._readers.get(topic, ()))
+
     def wants_bytes(self, topic: str) -> bool:
         """Whether anybody in this process wants the bytes of a topic."""
         return topic in self._wants_bytes
 
     def hand_over(self, topic: str, delivery: Delivery) -> None:
         """Give a message to the readers in this process."""
-        for callback in self._readers.get(topic, ()):
+        for callback in self._readers.get(topic, {}).values():
             callback(delivery)

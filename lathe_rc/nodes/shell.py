@@ -203,7 +203,7 @@ class CellNode(LifecycleNode):
             data: whether ``inside`` wants the bytes too.
         """
         if self.exchange.has(topic):
-            self.exchange.listen(topic, self.guarded(inside), data=data)
+            self.exchange.listen(topic, self.full_name, self.guarded(inside), data=data)
             return
         self.inlets[topic] = self.create_subscription(
             message_class(msgtype),
@@ -330,7 +330,7 @@ class CellNode(LifecycleNode):
             if not expected or not expected <= found or inlet.get_publisher_count() < len(expected):
                 return False
         for topic, outlet in self.outlets.items():
-            expected = {peer.name for peer in peers if topic in peer.subscribes} - self.exchange.members
+            expected = {peer.name for peer in peers if topic in peer.subscribes} - self.exchange.readers(topic)
             found = _names(self.get_subscriptions_info_by_topic(topic))
             if not expected <= found or outlet.get_subscription_count() < len(expected):
                 return False

@@ -204,10 +204,10 @@ class StageNode(CellNode):
     def _room(self, samples: int) -> list[tuple[Signals, Samples]]:
         """Arrays for a block's results, see `messages.allocate_together`: new ones where others here read them."""
         outputs = self._buffers.get(samples)
-        if outputs is None:
+        shared = any(self.exchange.read(topic) for topic, _ in self._encoders)
+        if outputs is None or shared:
             outputs = [messages.allocate_together(port.type, samples) for port in self.stage.outputs]
-            if not any(self.exchange.read(topic) for topic, _ in self._encoders):
-                self._buffers[samples] = outputs
+            self._buffers[samples] = outputs
         return outputs
 
     def _send(self, topic: str, data: bytes) -> None:
