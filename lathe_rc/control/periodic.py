@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.signals.noise import quantise
 from lathe_rc.transfer import System, TransferFunction, discretise, rest, step
 
 Array = npt.NDArray[np.float64]
@@ -158,13 +159,6 @@ class PeriodicState(NamedTuple):
 
 
 @kernel
-def _quantise(value: float, resolution: float) -> float:
-    if resolution > 0.0:
-        return float(np.rint(value / resolution) * resolution)
-    return value
-
-
-@kernel
 def _smooth(law: PeriodicLaw, state: PeriodicState, n: int) -> None:
     """Read the chunk that begins at sample ``n`` from the memory."""
     ring, smoothed, window, weights = state.ring, state.smoothed, state.window, law.weights
@@ -213,7 +207,7 @@ def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, me
     """
     values = state.values
     wanted = step(law.filter, state.reference, reference)
-    output = step(law.filter, state.output, _quantise(measurement, law.measurement_step))
+    output = step(law.filter, state.output, quantise(measurement, law.measurement_step))
     v = wanted - output
     s = min(max(output, -1.0), 1.0)
     place = n % state.smoothed.size
@@ -234,7 +228,7 @@ def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, me
     values[_DEMAND] = max(values[_DEMAND], abs(demand))
     values[_MEMORY] = max(values[_MEMORY], abs(stored))
     _monitor(law, state, n, wanted, v, applied)
-    return _quantise(applied, law.command_step), applied != demand
+    return quantise(applied, law.command_step), applied != demand
 
 
 @kernel

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.signals.noise import quantise
 from lathe_rc.transfer import TransferFunction
 
 Array = npt.NDArray[np.float64]
@@ -111,7 +112,7 @@ def control(pid: PidTable, state: Array, n: int, set_point: float, measurement: 
     wanted = set_point if move == way else state[_SET_POINT] + move
     state[SLOWED] += wanted != set_point
     state[_SET_POINT] = wanted
-    read = np.rint(measurement / pid.adc) * pid.adc if pid.adc > 0.0 else measurement
+    read = quantise(measurement, pid.adc)
     error = wanted - read
     slope = pid.decay * state[_SLOPE] + pid.derivative * (error - state[_ERROR])
     more = pid.integral * (error + state[_ERROR])
@@ -125,7 +126,7 @@ def control(pid: PidTable, state: Array, n: int, set_point: float, measurement: 
     state[SATURATED] += command != demand
     if pid.dac > 0.0:
         # A limit between two steps of the DAC stays a limit.
-        command = float(min(max(np.rint(command / pid.dac) * pid.dac, pid.low), pid.high))
+        command = float(min(max(quantise(command, pid.dac), pid.low), pid.high))
     state[_SLOPE], state[_ERROR], state[_COMMAND] = slope, error, command
     return command
 

@@ -29,6 +29,7 @@ import numpy.typing as npt
 from lathe_rc.errors import InputError
 from lathe_rc.files import replacing
 from lathe_rc.jit import kernel
+from lathe_rc.signals.interpolation import linear
 from lathe_rc.signals.table import read_table
 
 Array = npt.NDArray[np.float64]
@@ -80,20 +81,10 @@ def contraction(compliance: Array, stiffness: float | Array, gain: float) -> flo
 @kernel
 def _fill(heights: Array, offsets: Array, height: Array, set_point: Array) -> int:
     """Interpolate linearly; returns the samples beyond the ends."""
-    last = heights.size - 1
     beyond = 0
     for k in range(height.size):
-        z = height[k]
-        if z < heights[0] or z > heights[last]:
-            beyond += 1
-        if not z > heights[0]:
-            set_point[k] = offsets[0]
-        elif z >= heights[last]:
-            set_point[k] = offsets[last]
-        else:
-            i = np.searchsorted(heights, z, side="right") - 1
-            slope = (offsets[i + 1] - offsets[i]) / (heights[i + 1] - heights[i])
-            set_point[k] = offsets[i] + slope * (z - heights[i])
+        beyond += height[k] < heights[0] or height[k] > heights[-1]
+        set_point[k] = linear(heights, offsets, height[k])
     return beyond
 
 

@@ -33,6 +33,7 @@ import numpy.typing as npt
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.cutting_force import STEEL, SpecificForce, cutting_stiffness
+from lathe_rc.signals.interpolation import linear
 from lathe_rc.transfer import System, TransferFunction, discretise, rest, step
 
 Array = npt.NDArray[np.float64]
@@ -247,18 +248,6 @@ def _hardness(spots: Array, angle: float, height: float) -> float:
 
 
 @kernel
-def _interpolate(places: Array, values: Array, place: float) -> float:
-    """Linear between the rising ``places``, the same beyond their ends."""
-    last = places.size - 1
-    if not place > places[0]:
-        return float(values[0])
-    if place >= places[last]:
-        return float(values[last])
-    i = np.searchsorted(places, place, side="right") - 1
-    return float(values[i] + (values[i + 1] - values[i]) * (place - places[i]) / (places[i + 1] - places[i]))
-
-
-@kernel
 def _read(surface: Array, place: float) -> float:
     """The remembered surface at ``place`` [grid point]; the length of the ring is a power of two."""
     i = int(np.floor(place))
@@ -321,7 +310,7 @@ def _advance(
         wear[k] = state[_WEAR]
         stiffness = cutting_stiffness(process.kc1, process.mc, process.wear_factor, feed[k], wear[k])
         stiffness *= _hardness(process.spots, angle[k], height[k])
-        compliance = process.sign * _interpolate(process.heights, process.compliances, height[k])
+        compliance = process.sign * linear(process.heights, process.compliances, height[k])
 
         chip = process.depth + allowance[k] - cross_position[k] - displacement[k]
         if process.overlap > 0.0:

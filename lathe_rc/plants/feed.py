@@ -29,6 +29,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.backlash import follow
 from lathe_rc.plants.linear import discretise
+from lathe_rc.signals.noise import quantise
 from lathe_rc.transfer import TransferFunction
 
 Array = npt.NDArray[np.float64]
@@ -181,7 +182,7 @@ def _advance(
         # Within the gap the slide stands.
         velocity[k] = state[1] if table.half == 0.0 or state[_LOAD] != before else 0.0
         seen = state[_LOAD] if from_load else state[0]
-        measured[k] = np.rint(seen / resolution) * resolution if resolution > 0.0 else seen
+        measured[k] = quantise(seen, resolution)
     return saturated, limited
 
 

@@ -27,20 +27,13 @@ from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise
 from lathe_rc.plants.piezo import VOLTAGE, Stack, StackTable, extend
+from lathe_rc.signals.noise import quantise
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
 _CARRIAGE, _TOOL = 0, 2  # places of the positions in the state: x1, x1', x2, x2'
 _ROUNDS = 32  # at most, to find the carriage's position and the extension of the same sample
-
-
-@kernel
-def _read(true: float, resolution: float) -> float:
-    """What a position sensor makes of a displacement [m]."""
-    if resolution > 0.0:
-        return float(np.rint(true / resolution) * resolution)
-    return true
 
 
 @kernel
@@ -94,7 +87,7 @@ def _advance(
             x1 = min(max(free[0] + fine[0, 0] * state[4], -carriage_stroke), carriage_stroke)
             for _ in range(_ROUNDS):
                 guess = x1
-                measured[k] = _read(guess + noise[k], resolution)
+                measured[k] = quantise(guess + noise[k], resolution)
                 trial[:] = memory
                 e, cut = extend(stack, trial, set_point[k] - measured[k])
                 x1 = min(max(free[0] + fine[0, 0] * e, -carriage_stroke), carriage_stroke)
@@ -116,7 +109,7 @@ def _advance(
             stopped += 1
         carriage[k], carriage_velocity[k] = state[0], state[1]
         if not feedback:
-            measured[k] = _read(state[0] + noise[k], resolution)
+            measured[k] = quantise(state[0] + noise[k], resolution)
         delayed = (1.0 - part) * u0 + part * u1
         current[k] = (spring * (delayed - state[0]) - damper * state[1]) * force_per_current
         extension[k], extension_velocity[k] = state[2] - state[0], state[3] - state[1]

@@ -6,7 +6,17 @@ import zlib
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.jit import kernel
+
 Array = npt.NDArray[np.float64]
+
+
+@kernel
+def quantise(value: float, resolution: float) -> float:
+    """What a converter or sensor of a ``resolution`` makes of a value, in the same unit; 0 for none."""
+    if resolution > 0.0:
+        return float(np.rint(value / resolution) * resolution)
+    return value
 
 
 class Sensor:

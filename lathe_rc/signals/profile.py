@@ -5,7 +5,6 @@ A profile is a formula; what the cell runs is its table, a periodic cubic spline
 interpolation along the part, which also gives the derivatives for the feasibility check.
 """
 
-import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from scipy.interpolate import CubicSpline
 
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.signals.table import read_table
 
 Array = npt.NDArray[np.float64]
 
@@ -155,55 +155,8 @@ class Measured:
         return np.asarray(spline(self.angle[0] + np.mod(angle - self.angle[0], _TURN)))
 
 
-_MAX_FILE = 64 * 2**20
+_HEADERS = (("angle_deg", "radius_um"), ("angle_deg", "height_mm", "radius_um"))
 _CLOSEST = 1e-6  # [°, mm] between two points: closer ones are a slip, and their slope overflows
-
-
-def _numbers(row: list[str], path: Path, line: int) -> list[float]:
-    numbers = []
-    for text in row:
-        try:
-            number = float(text)
-        except ValueError:
-            raise InputError(f"{path}:{line}: {text.strip()!r} is not a number") from None
-        if not math.isfinite(number):
-            raise InputError(f"{path}:{line}: {text.strip()!r}; allowed: finite numbers")
-        numbers.append(number)
-    return numbers
-
-
-def _table(path: Path) -> tuple[list[str], Array]:
-    """Header and rows of a CSV file of numbers; lines that start with # are comments."""
-    try:
-        if path.exists() and not path.is_file():
-            raise InputError(f"{path}: cannot be read (not a file); check the profile's path")
-        if path.stat().st_size > _MAX_FILE:
-            raise InputError(f"{path}: larger than {_MAX_FILE // 2**20} MiB; thin the points out")
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the profile's path") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file; allowed: CSV in UTF-8") from None
-    rows = []
-    for n, line in enumerate(text.splitlines(), 1):
-        if line.strip() and line.lstrip()[0] != "#":
-            try:
-                rows += [(n, row) for row in csv.reader([line], strict=True)]
-            except csv.Error as error:
-                raise InputError(f"{path}:{n}: not CSV ({error})") from None
-    header = [name.strip() for name in rows[0][1]] if rows else []
-    if header not in (["angle_deg", "radius_um"], ["angle_deg", "height_mm", "radius_um"]):
-        raise InputError(
-            f"{path}: header {','.join(header)!r}; allowed: angle_deg,radius_um or angle_deg,height_mm,radius_um"
-        )
-    numbers = []
-    for n, row in rows[1:]:
-        if len(row) != len(header):
-            raise InputError(f"{path}:{n}: {len(row)} values; allowed: {len(header)}, as in the header")
-        numbers.append(_numbers(row, path, n))
-    if not numbers:
-        raise InputError(f"{path}: no points; give at least three angles")
-    return header, np.array(numbers)
 
 
 def _check_distances(path: Path, what: str, unit: str, places: Array) -> None:
@@ -224,7 +177,9 @@ def read_csv(path: Path) -> Measured:
     Raises:
         InputError: the file is missing, malformed, holds a number that is not finite, or repeats an angle.
     """
-    header, rows = _table(path)
+    header, rows = read_table(path, _HEADERS, "profile")
+    if not rows.size:
+        raise InputError(f"{path}: no points; give at least three angles")
     if len(header) == 2:
         rows = np.insert(rows, 1, 0.0, axis=1)
     angle_deg, heights_mm = np.unique(rows[:, 0]), np.unique(rows[:, 1])
