@@ -27,7 +27,7 @@ def spindle(monkeypatch):
         try:
             node = SpindleNode("spindle_encoder", "spindle_encoder", Reporter(), Exchange())
             node.trigger_configure()
-            node.exchange.join("/spindle_encoder", [topic for topic, _, _ in node.publications()])
+            node.exchange.join([topic for topic, _, _ in node.publications()])
             yield node
             # Left alive, it would hand its blocks to whoever comes to this domain next.
             node.destroy_node()

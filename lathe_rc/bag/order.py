@@ -40,7 +40,6 @@ class Merger:
     def __init__(self, dense: Mapping[str, str], sparse: Mapping[str, str]) -> None:
         self._dense, self._sparse = dense, sparse
         self._blocks: dict[str, deque[Head]] = {topic: deque() for topic in dense}
-        self._lacking = len(self._blocks)  # dense topics of which no block waits
         self._waiting: list[Entry] = []
         self._sequence = dict.fromkeys([*dense, *sparse], 0)
         self._received = dict.fromkeys(sparse.values(), 0)
@@ -53,10 +52,7 @@ class Merger:
 
     def add_block(self, topic: str, log_ns: int, data: bytes, *, first: int, companions: int, last: bool) -> None:
         """Take a block message."""
-        queue = self._blocks[topic]
-        if not queue:
-            self._lacking -= 1
-        queue.append(Head(self._entry(topic, log_ns, data), first, companions, last))
+        self._blocks[topic].append(Head(self._entry(topic, log_ns, data), first, companions, last))
 
     def add_sparse(self, topic: str, log_ns: int, data: bytes) -> None:
         """Take a sparse message."""
@@ -69,7 +65,7 @@ class Merger:
         Raises:
             LatheError: topics are cut into different blocks.
         """
-        while self._lacking == 0:
+        while all(self._blocks.values()):
             heads = [queue[0] for queue in self._blocks.values()]
             end = heads[0]
             for head in heads:
@@ -79,7 +75,6 @@ class Merger:
                 if self._received.get(self._dense[head.entry.topic], 0) < head.companions:
                     return
             entries = [queue.popleft().entry for queue in self._blocks.values()]
-            self._lacking = sum(not queue for queue in self._blocks.values())
             if self._waiting:
                 entries += [entry for entry in self._waiting if entry.log_ns <= end.entry.log_ns]
                 self._waiting = [entry for entry in self._waiting if entry.log_ns > end.entry.log_ns]
@@ -94,5 +89,4 @@ class Merger:
         self._waiting = []
         for queue in self._blocks.values():
             queue.clear()
-        self._lacking = len(self._blocks)
         return sorted(left)

@@ -247,7 +247,10 @@ class Stage(ABC):
         ]
 
     def perform(self, action: str) -> None:
-        """Carry out an event; the samples from now on feel it."""
+        """Carry out an event; the samples from now on feel it.
+
+        Stages with ``actions`` have their own; the others' events never get here, see `check_action`.
+        """
         raise NotImplementedError(action)
 
     @abstractmethod

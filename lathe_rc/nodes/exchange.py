@@ -34,20 +34,17 @@ class Exchange:
     """What a process hands over inside.
 
     Attributes:
-        members: fully qualified names of the nodes that take part.
         master: takes the Progress of a node, if the time master is in this process.
     """
 
     def __init__(self) -> None:
-        self.members: set[str] = set()
         self.master: Callable[[Any], None] | None = None
         self._inside: set[str] = set()
         self._readers: dict[str, dict[str, Callable[[Delivery], None]]] = defaultdict(dict)
         self._wants_bytes: set[str] = set()
 
-    def join(self, member: str, published: Iterable[str]) -> None:
-        """Take in a configured node and the fully qualified topics that it publishes."""
-        self.members.add(member)
+    def join(self, published: Iterable[str]) -> None:
+        """Take in the fully qualified topics that a configured node publishes."""
         self._inside.update(published)
 
     def has(self, topic: str) -> bool:

@@ -94,14 +94,10 @@ class BlockQueue:
             LatheError: see `add`.
         """
         block = delivery.of_block()
-        if block.first_index != self._expected or len(self.blocks) > self._limit:
+        if block.first_index != self._expected:
             return self.accept(block)
         # What else is checked cannot differ from block to block of a node in this process.
-        self._expected = block.first_index + block.samples
-        self._newest = block
-        self.received += 1
-        self.blocks.append(block)
-        return block
+        return self._append(block)
 
     def accept(self, block: Block) -> Block:
         """Check a block and queue it; see `add`."""
@@ -121,6 +117,9 @@ class BlockQueue:
             self.source, self._expected = block.source, block.first_index
         if block.first_index != self._expected:
             self._gap(block, self._expected)
+        return self._append(block)
+
+    def _append(self, block: Block) -> Block:
         self._expected = block.first_index + block.samples
         self._newest = block
         self.received += 1

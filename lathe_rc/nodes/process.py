@@ -57,7 +57,7 @@ def _start(nodes: Sequence[CellNode], exchange: Exchange) -> None:
     """
     ready = [node for node in nodes if node.autostart and node.trigger_configure() == TransitionCallbackReturn.SUCCESS]
     for node in ready:
-        exchange.join(node.full_name, (topic for topic, _, _ in node.publications()))
+        exchange.join(topic for topic, _, _ in node.publications())
     for node in ready:
         node.trigger_activate()
 

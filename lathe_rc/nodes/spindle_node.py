@@ -59,8 +59,7 @@ class SpindleNode(StageNode):
         self._state = self.create_publisher(CellState, "cell_state", latched_qos(1))
         self._clock_publisher = self.create_publisher(Clock, "/clock", QoSProfile(depth=10))
         self.create_subscription(Progress, "progress", self.guarded(self._on_progress), QoSProfile(depth=1000))
-        if self.full_name in self.exchange.members:
-            self.exchange.master = self.guarded(self._told.append)
+        self.exchange.master = self.guarded(self._told.append)
         self._say(CellState.WAITING, 0)
 
     def member_names(self) -> list[str]:

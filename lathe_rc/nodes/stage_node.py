@@ -191,7 +191,7 @@ class StageNode(CellNode):
             samples, last = ready
             inputs: list[Signals] = []
             for queue, track, delay in self._inputs:
-                if not delay and queue in shared:
+                if queue in shared:
                     inputs.append(queue.blocks[0].signals)
                     continue
                 if not delay:
@@ -203,9 +203,9 @@ class StageNode(CellNode):
 
     def _room(self, samples: int) -> list[tuple[Signals, Samples]]:
         """Arrays for a block's results, see `messages.allocate_together`: new ones where others here read them."""
-        outputs = self._buffers.get(samples)
         shared = any(self.exchange.read(topic) for topic, _ in self._encoders)
-        if outputs is None or shared:
+        outputs = None if shared else self._buffers.get(samples)
+        if outputs is None:
             outputs = [messages.allocate_together(port.type, samples) for port in self.stage.outputs]
             self._buffers[samples] = outputs
         return outputs
