@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line, ``lathe``."""
 
+import importlib
 import json
 import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import click
 from rich.console import Console
@@ -15,21 +16,31 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from lathe_rc import __version__, harness, resources, workshop
+from lathe_rc import __version__, harness, part, resources
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.fitting import fit
-from lathe_rc.studies.command import study
 
 _REFRESH = 0.1  # [s] between updates of the progress line
 _LOG_PERIOD = 2.0  # [s] between lines where there is no terminal
+_ELSEWHERE = ("fit", "measure", "study")  # commands in lathe_rc.commands, imported when they are wanted
 _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
 
 
 class _Group(click.Group):
-    """Turns the project's errors into one line and an exit code."""
+    """Turns the project's errors into one line and an exit code; imports a command's module when it is wanted."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """See `click.Group`."""
+        return sorted([*super().list_commands(ctx), *_ELSEWHERE])
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """See `click.Group`."""
+        if cmd_name in _ELSEWHERE:
+            found = getattr(importlib.import_module(f"lathe_rc.commands.{cmd_name}"), cmd_name)
+            return cast("click.Command", found)
+        return super().get_command(ctx, cmd_name)
 
     def invoke(self, ctx: click.Context) -> Any:
         # SIGTERM ends a command as Ctrl-C does: children are ended and bags closed on the way out.
@@ -45,11 +56,6 @@ class _Group(click.Group):
 @click.version_option(__version__)
 def main() -> None:
     """Emulate the control cell of a lathe for non-circular turning."""
-
-
-main.add_command(study)
-main.add_command(fit)
-main.add_command(workshop.command)
 
 
 def _load(name: str, overrides: Sequence[str]) -> Scenario:
@@ -129,7 +135,7 @@ def _table(result: harness.Result) -> RichTable:
     for column in ("", *columns.values()):
         table.add_column(column, justify="right" if column else "left")
     for label, revolution in (("first revolution", 0), ("last revolution", -1)):
-        told = workshop.numbers(result.part, revolution)
+        told = part.numbers(result.part, revolution)
         table.add_row(label, *(f"{told[name]:#.4g}" for name in columns))
     return table
 
@@ -187,8 +193,7 @@ def run(
         raise InputError(f"--group with --mode {mode}; allowed: --mode processes")
     result = _run(loaded, mode=mode, groups=split if groups else None, bag=bag)
     if profile:
-        found = workshop.part(result.recording)
-        workshop.write_profile(profile, result.recording, found, [found.form.rms.size - 1])
+        part.write_profile(profile, result.recording, result.part, [result.errors.rms.size - 1])
     if as_json:
         click.echo(json.dumps(result.summary()))
         return

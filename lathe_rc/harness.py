@@ -26,7 +26,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
-from lathe_rc import workshop
+from lathe_rc import part
 from lathe_rc.analysis.metrology import FormErrors, Measurement, form_errors
 from lathe_rc.bag import reader, repair
 from lathe_rc.bag.record import OfflineRecorder, about
@@ -103,8 +103,8 @@ class Result:
 
     @cached_property
     def part(self) -> Measurement:
-        """The part as the workshop measures it; see `lathe_rc.workshop.part`."""
-        return workshop.part(self.recording)
+        """The part as the workshop measures it; see `lathe_rc.part`."""
+        return part.measured(self.recording)
 
     @cached_property
     def digest(self) -> dict[str, str]:
@@ -116,7 +116,7 @@ class Result:
         errors = self.errors
 
         def of(revolution: int) -> dict[str, Any] | None:
-            return workshop.numbers(self.part, revolution) if errors.rms.size else None
+            return part.numbers(self.part, revolution) if errors.rms.size else None
 
         return {
             "scenario": self.scenario.name,

@@ -15,12 +15,12 @@ from numpy.testing import assert_allclose
 
 from lathe_rc.analysis.step_fit import SecondOrder
 from lathe_rc.cli import main
+from lathe_rc.commands.study import read
 from lathe_rc.control.invariance import FirstOrderInvariance
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.signals import speed
 from lathe_rc.studies import STUDIES, angle_domain, drive_models, invariance
 from lathe_rc.studies.angle_domain import AngleDomainParameters
-from lathe_rc.studies.command import read
 from lathe_rc.studies.drive_models import DriveModelsParameters
 from lathe_rc.studies.invariance import InvarianceParameters
 

@@ -9,7 +9,7 @@ from cells import scenario
 from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
-from lathe_rc import harness, workshop
+from lathe_rc import harness, part
 from lathe_rc.cli import main
 from lathe_rc.signals import profile as profiles
 
@@ -33,12 +33,12 @@ def test_a_bag_is_measured_as_the_run_was(turned):
     bag, result = turned
     told = json.loads(lathe("measure", bag, "--revolutions", "1,3-6", "--json").stdout)
     assert [line["revolution"] for line in told["revolutions"]] == [1, 3, 4, 5, 6]
-    assert told["revolutions"] == [workshop.numbers(result.part, k) for k in (0, 2, 3, 4, 5)]
+    assert told["revolutions"] == [part.numbers(result.part, k) for k in (0, 2, 3, 4, 5)]
 
 
 def test_before_anything_is_learned_the_form_itself_is_missing(turned):
     _, result = turned
-    first = workshop.numbers(result.part, 0)
+    first = part.numbers(result.part, 0)
     assert first["largest_upr"] == {"upr": 2, "amplitude": pytest.approx(100.0, rel=0.03)}
     assert np.hypot(*first["centre"]) == pytest.approx(20.0, rel=0.03)
     assert first["ront"] < first["peak_to_valley"]

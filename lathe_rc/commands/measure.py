@@ -4,64 +4,19 @@
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import click
 import numpy as np
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from lathe_rc.analysis import profile_csv
-from lathe_rc.analysis.metrology import Measurement, measure
+from lathe_rc import part
+from lathe_rc.analysis.metrology import Measurement
 from lathe_rc.bag import reader
-from lathe_rc.cell import messages
-from lathe_rc.cell.recording import Recording
 from lathe_rc.errors import InputError
 
 _SHOWN = 10  # revolutions, unless others are asked for
 _COLUMNS = ("rev", "RMS", "max", "P-V", "RONt", "eccentric", "largest UPR", "Ra")
-
-
-def part(recording: Recording, *, cutoff: float = 50.0) -> Measurement:
-    """The part that a run has turned; see `lathe_rc.analysis.metrology.measure`.
-
-    Args:
-        recording: of the run; with a tool.
-        cutoff: of the filters for roundness and roughness [undulations per revolution].
-
-    Raises:
-        InputError: it has no tool, or not one complete revolution.
-    """
-    if not {messages.TOOL, messages.ENCODER} <= set(recording.types.values()):
-        raise InputError("nothing to measure: the recording has no encoder and tool; record both")
-    angle, error = (
-        recording.of_type(kind)[field] for kind, field in ((messages.ENCODER, "angle_true"), (messages.TOOL, "error"))
-    )
-    found = measure(angle, error, roundness_cutoff=cutoff, roughness_cutoff=cutoff)
-    if not found.form.rms.size:
-        raise InputError("nothing to measure: the recording has no complete revolution; let it run longer")
-    return found
-
-
-def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
-    """What is told of one revolution, counted from 0; lengths in µm."""
-    around, waves = found.roundness, found.undulations.amplitude[revolution]
-    largest = int(np.argmax(waves[2:])) + 2  # 0 is the size of the part, 1 its place
-
-    def um(values: np.ndarray) -> float:
-        return float(values[revolution]) * 1e6
-
-    return {
-        "revolution": revolution % found.form.rms.size + 1,
-        "rms": um(found.form.rms),
-        "max": um(found.form.largest),
-        "peak_to_valley": um(found.form.peak_to_valley),
-        "ront": um(around.peak_to_valley),
-        "ronq": um(around.rms),
-        "centre": [um(around.x), um(around.y)],
-        "largest_upr": {"upr": largest, "amplitude": float(waves[largest]) * 1e6},
-        "ra": um(found.roughness.ra),
-    }
 
 
 def table(found: Measurement, revolutions: list[int]) -> RichTable:
@@ -70,7 +25,7 @@ def table(found: Measurement, revolutions: list[int]) -> RichTable:
     for column in _COLUMNS:
         lines.add_column(column, justify="right")
     for revolution in revolutions:
-        told = numbers(found, revolution)
+        told = part.numbers(found, revolution)
         upr = told["largest_upr"]
         lines.add_row(
             str(told["revolution"]),
@@ -80,20 +35,6 @@ def table(found: Measurement, revolutions: list[int]) -> RichTable:
             f"{told['ra']:.3g}",
         )
     return lines
-
-
-def write_profile(path: Path, recording: Recording, found: Measurement, revolutions: list[int]) -> None:
-    """Write radius deviations as CSV, with the heights along the part if it was fed."""
-    heights = None
-    if len(revolutions) > 1:
-        height = recording.of_type(messages.TOOL)["height"]
-        starts = found.form.starts
-        heights = np.array([height[starts[k] : starts[k + 1]].mean() for k in revolutions])
-        if np.ptp(heights) == 0.0:
-            heights = None
-    radius = found.profile[revolutions] if len(revolutions) > 1 else found.profile[revolutions[0]]
-    named = ", ".join(str(k + 1) for k in revolutions)
-    profile_csv.write(path, radius, heights=heights, comment=f"deviation from the desired form, revolution {named}")
 
 
 def _chosen(text: str, whole: int) -> list[int]:
@@ -111,7 +52,7 @@ def _chosen(text: str, whole: int) -> list[int]:
     return chosen
 
 
-@click.command("measure")
+@click.command()
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("--revolutions", default="", metavar="LIST", help="like 1,4,10-12; default: some from all of the run")
 @click.option(
@@ -123,19 +64,19 @@ def _chosen(text: str, whole: int) -> list[int]:
 )
 @click.option("--profile", type=click.Path(path_type=Path), help="CSV file to write these revolutions' profiles to")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
-def command(bag: Path, revolutions: str, cutoff: float, profile: Path | None, *, as_json: bool) -> None:
+def measure(bag: Path, revolutions: str, cutoff: float, profile: Path | None, *, as_json: bool) -> None:
     """Measure the part that a recorded run has turned: form error, roundness, roughness by revolution."""
     recording = reader.read(bag)
-    found = part(recording, cutoff=cutoff)
+    found = part.measured(recording, cutoff=cutoff)
     chosen = _chosen(revolutions, found.form.rms.size)
     if profile:
-        write_profile(profile, recording, found, chosen)
+        part.write_profile(profile, recording, found, chosen)
     if as_json:
         told = {
             "bag": str(bag),
             "cutoff_upr": cutoff,
             "unit": "um",
-            "revolutions": [numbers(found, k) for k in chosen],
+            "revolutions": [part.numbers(found, k) for k in chosen],
             "profile": str(profile) if profile else None,
         }
         click.echo(json.dumps(told))

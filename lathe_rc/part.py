@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The part that a run has turned, as the workshop measures it."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lathe_rc.analysis import profile_csv
+from lathe_rc.analysis.metrology import Measurement, measure
+from lathe_rc.cell import messages
+from lathe_rc.cell.recording import Recording
+from lathe_rc.errors import InputError
+
+
+def measured(recording: Recording, *, cutoff: float = 50.0) -> Measurement:
+    """The part that a run has turned; see `lathe_rc.analysis.metrology.measure`.
+
+    Args:
+        recording: of the run; with a tool.
+        cutoff: of the filters for roundness and roughness [undulations per revolution].
+
+    Raises:
+        InputError: it has no tool, or not one complete revolution.
+    """
+    if not {messages.TOOL, messages.ENCODER} <= set(recording.types.values()):
+        raise InputError("nothing to measure: the recording has no encoder and tool; record both")
+    angle, error = (
+        recording.of_type(kind)[field] for kind, field in ((messages.ENCODER, "angle_true"), (messages.TOOL, "error"))
+    )
+    found = measure(angle, error, roundness_cutoff=cutoff, roughness_cutoff=cutoff)
+    if not found.form.rms.size:
+        raise InputError("nothing to measure: the recording has no complete revolution; let it run longer")
+    return found
+
+
+def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
+    """What is told of one revolution, counted from 0; lengths in µm."""
+    around, waves = found.roundness, found.undulations.amplitude[revolution]
+    largest = int(np.argmax(waves[2:])) + 2  # 0 is the size of the part, 1 its place
+
+    def um(values: np.ndarray) -> float:
+        return float(values[revolution]) * 1e6
+
+    return {
+        "revolution": revolution % found.form.rms.size + 1,
+        "rms": um(found.form.rms),
+        "max": um(found.form.largest),
+        "peak_to_valley": um(found.form.peak_to_valley),
+        "ront": um(around.peak_to_valley),
+        "ronq": um(around.rms),
+        "centre": [um(around.x), um(around.y)],
+        "largest_upr": {"upr": largest, "amplitude": float(waves[largest]) * 1e6},
+        "ra": um(found.roughness.ra),
+    }
+
+
+def write_profile(path: Path, recording: Recording, found: Measurement, revolutions: list[int]) -> None:
+    """Write radius deviations as CSV, with the heights along the part if it was fed."""
+    heights = None
+    if len(revolutions) > 1:
+        height = recording.of_type(messages.TOOL)["height"]
+        starts = found.form.starts
+        heights = np.array([height[starts[k] : starts[k + 1]].mean() for k in revolutions])
+        if np.ptp(heights) == 0.0:
+            heights = None
+    radius = found.profile[revolutions] if len(revolutions) > 1 else found.profile[revolutions[0]]
+    named = ", ".join(str(k + 1) for k in revolutions)
+    profile_csv.write(path, radius, heights=heights, comment=f"deviation from the desired form, revolution {named}")
