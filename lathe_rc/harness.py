@@ -414,14 +414,24 @@ class Processes:
             raise kinds.get(event["exit_code"], LatheError)(event["message"])
         if event["event"] == "exit" and event["code"] and node not in self._abandoned:
             if event["code"] < 0:
-                raise LatheError(f"{node} was killed by {signal.Signals(-event['code']).name}")
+                raise LatheError(f"{node} was killed by {signal.Signals(-event['code']).name}{self._crash(node)}")
             raise LatheError(f"{node} ended with exit code {event['code']}{self._tail(node)}")
+
+    def _log(self, name: str) -> list[str]:
+        """The lines that a process has written."""
+        log = self._folder / f"{name.split('+', maxsplit=1)[0]}.log"
+        return log.read_text(encoding="utf-8", errors="replace").strip().splitlines() if log.exists() else []
 
     def _tail(self, name: str) -> str:
         """The last line of a process's log."""
-        log = self._folder / f"{name.split('+', maxsplit=1)[0]}.log"
-        lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines() if log.exists() else []
+        lines = self._log(name)
         return f": {lines[-1].strip()}" if lines else ""
+
+    def _crash(self, name: str) -> str:
+        """Where a library has crashed, if one has: the innermost call that `faulthandler` has written."""
+        lines = self._log(name)
+        start = next((place for place, line in enumerate(lines) if line.startswith("Current thread")), len(lines))
+        return f" in {lines[start + 1].strip()}" if start + 1 < len(lines) else ""
 
     def _tails(self) -> str:
         return "".join(f"; {name}{self._tail(name)}" for name in self._children)

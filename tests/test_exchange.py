@@ -43,7 +43,7 @@ def test_a_member_that_completes_a_block_at_once_does_not_get_it_twice(spindle):
         seen.append(delivery.block.first_index)
         spindle.exchange.master(Progress(name="/eager", blocks=len(seen), samples=64 * len(seen)))
 
-    spindle.exchange.listen("/encoder", "/eager", complete, data=False)
+    spindle.exchange.listen("/encoder", "/eager", complete)
     spindle.trigger_activate()
     spindle._begin()
     spindle.work()
@@ -53,7 +53,7 @@ def test_a_member_that_completes_a_block_at_once_does_not_get_it_twice(spindle):
 
 def test_what_is_handed_over_is_not_written_to_again(spindle):
     blocks = []
-    spindle.exchange.listen("/encoder", "/eager", lambda delivery: blocks.append(delivery.block), data=True)
+    spindle.exchange.listen("/encoder", "/eager", lambda delivery: blocks.append(delivery.block))
     spindle.trigger_activate()
     spindle._begin()
     angle = np.concatenate([block.signals["angle_true"] for block in blocks])
@@ -63,7 +63,7 @@ def test_what_is_handed_over_is_not_written_to_again(spindle):
 
 def test_bytes_are_made_for_those_who_want_them(spindle):
     given = []
-    spindle.exchange.listen("/encoder", "/eager", given.append, data=True)
+    spindle.exchange.listen("/encoder", "/eager", given.append)
     spindle.trigger_activate()
     spindle._begin()
     decoded = messages.decode(messages.ENCODER, given[1].data)
@@ -72,7 +72,7 @@ def test_bytes_are_made_for_those_who_want_them(spindle):
 
 
 def test_a_sample_that_is_not_finite_is_refused_where_it_is_made(spindle, monkeypatch):
-    spindle.exchange.listen("/encoder", "/eager", list, data=False)
+    spindle.exchange.listen("/encoder", "/eager", list)
     spindle.trigger_activate()
 
     def spoil(first, inputs, outputs):

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 from lathe_rc.errors import LatheError
 
+Data = bytes | memoryview  #: an encoded message
+
 
 class Entry(NamedTuple):
     """A message to be written; sorts as bags are sorted."""
@@ -14,7 +16,7 @@ class Entry(NamedTuple):
     log_ns: int
     topic: str
     sequence: int
-    data: bytes
+    data: Data
 
 
 class Head(NamedTuple):
@@ -40,21 +42,24 @@ class Merger:
     def __init__(self, dense: Mapping[str, str], sparse: Mapping[str, str]) -> None:
         self._dense, self._sparse = dense, sparse
         self._blocks: dict[str, deque[Head]] = {topic: deque() for topic in dense}
+        self._empty = len(self._blocks)  # topics without a block
         self._waiting: list[Entry] = []
         self._sequence = dict.fromkeys([*dense, *sparse], 0)
         self._received = dict.fromkeys(sparse.values(), 0)
         self.blocks = 0  #: complete blocks given back, over all topics
         self.complete = False  #: True when the last block of every topic has been given back
 
-    def _entry(self, topic: str, log_ns: int, data: bytes) -> Entry:
+    def _entry(self, topic: str, log_ns: int, data: Data) -> Entry:
         self._sequence[topic] += 1
         return Entry(log_ns, topic, self._sequence[topic], data)
 
-    def add_block(self, topic: str, log_ns: int, data: bytes, *, first: int, companions: int, last: bool) -> None:
+    def add_block(self, topic: str, log_ns: int, data: Data, *, first: int, companions: int, last: bool) -> None:
         """Take a block message."""
-        self._blocks[topic].append(Head(self._entry(topic, log_ns, data), first, companions, last))
+        queue = self._blocks[topic]
+        self._empty -= not queue
+        queue.append(Head(self._entry(topic, log_ns, data), first, companions, last))
 
-    def add_sparse(self, topic: str, log_ns: int, data: bytes) -> None:
+    def add_sparse(self, topic: str, log_ns: int, data: Data) -> None:
         """Take a sparse message."""
         self._waiting.append(self._entry(topic, log_ns, data))
         self._received[self._sparse[topic]] += 1
@@ -65,7 +70,7 @@ class Merger:
         Raises:
             LatheError: topics are cut into different blocks.
         """
-        while all(self._blocks.values()):
+        while not self._empty:
             heads = [queue[0] for queue in self._blocks.values()]
             end = heads[0]
             for head in heads:
@@ -75,6 +80,7 @@ class Merger:
                 if self._received.get(self._dense[head.entry.topic], 0) < head.companions:
                     return
             entries = [queue.popleft().entry for queue in self._blocks.values()]
+            self._empty = sum(not queue for queue in self._blocks.values())
             if self._waiting:
                 entries += [entry for entry in self._waiting if entry.log_ns <= end.entry.log_ns]
                 self._waiting = [entry for entry in self._waiting if entry.log_ns > end.entry.log_ns]

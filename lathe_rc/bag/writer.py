@@ -2,16 +2,14 @@
 """Writing rosbag2 directories.
 
 rosbags writes the directory, its metadata and the schemas. Its own MCAP storage has neither a chunk size nor a
-flush, which are what a crash promise needs, so the file itself is written by the mcap library.
+flush, which are what a crash promise needs; `lathe_rc.bag.mcap_file` has.
 """
 
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Literal, cast
 
-from mcap.writer import CompressionType
-from mcap.writer import Writer as McapFile
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
@@ -25,6 +23,7 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
+from lathe_rc.bag.mcap_file import McapFile
 from lathe_rc.cell import messages
 from lathe_rc.errors import InputError, LatheError
 
@@ -50,62 +49,56 @@ def offered_qos(depth: int, durability: Durability) -> Qos:
 
 
 class _McapStorage:
-    """rosbags' storage interface on mcap's writer."""
+    """rosbags' storage interface on `McapFile`."""
 
-    def __init__(self, path: Path, compression: CompressionMode, chunk_size: int, codec: CompressionType) -> None:
+    def __init__(self, path: Path, compression: CompressionMode, chunk_size: int, *, compress: bool) -> None:
         assert compression is CompressionMode.NONE, "chunks are compressed, not messages or files"
         self.path = path / f"{path.name}.mcap"
-        self._stream: BinaryIO = self.path.open("xb")
-        self._file = McapFile(self._stream, chunk_size=chunk_size, compression=codec)
-        self._file.start(profile="ros2", library="lathe_rc")
+        self.file = McapFile(self.path, chunk_size=chunk_size, compress=compress)
         self._schemas: dict[str, int] = {}
-        self._channels: dict[int, int] = {}
+        self.channels: dict[int, int] = {}
 
     def add_msgtype(self, connection: Connection) -> None:
         """Add a message type's definition."""
-        data = connection.msgdef.data.encode()
-        self._schemas[connection.msgtype] = self._file.register_schema(connection.msgtype, "ros2msg", data)
+        self._schemas[connection.msgtype] = self.file.add_schema(connection.msgtype, connection.msgdef.data)
 
     def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
         """Add a topic."""
         assert isinstance(connection.ext, ConnectionExtRosbag2)
-        self._channels[connection.id] = self._file.register_channel(
-            topic=connection.topic,
-            message_encoding=connection.ext.serialization_format,
-            schema_id=self._schemas[connection.msgtype],
-            metadata={
-                "offered_qos_profiles": offered_qos_profiles,
-                "topic_type_hash": connection.digest,
-            },
+        self.channels[connection.id] = self.file.add_channel(
+            connection.topic,
+            self._schemas[connection.msgtype],
+            connection.ext.serialization_format,
+            {"offered_qos_profiles": offered_qos_profiles, "topic_type_hash": connection.digest},
         )
-
-    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
-        """Write a message."""
-        self._file.add_message(self._channels[connection.id], timestamp, bytes(data), timestamp)
-
-    def flush(self) -> None:
-        """Hand everything so far to the operating system."""
-        self._file.flush()
-        self._stream.flush()
 
     def close(self, version: int, metadata: str) -> None:
         """Finish the file."""
-        self._file.add_metadata("rosbag2", {"serialized_metadata": metadata})
-        self._file.finish()
-        self._stream.close()
-
-    def abort(self) -> None:
-        """Leave the file as it is."""
-        self._stream.close()
+        self.file.add_metadata("rosbag2", {"serialized_metadata": metadata})
+        self.file.finish()
 
 
 class _Writer(RosbagWriter):
-    """rosbags' writer with the storage above."""
+    """rosbags' writer with the storage above, which is told of messages directly and counts them itself."""
 
-    def __init__(self, path: Path, chunk_size: int, codec: CompressionType) -> None:
+    def __init__(self, path: Path, chunk_size: int, *, compress: bool) -> None:
         super().__init__(path, version=9, storage_plugin=StoragePlugin.MCAP)
-        make = partial(_McapStorage, chunk_size=chunk_size, codec=codec)
+        make = partial(_McapStorage, chunk_size=chunk_size, compress=compress)
         self.STORAGE_PLUGINS = {StoragePlugin.MCAP: make}  # type: ignore[dict-item]  # wants a class, only calls it
+
+    @property
+    def mcap(self) -> _McapStorage:
+        """The storage, once open."""
+        return cast("_McapStorage", self.storage)
+
+    def close(self) -> None:
+        """See rosbags; the metadata tell of the messages that the storage has been given."""
+        file = self.mcap.file
+        file.flush()
+        self.counts = {number: file.counts[channel] for number, channel in self.mcap.channels.items()}
+        if file.first_ns is not None and file.last_ns is not None:
+            self.min_timestamp, self.max_timestamp = file.first_ns, file.last_ns
+        super().close()
 
 
 def refuse_existing(path: Path) -> None:
@@ -133,30 +126,29 @@ class BagWriter:
 
     def __init__(self, path: Path, *, compression: Compression, chunk_size: int, about: Mapping[str, str]) -> None:
         refuse_existing(path)
-        codec = CompressionType.ZSTD if compression == "zstd" else CompressionType.NONE
-        self._writer = _Writer(path, chunk_size, codec)
+        self._writer = _Writer(path, chunk_size, compress=compression == "zstd")
         for key, text in about.items():
             self._writer.set_custom_data(key, text)
         try:
             self._writer.open()
         except OSError as error:
             raise InputError(f"{path}: cannot be made ({error.strerror})") from None
-        self._connections: dict[str, Connection] = {}
+        self._file = self._writer.mcap.file
+        self._channels: dict[str, int] = {}
 
     def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
         """Announce a fully qualified topic."""
-        self._connections[topic] = self._writer.add_connection(
-            topic, msgtype, typestore=messages.store(), offered_qos_profiles=[qos]
-        )
+        connection = self._writer.add_connection(topic, msgtype, typestore=messages.store(), offered_qos_profiles=[qos])
+        self._channels[topic] = self._writer.mcap.channels[connection.id]
 
-    def write(self, topic: str, log_ns: int, data: bytes) -> None:
+    def write(self, topic: str, log_ns: int, data: bytes | memoryview) -> None:
         """Append a message to a topic that has been announced.
 
         Raises:
             LatheError: the disk does not take it.
         """
         try:
-            self._writer.write(self._connections[topic], log_ns, data)
+            self._file.add_message(self._channels[topic], log_ns, data)
         except OSError as error:
             raise LatheError(f"{self._writer.path}: cannot write ({error.strerror})") from None
 

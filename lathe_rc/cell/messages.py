@@ -81,24 +81,6 @@ def allocate(msgtype: str, samples: int) -> Signals:
     return {name: np.zeros(samples, dtype) for name, dtype in sample_fields(msgtype).items()}
 
 
-@cache
-def _kinds(msgtype: str) -> tuple[tuple[str, ...], tuple[tuple[str, np.dtype[Any]], ...]]:
-    """Names of the float64 fields of a block type, and the others."""
-    fields = sample_fields(msgtype)
-    real = tuple(name for name, dtype in fields.items() if dtype == np.float64)
-    return real, tuple((name, dtype) for name, dtype in fields.items() if dtype != np.float64)
-
-
-def allocate_together(msgtype: str, samples: int) -> tuple[Signals, Samples]:
-    """Arrays for ``samples`` samples of a block type, not zeroed, and all float64 ones as one, shape (m, samples)."""
-    real, others = _kinds(msgtype)
-    together = np.empty((len(real), samples))
-    signals = dict(zip(real, together, strict=True))
-    for name, dtype in others:
-        signals[name] = np.zeros(samples, dtype)
-    return signals, together
-
-
 def header(index: int, step_ns: int) -> Any:
     """std_msgs/Header with the simulated time of sample ``index``."""
     seconds, nanoseconds = divmod(START_NS + index * step_ns, 1_000_000_000)
@@ -113,9 +95,9 @@ def stamp_ns(message: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
-def stamp_of(data: bytes) -> int:
+def stamp_of(data: bytes | memoryview) -> int:
     """Simulated time [ns] of an encoded message whose first field is a header; nothing else of it is decoded."""
-    stamp = decode("builtin_interfaces/msg/Time", data[:12])  # the header's first field
+    stamp = decode("builtin_interfaces/msg/Time", bytes(data[:12]))  # the header's first field
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 

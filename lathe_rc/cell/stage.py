@@ -107,7 +107,8 @@ class Stage(ABC):
     def declare(self, *, inputs: Sequence[Input] = (), outputs: Sequence[Output] = ()) -> None:
         """Set the ports; to be called once, at the end of the constructor."""
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
-        if any(output.joint for output in self.outputs):
+        self._joints = [(place, output.joint) for place, output in enumerate(self.outputs) if output.joint]
+        if self._joints:
             self.sparse_topics[f"{self.name}/joint_states"] = messages.JOINTS
         if self.actions:
             self.sparse_topics[f"{self.name}/events"] = messages.EVENT
@@ -196,27 +197,31 @@ class Stage(ABC):
         Returns:
             The sparse messages of the block, by sample index.
         """
+        if self._triggers or self._scheduled:
+            sparse = self._advance_with_events(first, inputs, outputs)
+        else:
+            sparse = self.process(first, inputs, outputs)
+        for place, joint in self._joints:
+            sparse = sparse + self._joint_states(first, joint, outputs[place])
+        if len(sparse) > 1:
+            sparse.sort(key=lambda message: message.index)
+        return sparse
+
+    def _advance_with_events(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+        """Compute a block in pieces, from event to event."""
         samples = next(iter(outputs[0].values())).size
         sparse: list[Sparse] = []
         start = 0
-        if self._triggers or self._scheduled:
-            for index, action in self._due(first, samples, inputs):
-                sparse += self._compute(first, start, index - first, inputs, outputs)
-                start = index - first
-                self.perform(action)
-                sparse.append(Sparse(f"{self.name}/events", messages.EVENT, index, {"action": action}))
-        sparse += self._compute(first, start, samples, inputs, outputs)
-        for output, signals in zip(self.outputs, outputs, strict=True):
-            if output.joint:
-                sparse += self._joint_states(first, output.joint, signals)
-        sparse.sort(key=lambda message: message.index)
-        return sparse
+        for index, action in self._due(first, samples, inputs):
+            sparse += self._compute(first, start, index - first, inputs, outputs)
+            start = index - first
+            self.perform(action)
+            sparse.append(Sparse(f"{self.name}/events", messages.EVENT, index, {"action": action}))
+        return sparse + self._compute(first, start, samples, inputs, outputs)
 
     def _compute(
         self, first: int, start: int, stop: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        if start == 0 and stop == next(iter(outputs[0].values())).size:
-            return self.process(first, inputs, outputs)
         if start == stop:
             return []
         return self.process(first + start, _cut(inputs, start, stop), _cut(outputs, start, stop))

@@ -8,9 +8,8 @@ does not match the layout is decoded by rosbags and learned anew: CDR itself is 
 """
 
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +18,8 @@ from lathe_rc.cell.messages import MAX_BLOCK, START_NS, Samples, Signals
 
 _BILLION = 1_000_000_000
 _MOST_FIELDS = 16
-_ZEROS = np.zeros(_MOST_FIELDS * MAX_BLOCK)
+_ZEROS = np.zeros(_MOST_FIELDS * (MAX_BLOCK + 1))
+_SHIFT = 4  # CDR aligns to what follows its first four bytes: with so many before, to memory as well
 # Number in the message: struct format and a value that differs from 0 in every byte.
 _NUMBERS = {
     "sec": ("<i", 0x01010101),
@@ -80,8 +80,49 @@ class _Layout:
         return True
 
 
-# How a block of one length is made: numbers and their places, the message, its arrays, and all of them as one.
-_Made = tuple[list[tuple[Callable[..., None], int]], Samples, list[tuple[str, Samples]], Samples | None]
+class Room(NamedTuple):
+    """Memory of a message, for the samples of a block to be computed into.
+
+    Attributes:
+        signals: its arrays by field; zero at first.
+        message: the whole, shape (bytes,).
+        reals: all float64 arrays and the lengths between them as one array; None where a type has others too.
+    """
+
+    signals: Signals
+    message: Samples
+    reals: Samples | None
+
+
+class _Form:
+    """How blocks of one length are made."""
+
+    def __init__(self, layout: _Layout, step_ns: int) -> None:
+        template = np.frombuffer(layout.template, np.uint8).copy()
+        code, place = layout.places["step_ns"]
+        code.pack_into(template.data, place, step_ns)  # in all blocks the same
+        self.template, self.samples = template, layout.samples
+        varying = [layout.places[name] for name in ("sec", "nanosec", "first_index", "last", "companions")]
+        self.numbers = [(code.pack_into, place) for code, place in varying]
+        self.fields = [(name, dtype, place + _SHIFT) for name, (dtype, place) in layout.fields.items()]
+        places = [place for _, dtype, place in self.fields if dtype == np.float64]
+        gaps = set(np.diff(places).tolist()) or {8 * layout.samples}
+        # Evenly spaced, the arrays are rows of one.
+        self.rows = (len(places), layout.samples) if len(places) == len(self.fields) and len(gaps) == 1 else None
+        self.names, self.start, self.strides = [name for name, _, _ in self.fields], places[0], (min(gaps), 8)
+        self.reals = min(gaps) // 8 * (len(places) - 1) + layout.samples
+
+    def room(self) -> Room:
+        """Memory for one more."""
+        memory = np.empty(self.template.size + _SHIFT, np.uint8)
+        message = memory[_SHIFT:]
+        message[:] = self.template
+        if self.rows is None:
+            signals = {name: np.frombuffer(memory, dtype, self.samples, place) for name, dtype, place in self.fields}
+            return Room(signals, message, None)
+        rows = np.ndarray(self.rows, np.float64, memory, self.start, self.strides)
+        reals = np.frombuffer(memory, np.float64, self.reals, self.start)
+        return Room(dict(zip(self.names, rows, strict=True)), message, reals)
 
 
 @dataclass(slots=True)
@@ -104,23 +145,24 @@ class Block:
     log_ns: int
     signals: Signals
 
-    def copy_to(self, signals: Signals) -> None:
+    def copy_to(self, signals: Signals, *, check: bool = True) -> None:
         """Copy samples into arrays of shape (samples,), by field.
 
         Raises:
-            ValueError: a sample is NaN or infinite.
+            ValueError: a sample is NaN or infinite, unless that has been checked.
         """
         for name, array in signals.items():
             array[:] = self.signals[name]
-            self._check(name, array)
+            if check:
+                self._check(name, array)
 
-    def check(self, together: Samples) -> None:
-        """Refuse samples that no reader could use; ``together`` are all float64 arrays, shape (m, samples).
+    def check(self, reals: Samples | None) -> None:
+        """Refuse samples that no reader could use; ``reals`` are all of them at once, see `Room`.
 
         Raises:
             ValueError: a sample is NaN or infinite.
         """
-        if np.dot(together.ravel(), _ZEROS[: together.size]) != 0.0:
+        if reals is None or np.dot(reals, _ZEROS[: reals.size]) != 0.0:
             for name, array in self.signals.items():
                 self._check(name, array)
 
@@ -145,29 +187,19 @@ class Encoder:
 
     def __init__(self, msgtype: str, run_id: str, source: str, step_ns: int) -> None:
         self._type, self._run_id, self._source, self._step_ns = msgtype, run_id, source, step_ns
-        self._made: dict[int, _Made] = {}
+        self._forms: dict[int, _Form] = {}
 
     def prepare(self, samples: int) -> None:
         """Learn the layout for a length ahead of its first block."""
-        self._layout(samples)
+        self._form(samples)
 
-    def _layout(self, samples: int) -> _Made:
-        layout = _Layout(self._type, self._run_id, self._source, samples)
-        buffer = np.frombuffer(layout.template, np.uint8).copy()
-        code, place = layout.places["step_ns"]
-        code.pack_into(buffer.data, place, self._step_ns)  # in all blocks the same
-        varying = [layout.places[name] for name in ("sec", "nanosec", "first_index", "last", "companions")]
-        numbers = [(code.pack_into, place) for code, place in varying]
-        views = [
-            (name, np.frombuffer(buffer.data, dtype, samples, place)) for name, (dtype, place) in layout.fields.items()
-        ]
-        together = None
-        places = [place for dtype, place in layout.fields.values() if dtype == np.float64]
-        if len(places) == len(views) > 1 and len(set(np.diff(places))) == 1:
-            # Evenly spaced, the arrays are one: filled by one copy.
-            together = np.ndarray((len(places), samples), np.float64, buffer, places[0], (places[1] - places[0], 8))
-        self._made[samples] = numbers, buffer, views, together
-        return self._made[samples]
+    def _form(self, samples: int) -> _Form:
+        form = self._forms[samples] = _Form(_Layout(self._type, self._run_id, self._source, samples), self._step_ns)
+        return form
+
+    def room(self, samples: int) -> Room:
+        """Memory for a block's message."""
+        return (self._forms.get(samples) or self._form(samples)).room()
 
     def block(self, first: int, signals: Signals, *, last: bool, companions: int) -> Block:
         """The same block as readers find it who need no bytes; it holds ``signals`` themselves."""
@@ -175,34 +207,33 @@ class Encoder:
         log_ns = START_NS + (first + samples - 1) * self._step_ns
         return Block(self._run_id, self._source, first, self._step_ns, last, companions, samples, log_ns, signals)
 
-    def encode(
-        self, first: int, signals: Signals, *, last: bool, companions: int, together: Samples | None = None
-    ) -> tuple[int, bytes]:
-        """A block from sample ``first`` on, stamped with the time of its last sample.
+    def stamp(self, room: Room, first: int, samples: int, *, last: bool, companions: int) -> int:
+        """Complete a message whose samples have been computed, with the time of its last sample.
 
         Args:
+            room: its memory.
             first: index of its first sample.
-            signals: its arrays.
+            samples: its length.
             last: the run ends with it.
             companions: see BlockInfo.msg.
-            together: the float64 ones among the arrays as one, if they are; see `messages.allocate_together`.
 
         Returns:
-            The stamp [ns] and the bytes.
+            The stamp [ns].
         """
-        samples = next(iter(signals.values())).size
-        numbers, buffer, views, whole = self._made.get(samples) or self._layout(samples)
         log_ns = START_NS + (first + samples - 1) * self._step_ns
         seconds, nanoseconds = divmod(log_ns, _BILLION)
-        data = buffer.data
-        for (pack_into, place), number in zip(numbers, (seconds, nanoseconds, first, last, companions), strict=True):
+        data, values = room.message.data, (seconds, nanoseconds, first, last, companions)
+        for (pack_into, place), number in zip(self._forms[samples].numbers, values, strict=True):
             pack_into(data, place, number)
-        if whole is not None and together is not None:
-            whole[:] = together
-        else:
-            for name, view in views:
-                view[:] = signals[name]
-        return log_ns, buffer.tobytes()
+        return log_ns
+
+    def encode(self, first: int, signals: Signals, *, last: bool, companions: int) -> tuple[int, bytes]:
+        """A block of arrays that are elsewhere; stamp [ns] and bytes. See `stamp`."""
+        samples = next(iter(signals.values())).size
+        room = self.room(samples)
+        for name, array in room.signals.items():
+            array[:] = signals[name]
+        return self.stamp(room, first, samples, last=last, companions=companions), room.message.tobytes()
 
 
 class Decoder:

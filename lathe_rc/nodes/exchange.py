@@ -18,16 +18,11 @@ class Delivery(NamedTuple):
 
     Attributes:
         block: its content; None for a message at a chosen sample.
-        data: its bytes; empty if no reader in this process wants them.
+        data: its bytes.
     """
 
     block: Block | None
-    data: bytes
-
-    def of_block(self) -> Block:
-        """The block of a topic that carries one."""
-        assert self.block is not None, "a topic of blocks carries nothing else"
-        return self.block
+    data: bytes | memoryview
 
 
 class Exchange:
@@ -41,7 +36,6 @@ class Exchange:
         self.master: Callable[[Any], None] | None = None
         self._inside: set[str] = set()
         self._readers: dict[str, dict[str, Callable[[Delivery], None]]] = defaultdict(dict)
-        self._wants_bytes: set[str] = set()
 
     def join(self, published: Iterable[str]) -> None:
         """Take in the fully qualified topics that a configured node publishes."""
@@ -51,11 +45,9 @@ class Exchange:
         """Whether a node of this process publishes a topic."""
         return topic in self._inside
 
-    def listen(self, topic: str, member: str, callback: Callable[[Delivery], None], *, data: bool) -> None:
-        """Let a node read a topic that `has`; ``data`` says whether it wants the bytes too."""
+    def listen(self, topic: str, member: str, callback: Callable[[Delivery], None]) -> None:
+        """Let a node read a topic that `has`."""
         self._readers[topic][member] = callback
-        if data:
-            self._wants_bytes.add(topic)
 
     def read(self, topic: str) -> bool:
         """Whether anybody in this process reads a topic."""
@@ -64,10 +56,6 @@ class Exchange:
     def readers(self, topic: str) -> set[str]:
         """Fully qualified names of the nodes that read a topic here, and not through DDS."""
         return set(self._readers.get(topic, ()))
-
-    def wants_bytes(self, topic: str) -> bool:
-        """Whether anybody in this process wants the bytes of a topic."""
-        return topic in self._wants_bytes
 
     def hand_over(self, topic: str, delivery: Delivery) -> None:
         """Give a message to the readers in this process."""

@@ -93,11 +93,16 @@ class BlockQueue:
         Raises:
             LatheError: see `add`.
         """
-        block = delivery.of_block()
-        if block.first_index != self._expected:
+        block = delivery.block
+        assert block is not None, "a topic of blocks carries nothing else"
+        if block.first_index != self._expected or len(self.blocks) >= self._limit:
             return self.accept(block)
         # What else is checked cannot differ from block to block of a node in this process.
-        return self._append(block)
+        self._expected += block.samples
+        self._newest = block
+        self.received += 1
+        self.blocks.append(block)
+        return block
 
     def accept(self, block: Block) -> Block:
         """Check a block and queue it; see `add`."""

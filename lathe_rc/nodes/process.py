@@ -2,6 +2,7 @@
 """A process with one node or several: start, loop, signals, exit code."""
 
 import ctypes
+import faulthandler
 import gc
 import os
 import signal
@@ -62,6 +63,11 @@ def _start(nodes: Sequence[CellNode], exchange: Exchange) -> None:
         node.trigger_activate()
 
 
+def _due(nodes: Sequence[CellNode], now: float) -> float:
+    """When the next tick of a node is due; now if all are done."""
+    return min((node.next_tick for node in nodes if not node.done), default=now)
+
+
 def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
     executor = EventsExecutor()
     for node in nodes:
@@ -70,8 +76,7 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
     look = 0.0
     while not stop.signal:
         now = time.monotonic()
-        due = min((node.next_tick for node in nodes if not node.done), default=now)
-        if due <= now:
+        if _due(nodes, now) <= now:
             for node in nodes:
                 if now >= node.next_tick and not (node.done or node.failure):
                     node.tick(now)
@@ -81,14 +86,16 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
                 look = now + _LONGEST_WAIT
                 if reporter.orphaned:
                     return
-        executor.spin_once(timeout_sec=min(max(due - now, 0.0), _LONGEST_WAIT))
+        due = _due(nodes, now)
+        wait = 0.0 if any(node.due for node in nodes) else due - now
+        executor.spin_once(timeout_sec=min(max(wait, 0.0), _LONGEST_WAIT))
         # Take what else has arrived before computing: a burst in makes a burst out, and neighbours wake up once
         # for all of it. Waking them is the dearest part of a hop.
         handled = -1
         while handled < (handled := sum(node.handled for node in nodes)) and not stop.signal:
             executor.spin_once(timeout_sec=0.0)
-        # What a node hands over inside is work for its neighbours.
-        while (waiting := [node for node in nodes if node.due]) and not stop.signal:
+        # What a node hands over inside is work for its neighbours; services get their turn all the same.
+        while (waiting := [node for node in nodes if node.due]) and time.monotonic() < due and not stop.signal:
             for node in waiting:
                 node.due = False
                 node.work()
@@ -113,6 +120,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
     Returns:
         The exit code: 0, or that of the first failure.
     """
+    faulthandler.enable()  # a crash of a library leaves where it happened in the log
     _tune()
     reporter = Reporter()
     os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("fastdds.xml")))

@@ -9,7 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lathe_rc_msgs.msg import CellState
 from rclpy.qos import QoSProfile
 
-from lathe_rc.bag.order import Entry, Merger
+from lathe_rc.bag.order import Data, Entry, Merger
 from lathe_rc.bag.record import about, signal_depth
 from lathe_rc.bag.writer import BagWriter, offered_qos
 from lathe_rc.cell import messages
@@ -115,7 +115,6 @@ class RecorderNode(CellNode):
                 msgtype,
                 lambda data: self._on_sparse(topic, data),
                 lambda delivery: self._on_sparse(topic, delivery.data),
-                data=True,
             )
             return
         queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
@@ -126,12 +125,11 @@ class RecorderNode(CellNode):
             msgtype,
             lambda data: self._on_block(queue, queue.add, data, data),
             lambda delivery: self._on_block(queue, queue.take, delivery, delivery.data),
-            data=True,
         )
 
     # ---- data ---------------------------------------------------------------------------------------
 
-    def _on_sparse(self, topic: str, data: bytes) -> None:
+    def _on_sparse(self, topic: str, data: Data) -> None:
         if self.done:
             return
         stamp = messages.stamp_of(data)
@@ -141,7 +139,7 @@ class RecorderNode(CellNode):
             self._merger.add_sparse(topic, stamp, data)
             self._drain()
 
-    def _on_block(self, queue: BlockQueue, accept: Callable[[T], Block], given: T, data: bytes) -> None:
+    def _on_block(self, queue: BlockQueue, accept: Callable[[T], Block], given: T, data: Data) -> None:
         if self.done:
             return
         block = accept(given)
@@ -159,7 +157,7 @@ class RecorderNode(CellNode):
         )
         self._drain()
 
-    def _write_unsorted(self, queue: BlockQueue, block: Block, data: bytes) -> None:
+    def _write_unsorted(self, queue: BlockQueue, block: Block, data: Data) -> None:
         """Free-running, blocks may be missing, so nothing can be waited for: write in the order of arrival."""
         self._write(Entry(block.log_ns, queue.topic, 0, data))
         if block.last:

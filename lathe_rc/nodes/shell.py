@@ -190,8 +190,6 @@ class CellNode(LifecycleNode):
         msgtype: str,
         callback: Callable[[bytes], object],
         inside: Callable[[Delivery], object],
-        *,
-        data: bool = False,
     ) -> None:
         """Read a signal topic.
 
@@ -200,10 +198,9 @@ class CellNode(LifecycleNode):
             msgtype: message type.
             callback: gets the encoded message from DDS.
             inside: gets what a node of this process hands over instead.
-            data: whether ``inside`` wants the bytes too.
         """
         if self.exchange.has(topic):
-            self.exchange.listen(topic, self.full_name, self.guarded(inside), data=data)
+            self.exchange.listen(topic, self.full_name, self.guarded(inside))
             return
         self.inlets[topic] = self.create_subscription(
             message_class(msgtype),

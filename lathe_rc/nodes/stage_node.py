@@ -8,11 +8,11 @@ from lathe_rc_msgs.srv import Schedule
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.framing import Framer
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.stage import Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.track import Track
-from lathe_rc.cell.wire import Encoder
+from lathe_rc.cell.wire import Block, Encoder, Room
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes.exchange import Delivery
 from lathe_rc.nodes.ports import BlockQueue, message_class, signal_qos
@@ -49,7 +49,6 @@ class StageNode(CellNode):
         ]
         for _, encoder in self._encoders:
             encoder.prepare(self.table.block_size)
-        self._buffers: dict[int, list[tuple[Signals, Samples]]] = {}
         self._sparse_topics = {topic: self.topic(topic) for topic in self.stage.sparse_topics}
         self._queues: dict[str, BlockQueue] = {}
         self._tracks: dict[str, Track] = {}
@@ -147,7 +146,8 @@ class StageNode(CellNode):
         while track.end < until and queue.blocks:
             block = queue.blocks.popleft()
             try:
-                block.copy_to(track.extend(block.samples))
+                # Who computes a block in this process has checked it.
+                block.copy_to(track.extend(block.samples), check=not queue.inside)
             except ValueError as error:
                 raise LatheError(f"{queue.topic}: {error}") from None
         return track.end >= until
@@ -157,13 +157,13 @@ class StageNode(CellNode):
         for queue in self._forward:
             if not queue.blocks:
                 return None
-        heads = [queue.blocks[0] for queue in self._forward]
-        head = heads[0]
+        head = self._forward[0].blocks[0]
         if not self._started:
             # Alone, a node may join a stream that is under way; in a cell it begins at 0.
             self._join(head.first_index)
-        for other in heads:
-            if other.first_index != self.samples or other.samples != head.samples:
+        for queue in self._forward:
+            if queue.blocks[0].first_index != self.samples or queue.blocks[0].samples != head.samples:
+                heads = [queue.blocks[0] for queue in self._forward]
                 spans = ", ".join(f"{b.source} {b.first_index}+{b.samples}" for b in heads)
                 raise LatheError(f"inputs are not cut into the same blocks at sample {self.samples}: {spans}")
         for queue in self._feedback:
@@ -201,15 +201,6 @@ class StageNode(CellNode):
                 queue.blocks.popleft()
             self.compute(samples, inputs, last=last)
 
-    def _room(self, samples: int) -> list[tuple[Signals, Samples]]:
-        """Arrays for a block's results, see `messages.allocate_together`: new ones where others here read them."""
-        shared = any(self.exchange.read(topic) for topic, _ in self._encoders)
-        outputs = None if shared else self._buffers.get(samples)
-        if outputs is None:
-            outputs = [messages.allocate_together(port.type, samples) for port in self.stage.outputs]
-            self._buffers[samples] = outputs
-        return outputs
-
     def _send(self, topic: str, data: bytes) -> None:
         """Publish, unless all who read the topic are in this process."""
         if topic in self._outside or not self.exchange.read(topic):
@@ -217,8 +208,8 @@ class StageNode(CellNode):
 
     def compute(self, samples: int, inputs: Sequence[Signals], *, last: bool) -> None:
         """Compute and publish one block."""
-        room = self._room(samples)
-        for sparse in self.stage.advance(self.samples, inputs, [signals for signals, _ in room]):
+        rooms = [encoder.room(samples) for _, encoder in self._encoders]
+        for sparse in self.stage.advance(self.samples, inputs, [room.signals for room in rooms]):
             framed = self._framer.sparse(sparse)
             topic, data = self._sparse_topics[sparse.topic], messages.encode(sparse.type, framed)
             self._send(topic, data)
@@ -227,29 +218,26 @@ class StageNode(CellNode):
                 values = {key: float(value) for key, value in sparse.values.items()}
                 self.reporter("cycle", self.get_name(), sample=sparse.index, **values)
         companions = self._framer.companions
-        for (topic, encoder), signals in zip(self._encoders, room, strict=True):
-            self._publish(topic, encoder, *signals, last=last, companions=companions)
+        for (topic, encoder), room in zip(self._encoders, rooms, strict=True):
+            encoder.stamp(room, self.samples, samples, last=last, companions=companions)
+            self._publish(topic, room, encoder.block(self.samples, room.signals, last=last, companions=companions))
         self.blocks += 1
         self.samples += samples
         self.progressed(self.blocks, self.samples, last=last)
         if last:
             self.ended()
 
-    def _publish(
-        self, topic: str, encoder: Encoder, signals: Signals, together: Samples, *, last: bool, companions: int
-    ) -> None:
+    def _publish(self, topic: str, room: Room, block: Block) -> None:
         """A block to those who read it, here and elsewhere."""
-        inside, data = self.exchange.read(topic), b""
-        if not inside or topic in self._outside or self.exchange.wants_bytes(topic):
-            _, data = encoder.encode(self.samples, signals, last=last, companions=companions, together=together)
-            self._send(topic, data)
+        inside = self.exchange.read(topic)
+        if not inside or topic in self._outside:
+            self.outlets[topic].publish(room.message.tobytes())
         if inside:
-            block = encoder.block(self.samples, signals, last=last, companions=companions)
             try:
-                block.check(together)
+                block.check(room.reals)
             except ValueError as error:
                 raise LatheError(f"{topic}: {error}") from None
-            self.exchange.hand_over(topic, Delivery(block, data))
+            self.exchange.hand_over(topic, Delivery(block, room.message.data))
 
     def ended(self) -> None:
         """The last block has been computed."""
