@@ -3,7 +3,7 @@
 
 rosbags encodes and decodes any message, at 10 µs each. All blocks of a topic, however, are the same bytes but for a
 few numbers and the samples. So for each length of block one message is encoded by rosbags, the places of the
-numbers are found by changing them one at a time, and from then on only those places are written or read. Whatever
+numbers are found by changing them, and from then on only those places are written or read. Whatever
 does not match the layout is decoded by rosbags and learned anew: CDR itself is nowhere written by hand.
 """
 
@@ -20,25 +20,18 @@ _BILLION = 1_000_000_000
 _MOST_FIELDS = 16
 _ZEROS = np.zeros(_MOST_FIELDS * (MAX_BLOCK + 1))
 _SHIFT = 4  # CDR aligns to what follows its first four bytes: with so many before, to memory as well
-# Number in the message: struct format and a value that differs from 0 in every byte.
-_NUMBERS = {
-    "sec": ("<i", 0x01010101),
-    "nanosec": ("<I", 0x01010101),
-    "first_index": ("<Q", 0x0101010101010101),
-    "step_ns": ("<I", 0x01010101),
-    "last": ("<?", 1),
-    "companions": ("<Q", 0x0101010101010101),
-}
+# What differs from block to block, but for the samples: the stamp, and what follows the texts of a BlockInfo.
+_STAMP = struct.Struct("<iI")  # sec, nanosec
+_INFO = struct.Struct("<QI?3xQ")  # first_index, step_ns, last, companions
+_NOTHING, _ANYTHING = (0, 0, 0, 0, False, 0), (0x01010101, 0x01010101, 2**56 + 1, 0x01010101, True, 2**56 + 1)
+_Numbers = tuple[int, int, int, int, bool, int]
 
 
-def _message(msgtype: str, run_id: str, source: str, samples: int, numbers: dict[str, int], fill: int = 0) -> bytes:
+def _message(msgtype: str, run_id: str, source: str, samples: int, numbers: _Numbers, fill: int = 0) -> bytes:
     """A block encoded by rosbags."""
-    values = dict.fromkeys(_NUMBERS, 0) | numbers
     types = messages.store().types
-    stamp = types["builtin_interfaces/msg/Time"](values["sec"], values["nanosec"])
-    info = types[f"{messages.PACKAGE}/msg/BlockInfo"](
-        run_id, source, values["first_index"], values["step_ns"], bool(values["last"]), values["companions"]
-    )
+    stamp = types["builtin_interfaces/msg/Time"](*numbers[:2])
+    info = types[f"{messages.PACKAGE}/msg/BlockInfo"](run_id, source, *numbers[2:])
     arrays = [
         np.frombuffer(bytes([fill]) * (samples * dtype.itemsize), dtype)
         for dtype in messages.sample_fields(msgtype).values()
@@ -51,16 +44,20 @@ class _Layout:
 
     def __init__(self, msgtype: str, run_id: str, source: str, samples: int) -> None:
         self.run_id, self.source, self.samples = run_id, source, samples
-        self.template = _message(msgtype, run_id, source, samples, {})
-        self.places: dict[str, tuple[struct.Struct, int]] = {}
-        changing = np.zeros(len(self.template), dtype=bool)
+        self.template = _message(msgtype, run_id, source, samples, _NOTHING)
         blank = np.frombuffer(self.template, np.uint8)
-        for name, (code, value) in _NUMBERS.items():
-            changed = np.frombuffer(_message(msgtype, run_id, source, samples, {name: value}), np.uint8) != blank
-            self.places[name] = struct.Struct(code), int(np.argmax(changed))
-            changing |= changed
-        self.numbers = [(code.unpack_from, place) for code, place in self.places.values()]
-        filled = np.frombuffer(_message(msgtype, run_id, source, samples, {}, fill=1), np.uint8) != blank
+        numbered = _message(msgtype, run_id, source, samples, _ANYTHING)
+        different = np.flatnonzero(np.frombuffer(numbered, np.uint8) != blank)
+        self.stamp = int(different[0])
+        self.info = int(different[different >= self.stamp + _STAMP.size][0])
+        patched = bytearray(self.template)
+        _STAMP.pack_into(patched, self.stamp, *_ANYTHING[:2])
+        _INFO.pack_into(patched, self.info, *_ANYTHING[2:])
+        assert patched == numbered, "the numbers of a block are not where CDR should have them"
+        changing = np.zeros(len(self.template), dtype=bool)
+        changing[self.stamp : self.stamp + _STAMP.size] = True
+        changing[self.info : self.info + _INFO.size] = True
+        filled = np.frombuffer(_message(msgtype, run_id, source, samples, _NOTHING, fill=1), np.uint8) != blank
         changing |= filled
         self.fields: dict[str, tuple[np.dtype[Any], int]] = {}
         edges = np.flatnonzero(np.diff(filled.astype(np.int8), prepend=0) == 1)
@@ -97,13 +94,9 @@ class Room(NamedTuple):
 class _Form:
     """How blocks of one length are made."""
 
-    def __init__(self, layout: _Layout, step_ns: int) -> None:
-        template = np.frombuffer(layout.template, np.uint8).copy()
-        code, place = layout.places["step_ns"]
-        code.pack_into(template.data, place, step_ns)  # in all blocks the same
-        self.template, self.samples = template, layout.samples
-        varying = [layout.places[name] for name in ("sec", "nanosec", "first_index", "last", "companions")]
-        self.numbers = [(code.pack_into, place) for code, place in varying]
+    def __init__(self, layout: _Layout) -> None:
+        self.template, self.samples = np.frombuffer(layout.template, np.uint8), layout.samples
+        self.stamp, self.info = layout.stamp, layout.info
         self.fields = [(name, dtype, place + _SHIFT) for name, (dtype, place) in layout.fields.items()]
         places = [place for _, dtype, place in self.fields if dtype == np.float64]
         gaps = set(np.diff(places).tolist()) or {8 * layout.samples}
@@ -194,7 +187,7 @@ class Encoder:
         self._form(samples)
 
     def _form(self, samples: int) -> _Form:
-        form = self._forms[samples] = _Form(_Layout(self._type, self._run_id, self._source, samples), self._step_ns)
+        form = self._forms[samples] = _Form(_Layout(self._type, self._run_id, self._source, samples))
         return form
 
     def room(self, samples: int) -> Room:
@@ -221,10 +214,9 @@ class Encoder:
             The stamp [ns].
         """
         log_ns = START_NS + (first + samples - 1) * self._step_ns
-        seconds, nanoseconds = divmod(log_ns, _BILLION)
-        data, values = room.message.data, (seconds, nanoseconds, first, last, companions)
-        for (pack_into, place), number in zip(self._forms[samples].numbers, values, strict=True):
-            pack_into(data, place, number)
+        form, data = self._forms[samples], room.message.data
+        _STAMP.pack_into(data, form.stamp, *divmod(log_ns, _BILLION))
+        _INFO.pack_into(data, form.info, first, self._step_ns, last, companions)
         return log_ns
 
     def encode(self, first: int, signals: Signals, *, last: bool, companions: int) -> tuple[int, bytes]:
@@ -251,7 +243,7 @@ class Decoder:
 
     def prepare(self) -> None:
         """Let rosbags build its codec of the type ahead of the first block."""
-        messages.decode(self._type, _message(self._type, "", "", 1, {}))
+        messages.decode(self._type, _message(self._type, "", "", 1, _NOTHING))
 
     def decode(self, data: bytes) -> Block:
         """A block from its bytes.
@@ -262,9 +254,8 @@ class Decoder:
         layout = self._layout
         if layout is None or not layout.fits(data):
             layout = self._layout = self._learn(data)
-        sec, nanosec, first_index, step_ns, last, companions = [
-            unpack(data, place)[0] for unpack, place in layout.numbers
-        ]
+        sec, nanosec = _STAMP.unpack_from(data, layout.stamp)
+        first_index, step_ns, last, companions = _INFO.unpack_from(data, layout.info)
         samples = layout.samples
         fields = layout.fields
         return Block(

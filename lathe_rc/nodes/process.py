@@ -68,6 +68,16 @@ def _due(nodes: Sequence[CellNode], now: float) -> float:
     return min((node.next_tick for node in nodes if not node.done), default=now)
 
 
+def _work(nodes: Sequence[CellNode], stop: _Stop, until: float) -> None:
+    """Let nodes compute: what one hands over inside is work for its neighbours; yet services get their turn."""
+    while (waiting := [node for node in nodes if node.due]) and not stop.signal:
+        for node in waiting:
+            node.due = False
+            node.work()
+        if time.monotonic() >= until:
+            return
+
+
 def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
     executor = EventsExecutor()
     for node in nodes:
@@ -94,11 +104,7 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
         handled = -1
         while handled < (handled := sum(node.handled for node in nodes)) and not stop.signal:
             executor.spin_once(timeout_sec=0.0)
-        # What a node hands over inside is work for its neighbours; services get their turn all the same.
-        while (waiting := [node for node in nodes if node.due]) and time.monotonic() < due and not stop.signal:
-            for node in waiting:
-                node.due = False
-                node.work()
+        _work(nodes, stop, due)
 
 
 def _tune() -> None:
