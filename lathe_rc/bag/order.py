@@ -11,21 +11,23 @@ Data = bytes | memoryview  #: an encoded message
 
 
 class Entry(NamedTuple):
-    """A message to be written; sorts as bags are sorted."""
+    """A message to be written; sorts as bags are sorted.
+
+    Attributes:
+        log_ns: log time.
+        topic: fully qualified.
+        sequence: number of the message on its topic, from 1.
+        data: its bytes.
+        first, companions, last: of a block: what its info says.
+    """
 
     log_ns: int
     topic: str
     sequence: int
     data: Data
-
-
-class Head(NamedTuple):
-    """A block message and what its info says."""
-
-    entry: Entry
-    first: int
-    companions: int
-    last: bool
+    first: int = 0
+    companions: int = 0
+    last: bool = False
 
 
 class Merger:
@@ -41,7 +43,7 @@ class Merger:
 
     def __init__(self, dense: Mapping[str, str], sparse: Mapping[str, str]) -> None:
         self._dense, self._sparse = dense, sparse
-        self._blocks: dict[str, deque[Head]] = {topic: deque() for topic in dense}
+        self._blocks: dict[str, deque[Entry]] = {topic: deque() for topic in dense}
         self._empty = len(self._blocks)  # topics without a block
         self._waiting: list[Entry] = []
         self._sequence = dict.fromkeys([*dense, *sparse], 0)
@@ -49,19 +51,19 @@ class Merger:
         self.blocks = 0  #: complete blocks given back, over all topics
         self.complete = False  #: True when the last block of every topic has been given back
 
-    def _entry(self, topic: str, log_ns: int, data: Data) -> Entry:
-        self._sequence[topic] += 1
-        return Entry(log_ns, topic, self._sequence[topic], data)
-
-    def add_block(self, topic: str, log_ns: int, data: Data, *, first: int, companions: int, last: bool) -> None:
-        """Take a block message."""
+    def add_block(self, topic: str, log_ns: int, data: Data, *, first: int, companions: int, last: bool) -> bool:
+        """Take a block message; returns whether every topic has one now, so that it is worth asking `release`."""
         queue = self._blocks[topic]
-        self._empty -= not queue
-        queue.append(Head(self._entry(topic, log_ns, data), first, companions, last))
+        if not queue:
+            self._empty -= 1
+        sequence = self._sequence[topic] = self._sequence[topic] + 1
+        queue.append(Entry(log_ns, topic, sequence, data, first, companions, last))
+        return not self._empty
 
     def add_sparse(self, topic: str, log_ns: int, data: Data) -> None:
         """Take a sparse message."""
-        self._waiting.append(self._entry(topic, log_ns, data))
+        self._sequence[topic] += 1
+        self._waiting.append(Entry(log_ns, topic, self._sequence[topic], data))
         self._received[self._sparse[topic]] += 1
 
     def release(self) -> Iterator[list[Entry]]:
@@ -74,16 +76,16 @@ class Merger:
             heads = [queue[0] for queue in self._blocks.values()]
             end = heads[0]
             for head in heads:
-                if head.first != end.first or head.entry.log_ns != end.entry.log_ns or head.last != end.last:
-                    spans = ", ".join(f"{other.entry.topic} from {other.first}" for other in heads)
+                if head.first != end.first or head.log_ns != end.log_ns or head.last != end.last:
+                    spans = ", ".join(f"{other.topic} from {other.first}" for other in heads)
                     raise LatheError(f"topics are not cut into the same blocks: {spans}")
-                if self._received.get(self._dense[head.entry.topic], 0) < head.companions:
+                if self._received.get(self._dense[head.topic], 0) < head.companions:
                     return
-            entries = [queue.popleft().entry for queue in self._blocks.values()]
+            entries = [queue.popleft() for queue in self._blocks.values()]
             self._empty = sum(not queue for queue in self._blocks.values())
             if self._waiting:
-                entries += [entry for entry in self._waiting if entry.log_ns <= end.entry.log_ns]
-                self._waiting = [entry for entry in self._waiting if entry.log_ns > end.entry.log_ns]
+                entries += [entry for entry in self._waiting if entry.log_ns <= end.log_ns]
+                self._waiting = [entry for entry in self._waiting if entry.log_ns > end.log_ns]
             self.blocks += 1
             self.complete = end.last
             entries.sort()
@@ -91,8 +93,9 @@ class Merger:
 
     def rest(self) -> list[Entry]:
         """Give back everything that is left, sorted: what an interrupted run has of its last blocks."""
-        left = [*self._waiting, *(block.entry for queue in self._blocks.values() for block in queue)]
+        left = [*self._waiting, *(block for queue in self._blocks.values() for block in queue)]
         self._waiting = []
         for queue in self._blocks.values():
             queue.clear()
+        self._empty = len(self._blocks)
         return sorted(left)

@@ -147,15 +147,15 @@ class RecorderNode(CellNode):
         if self._merger is None:
             self._write_unsorted(queue, block, data)
             return
-        self._merger.add_block(
+        if self._merger.add_block(
             queue.topic,
             block.log_ns,
             data,
             first=block.first_index,
             companions=block.companions,
             last=block.last,
-        )
-        self._drain()
+        ):
+            self._drain()
 
     def _write_unsorted(self, queue: BlockQueue, block: Block, data: Data) -> None:
         """Free-running, blocks may be missing, so nothing can be waited for: write in the order of arrival."""
@@ -179,7 +179,8 @@ class RecorderNode(CellNode):
         assert self._merger is not None
         for entries in self._merger.release():
             for entry in entries:
-                self._write(entry)
+                self._open.write(entry.topic, entry.log_ns, entry.data)
+            self._log_ns = entries[-1].log_ns
             self._blocks += 1
             self._samples = (self._log_ns - messages.START_NS) // self.table.step_ns + 1
             if self._merger.complete:

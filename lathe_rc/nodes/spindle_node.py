@@ -70,8 +70,8 @@ class SpindleNode(StageNode):
         """See `CellNode`."""
         return {
             **super().statistics(),
-            "blocks in flight": self.blocks - self._slowest[1],
-            "slowest member": self._slowest[0],
+            "blocks in flight": self.blocks - self._least,
+            "slowest member": self._slowest,
             "schedule slipped [s]": round(self.slipped, 3),
         }
 
@@ -79,9 +79,13 @@ class SpindleNode(StageNode):
         self._state.publish(CellState(run_id=self.table.run_id, state=state, first_index=first, message=why[:1024]))
 
     @property
-    def _slowest(self) -> tuple[str, int]:
-        name = min(self._completed, key=lambda name: self._completed[name], default="")
-        return name, self._completed.get(name, self.blocks)
+    def _slowest(self) -> str:
+        return min(self._completed, key=lambda name: self._completed[name], default="")
+
+    @property
+    def _least(self) -> int:
+        """Blocks that every member has completed."""
+        return min(self._completed.values(), default=self.blocks)
 
     # ---- start --------------------------------------------------------------------------------------
 
@@ -123,12 +127,13 @@ class SpindleNode(StageNode):
             return
         if progress.blocks > self.blocks:
             raise LatheError(f"{progress.name} claims {progress.blocks} blocks; {self.blocks} were sent")
-        before = self._slowest[1]
+        before = self._least
         self._completed[progress.name] = progress.blocks
+        least = self._least
         self._heard = time.monotonic()
         self._stalled = ""
-        if self._slowest[1] > before:
-            samples = min(self._slowest[1] * self.table.block_size, self.samples)
+        if least > before:
+            samples = min(least * self.table.block_size, self.samples)
             stamp = messages.header(max(samples - 1, 0), self.table.step_ns).stamp
             clock = Clock()
             clock.clock.sec, clock.clock.nanosec = stamp.sec, stamp.nanosec
@@ -136,7 +141,7 @@ class SpindleNode(StageNode):
             if self._heard >= self._report_due:
                 self._report_due = self._heard + _REPORT_PERIOD
                 self.reporter("progress", self.get_name(), samples=samples)
-        if self._slowest[1] == self._blocks_in_run:
+        if least == self._blocks_in_run:
             self._finish_run()
         else:
             self.release()
@@ -145,7 +150,7 @@ class SpindleNode(StageNode):
         """Whether the window lets one more block go."""
         if not self._completed or not self.table.window:
             return True
-        return self.blocks - self._slowest[1] < self.table.window
+        return self.blocks - self._least < self.table.window
 
     def release(self) -> None:
         """Let go every block that credit and pace allow."""
@@ -202,7 +207,7 @@ class SpindleNode(StageNode):
         if not self._running and not self._member_names:
             self._begin()
         self.release()
-        name, blocks = self._slowest
+        name, blocks = self._slowest, self._least
         if self._running and not self._credit() and now - self._heard > _STALL and self._stalled != name:
             self._stalled = name
             self.get_logger().warning(f"{name} has been silent for {_STALL * 1e3:.0f} ms at block {blocks}")
