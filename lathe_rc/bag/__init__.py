@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags: write, read, repair."""
+"""Bags: write, read, check, recover."""

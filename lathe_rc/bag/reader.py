@@ -1,57 +1,52 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading bags of the cell back."""
+"""Reading bags of the cell back, whole."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from rosbags.rosbag2 import Reader, ReaderError
 
+from lathe_rc.bag.stream import feed
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc.cell.messages import START_NS, Samples, Signals
 from lathe_rc.cell.recording import Recording, SparseTopic
-from lathe_rc.cell.wire import Decoder
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.cell.stage import Sparse
+
+
+class _Whole:
+    """Keeps every piece; a sink."""
+
+    def __init__(self) -> None:
+        self.dense: dict[str, dict[str, list[Samples]]] = {}
+        self.sparse: dict[str, list[Sparse]] = {}
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        for topic, signals in dense.items():
+            fields = self.dense.setdefault(topic, {name: [] for name in signals})
+            for name, array in signals.items():
+                fields[name].append(array)
+        for topic, found in sparse.items():
+            self.sparse.setdefault(topic, []).extend(found)
 
 
 def read(path: Path) -> Recording:
-    """All signal topics of a bag.
+    """All signal topics of a bag; memory for all of it is needed, see `lathe_rc.bag.stream` otherwise.
 
     Raises:
         InputError: not a bag.
         LatheError: a block is missing or repeated.
     """
-    parts: dict[str, dict[str, list[Samples]]] = {}
-    sparse: dict[str, SparseTopic] = {}
-    expected: dict[str, int] = {}
-    decoders: dict[str, Decoder] = {}
-    types: dict[str, str] = {}
-    try:
-        with Reader(path) as reader:
-            known = messages.block_types() | messages.sparse_types()
-            wanted = [connection for connection in reader.connections if connection.msgtype in known]
-            for connection in wanted:
-                types[connection.topic] = connection.msgtype
-                if connection.msgtype in messages.block_types():
-                    decoders[connection.topic] = Decoder(connection.msgtype)
-                    parts[connection.topic] = {name: [] for name in messages.sample_fields(connection.msgtype)}
-                    expected[connection.topic] = 0
-                else:
-                    sparse[connection.topic] = SparseTopic()
-            for connection, stamp, data in reader.messages(wanted):
-                topic = connection.topic
-                if topic in sparse:
-                    sparse[topic].add(stamp, messages.decode(connection.msgtype, bytes(data)))
-                    continue
-                block = decoders[topic].decode(bytes(data))
-                if block.first_index != expected[topic]:
-                    raise LatheError(f"{path}: {topic} goes from sample {expected[topic]} to {block.first_index}")
-                expected[topic] += block.samples
-                for name, arrays in parts[topic].items():
-                    arrays.append(block.signals[name])
-    except (ReaderError, OSError, ValueError) as error:
-        raise InputError(f"{path}: not a readable bag ({error})") from None
-    dense = {
-        topic: {name: np.concatenate(arrays) if arrays else np.empty(0) for name, arrays in fields.items()}
-        for topic, fields in parts.items()
-    }
-    return Recording(types, dense, sparse)
+    whole = _Whole()
+    header = feed(path, [whole])
+    dense, sparse = {}, {}
+    for topic, msgtype in header.types.items():
+        if msgtype in messages.block_types():
+            parts = whole.dense.get(topic, {})
+            empty = messages.allocate(msgtype, 0)
+            dense[topic] = {name: np.concatenate(parts.get(name) or [array]) for name, array in empty.items()}
+        else:
+            sparse[topic] = SparseTopic()
+            for message in whole.sparse.get(topic, []):
+                sparse[topic].append(START_NS + message.index * header.step_ns, message.values)
+    return Recording(header.types, dense, sparse)

@@ -5,7 +5,7 @@ rosbags writes the directory, its metadata and the schemas. Its own MCAP storage
 flush, which are what a crash promise needs; `lathe_rc.bag.mcap_file` has.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Literal, cast
@@ -20,8 +20,9 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from rosbags.rosbag2 import CompressionMode, StoragePlugin, WriterError
 from rosbags.rosbag2 import Writer as RosbagWriter
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from lathe_rc.bag.mcap_file import McapFile
 from lathe_rc.cell import messages
@@ -118,7 +119,7 @@ class BagWriter:
         path: its folder; must not exist.
         compression: of the chunks.
         chunk_size: bytes after which a chunk is written out: what a crash may lose.
-        about: key and text pairs for the bag's metadata.
+        about: texts that the bag says of itself, see `tell`.
 
     Raises:
         InputError: the folder exists or cannot be made.
@@ -127,18 +128,58 @@ class BagWriter:
     def __init__(self, path: Path, *, compression: Compression, chunk_size: int, about: Mapping[str, str]) -> None:
         refuse_existing(path)
         self._writer = _Writer(path, chunk_size, compress=compression == "zstd")
-        for key, text in about.items():
-            self._writer.set_custom_data(key, text)
         try:
             self._writer.open()
         except OSError as error:
             raise InputError(f"{path}: cannot be made ({error.strerror})") from None
         self._file = self._writer.mcap.file
         self._channels: dict[str, int] = {}
+        self.tell(about)
+
+    def tell(self, about: Mapping[str, str]) -> None:
+        """Store texts: in the file at once, where they survive a crash, and in metadata.yaml at the end."""
+        for key, text in about.items():
+            self._writer.set_custom_data(key, text)
+        if about:
+            self._file.add_metadata("lathe_rc", about)
 
     def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
-        """Announce a fully qualified topic."""
-        connection = self._writer.add_connection(topic, msgtype, typestore=messages.store(), offered_qos_profiles=[qos])
+        """Announce a fully qualified topic of a type that this package knows."""
+        self._added(
+            topic, self._writer.add_connection(topic, msgtype, typestore=messages.store(), offered_qos_profiles=[qos])
+        )
+
+    def copy_topic(self, topic: str, msgtype: str, qos: Sequence[Qos], *, definition: str, digest: str) -> bool:
+        """Announce a topic as another bag describes it.
+
+        Args:
+            topic: name.
+            msgtype: message type.
+            qos: of its publishers.
+            definition: text of the type; may be empty if this package or ROS itself has it.
+            digest: of the type; may be empty.
+
+        Returns:
+            False if nobody knows the type.
+        """
+        store = messages.store()
+        try:
+            if definition and not digest:
+                store = get_typestore(Stores.ROS2_JAZZY)
+                own = get_types_from_msg(definition, msgtype)
+                store.register({name: fields for name, fields in own.items() if name not in store.fielddefs})
+            if definition and digest:
+                made = self._writer.add_connection(
+                    topic, msgtype, msgdef=definition, rihs01=digest, offered_qos_profiles=qos
+                )
+            else:
+                made = self._writer.add_connection(topic, msgtype, typestore=store, offered_qos_profiles=qos)
+        except (TypesysError, WriterError, KeyError):
+            return False
+        self._added(topic, made)
+        return True
+
+    def _added(self, topic: str, connection: Connection) -> None:
         self._channels[topic] = self._writer.mcap.channels[connection.id]
 
     def write(self, topic: str, log_ns: int, data: bytes | memoryview) -> None:
@@ -149,6 +190,17 @@ class BagWriter:
         """
         try:
             self._file.add_message(self._channels[topic], log_ns, data)
+        except OSError as error:
+            raise LatheError(f"{self._writer.path}: cannot write ({error.strerror})") from None
+
+    def flush(self) -> None:
+        """Hand what has been written so far to the operating system.
+
+        Raises:
+            LatheError: the disk does not take it.
+        """
+        try:
+            self._file.flush()
         except OSError as error:
             raise LatheError(f"{self._writer.path}: cannot write ({error.strerror})") from None
 

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Making a complete bag of one that was cut off or is broken in places."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from lathe_rc.bag.salvage import Salvage
+from lathe_rc.bag.writer import BagWriter, refuse_existing
+
+_CHUNK = 2**20  # [B]
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What came of a broken bag.
+
+    Attributes:
+        saved: messages.
+        skipped: messages of topics whose type nobody knows.
+        lost_bytes: bytes of the files that gave nothing.
+        damage: what was wrong, one line each.
+    """
+
+    saved: int
+    skipped: int
+    lost_bytes: int
+    damage: tuple[str, ...]
+
+    @property
+    def lossy(self) -> bool:
+        """Whether anything is missing."""
+        return bool(self.lost_bytes or self.skipped)
+
+
+def recover(path: Path, target: Path) -> Recovery:
+    """Write what is whole of a bag to a new one.
+
+    Args:
+        path: folder or file.
+        target: folder of the new bag; must not exist.
+
+    Raises:
+        InputError: nothing to read from, or the target exists.
+        LatheError: the disk does not take it.
+    """
+    refuse_existing(target)
+    salvage = Salvage(path)
+    writer = BagWriter(target, compression="zstd", chunk_size=_CHUNK, about={})
+    known: set[str] = set()
+    refused: set[str] = set()
+    saved = skipped = 0
+    try:
+        for topic, log_ns, data in salvage:
+            if topic not in known and topic not in refused:
+                said = salvage.topics[topic]
+                added = writer.copy_topic(topic, said.type, said.qos, definition=said.definition, digest=said.digest)
+                (known if added else refused).add(topic)
+            if topic in refused:
+                skipped += 1
+                continue
+            writer.write(topic, log_ns, data)
+            saved += 1
+        for topic, said in salvage.topics.items():
+            if topic not in known | refused:  # announced, without a message
+                writer.copy_topic(topic, said.type, said.qos, definition=said.definition, digest=said.digest)
+        writer.tell(salvage.about | {"lathe_rc.recovered": f"{saved} messages; {salvage.lost_bytes} B lost"})
+    finally:
+        writer.close()
+    damage = [*salvage.damage, *(f"{topic}: type {salvage.topics[topic].type} is not known" for topic in refused)]
+    return Recovery(saved, skipped, salvage.lost_bytes, tuple(damage))
+
+
+def mend(path: Path) -> Recovery | None:
+    """Complete a bag in place: index and metadata for every message that reached the disk.
+
+    Args:
+        path: folder of the bag.
+
+    Returns:
+        None if there was nothing to mend.
+    """
+    if not any(path.glob("*.mcap")) or (path / "metadata.yaml").exists():
+        return None
+    workshop = path.with_name(f"{path.name}.mending")
+    shutil.rmtree(workshop, ignore_errors=True)
+    new = workshop / path.name  # the file inside takes the folder's name
+    found = recover(path, new)
+    old = path.with_name(f"{path.name}.cut")
+    path.rename(old)
+    new.rename(path)
+    workshop.rmdir()
+    shutil.rmtree(old)
+    return found
