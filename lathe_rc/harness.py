@@ -28,7 +28,8 @@ from typing import Any, Literal
 
 from lathe_rc import part
 from lathe_rc.analysis.metrology import FormErrors, Measurement, form_errors
-from lathe_rc.bag import reader, repair
+from lathe_rc.bag import reader, recover
+from lathe_rc.bag.check import write_digests
 from lathe_rc.bag.record import OfflineRecorder, about
 from lathe_rc.bag.writer import BagWriter, refuse_existing
 from lathe_rc.cell import messages
@@ -175,6 +176,22 @@ def run(
         raise InputError(f"{cell.master.name}.revolutions = 0; the run needs an end: allowed above 0")
     if bag is not None:
         refuse_existing(bag)
+    result = _run(scenario, cell, mode, groups, bag, watch, domain)
+    if bag is not None:
+        write_digests(bag, result.digest)
+    return result
+
+
+def _run(
+    scenario: Scenario,
+    cell: Cell,
+    mode: Mode,
+    groups: Sequence[Sequence[str]] | None,
+    bag: Path | None,
+    watch: Callable[[Event], None],
+    domain: int | None,
+) -> Result:
+    assert cell.master.samples is not None
     watch({"event": "checked", "node": cell.master.name, "samples": cell.master.samples, "step": scenario.shared.step})
     if mode == "offline":
         return _offline(scenario, cell, bag, watch)
@@ -190,7 +207,7 @@ def run(
         except BaseException:
             processes.stop()
             if bag is not None:
-                repair.mend(bag)
+                recover.mend(bag)
             raise
         return Result(
             scenario=scenario,

@@ -17,7 +17,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness
-from lathe_rc.bag import reader, repair
+from lathe_rc.bag import reader, recover
 from lathe_rc.cell import messages
 from lathe_rc.errors import InputError
 
@@ -213,7 +213,7 @@ def test_what_is_no_bag_is_refused(tmp_path, make):
         reader.read(bag)
 
 
-# --- repair
+# --- recovery
 
 
 def chunks_of(path):
@@ -251,7 +251,7 @@ def test_every_complete_chunk_of_a_cut_bag_is_saved(recorded, tmp_path_factory, 
     length = int(part * file_of(path).stat().st_size)
     expected = max((count for end, count in chunks_of(path) if end <= length), default=0)
     broken = cut(path, tmp_path_factory.mktemp("cut"), length)
-    assert repair.mend(broken) == expected
+    assert recover.mend(broken).saved == expected
     assert read_by_mcap(broken) == read_by_mcap(path)[:expected]
     assert len(read_by_rosbags(broken)) == expected
     saved = reader.read(broken)
@@ -270,13 +270,13 @@ def test_cut_bag_with_a_damaged_end_is_saved_up_to_it(recorded, tmp_path, part, 
     with file_of(broken).open("ab") as stream:
         stream.write(tail)
     expected = max(count for end, count in chunks_of(recorded.path) if end <= length)
-    assert repair.mend(broken) == expected
+    assert recover.mend(broken).saved == expected
     assert read_by_mcap(broken) == read_by_mcap(recorded.path)[:expected]
 
 
 def test_saved_bag_keeps_schemas_and_qos(recorded, tmp_path):
     broken = cut(recorded.path, tmp_path, file_of(recorded.path).stat().st_size // 2)
-    repair.mend(broken)
+    recover.mend(broken)
 
     def told(path):
         with file_of(path).open("rb") as stream:
@@ -288,12 +288,12 @@ def test_saved_bag_keeps_schemas_and_qos(recorded, tmp_path):
 
 def test_whole_bag_is_left_alone(recorded):
     before = file_of(recorded.path).read_bytes()
-    assert repair.mend(recorded.path) is None
+    assert recover.mend(recorded.path) is None
     assert file_of(recorded.path).read_bytes() == before
 
 
 def test_nothing_is_made_where_there_is_no_bag(tmp_path):
-    assert repair.mend(tmp_path / "none") is None
+    assert recover.mend(tmp_path / "none") is None
     assert not list(tmp_path.iterdir())
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from lathe_rc.cell.messages import Samples, Signals
 
-_NOT_SIGNALS = {"header", "run_id", "source", "__msgtype__"}
+NOT_SIGNALS = {"header", "run_id", "source", "__msgtype__"}
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,13 @@ class SparseTopic:
 
     def add(self, stamp: int, message: Any) -> None:
         """Append a message."""
+        self.append(stamp, {name: value for name, value in vars(message).items() if name not in NOT_SIGNALS})
+
+    def append(self, stamp: int, values: Mapping[str, Any]) -> None:
+        """Append the values of a message."""
         self.stamps.append(stamp)
-        for name, value in vars(message).items():
-            if name not in _NOT_SIGNALS:
-                self.values.setdefault(name, []).append(value)
+        for name, value in values.items():
+            self.values.setdefault(name, []).append(value)
 
 
 @dataclass(frozen=True)
@@ -52,10 +55,36 @@ class Recording:
         It is the SHA-256 of the SHA-256 of each field's samples in the order of the fields, little-endian; of sparse
         topics the time stamps come first. Blocks leave no trace in it.
         """
-        found = {topic: _combine(list(signals.values())) for topic, signals in self.dense.items()}
-        for topic, part in self.sparse.items():
-            found[topic] = _combine([np.array(part.stamps, dtype=np.int64), *map(_flat, part.values.values())])
-        return dict(sorted(found.items()))
+        digester = Digester()
+        for topic, signals in self.dense.items():
+            digester.dense(topic, signals)
+        return digester.result(self.sparse)
+
+
+class Digester:
+    """Digests of a run whose signals come in pieces; see `Recording.digests`."""
+
+    def __init__(self) -> None:
+        self._fields: dict[str, dict[str, Any]] = {}
+
+    def dense(self, topic: str, signals: Signals) -> None:
+        """Take the next samples of a dense topic, arrays of shape (n,) by field."""
+        fields = self._fields.setdefault(topic, {name: hashlib.sha256() for name in signals})
+        for name, samples in signals.items():
+            fields[name].update(_bytes(samples))
+
+    def result(self, sparse: Mapping[str, SparseTopic]) -> dict[str, str]:
+        """One digest for each topic, the sparse ones whole."""
+        found = {topic: [part.digest() for part in fields.values()] for topic, fields in self._fields.items()}
+        for topic, part in sparse.items():
+            arrays = [np.array(part.stamps, dtype=np.int64), *map(_flat, part.values.values())]
+            found[topic] = [hashlib.sha256(_bytes(array)).digest() for array in arrays]
+        return {topic: hashlib.sha256(b"".join(parts)).hexdigest() for topic, parts in sorted(found.items())}
+
+
+def _bytes(samples: Samples) -> memoryview:
+    little = samples.astype(samples.dtype.newbyteorder("<"), copy=False)
+    return np.ascontiguousarray(little).data
 
 
 def _flat(values: Sequence[Any]) -> Samples:
@@ -66,11 +95,3 @@ def _flat(values: Sequence[Any]) -> Samples:
             text = isinstance(item, str)
             parts.append(np.frombuffer(f"{item}\0".encode(), np.uint8) if text else np.atleast_1d(item))
     return np.concatenate(parts) if parts else np.empty(0)
-
-
-def _combine(fields: Sequence[Samples]) -> str:
-    whole = hashlib.sha256()
-    for samples in fields:
-        little = samples.astype(samples.dtype.newbyteorder("<"), copy=False)
-        whole.update(hashlib.sha256(np.ascontiguousarray(little).data).digest())
-    return whole.hexdigest()

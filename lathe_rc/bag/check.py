@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a bag is what it should be: every sample once, finite, and as it was when it was recorded."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lathe_rc.bag.source import Source
+from lathe_rc.cell import messages
+from lathe_rc.cell.recording import NOT_SIGNALS, Digester, SparseTopic
+from lathe_rc.cell.wire import Block, Decoder
+from lathe_rc.errors import InputError
+
+DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, as the harness found them
+_MOST_FINDINGS = 20  # that are told of one topic
+_MOST_DIGESTS = 2**20  # size of that file [B]
+
+
+@dataclass
+class Findings:
+    """What a check found.
+
+    Attributes:
+        wrong: what should not be there: numbers that are none, other digests than recorded.
+        lost: what should be there: gaps, topics that end early.
+        digests: of each signal topic, as `lathe_rc.cell.recording` makes them; empty if something is lost.
+        compared: topics whose digest was recorded and is the same.
+        messages: all of them.
+        samples: of the dense topics that are all of one length.
+    """
+
+    wrong: list[str] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
+    digests: dict[str, str] = field(default_factory=dict)
+    compared: int = 0
+    messages: int = 0
+    samples: int = 0
+
+    @property
+    def exit_code(self) -> int:
+        """0: clean; 3: something is lost; 1: something is wrong."""
+        return 1 if self.wrong else 3 if self.lost else 0
+
+
+class _Dense:
+    """Looks at the blocks of a topic."""
+
+    def __init__(self, topic: str, msgtype: str, findings: Findings, digester: Digester) -> None:
+        self._topic, self._findings, self._digester = topic, findings, digester
+        self._decoder = Decoder(msgtype)
+        self._told = 0
+        self._step_ns: int | None = None
+        self._run_id = ""
+        self.end = 0
+        self.ended = False
+
+    def _tell(self, where: list[str], what: str) -> None:
+        self._told += 1
+        if self._told <= _MOST_FINDINGS:
+            where.append(f"{self._topic}: {what}")
+        elif self._told == _MOST_FINDINGS + 1:
+            where.append(f"{self._topic}: and more of the kind")
+
+    def add(self, log_ns: int, data: bytes) -> None:
+        try:
+            block = self._decoder.decode(data)
+        except ValueError as error:
+            self._tell(self._findings.wrong, str(error))
+            return
+        if self._step_ns is None:
+            self._step_ns, self._run_id = block.step_ns, block.run_id
+        if (block.step_ns, block.run_id) != (self._step_ns, self._run_id):
+            self._tell(self._findings.wrong, f"another run or step from sample {block.first_index} on")
+        if self.ended:
+            self._tell(self._findings.wrong, f"goes on at sample {block.first_index} after its last block")
+        if log_ns != block.log_ns:
+            self._tell(self._findings.wrong, f"log time {log_ns} ns of the block at {block.first_index}, not its stamp")
+        self._sequence(block)
+        self._finite(block)
+        self._digester.dense(self._topic, block.signals)
+        self.end, self.ended = block.first_index + block.samples, block.last
+
+    def _sequence(self, block: Block) -> None:
+        missing = block.first_index - self.end
+        if missing > 0:
+            self._tell(self._findings.lost, f"{missing} samples are missing before sample {block.first_index}")
+        elif missing < 0:
+            self._tell(self._findings.wrong, f"goes back from sample {self.end} to {block.first_index}")
+
+    def _finite(self, block: Block) -> None:
+        for name, array in block.signals.items():
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                bad = int(np.flatnonzero(~np.isfinite(array))[0])
+                self._tell(self._findings.wrong, f"{name} = {array[bad]} at sample {block.first_index + bad}")
+
+
+def check(path: Path) -> Findings:
+    """Look at every message of a bag.
+
+    Raises:
+        InputError: not a bag, or one that is cut off or broken: then only `lathe_rc.bag.recover` reads it.
+    """
+    findings, digester = Findings(), Digester()
+    sparse: dict[str, SparseTopic] = {}
+    with Source(path) as source:
+        types = {topic: said.type for topic, said in source.topics.items()}
+        dense = {t: _Dense(t, k, findings, digester) for t, k in types.items() if k in messages.block_types()}
+        sparse = {topic: SparseTopic() for topic, kind in types.items() if kind in messages.sparse_types()}
+        counts = dict.fromkeys(types, 0)
+        for topic, log_ns, data in source.messages():
+            counts[topic] += 1
+            if topic in dense:
+                dense[topic].add(log_ns, data)
+            elif topic in sparse:
+                _add(sparse[topic], topic, types[topic], log_ns, data, findings)
+        for topic, said in source.topics.items():
+            if said.count != counts[topic]:
+                findings.wrong.append(f"{topic}: {counts[topic]} messages, {said.count} by the metadata")
+        findings.messages = sum(counts.values())
+    _ends(dense, findings)
+    if dense and not findings.lost and not findings.wrong:
+        findings.digests = digester.result(sparse)
+        _compare(path, findings)
+    return findings
+
+
+def _add(part: SparseTopic, topic: str, msgtype: str, log_ns: int, data: bytes, findings: Findings) -> None:
+    try:
+        message = messages.decode(msgtype, data)
+    except Exception as error:  # noqa: BLE001 - rosbags' generated code raises whatever broken bytes lead to
+        findings.wrong.append(f"{topic}: message at {log_ns} ns cannot be decoded ({type(error).__name__})")
+        return
+    part.append(log_ns, {name: value for name, value in vars(message).items() if name not in NOT_SIGNALS})
+
+
+def _ends(dense: Mapping[str, _Dense], findings: Findings) -> None:
+    """Every dense topic of a complete run ends with the same sample, in a block that says so."""
+    end = max((part.end for part in dense.values()), default=0)
+    for topic, part in dense.items():
+        if part.end < end:
+            findings.lost.append(f"{topic}: ends at sample {part.end}, others at {end}")
+        elif not part.ended:
+            findings.lost.append(f"{topic}: no last block; the run went on")
+    findings.samples = end
+
+
+def _compare(path: Path, findings: Findings) -> None:
+    file = path / DIGESTS
+    if not path.is_dir() or not file.exists():
+        return
+    if file.stat().st_size > _MOST_DIGESTS:
+        raise InputError(f"{file}: {file.stat().st_size} B; allowed: up to {_MOST_DIGESTS}")
+    try:
+        recorded: Any = json.loads(file.read_text(encoding="utf-8"))
+        told = {str(topic): str(digest) for topic, digest in recorded["digest"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        findings.wrong.append(f"{DIGESTS}: not what the harness writes")
+        return
+    for topic in sorted(told | findings.digests):
+        if told.get(topic) != findings.digests.get(topic):
+            findings.wrong.append(f"{topic}: digest {findings.digests.get(topic)}, recorded {told.get(topic)}")
+        else:
+            findings.compared += 1
+
+
+def write_digests(path: Path, digest: Mapping[str, str]) -> None:
+    """Leave the digests of a run in its bag's folder."""
+    (path / DIGESTS).write_text(json.dumps({"digest": dict(digest)}, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Opening bags, whoever made them: rosbag2 folders of any storage and compression that rosbags reads, or an MCAP file.
+
+Nothing in a bag is trusted: what it says of sizes is checked before anything of that size is made.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import lz4.frame
+import zstandard
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC
+from rosbags.interfaces import Qos
+from rosbags.rosbag2 import Reader, ReaderError
+
+from lathe_rc.errors import InputError
+
+MOST_BYTES = 2**28  #: longest chunk or record that is read into memory [B]
+MOST_TOPICS = 4096  #: topics of a bag
+MOST_TEXT = 2**20  #: longest text in its metadata [B]
+
+_RECORD = struct.Struct("<BQ")  # opcode, length
+_CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
+_BROKEN = (ReaderError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error, EOFError)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """What a bag says of a topic.
+
+    Attributes:
+        type: message type.
+        definition: its text.
+        qos: offered by the publishers.
+        count: messages.
+    """
+
+    type: str
+    definition: str
+    qos: tuple[Qos, ...]
+    count: int
+
+
+def unpack(compression: str, data: bytes, size: int) -> bytes:
+    """The records of a chunk; never more than it says.
+
+    Raises:
+        ValueError: it does not unpack to ``size`` bytes, or not at all.
+    """
+    if not 0 <= size <= MOST_BYTES:
+        raise ValueError(f"{size} B when unpacked; allowed: up to {MOST_BYTES}")
+    try:
+        if compression == "zstd":
+            unpacker = zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True)
+            whole = unpacker.read(size + 1)
+        elif compression == "lz4":
+            whole = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+        elif compression == "":
+            whole = data
+        else:
+            raise ValueError(f"compression {compression[:64]!r} is not known; allowed: zstd, lz4, none")
+    except (zstandard.ZstdError, RuntimeError) as error:
+        raise ValueError(_line(error)) from None
+    if len(whole) != size:
+        raise ValueError(f"it does not unpack to the {size} B that it says")
+    return whole
+
+
+def unpacked_size(data: bytes) -> int:
+    """Size that a zstd frame says it has [B], from its first 18 bytes; -1 if it says nothing or is none."""
+    try:
+        return int(zstandard.frame_content_size(data))
+    except zstandard.ZstdError:
+        return -1
+
+
+def read_record(stream: BinaryIO, limit: int) -> tuple[int, bytes] | None:
+    """Opcode and content of the next record of an MCAP file.
+
+    Args:
+        stream: at a record.
+        limit: where the file or the chunk ends.
+
+    Returns:
+        None at the end.
+
+    Raises:
+        ValueError: it is cut off, or longer than allowed.
+    """
+    place = stream.tell()
+    if place == limit:
+        return None
+    head = stream.read(_RECORD.size)
+    opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, limit)
+    if place + _RECORD.size + length > limit:
+        raise ValueError(f"cut off at byte {place}")
+    if length > MOST_BYTES:
+        raise ValueError(f"record of {length} B at byte {place}; allowed: up to {MOST_BYTES}")
+    return opcode, stream.read(length)
+
+
+def read_chunk(content: bytes) -> bytes:
+    """The records of a chunk.
+
+    Raises:
+        ValueError: it is broken.
+    """
+    if len(content) < _CHUNK.size:
+        raise ValueError("chunk without a head")
+    _, _, size, crc, name = _CHUNK.unpack_from(content)
+    if size > MOST_BYTES or _CHUNK.size + name + 8 > len(content):
+        raise ValueError(f"chunk of {size} B; allowed: up to {MOST_BYTES}")
+    compression = content[_CHUNK.size : _CHUNK.size + name].decode("utf-8", "replace")
+    whole = unpack(compression, content[_CHUNK.size + name + 8 :], size)
+    if crc and zlib.crc32(whole) != crc:
+        raise ValueError("the checksum of a chunk is wrong")
+    return whole
+
+
+def _check_sizes(path: Path) -> None:
+    """Refuse an MCAP file in which something is longer than it says or than is allowed.
+
+    Raises:
+        ValueError: names the place.
+    """
+    limit = path.stat().st_size - len(MCAP0_MAGIC)
+    with path.open("rb") as stream:
+        if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+            raise ValueError(f"{path.name}: not an MCAP file")
+        place = stream.tell()
+        try:
+            while record := read_record(stream, limit):
+                if record[0] == Opcode.CHUNK:
+                    read_chunk(record[1])
+                place = stream.tell()
+        except ValueError as error:
+            raise ValueError(f"{path.name}: {error}, after byte {place}; lathe bag recover saves the rest") from None
+
+
+class Source:
+    """A bag that is read; a context manager.
+
+    Args:
+        path: a rosbag2 folder or an MCAP file.
+
+    Attributes:
+        path: see above.
+        topics: by name.
+        about: texts that the bag says of itself, see docs/bags.md.
+        first_ns, last_ns: smallest and largest log time; 0 and 0 if it is empty.
+
+    Raises:
+        InputError: not a bag, or one that cannot be whole.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        files = [path] if path.is_file() else sorted(path.glob("*.mcap"))
+        try:
+            for file in files:
+                _check_sizes(file)
+            self._check_metadata()
+            self._reader = Reader(path)
+            self._reader.open()
+        except _BROKEN as error:
+            raise InputError(f"{path}: not a readable bag ({_line(error)})") from None
+        try:
+            self._read_head()
+        except _BROKEN as error:
+            self._reader.close()
+            raise InputError(f"{path}: not a readable bag ({_line(error)})") from None
+
+    def _check_metadata(self) -> None:
+        metadata = self.path / "metadata.yaml"
+        if metadata.exists() and metadata.stat().st_size > MOST_TEXT * 16:
+            raise InputError(f"{metadata}: {metadata.stat().st_size} B; allowed: up to {MOST_TEXT * 16}")
+
+    def _read_head(self) -> None:
+        connections = self._reader.connections
+        if len(connections) > MOST_TOPICS:
+            raise InputError(f"{self.path}: {len(connections)} topics; allowed: up to {MOST_TOPICS}")
+        self.topics: dict[str, Topic] = {}
+        for connection in connections:
+            ext: Any = connection.ext
+            known = self.topics.get(connection.topic)
+            count = connection.msgcount + (known.count if known else 0)
+            self.topics[connection.topic] = Topic(
+                connection.msgtype, connection.msgdef.data, tuple(ext.offered_qos_profiles), count
+            )
+        custom: Any = getattr(self._reader.storage.metadata, "custom", None) or {}
+        texts = {key: text for key, text in custom.items() if isinstance(key, str) and isinstance(text, str)}
+        self.about: Mapping[str, str] = {key[:256]: text[:MOST_TEXT] for key, text in texts.items()}
+        empty = not self._reader.message_count
+        self.first_ns = 0 if empty else self._reader.start_time
+        self.last_ns = 0 if empty else self._reader.end_time - 1
+
+    def __enter__(self) -> "Source":
+        """Itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close it."""
+        self._reader.close()
+
+    def messages(
+        self, topics: set[str] | None = None, *, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """Topic, log time [ns] and bytes of each message, in the order of log times.
+
+        Args:
+            topics: those wanted; None: all.
+            start_ns: log times from this on [ns].
+            stop_ns: log times before this [ns].
+
+        Raises:
+            InputError: the bag is broken where the next message should be.
+        """
+        wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
+        if not wanted:
+            return
+        try:
+            for connection, log_ns, data in self._reader.messages(wanted, start=start_ns, stop=stop_ns):
+                yield connection.topic, log_ns, bytes(data)
+        except _BROKEN as error:
+            raise InputError(f"{self.path}: broken ({_line(error)}); lathe bag check says more") from None
+
+
+def _line(error: BaseException) -> str:
+    """The first line of what a library says, and not much of it."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags piece by piece: what they hold goes to sinks as from an offline run, in as little memory."""
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lathe_rc.bag.source import Source
+from lathe_rc.cell import messages
+from lathe_rc.cell.engine import Sink
+from lathe_rc.cell.messages import START_NS, Signals
+from lathe_rc.cell.recording import NOT_SIGNALS
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wire import Block, Decoder
+from lathe_rc.errors import LatheError
+
+_AHEAD = 64  # pieces that one topic may be ahead of another
+
+
+@dataclass(frozen=True)
+class BagHeader:
+    """What a bag of the cell is, once it has been read.
+
+    Attributes:
+        types: message type by fully qualified signal topic.
+        samples: of every dense topic.
+        left: samples that some topics have beyond that: the recording was interrupted; 0 if it was not.
+        step_ns: sampling step [ns]; 0 if the bag has no dense topic.
+        run_id: identity of the run.
+        sources: node that made it, by topic.
+        about: texts that the bag says of itself.
+    """
+
+    types: Mapping[str, str]
+    samples: int
+    left: int
+    step_ns: int
+    run_id: str
+    sources: Mapping[str, str]
+    about: Mapping[str, str]
+
+
+class _Dense:
+    """Blocks of a topic that have not been handed on."""
+
+    def __init__(self, topic: str, msgtype: str) -> None:
+        self.topic, self.type = topic, msgtype
+        self.blocks: deque[Block] = deque()
+        self.first = self.end = 0
+        self.newest: Block | None = None
+        self._decoder = Decoder(msgtype)
+
+    def add(self, data: bytes) -> None:
+        """Take a message.
+
+        Raises:
+            LatheError: samples are missing or repeated, or the block is broken.
+        """
+        try:
+            block = self._decoder.decode(data)
+        except ValueError as error:
+            raise LatheError(f"{self.topic}: {error}") from None
+        if block.first_index != self.end:
+            raise LatheError(f"{self.topic} goes from sample {self.end} to {block.first_index}")
+        if self.newest and block.step_ns != self.newest.step_ns:
+            raise LatheError(f"{self.topic}: the step changes from {self.newest.step_ns} to {block.step_ns} ns")
+        self.end += block.samples
+        self.newest = block
+        self.blocks.append(block)
+
+    def take(self, samples: int) -> Signals:
+        """The next samples, as arrays of their own."""
+        signals = messages.allocate(self.type, samples)
+        filled = 0
+        while filled < samples:
+            block = self.blocks[0]
+            skip = self.first - block.first_index
+            count = min(block.samples - skip, samples - filled)
+            for name, array in signals.items():
+                array[filled : filled + count] = block.signals[name][skip : skip + count]
+            filled += count
+            self.first += count
+            if skip + count == block.samples:
+                self.blocks.popleft()
+        return signals
+
+
+class Feeder:
+    """Turns messages of signal topics into pieces; for a bag, or for what is heard live.
+
+    Args:
+        types: message type by fully qualified topic; others than signal topics are left out.
+        sinks: get the pieces.
+        piece: samples in a piece.
+
+    Attributes:
+        types: of the signal topics.
+        first: samples handed on so far.
+    """
+
+    def __init__(self, types: Mapping[str, str], sinks: Iterable[Sink], piece: int) -> None:
+        known = messages.block_types() | messages.sparse_types()
+        self.types = {topic: msgtype for topic, msgtype in types.items() if msgtype in known}
+        self._dense = {t: _Dense(t, kind) for t, kind in self.types.items() if kind in messages.block_types()}
+        self._sparse: dict[str, list[tuple[int, Mapping[str, Any]]]] = {
+            topic: [] for topic in self.types if topic not in self._dense
+        }
+        self._sinks, self._piece = list(sinks), piece
+        self.first = 0
+
+    @property
+    def step_ns(self) -> int:
+        """Sampling step [ns]; 0 before the first block."""
+        return next((dense.newest.step_ns for dense in self._dense.values() if dense.newest), 0)
+
+    @property
+    def run_id(self) -> str:
+        """Identity of the run."""
+        return next((dense.newest.run_id for dense in self._dense.values() if dense.newest), "")
+
+    def sources(self) -> dict[str, str]:
+        """The node that made each dense topic."""
+        return {topic: dense.newest.source for topic, dense in self._dense.items() if dense.newest}
+
+    def add(self, topic: str, log_ns: int, data: bytes) -> None:
+        """Take a message.
+
+        Raises:
+            LatheError: samples are missing, or a topic stands still while others go on.
+        """
+        dense = self._dense.get(topic)
+        if dense is None:
+            message = messages.decode(self.types[topic], data)
+            values = {name: value for name, value in vars(message).items() if name not in NOT_SIGNALS}
+            self._sparse[topic].append((log_ns, values))
+            return
+        dense.add(data)
+        if dense.end - self.first >= self._piece:
+            self._hand_on(self._piece)
+
+    def _hand_on(self, samples: int) -> None:
+        ends = {topic: dense.end for topic, dense in self._dense.items()}
+        while (ready := min(ends.values())) - self.first >= samples:
+            self._give(samples)
+        slow = min(ends, key=lambda topic: ends[topic])
+        if max(ends.values()) - ready > _AHEAD * self._piece:
+            raise LatheError(f"{slow} ends at sample {ready}, others at {max(ends.values())}")
+
+    def _give(self, samples: int) -> None:
+        end_ns = START_NS + (self.first + samples) * self.step_ns
+        pieces = {topic: dense.take(samples) for topic, dense in self._dense.items()}
+        sparse: dict[str, list[Sparse]] = {}
+        for topic, waiting in self._sparse.items():
+            count = next((k for k, (stamp, _) in enumerate(waiting) if stamp >= end_ns), len(waiting))
+            sparse[topic] = [
+                Sparse(topic, self.types[topic], (stamp - START_NS) // self.step_ns, dict(values))
+                for stamp, values in waiting[:count]
+            ]
+            del waiting[:count]
+        for sink in self._sinks:
+            sink.chunk(self.first, samples, pieces, sparse)
+        self.first += samples
+
+    def finish(self) -> int:
+        """Hand on the rest.
+
+        Returns:
+            Samples that some topics have more than others: 0 if the recording is complete.
+        """
+        if not self._dense:
+            return 0
+        ends = [dense.end for dense in self._dense.values()]
+        if min(ends) > self.first:
+            self._give(min(ends) - self.first)
+        return max(ends) - min(ends)
+
+
+def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536) -> BagHeader:
+    """Read a bag of the cell and hand its signals to sinks, in pieces.
+
+    Args:
+        path: the bag.
+        sinks: get every sample once, in order; topics are fully qualified.
+        piece: samples in a piece; the last may be shorter.
+
+    Raises:
+        InputError: not a bag.
+        LatheError: samples are missing or repeated.
+    """
+    with Source(path) as source:
+        feeder = Feeder({topic: kind.type for topic, kind in source.topics.items()}, sinks, piece)
+        try:
+            for topic, log_ns, data in source.messages(set(feeder.types)):
+                feeder.add(topic, log_ns, data)
+        except LatheError as error:
+            raise type(error)(f"{path}: {error}") from None
+        left = feeder.finish()
+        return BagHeader(
+            feeder.types, feeder.first, left, feeder.step_ns, feeder.run_id, feeder.sources(), dict(source.about)
+        )

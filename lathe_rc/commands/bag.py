@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command group ``lathe bag``: what a bag holds, whether it is whole, and making it whole."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from lathe_rc import part
+from lathe_rc.bag import reader
+from lathe_rc.bag.check import check as check_bag
+from lathe_rc.bag.recover import recover as recover_bag
+from lathe_rc.bag.source import Source
+from lathe_rc.cell import messages
+from lathe_rc.errors import InputError, LatheError
+
+_JSON = click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+_BAG = click.argument("path", metavar="BAG", type=click.Path(path_type=Path))
+_LOSSY = 3  # exit code where something is missing
+
+
+@click.group()
+def bag() -> None:
+    """Ask bags: what is in them, are they whole, and save what is left of a broken one."""
+
+
+def _metrics(path: Path, types: set[str]) -> dict[str, Any] | None:
+    """First and last revolution of the part, if the bag has one."""
+    if not {messages.TOOL, messages.ENCODER} <= types:
+        return None
+    found = part.measured(reader.read(path))
+    return {"revolutions": int(found.form.rms.size), "first": part.numbers(found, 0), "last": part.numbers(found, -1)}
+
+
+@bag.command()
+@_BAG
+@click.option("--metrics/--no-metrics", default=True, help="form error of the part; reads the whole bag")
+@_JSON
+def info(path: Path, *, metrics: bool, as_json: bool) -> None:
+    """Topics, rates, span, scenario and the form error of the part."""
+    with Source(path) as source:
+        span = (source.last_ns - source.first_ns) * 1e-9
+        types = {said.type for said in source.topics.values()}
+        topics: dict[str, dict[str, Any]] = {
+            topic: {
+                "type": said.type,
+                "messages": said.count,
+                "rate_hz": (said.count - 1) / span if span > 0 and said.count > 1 else None,
+            }
+            for topic, said in sorted(source.topics.items())
+        }
+        told: dict[str, Any] = {
+            "bag": str(path),
+            "start_s": source.first_ns * 1e-9,
+            "span_s": span,
+            "topics": topics,
+            "about": dict(source.about),
+        }
+    told["error_um"] = _metrics(path, types) if metrics else None
+    if as_json:
+        click.echo(json.dumps(told))
+        return
+    console = Console(highlight=False, soft_wrap=True)
+    table = RichTable(show_edge=False, header_style="bold")
+    for column, justify in (("topic", "left"), ("type", "left"), ("messages", "right"), ("rate [Hz]", "right")):
+        table.add_column(column, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    for topic, said in topics.items():
+        rate = f"{said['rate_hz']:.4g}" if said["rate_hz"] else ""
+        table.add_row(Text(topic), Text(said["type"].rpartition("/")[2]), str(said["messages"]), rate)
+    console.print(table)
+    console.print(f"span: {span:.6g} s from {told['start_s']:.6g} s on")
+    if told["error_um"]:
+        first, last = told["error_um"]["first"], told["error_um"]["last"]
+        console.print(
+            f"form error: {first['rms']:.4g} µm RMS in revolution 1, {last['rms']:.4g} in {last['revolution']}"
+        )
+    for key, text in told["about"].items():
+        if key == "lathe_rc.scenario":
+            console.print("scenario:")
+            console.print(Text("  " + text.strip().replace("\n", "\n  ")))
+        else:
+            console.print(Text(f"{key.removeprefix('lathe_rc.')}: {text}"))
+
+
+@bag.command()
+@_BAG
+@_JSON
+@click.pass_context
+def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
+    """Verify sequence, gaps, numbers, checksums and recorded digests; exit code 0: clean, 3: lossy, 1: wrong."""
+    if not path.exists():
+        raise InputError(f"{path}: no such bag")
+    try:
+        found = check_bag(path)
+    except InputError as error:
+        raise LatheError(str(error)) from None
+    told = {
+        "bag": str(path),
+        "clean": not found.exit_code,
+        "wrong": found.wrong,
+        "lost": found.lost,
+        "messages": found.messages,
+        "samples": found.samples,
+        "digests_compared": found.compared,
+        "digest": found.digests,
+    }
+    if as_json:
+        click.echo(json.dumps(told))
+    else:
+        for what in (*found.wrong, *found.lost):
+            click.echo(what)
+        state = {0: "clean", 1: "wrong", _LOSSY: "lossy"}[found.exit_code]
+        digests = f"{found.compared} digests as recorded" if found.compared else "no digests recorded"
+        click.echo(f"{state}: {found.messages} messages, {found.samples} samples, {digests}")
+    ctx.exit(found.exit_code)
+
+
+@bag.command()
+@_BAG
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="folder of the new bag; default: BAG_recovered")
+@_JSON
+@click.pass_context
+def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: bool) -> None:
+    """Write what is whole of a broken bag to a new one; exit code 0: nothing is missing, 3: something is."""
+    target = output or path.with_name(f"{path.stem if path.is_file() else path.name}_recovered")
+    found = recover_bag(path, target)
+    told = {
+        "bag": str(path),
+        "output": str(target),
+        "saved": found.saved,
+        "skipped": found.skipped,
+        "lost_bytes": found.lost_bytes,
+        "damage": list(found.damage),
+    }
+    if as_json:
+        click.echo(json.dumps(told))
+    else:
+        for what in found.damage:
+            click.echo(what)
+        click.echo(f"{found.saved} messages saved, {found.skipped} skipped, {found.lost_bytes} B lost")
+        click.echo(f"bag: {target}")
+    ctx.exit(_LOSSY if found.lossy else 0)

@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags that are cut off, broken, hostile or made by others: nothing that is whole is lost, nothing crashes."""
+
+import json
+import shutil
+import struct
+
+import numpy as np
+import pytest
+import zstandard
+from cells import scenario
+from click.testing import CliRunner
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagWriter
+from rosbags.typesys import Stores, get_typestore
+
+from lathe_rc import harness
+from lathe_rc.bag.check import check
+from lathe_rc.bag.recover import recover
+from lathe_rc.bag.salvage import Salvage
+from lathe_rc.bag.source import MOST_BYTES, Source
+from lathe_rc.bag.writer import BagWriter, offered_qos
+from lathe_rc.cell import messages
+from lathe_rc.cell.wire import Encoder
+from lathe_rc.cli import main
+from lathe_rc.errors import InputError
+
+MODES = [
+    pytest.param(plugin, mode, id=f"{plugin.name}-{mode.name}".lower())
+    for plugin in (StoragePlugin.SQLITE3, StoragePlugin.MCAP)
+    for mode in (CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE, CompressionMode.STORAGE)
+    if plugin == StoragePlugin.MCAP or mode != CompressionMode.STORAGE
+]
+
+
+def lathe(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def strange_bag(path, plugin, mode, count=600):
+    """A bag that other people's tools might have made, of types that this package does not publish."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    point, text = store.types["geometry_msgs/msg/Point"], store.types["std_msgs/msg/String"]
+    sent = []
+    writer = RosbagWriter(path, version=9, storage_plugin=plugin)
+    if mode != CompressionMode.NONE:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        points = writer.add_connection("/where", point.__msgtype__, typestore=store)
+        texts = writer.add_connection("/said", text.__msgtype__, typestore=store)
+        for number in range(count):
+            topic, message = (points, point(number, 0.5, -number)) if number % 3 else (texts, text(f"word {number}"))
+            data = bytes(store.serialize_cdr(message, topic.msgtype))
+            writer.write(topic, 10**9 + number * 1000, data)
+            sent.append((topic.topic, 10**9 + number * 1000, data))
+    return sent
+
+
+def read_by_others(path):
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
+        return [(connection.topic, stamp, bytes(data)) for connection, stamp, data in bag.messages()]
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory):
+    path = tmp_path_factory.mktemp("turned") / "bag"
+    harness.run(scenario(spindle_encoder={"revolutions": 20.0}, recorder={"chunk_size": 65536}), bag=path)
+    return path
+
+
+def copied(path, folder):
+    return shutil.copytree(path, folder / "copy")
+
+
+def mcap_of(path):
+    return next(path.glob("*.mcap"))
+
+
+@pytest.mark.parametrize(("plugin", "mode"), MODES)
+def test_bags_of_others_are_read_checked_and_recovered(tmp_path, plugin, mode):
+    sent = strange_bag(tmp_path / "strange", plugin, mode)
+    with Source(tmp_path / "strange") as source:
+        assert list(source.messages()) == sent
+        assert {topic: said.count for topic, said in source.topics.items()} == {"/where": 400, "/said": 200}
+    assert check(tmp_path / "strange").exit_code == 0
+    assert recover(tmp_path / "strange", tmp_path / "new").saved == len(sent)
+    assert read_by_others(tmp_path / "new") == sent
+
+
+@pytest.mark.parametrize(("plugin", "mode"), MODES)
+def test_bags_of_others_that_are_cut_off_give_what_is_whole(tmp_path, plugin, mode):
+    strange_bag(tmp_path / "strange", plugin, mode)
+    file = next(file for file in (tmp_path / "strange").iterdir() if file.suffix != ".yaml")
+    whole = file.read_bytes()
+    sent = strange_bag(tmp_path / "again", plugin, CompressionMode.NONE)
+    random = np.random.default_rng(3)
+    for number, length in enumerate(random.integers(0, len(whole), 25)):
+        file.write_bytes(whole[:length])
+        target = tmp_path / f"new{number}"
+        recover(tmp_path / "strange", target)
+        assert set(read_by_others(target)) <= set(sent)
+
+
+def chunk_ends(data):
+    """End of each chunk of an MCAP file, and the messages up to there."""
+    place, ends, count = 8, [], 0
+    while data[place] != 0x0F:  # data end
+        (length,) = struct.unpack_from("<Q", data, place + 1)
+        if data[place] == 0x06:
+            size, name = struct.unpack_from("<Q4xI", data, place + 9 + 16)
+            start = place + 9 + 32 + name + 8
+            records = zstandard.decompress(data[start : place + 9 + length], size)
+            inner = 0
+            while inner < len(records):
+                count += records[inner] == 0x05
+                inner += 9 + struct.unpack_from("<Q", records, inner + 1)[0]
+            ends.append((place + 9 + length, count))
+        place += 9 + length
+    return ends
+
+
+def test_a_thousand_cuts_lose_no_more_than_the_cut_chunk(tmp_path):
+    made = scenario(spindle_encoder={"revolutions": 8.0}, recorder={"chunk_size": 32768})
+    harness.run(made, bag=tmp_path / "bag")
+    data = mcap_of(tmp_path / "bag").read_bytes()
+    ends = chunk_ends(data)
+    assert len(ends) > 20
+    place = tmp_path / "cut.mcap"
+    for number, length in enumerate(np.random.default_rng(1).integers(0, len(data), 1000)):
+        place.write_bytes(data[:length])
+        expected = max((count for end, count in ends if end <= length), default=0)
+        found = Salvage(place)
+        assert sum(1 for _ in found) == expected
+        assert found.damage
+        if number % 50 == 0:
+            assert recover(place, tmp_path / f"new{number}").saved == expected
+
+
+def test_a_broken_chunk_in_the_middle_costs_that_chunk_alone(turned, tmp_path):
+    bag = copied(turned, tmp_path)
+    data = bytearray(mcap_of(bag).read_bytes())
+    ends = chunk_ends(bytes(data))
+    data[(ends[4][0] + ends[5][0]) // 2] ^= 0x10
+    mcap_of(bag).write_bytes(data)
+    assert lathe("bag", "check", bag).exit_code == 1
+    found = lathe("bag", "recover", bag, "-o", tmp_path / "new", "--json")
+    assert found.exit_code == 3
+    assert json.loads(found.stdout)["saved"] == ends[-1][1] - (ends[5][1] - ends[4][1])
+    assert "samples are missing before sample" in lathe("bag", "check", tmp_path / "new").stdout
+
+
+def test_what_is_clean_is_said_to_be_clean(turned, tmp_path):
+    found = lathe("bag", "check", turned, "--json")
+    assert found.exit_code == 0
+    told = json.loads(found.stdout)
+    assert told["digest"] == json.loads((turned / "digests.json").read_text())["digest"]
+    assert told["digests_compared"] == len(told["digest"]) == 9
+    again = lathe("bag", "recover", turned, "-o", tmp_path / "new")
+    assert again.exit_code == 0, again.stdout
+    assert check(tmp_path / "new").digests == check(turned).digests
+
+
+def test_another_digest_than_recorded_is_wrong(turned, tmp_path):
+    bag = copied(turned, tmp_path)
+    told = json.loads((bag / "digests.json").read_text())
+    told["digest"]["/tool"] = "0" * 64
+    (bag / "digests.json").write_text(json.dumps(told))
+    found = lathe("bag", "check", bag)
+    assert found.exit_code == 1
+    assert "/tool: digest " in found.stdout
+
+
+INF_AT_7 = np.where(np.arange(64) == 7, np.inf, 0.0)
+
+
+def blocks(change, count=10):
+    """Blocks of a topic as (first sample, samples, last), changed on the way."""
+    made = [change(number, (64 * number, np.full(64, float(number)), number == count - 1)) for number in range(count)]
+    return [block for block in made if block is not None]
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "said"),
+    [
+        (lambda k, b: None if k == 4 else b, 3, "/a/command: 64 samples are missing before sample 320"),
+        (lambda k, b: (b[0] - 64, *b[1:]) if k == 5 else b, 1, "/a/command: goes back from sample 320 to 256"),
+        (lambda k, b: (b[0], b[1] + INF_AT_7, b[2]) if k == 2 else b, 1, "position = inf at sample 135"),
+        (lambda _, b: (*b[:2], False), 3, "/a/command: no last block"),
+        (lambda k, b: (*b[:2], k == 3 or b[2]), 1, "/a/command: goes on at sample 256 after its last block"),
+    ],
+)  # fmt: skip
+def test_each_flaw_is_named(tmp_path, change, code, said):
+    encoder = Encoder(messages.COMMAND, "run", "/a", 15_625)
+    writer = BagWriter(tmp_path / "bag", compression="none", chunk_size=4096, about={})
+    writer.add_topic("/a/command", messages.COMMAND, offered_qos(10, "volatile"))
+    for first, samples, last in blocks(change):
+        stamp, data = encoder.encode(first, {"position": samples}, last=last, companions=0)
+        writer.write("/a/command", stamp, data)
+    writer.close()
+    found = lathe("bag", "check", tmp_path / "bag")
+    assert found.exit_code == code
+    assert said in found.stdout
+
+
+# --- what nobody should be trusted with
+
+
+def mcap(*records):
+    """An MCAP file of (opcode, content) with a right head and no end."""
+    head = (1, struct.pack("<I4sI", 4, b"ros2", 0))
+    return b"\x89MCAP0\r\n" + b"".join(struct.pack("<BQ", code, len(text)) + text for code, text in (head, *records))
+
+
+def chunk(data, size=None, compression=b"zstd"):
+    head = struct.pack("<QQQII", 0, 0, len(data) if size is None else size, 0, len(compression)) + compression
+    packed = zstandard.compress(data) if compression == b"zstd" else data
+    return 6, head + struct.pack("<Q", len(packed)) + packed
+
+
+BOMB = bytes(50_000_000)
+
+
+@pytest.mark.parametrize(
+    "records",
+    [
+        [chunk(BOMB, size=1000)],
+        [chunk(b"", size=MOST_BYTES + 1)],
+        [chunk(b"x" * 30, compression=b"")],
+        [chunk(struct.pack("<BQ", 5, 2**60) + bytes(22))],
+        [chunk(struct.pack("<BQHIQQ", 5, 22, 77, 0, 0, 0))],
+        [(4, struct.pack("<HHI", 1, 99, 2**31))],
+        [(3, struct.pack("<HI", 1, 2**32 - 1) + b"name")],
+        [(12, struct.pack("<II", 2**31, 5))],
+        [(6, b"")],
+        [(5, b"")],
+        [(0, b""), (255, b"?" * 100)],
+    ],
+)
+def test_hostile_files_are_refused_in_a_line(tmp_path, records):
+    file = tmp_path / "hostile.mcap"
+    file.write_bytes(mcap(*records))
+    checked = lathe("bag", "check", file)
+    assert checked.exit_code == 1
+    assert checked.stderr.startswith(f"lathe: {file}: not a readable bag (")
+    assert checked.stderr.count("\n") == 1
+    recovered = lathe("bag", "recover", file, "-o", tmp_path / "new")
+    assert recovered.exit_code in (0, 3), recovered.exception
+    assert "0 messages saved" in recovered.stdout
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_random_damage_never_crashes(turned, tmp_path, seed):
+    random = np.random.default_rng(seed)
+    data = bytearray(mcap_of(turned).read_bytes())
+    for place in random.integers(8, len(data), 30):
+        data[place] = random.integers(0, 256)
+    (tmp_path / "bad.mcap").write_bytes(data)
+    assert lathe("bag", "check", tmp_path / "bad.mcap").exit_code in (0, 1, 3)
+    assert lathe("bag", "recover", tmp_path / "bad.mcap").exit_code in (0, 3)
+
+
+def test_where_there_is_no_bag_it_says_so(tmp_path):
+    with pytest.raises(InputError, match="no bag; allowed"):
+        recover(tmp_path, tmp_path / "new")
+    assert lathe("bag", "check", tmp_path / "none").exit_code == 2
+    assert not list(tmp_path.iterdir())
