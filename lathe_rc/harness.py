@@ -28,9 +28,9 @@ from typing import Any, Literal
 
 from lathe_rc import part
 from lathe_rc.analysis.metrology import FormErrors, Measurement, form_errors
-from lathe_rc.bag import reader, recover
+from lathe_rc.bag import reader, recover, story
 from lathe_rc.bag.check import write_digests
-from lathe_rc.bag.record import OfflineRecorder, about
+from lathe_rc.bag.record import OfflineRecorder
 from lathe_rc.bag.writer import BagWriter, refuse_existing
 from lathe_rc.cell import messages
 from lathe_rc.cell.collect import Collector
@@ -247,7 +247,7 @@ def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[
             bag,
             compression=table.compression,
             chunk_size=table.chunk_size,
-            about=about(scenario.shared, []),
+            about=story.tell(scenario, []),
         )
         sinks.append(OfflineRecorder(cell, engine.samples, writer))
     start = time.monotonic()

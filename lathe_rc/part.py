@@ -1,16 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The part that a run has turned, as the workshop measures it."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lathe_rc.analysis import profile_csv
-from lathe_rc.analysis.metrology import Measurement, measure
+from lathe_rc.analysis.metrology import Measurement, form_errors, measure
 from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.recording import Recording
+from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
+
+_TOGETHER = 16  # revolutions that are looked at at once
 
 
 def measured(recording: Recording, *, cutoff: float = 50.0) -> Measurement:
@@ -53,6 +58,44 @@ def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
         "largest_upr": {"upr": largest, "amplitude": float(waves[largest]) * 1e6},
         "ra": um(found.roughness.ra),
     }
+
+
+class ErrorsByRevolution:
+    """Form error by revolution of a run that comes in pieces; a sink of the engine and of `lathe_rc.bag.stream`.
+
+    Args:
+        types: message type by fully qualified topic.
+    """
+
+    def __init__(self, types: Mapping[str, str]) -> None:
+        self._topics = [
+            next((topic for topic, found in types.items() if found == kind), None)
+            for kind in (messages.ENCODER, messages.TOOL)
+        ]
+        self._angle, self._error = np.empty(0), np.empty(0)
+        self._rms: list[np.ndarray] = []
+        self._done = 0  # revolutions
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        encoder, tool = self._topics
+        if encoder is None or tool is None:
+            return
+        names = {topic.lstrip("/"): signals for topic, signals in dense.items()}
+        self._angle = np.concatenate([self._angle, names[encoder.lstrip("/")]["angle_true"]])
+        self._error = np.concatenate([self._error, names[tool.lstrip("/")]["error"]])
+        if self._angle[-1] - self._angle[0] > _TOGETHER * 2.0 * np.pi:
+            # A start two samples from the end may still move: it stays for the next piece.
+            found = form_errors(self._angle, self._error, self._done)
+            whole = int(np.searchsorted(found.starts, self._angle.size - 2)) - 1
+            self._rms.append(found.rms[:whole])
+            self._done += whole
+            keep = int(found.starts[whole])
+            self._angle, self._error = self._angle[keep:], self._error[keep:]
+
+    def rms(self) -> np.ndarray:
+        """RMS form error of each complete revolution [m], shape (revolutions,); to be asked at the end."""
+        return np.concatenate([*self._rms, form_errors(self._angle, self._error, self._done).rms])
 
 
 def write_profile(path: Path, recording: Recording, found: Measurement, revolutions: list[int]) -> None:

@@ -41,18 +41,19 @@ class FormErrors:
     starts: npt.NDArray[np.int64]
 
 
-def _starts(turns: Array, step: Array) -> npt.NDArray[np.int64]:
-    """First sample of each complete revolution and of the one after; ``step`` in revolutions."""
+def _starts(turns: Array, step: Array, first: int = 0) -> npt.NDArray[np.int64]:
+    """First sample of each complete revolution from ``first`` on and of the one after; ``step`` in revolutions."""
     whole = int(np.floor(turns[-1] + 2 * step[-1]))
-    return np.searchsorted(turns, np.arange(whole + 1))
+    return np.searchsorted(turns, np.arange(first, max(whole, first) + 1))
 
 
-def form_errors(angle: Array, error: Array) -> FormErrors:
+def form_errors(angle: Array, error: Array, first: int = 0) -> FormErrors:
     """Form error by revolution.
 
     Args:
         angle: true spindle angle [rad], increasing, shape (n,).
         error: form error [m], shape (n,).
+        first: revolutions before the first sample, of a run that is looked at in pieces.
 
     The mean square is taken over the angle, not over time: a place that the spindle passes slowly counts once.
     A revolution that the run ends within is left out, unless less than two samples are missing.
@@ -61,7 +62,7 @@ def form_errors(angle: Array, error: Array) -> FormErrors:
         return FormErrors(np.empty(0), np.empty(0), np.empty(0), np.zeros(1, dtype=np.int64))
     turns = angle / (2.0 * np.pi)
     step = np.diff(turns, append=2 * turns[-1] - turns[-2])
-    starts = _starts(turns, step)
+    starts = _starts(turns, step, first)
     whole = starts.size - 1
     edges = starts[:-1]
     squares = np.add.reduceat(error * error * step, edges)[:whole] if whole else np.empty(0)

@@ -148,19 +148,27 @@ def _ends(dense: Mapping[str, _Dense], findings: Findings) -> None:
     findings.samples = end
 
 
-def _compare(path: Path, findings: Findings) -> None:
+def recorded(path: Path) -> dict[str, str]:
+    """The digests that were left in a bag's folder when it was made; empty if there are none.
+
+    Raises:
+        InputError: the file is not what it should be.
+    """
     file = path / DIGESTS
     if not path.is_dir() or not file.exists():
-        return
+        return {}
     if file.stat().st_size > _MOST_DIGESTS:
         raise InputError(f"{file}: {file.stat().st_size} B; allowed: up to {_MOST_DIGESTS}")
     try:
-        recorded: Any = json.loads(file.read_text(encoding="utf-8"))
-        told = {str(topic): str(digest) for topic, digest in recorded["digest"].items()}
+        told: Any = json.loads(file.read_text(encoding="utf-8"))
+        return {str(topic): str(digest) for topic, digest in told["digest"].items()}
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        findings.wrong.append(f"{DIGESTS}: not what the harness writes")
-        return
-    for topic in sorted(told | findings.digests):
+        raise InputError(f"{file}: not what the harness writes; remove it") from None
+
+
+def _compare(path: Path, findings: Findings) -> None:
+    told = recorded(path)
+    for topic in sorted(told | findings.digests) if told else ():
         if told.get(topic) != findings.digests.get(topic):
             findings.wrong.append(f"{topic}: digest {findings.digests.get(topic)}, recorded {told.get(topic)}")
         else:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recording an offline run: the messages that a cell of ROS nodes would have sent, in the same order."""
 
-import json
 from collections.abc import Mapping
 
 from lathe_rc.bag.order import Merger
@@ -23,14 +22,6 @@ def signal_depth(shared: SharedParameters) -> int:
     A reader of a feedback edge may be a window behind itself, and the publisher a window ahead of it.
     """
     return 2 * (shared.window or _FREE_RUNNING) + _SPARE
-
-
-def about(shared: SharedParameters, host_topics: list[str]) -> dict[str, str]:
-    """What a bag says of itself in its metadata."""
-    return {
-        "lathe_rc.run_id": shared.run_id,
-        "lathe_rc.host_topics": json.dumps(host_topics),
-    }
 
 
 class OfflineRecorder:

@@ -8,6 +8,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -19,13 +20,15 @@ from mcap.writer import MCAP0_MAGIC
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import Reader, ReaderError
 
-from lathe_rc.errors import InputError
+from lathe_rc.cell.wire import Block, Decoder
+from lathe_rc.errors import InputError, LatheError
 
 MOST_BYTES = 2**28  #: longest chunk or record that is read into memory [B]
 MOST_TOPICS = 4096  #: topics of a bag
 MOST_TEXT = 2**20  #: longest text in its metadata [B]
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
+_MESSAGE = struct.Struct("<H4xQ8x")  # channel, log time
 _CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
 _BROKEN = (ReaderError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error, EOFError)
 
@@ -123,16 +126,12 @@ def read_chunk(content: bytes) -> bytes:
     return whole
 
 
-def _check_sizes(path: Path) -> None:
-    """Refuse an MCAP file in which something is longer than it says or than is allowed.
-
-    Raises:
-        ValueError: names the place.
-    """
+def _damage(path: Path) -> str:
+    """What is longer than it says or than is allowed in an MCAP file, and where; empty if nothing is."""
     limit = path.stat().st_size - len(MCAP0_MAGIC)
     with path.open("rb") as stream:
         if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise ValueError(f"{path.name}: not an MCAP file")
+            return f"{path.name}: not an MCAP file"
         place = stream.tell()
         try:
             while record := read_record(stream, limit):
@@ -140,7 +139,28 @@ def _check_sizes(path: Path) -> None:
                     read_chunk(record[1])
                 place = stream.tell()
         except ValueError as error:
-            raise ValueError(f"{path.name}: {error}, after byte {place}; lathe bag recover saves the rest") from None
+            return f"{path.name}: {error}, after byte {place}; lathe bag recover saves the rest"
+    return ""
+
+
+def _messages(whole: bytes, topics: Mapping[int, str]) -> list[tuple[str, int, bytes]]:
+    """Topic, log time and bytes of the wanted messages among the records of a chunk, by log time."""
+    found = []
+    place, end = 0, len(whole)
+    while place < end:
+        opcode, length = _RECORD.unpack_from(whole, place)
+        place += _RECORD.size
+        if place + length > end:
+            raise ValueError("a record is longer than its chunk")
+        if opcode == Opcode.MESSAGE:
+            channel, log_ns = _MESSAGE.unpack_from(whole, place)
+            topic = topics.get(channel)
+            if topic is not None:
+                found.append((topic, log_ns, whole[place + 22 : place + length]))
+        place += length
+    if any(a[1] > b[1] for a, b in pairwise(found)):
+        found.sort(key=lambda message: message[1])
+    return found
 
 
 class Source:
@@ -163,13 +183,20 @@ class Source:
         self.path = path
         files = [path] if path.is_file() else sorted(path.glob("*.mcap"))
         try:
-            for file in files:
-                _check_sizes(file)
             self._check_metadata()
             self._reader = Reader(path)
             self._reader.open()
         except _BROKEN as error:
-            raise InputError(f"{path}: not a readable bag ({_line(error)})") from None
+            why = _line(error)
+            for file in files:
+                why = _damage(file) or why
+            raise InputError(f"{path}: not a readable bag ({why})") from None
+        self._find_chunks()
+        # Chunks in order are checked as they are read, the others by rosbags, which trusts what they say of sizes.
+        why = next((text for file in files if (text := _damage(file))), "") if not self._in_order else ""
+        if why:
+            self._reader.close()
+            raise InputError(f"{path}: not a readable bag ({why})")
         try:
             self._read_head()
         except _BROKEN as error:
@@ -210,6 +237,43 @@ class Source:
         """Close it."""
         self._reader.close()
 
+    def _find_chunks(self) -> None:
+        """See whether the file is chunks one after the other, which are read faster than messages one by one."""
+        storages: Any = getattr(self._reader.storage, "storages", [self._reader.storage])
+        self._storage: Any = storages[0]
+        chunks = getattr(self._storage, "chunks", [])
+        followed = all(a.message_end_time <= b.message_start_time for a, b in pairwise(chunks))
+        self._in_order = len(storages) == 1 and bool(chunks) and followed and not self._reader.compression_mode
+
+    def _chunks(self, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, bytes]]:
+        """Messages of the wanted connections, chunk by chunk."""
+        with Path(str(self._storage.path)).open("rb") as stream:
+            for chunk in self._storage.chunks:
+                if chunk.message_end_time < start_ns or chunk.message_start_time >= stop_ns:
+                    continue
+                if not topics.keys() & chunk.message_index_offsets.keys():
+                    continue
+                stream.seek(chunk.chunk_start_offset)
+                record = read_record(stream, chunk.chunk_start_offset + chunk.chunk_length)
+                found = _messages(read_chunk(record[1] if record else b""), topics)
+                for topic, log_ns, data in found:
+                    if start_ns <= log_ns < stop_ns:
+                        yield topic, log_ns, data
+
+    def blocks(self, topic: str, *, start_ns: int | None = None) -> Iterator[Block]:
+        """The blocks of a dense topic, from a log time [ns] on.
+
+        Raises:
+            InputError: see `messages`.
+            LatheError: a block is broken.
+        """
+        decoder = Decoder(self.topics[topic].type)
+        for _, _, data in self.messages({topic}, start_ns=start_ns):
+            try:
+                yield decoder.decode(data)
+            except ValueError as error:
+                raise LatheError(f"{self.path}: {topic}: {error}") from None
+
     def messages(
         self, topics: set[str] | None = None, *, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[str, int, bytes]]:
@@ -227,6 +291,11 @@ class Source:
         if not wanted:
             return
         try:
+            if self._in_order:
+                names = {c.topic for c in wanted}
+                channels = {c.id: c.topic for c in self._storage.connections if c.topic in names}
+                yield from self._chunks(channels, start_ns or 0, stop_ns or 2**63)
+                return
             for connection, log_ns, data in self._reader.messages(wanted, start=start_ns, stop=stop_ns):
                 yield connection.topic, log_ns, bytes(data)
         except _BROKEN as error:

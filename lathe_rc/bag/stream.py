@@ -177,6 +177,36 @@ class Feeder:
         return max(ends) - min(ends)
 
 
+class Tape:
+    """A dense topic of a bag, read as it is needed.
+
+    Args:
+        path: the bag.
+        topic: fully qualified.
+
+    Raises:
+        InputError: not a bag.
+    """
+
+    def __init__(self, path: Path, topic: str) -> None:
+        self._source = Source(path)
+        self._dense = _Dense(topic, self._source.topics[topic].type)
+        self._messages = self._source.messages({topic})
+
+    def take(self, samples: int) -> Signals:
+        """The next samples, arrays of shape (samples,).
+
+        Raises:
+            LatheError: there are not so many, or some are missing.
+        """
+        while self._dense.end - self._dense.first < samples:
+            found = next(self._messages, None)
+            if found is None:
+                raise LatheError(f"{self._dense.topic} ends at sample {self._dense.end}")
+            self._dense.add(found[2])
+        return self._dense.take(samples)
+
+
 def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536) -> BagHeader:
     """Read a bag of the cell and hand its signals to sinks, in pieces.
 

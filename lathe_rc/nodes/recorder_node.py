@@ -9,11 +9,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lathe_rc_msgs.msg import CellState
 from rclpy.qos import QoSProfile
 
+from lathe_rc.bag import story
 from lathe_rc.bag.order import Data, Entry, Merger
-from lathe_rc.bag.record import about, signal_depth
+from lathe_rc.bag.record import signal_depth
 from lathe_rc.bag.writer import BagWriter, offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.cell.recorder import RecorderParameters
+from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wire import Block
 from lathe_rc.errors import LatheError, LossyRunError
@@ -22,6 +24,7 @@ from lathe_rc.nodes.shell import CellNode
 
 T = TypeVar("T")
 
+_FLUSH_PERIOD = 0.5  # [s] of wall time after which messages are written out even if they fill no chunk
 _HOST_TOPICS = {
     "/diagnostics": (DiagnosticArray, QoSProfile(depth=100)),
     "cell_state": (CellState, latched_qos(4)),
@@ -36,12 +39,11 @@ class RecorderNode(CellNode):
         assert isinstance(self.table, RecorderParameters)
         name = self.table.bag or f"bag_{self.table.run_id or 'cell'}"
         self._path = Path(name)
-        host = [self.topic(topic) for topic in _HOST_TOPICS]
         self._writer: BagWriter | None = BagWriter(
             self._path,
             compression=self.table.compression,
             chunk_size=self.table.chunk_size,
-            about=about(self.table, host),
+            about={},
         )
         self._depth = signal_depth(self.table)
         self._queues: dict[str, BlockQueue] = {}
@@ -50,6 +52,7 @@ class RecorderNode(CellNode):
         self._ended: set[str] = set()  # topics whose last block has come
         self._blocks = self._samples = 0
         self._log_ns = messages.START_NS
+        self._flush_due = 0.0
 
     def activate_part(self) -> None:
         """Subscribe to the host topics; the signals follow when the members have announced them."""
@@ -102,9 +105,18 @@ class RecorderNode(CellNode):
             for topic, msgtype, sparse in zip(member.publishes, member.types, member.sparse, strict=True):
                 if topic not in self._queues and topic not in self._sparse:
                     self._subscribe(topic, msgtype, name, sparse=sparse, in_cell=not alone)
+        self._explain()
         if not alone and self.table.window:
             self._merger = Merger({t: q.source for t, q in self._queues.items()}, self._sparse)
         self.announce()
+
+    def _explain(self) -> None:
+        """Let the bag say what was run, with the parameters that the members really have."""
+        names = list(self.members) if self.master is None else list(self.master.members)
+        tables = self.tables(names)
+        if tables:
+            host = [self.topic(topic) for topic in _HOST_TOPICS]
+            self._open.tell(story.tell(Scenario(self.table.run_id or "cell", tables), host))
 
     def _subscribe(self, topic: str, msgtype: str, source: str, *, sparse: bool, in_cell: bool) -> None:
         self._open.add_topic(topic, msgtype, offered_qos(self._depth, "transient_local"))
@@ -128,6 +140,13 @@ class RecorderNode(CellNode):
         )
 
     # ---- data ---------------------------------------------------------------------------------------
+
+    def tick(self, now: float) -> None:
+        """See `CellNode`; what a crash may lose is bounded in time as well."""
+        super().tick(now)
+        if self._writer is not None and now >= self._flush_due:
+            self._flush_due = now + _FLUSH_PERIOD
+            self.attempt(self._writer.flush)
 
     def _on_sparse(self, topic: str, data: Data) -> None:
         if self.done:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The shell that all nodes share: lifecycle, membership and start handshake, progress, diagnostics, end."""
 
+import json
 import os
 import time
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -274,6 +275,17 @@ class CellNode(LifecycleNode):
         rules = [f"{topic}:={self.topic(topic).removeprefix(namespace)}" for topic in self.relative_topics()]
         changed = sorted({rule for rule in rules if rule.split(":=")[0] != rule.split(":=")[1]})
         return self.table.model_copy(update={"remap": changed})
+
+    def tables(self, names: Iterable[str]) -> dict[str, NodeParameters]:
+        """The parameters that members have announced, by their name in this node's namespace; strangers left out."""
+        namespace = self.get_namespace().rstrip("/") + "/"
+        found = {}
+        for name in names:
+            member = self.members[name]
+            if member.stage in TABLES:
+                values = json.loads(member.parameters) | {"stage": member.stage}
+                found[name.removeprefix(namespace)] = TABLES[member.stage].read(name, values)
+        return found
 
     def relative_topics(self) -> list[str]:
         """Signal topics of the stage that it runs, before remapping, if it runs one."""

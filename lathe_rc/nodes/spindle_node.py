@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The spindle as time master: it starts the run, lets blocks go by window and pace, and ends it."""
 
-import json
 import time
 from collections import deque
 
@@ -10,7 +9,6 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
@@ -101,15 +99,7 @@ class SpindleNode(StageNode):
 
     def _check_cell(self) -> None:
         """The same check as before an offline run, with the parameters that the members really have."""
-        namespace = self.get_namespace().rstrip("/") + "/"
-        nodes = {}
-        for name in self.member_names():
-            member = self.members[name]
-            if member.stage not in TABLES:
-                continue
-            values = json.loads(member.parameters) | {"stage": member.stage}
-            nodes[name.removeprefix(namespace)] = TABLES[member.stage].read(name, values)
-        Cell(nodes).check()
+        Cell(self.tables(self.member_names())).check()
 
     def _begin(self) -> None:
         self._running = True

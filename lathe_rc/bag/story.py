@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a bag tells of its run, so that it explains itself for months: scenario, files, versions."""
+
+import base64
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from lathe_rc import __version__
+from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.recorder import RecorderParameters
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.errors import InputError
+
+SCENARIO, NAME, VERSIONS = "lathe_rc.scenario", "lathe_rc.name", "lathe_rc.versions"
+RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"
+_FILE = "lathe_rc.file."  # and NODE.PARAM: what was in the file that the parameter names
+_MOST_FILE = 2**19  # longest such file that is kept [B]
+_PACKAGES = ("numpy", "scipy", "numba", "mcap", "rosbags")
+
+
+def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
+    """The texts that go into a bag's metadata.
+
+    Args:
+        scenario: with the parameters that the nodes really have.
+        host_topics: recorded beside the signals.
+    """
+    nodes: dict[str, NodeParameters] = {}
+    files: dict[str, str] = {}
+    for name, table in scenario.nodes.items():
+        if isinstance(table, RecorderParameters):
+            continue
+        nodes[name] = table
+        for row in type(table).rows().values():
+            path = Path(str(getattr(table, row.name))) if row.is_path else Path()
+            if row.is_path and path.is_file() and path.stat().st_size <= _MOST_FILE:
+                files[f"{_FILE}{name}.{row.name}"] = base64.b64encode(path.read_bytes()).decode()
+    return {
+        RUN_ID: scenario.shared.run_id,
+        NAME: scenario.name,
+        HOST_TOPICS: json.dumps(list(host_topics)),
+        VERSIONS: json.dumps(_versions()),
+        SCENARIO: Scenario(scenario.name, nodes).to_yaml(),
+        **files,
+    }
+
+
+def _versions() -> dict[str, str]:
+    found = {"lathe_rc": __version__, "python": platform.python_version(), "machine": platform.machine()}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found
+
+
+def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str] = ()) -> Scenario:
+    """The scenario that a bag was made with; its files are written to ``folder``, which must last as long as it.
+
+    Raises:
+        InputError: the bag has none, or one that this version does not accept.
+    """
+    if SCENARIO not in about:
+        raise InputError("the bag holds no scenario; it was not made by lathe_rc, or its recorder never saw the cell")
+    file = folder / "scenario.yaml"
+    file.write_text(about[SCENARIO], encoding="utf-8")
+    sets: list[str] = []
+    for key, text in about.items():
+        node, dot, name = key.removeprefix(_FILE).rpartition(".")
+        if not key.startswith(_FILE) or not dot:
+            continue
+        place = folder / f"file{len(sets)}"
+        place.write_bytes(base64.b64decode(text))
+        sets.append(f"{node}.{name}={place}")
+    loaded = scenarios.load(file, [*sets, *overrides])
+    return Scenario(about.get(NAME, "") or loaded.name, loaded.nodes)

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Re-simulation: a recorded run comes out again to the bit, and a changed controller does what it should."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from cells import scenario
+from click.testing import CliRunner
+from numpy.testing import assert_allclose
+
+from lathe_rc import harness
+from lathe_rc.analysis.metrology import form_errors
+from lathe_rc.bag import reader, story
+from lathe_rc.bag.resim import resimulate
+from lathe_rc.bag.source import Source
+from lathe_rc.bag.stream import feed
+from lathe_rc.cli import main
+from lathe_rc.errors import InputError
+from lathe_rc.part import ErrorsByRevolution
+
+DEVIATION = {"deviation_amplitude": [0.1], "deviation_frequency": [10.7]}
+
+
+def lathe(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def made(**nodes):
+    spindle = {"revolutions": 30.0, **DEVIATION}
+    form = {"profile": "harmonics", "harmonic_order": [2], "harmonic_amplitude": [100e-6], "harmonic_phase": [0.0]}
+    given = {"spindle_encoder": spindle, "tool": form, **nodes}
+    return scenario(**given)
+
+
+@pytest.fixture(scope="module")
+def processes(tmp_path_factory):
+    """A run of real processes, with events on the way."""
+    path = tmp_path_factory.mktemp("processes") / "bag"
+    loaded = made(learning_controller={"events": ["revolution 5.5: freeze", "second 0.6: learn"]})
+    return path, harness.run(loaded, mode="processes", bag=path)
+
+
+def test_an_unchanged_process_run_comes_out_to_the_bit(processes):
+    path, result = processes
+    found = lathe("resim", path, "--json")
+    assert found.exit_code == 0
+    told = json.loads(found.stdout)
+    assert (told["equal"], told["changed"], told["different"]) == (True, False, [])
+    assert told["digest"] == result.digest
+    assert np.array_equal(told["rms_um"], result.errors.rms * 1e6)
+
+
+def test_what_it_writes_is_the_bag_again(processes, tmp_path):
+    path, result = processes
+    assert lathe("resim", path, "-o", tmp_path / "again").exit_code == 0
+    assert reader.read(tmp_path / "again").digests() == result.digest
+    signals = {topic for topic, kind in result.recording.types.items()}
+    with Source(path) as old, Source(tmp_path / "again") as new:
+        assert list(old.messages(signals)) == list(new.messages())
+
+
+def test_a_changed_lead_shows_the_change_of_a_run_with_that_lead(processes):
+    path, _ = processes
+    change = "learning_controller.lead_time=1.2e-3"
+    found = resimulate(path, [change])
+    other = made(learning_controller={"lead_time": 1.2e-3, "events": ["revolution 5.5: freeze", "second 0.6: learn"]})
+    expected = harness.run(other)
+    assert found.changed
+    assert set(found.different) == {
+        "/coarse/command", "/coarse/learning", "/coarse/state", "/tool", "/tool/joint_states",
+        "/electrodynamic_actuator/joint_states",
+    }  # fmt: skip
+    assert_allclose(found.rms, expected.errors.rms, rtol=1e-12)
+    assert found.rms[-1] > 1.3 * found.recorded_rms[-1]
+    shown = lathe("resim", path, "--set", change)
+    assert shown.exit_code == 0
+    assert "different from the recording: /coarse/command" in shown.stdout
+
+
+def test_a_controller_from_a_file_takes_the_place_of_the_recorded_one(processes, tmp_path):
+    path, result = processes
+    file = tmp_path / "mine.yaml"
+    text = "/learning_controller:\n  ros__parameters:\n    feedback_delay: 2048\n    learning_gain: 0.5\n"
+    file.write_text(text)
+    found = resimulate(path, controller=file)
+    assert found.scenario.nodes["learning_controller"].learning_gain == 0.5
+    assert found.rms[3] > result.errors.rms[3]
+    file.write_text(text.replace("learning_controller", "another"))
+    assert "no node 'another' in the bag's scenario" in lathe("resim", path, "--controller", file).stderr
+
+
+def test_the_recorded_spindle_counts_not_the_law(processes, tmp_path):
+    """A bag whose spindle really turned otherwise than its parameters say."""
+    other = tmp_path / "other"
+    slow = {"revolutions": 30.0, "deviation_amplitude": [0.05], "deviation_frequency": [7.0]}
+    harness.run(made(spindle_encoder=slow), bag=other)
+    metadata = other / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("deviation_amplitude: [0.05]", "deviation_amplitude: [0.02]"))
+    with Source(other) as source:
+        assert "deviation_amplitude: [0.02]" in source.about[story.SCENARIO]
+    assert resimulate(other).different == []
+
+
+def test_the_bag_holds_the_files_of_its_scenario(tmp_path):
+    form = tmp_path / "form.csv"
+    angle = np.arange(0.0, 360.0, 2.0)
+    lines = [f"{a},{30.0 * np.cos(2 * np.radians(a))}" for a in angle]
+    form.write_text("angle_deg,radius_um\n" + "\n".join(lines) + "\n")
+    bag = tmp_path / "bag"
+    harness.run(scenario(tool={"profile": "csv", "profile_file": str(form)}), bag=bag)
+    form.unlink()
+    assert resimulate(bag).different == []
+
+
+def test_versions_and_identity_are_in_the_bag(processes):
+    path, result = processes
+    with Source(path) as source:
+        assert json.loads(source.about[story.VERSIONS])["numpy"] == np.__version__
+        assert source.about[story.RUN_ID] == result.scenario.shared.run_id
+        assert json.loads(source.about[story.HOST_TOPICS]) == ["/diagnostics", "/cell_state"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--set", "spindle_encoder.nominal_rpm=900"], "the spindle and what all nodes share come from the bag"),
+        (["--set", "block_size=32"], "the spindle and what all nodes share come from the bag"),
+        (["--set", "tool.fed=1"], "tool.fed: unknown parameter"),
+        (["--set", "learning_controller.lead_time=0.02"], "learning diverges"),
+    ],
+)
+def test_changes_that_cannot_be_are_refused(processes, arguments, said):
+    found = lathe("resim", processes[0], *arguments)
+    assert found.exit_code == 2
+    assert said in found.stderr
+
+
+def test_a_bag_without_a_scenario_says_what_is_missing(processes, tmp_path):
+    bag = tmp_path / "bag"
+    shutil.copytree(processes[0], bag)
+    file = next(bag.glob("*.mcap"))
+    (bag / "metadata.yaml").unlink()
+    file.rename(tmp_path / "alone.mcap")
+    with pytest.raises(InputError, match="the bag holds no scenario"):
+        resimulate(tmp_path / "alone.mcap")
+
+
+@pytest.mark.parametrize("piece", [64, 1000, 65536])
+def test_errors_by_revolution_are_those_of_the_whole(processes, piece):
+    path, result = processes
+    sink = ErrorsByRevolution(result.recording.types)
+    feed(path, [sink], piece=piece)
+    whole = result.recording
+    angle, error = whole.dense["/encoder"]["angle_true"], whole.dense["/tool"]["error"]
+    assert np.array_equal(sink.rms(), form_errors(angle, error).rms)
