@@ -5,6 +5,7 @@ The records are those of the mcap library; its own writer takes 14 µs for a mes
 needs for a block. Here a message costs a header and two appends, and the rest of the work is done once a chunk.
 """
 
+import os
 import struct
 import zlib
 from collections.abc import Mapping
@@ -33,6 +34,7 @@ _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log ti
 _AFTER_LENGTH = _MESSAGE.size - 9  # bytes of it that the length counts
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of what follows: log time and place in pairs
 _FOOTER = struct.Struct("<BQQQ")
+_ROOM, _ROOM_PER_CHUNK = 2**17, 1024  # kept of the disk for index and metadata [B]
 _LEVEL = -5  # of zstd: a fifth of the time of its default, for files 7 % larger (docs/bags.md)
 
 
@@ -79,6 +81,8 @@ class McapFile:
         self.last_ns: int | None = None
         self._begin_chunk()
         self._offset = 0
+        self._reserve = path.with_name(f"{path.name}.reserve")
+        self._kept = self._described = 0
         self._put(MCAP0_MAGIC + _encoded(Header("ros2", "lathe_rc")))
 
     def _begin_chunk(self) -> None:
@@ -87,11 +91,29 @@ class McapFile:
         self._indexes: dict[int, list[int]] = {}  # log time and place of each message, by channel
 
     def _put(self, data: bytes) -> None:
-        """Write at the end."""
+        """Write at the end; what does not fit leaves no trace."""
         rest = memoryview(data)
-        while rest:
-            rest = rest[self._stream.write(rest) :]
+        try:
+            while rest:
+                rest = rest[self._stream.write(rest) :]
+        except OSError:
+            self._stream.truncate(self._offset)
+            self._stream.seek(self._offset)
+            raise
         self._offset += len(data)
+
+    def _keep_room(self) -> None:
+        """Hold as much of the disk as completing the file will take: then a full disk cannot make it unreadable."""
+        needed = _ROOM + _ROOM_PER_CHUNK * (len(self._chunks) + 1) + 2 * self._described
+        if needed > self._kept:
+            needed += _ROOM
+            with self._reserve.open("ab") as stream:
+                os.posix_fallocate(stream.fileno(), 0, needed)
+            self._kept = needed
+
+    def free_room(self) -> None:
+        """Let completing the file begin."""
+        self._reserve.unlink(missing_ok=True)
 
     def add_schema(self, name: str, text: str) -> int:
         """Describe a message type; returns its number."""
@@ -115,6 +137,7 @@ class McapFile:
         return channel.id
 
     def _append(self, data: bytes) -> None:
+        self._described += len(data)
         self._parts.append(data)
         self._size += len(data)
 
@@ -132,10 +155,20 @@ class McapFile:
             self.flush()
 
     def flush(self) -> None:
-        """Hand every message so far to the operating system, as a chunk."""
-        indexes = self._indexes
-        if not indexes:
+        """Hand every message so far to the operating system, as a chunk; if it does not take it, they are lost."""
+        if not self._indexes:
             return
+        try:
+            self._write_chunk(self._indexes)
+        except OSError:
+            for channel, index in self._indexes.items():
+                self.counts[channel] -= len(index) // 2
+            raise
+        finally:
+            self._begin_chunk()
+
+    def _write_chunk(self, indexes: Mapping[int, list[int]]) -> None:
+        self._keep_room()
         first = min(min(index[::2]) for index in indexes.values())
         last = max(max(index[::2]) for index in indexes.values())
         self.first_ns = first if self.first_ns is None else min(first, self.first_ns)
@@ -171,7 +204,6 @@ class McapFile:
                 uncompressed_size=chunk.uncompressed_size,
             )
         )
-        self._begin_chunk()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Append texts that describe the file."""
@@ -184,6 +216,7 @@ class McapFile:
         """Write the summary and close the file."""
         try:
             self.flush()
+            self.free_room()
             self._put(_encoded(DataEnd(0)))
             self._put(self._summary())
         finally:
@@ -191,6 +224,7 @@ class McapFile:
 
     def abort(self) -> None:
         """Close the file as it is."""
+        self.free_room()
         self._stream.close()
 
     def _summary(self) -> bytes:

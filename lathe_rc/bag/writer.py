@@ -75,6 +75,7 @@ class _McapStorage:
 
     def close(self, version: int, metadata: str) -> None:
         """Finish the file."""
+        self.file.free_room()
         self.file.add_metadata("rosbag2", {"serialized_metadata": metadata})
         self.file.finish()
 
@@ -95,7 +96,6 @@ class _Writer(RosbagWriter):
     def close(self) -> None:
         """See rosbags; the metadata tell of the messages that the storage has been given."""
         file = self.mcap.file
-        file.flush()
         self.counts = {number: file.counts[channel] for number, channel in self.mcap.channels.items()}
         if file.first_ns is not None and file.last_ns is not None:
             self.min_timestamp, self.max_timestamp = file.first_ns, file.last_ns
@@ -191,7 +191,12 @@ class BagWriter:
         try:
             self._file.add_message(self._channels[topic], log_ns, data)
         except OSError as error:
-            raise LatheError(f"{self._writer.path}: cannot write ({error.strerror})") from None
+            raise self._full(error) from None
+
+    def _full(self, error: OSError) -> LatheError:
+        return LatheError(
+            f"{self._writer.path}: cannot write ({error.strerror}); what was recorded before is readable: make room"
+        )
 
     def flush(self) -> None:
         """Hand what has been written so far to the operating system.
@@ -202,8 +207,17 @@ class BagWriter:
         try:
             self._file.flush()
         except OSError as error:
-            raise LatheError(f"{self._writer.path}: cannot write ({error.strerror})") from None
+            raise self._full(error) from None
 
     def close(self) -> None:
-        """Finish the file and its metadata."""
-        self._writer.close()
+        """Finish the file and its metadata.
+
+        Raises:
+            LatheError: the disk did not take the last messages; the bag is complete but for them.
+        """
+        try:
+            self._file.flush()
+        except OSError as error:
+            raise self._full(error) from None
+        finally:
+            self._writer.close()

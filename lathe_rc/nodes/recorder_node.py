@@ -211,16 +211,20 @@ class RecorderNode(CellNode):
         self._open.write(entry.topic, entry.log_ns, entry.data)
         self._log_ns = max(self._log_ns, entry.log_ns)
 
+    def _write_rest(self) -> None:
+        assert self._merger is not None
+        for entry in self._merger.rest():
+            self._write(entry)
+
     def finish(self) -> None:
         """Write what is left and close the bag."""
         if getattr(self, "_writer", None) is None:
             return
         complete = bool(self._queues) and (self._merger.complete if self._merger else self._ended == set(self._queues))
+        if self._merger is not None:
+            self.attempt(self._write_rest)
         try:
-            if self._merger is not None:
-                for entry in self._merger.rest():
-                    self._write(entry)
-            self._open.close()
+            self.attempt(self._open.close)
         except OSError as error:
             self.fail(LatheError(f"{self._path}: cannot be closed ({error.strerror})"))
         finally:
