@@ -83,6 +83,7 @@ class McapFile:
         self._offset = 0
         self._reserve = path.with_name(f"{path.name}.reserve")
         self._kept = self._described = 0
+        self._refused: OSError | None = None
         self._put(MCAP0_MAGIC + _encoded(Header("ros2", "lathe_rc")))
 
     def _begin_chunk(self) -> None:
@@ -159,8 +160,11 @@ class McapFile:
         if not self._indexes:
             return
         try:
+            if self._refused:
+                raise self._refused  # what follows a gap is not recorded either
             self._write_chunk(self._indexes)
-        except OSError:
+        except OSError as error:
+            self._refused = error
             for channel, index in self._indexes.items():
                 self.counts[channel] -= len(index) // 2
             raise

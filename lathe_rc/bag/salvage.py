@@ -147,9 +147,9 @@ class Salvage:
                 return
             if opcode == Opcode.CHUNK:
                 try:
-                    whole = read_chunk(content)
+                    whole = read_chunk(content, place)
                 except ValueError as error:
-                    self._lose(file, place, stream.tell(), f"chunk at byte {place}: {error}")
+                    self._lose(file, place, stream.tell(), str(error))
                     continue
                 yield from self._records(file, BytesIO(whole), len(whole), schemas, channels, inside=place)
             elif found := self._record(file, opcode, content, schemas, channels):

@@ -108,21 +108,20 @@ def read_record(stream: BinaryIO, limit: int) -> tuple[int, bytes] | None:
     return opcode, stream.read(length)
 
 
-def read_chunk(content: bytes) -> bytes:
-    """The records of a chunk.
+def read_chunk(content: bytes, place: int) -> bytes:
+    """The records of a chunk that stands at byte ``place``.
 
     Raises:
         ValueError: it is broken.
     """
-    if len(content) < _CHUNK.size:
-        raise ValueError("chunk without a head")
-    _, _, size, crc, name = _CHUNK.unpack_from(content)
-    if size > MOST_BYTES or _CHUNK.size + name + 8 > len(content):
-        raise ValueError(f"chunk of {size} B; allowed: up to {MOST_BYTES}")
-    compression = content[_CHUNK.size : _CHUNK.size + name].decode("utf-8", "replace")
-    whole = unpack(compression, content[_CHUNK.size + name + 8 :], size)
+    try:
+        _, _, size, crc, name = _CHUNK.unpack_from(content)
+        start = _CHUNK.size + name
+        whole = unpack(content[_CHUNK.size : start].decode("utf-8", "replace"), content[start + 8 :], size)
+    except (ValueError, struct.error) as error:
+        raise ValueError(f"chunk at byte {place}: {_line(error)}") from None
     if crc and zlib.crc32(whole) != crc:
-        raise ValueError("the checksum of a chunk is wrong")
+        raise ValueError(f"chunk at byte {place}: its checksum is wrong")
     return whole
 
 
@@ -136,10 +135,10 @@ def _damage(path: Path) -> str:
         try:
             while record := read_record(stream, limit):
                 if record[0] == Opcode.CHUNK:
-                    read_chunk(record[1])
+                    read_chunk(record[1], place)
                 place = stream.tell()
         except ValueError as error:
-            return f"{path.name}: {error}, after byte {place}; lathe bag recover saves the rest"
+            return f"{path.name}: {error}; lathe bag recover saves the rest"
     return ""
 
 
@@ -255,7 +254,7 @@ class Source:
                     continue
                 stream.seek(chunk.chunk_start_offset)
                 record = read_record(stream, chunk.chunk_start_offset + chunk.chunk_length)
-                found = _messages(read_chunk(record[1] if record else b""), topics)
+                found = _messages(read_chunk(record[1] if record else b"", chunk.chunk_start_offset), topics)
                 for topic, log_ns, data in found:
                     if start_ns <= log_ns < stop_ns:
                         yield topic, log_ns, data
