@@ -235,9 +235,9 @@ class TestLaunch:
         assert values["recorder"]["bag"] == str(tmp_path / "elsewhere")
 
     def test_groups_nodes_as_the_scenario_says(self, start: Callable[..., Any]) -> None:
-        nodes = start(scenario="full_cell.yaml")
-        assert [len(node.arguments) for node in nodes] == [4, 9]
-        assert nodes[1].arguments[:2] == ["fine_controller:learning_controller", "piezo_actuator:piezo_actuator"]
+        (together,) = start(scenario="full_cell.yaml")
+        assert len(together.arguments) == 13
+        assert together.arguments[3:5] == ["fine_controller:learning_controller", "piezo_actuator:piezo_actuator"]
 
     def test_refuses_a_bag_that_exists(self, start: Callable[..., Any], tmp_path: Path) -> None:
         with pytest.raises(InputError, match="exists"):
