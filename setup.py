@@ -36,9 +36,9 @@ def shared_files() -> list[tuple[str, list[str]]]:
     return list(folders.items())
 
 
-def requirements() -> list[str]:
-    """Return the run-time requirements; the lock files are made from the same list."""
-    lines = (HERE / "requirements" / "runtime.in").read_text(encoding="utf-8").splitlines()
+def requirements(name: str) -> list[str]:
+    """Return the requirements in a list; the lock files are made from the same lists."""
+    lines = (HERE / "requirements" / f"{name}.in").read_text(encoding="utf-8").splitlines()
     return [line for line in lines if line and not line.startswith("#")]
 
 
@@ -51,14 +51,15 @@ setup(
     license="Apache-2.0",
     packages=find_packages(include=["lathe_rc", "lathe_rc.*"]),
     # lathe_rc/msg_defs is a link to msg_defs: importlib.resources finds the messages in every installation
-    package_data={"lathe_rc": ["py.typed", "nodes/*.xml", "msg_defs/msg/*.msg", "msg_defs/srv/*.srv"]},
+    package_data={"lathe_rc": ["py.typed", "nodes/*.xml", "msg_defs/msg/*.msg", "msg_defs/srv/*.srv", "view/*.j2"]},
     data_files=shared_files(),
     python_requires=">=3.10",
-    install_requires=requirements(),
+    install_requires=requirements("runtime"),
+    extras_require={"view": requirements("view")},
     entry_points={
         "console_scripts": [
             "lathe = lathe_rc.cli:main",
-            *(f"{node} = lathe_rc.nodes.{node}:main" for node in [*NODES, "container"]),
+            *(f"{node} = lathe_rc.nodes.{node}:main" for node in [*NODES, "container", "replayer"]),
         ],
     },
     zip_safe=False,

@@ -63,7 +63,7 @@ class Recipe:
         Raises:
             StepError: a command failed.
         """
-        say(f"setting up in {HOME} (from nothing: a minute or two, and 1 GB)")
+        say(f"setting up in {HOME} (from nothing: a minute or two, and 1.7 GB)")
         if read(PACKAGES_STAMP) != self._packages_key:
             clear(INSTALL, BUILD, VENV)
             self._make_virtual_environment(lock)

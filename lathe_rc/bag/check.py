@@ -11,7 +11,7 @@ import numpy as np
 
 from lathe_rc.bag.source import Source
 from lathe_rc.cell import messages
-from lathe_rc.cell.recording import NOT_SIGNALS, Digester, SparseTopic
+from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import InputError
 
@@ -130,11 +130,9 @@ def check(path: Path) -> Findings:
 
 def _add(part: SparseTopic, topic: str, msgtype: str, log_ns: int, data: bytes, findings: Findings) -> None:
     try:
-        message = messages.decode(msgtype, data)
-    except Exception as error:  # noqa: BLE001 - rosbags' generated code raises whatever broken bytes lead to
-        findings.wrong.append(f"{topic}: message at {log_ns} ns cannot be decoded ({type(error).__name__})")
-        return
-    part.append(log_ns, {name: value for name, value in vars(message).items() if name not in NOT_SIGNALS})
+        part.append(log_ns, messages.values_of(msgtype, data))
+    except ValueError as error:
+        findings.wrong.append(f"{topic}: at {log_ns} ns: {error}")
 
 
 def _ends(dense: Mapping[str, _Dense], findings: Findings) -> None:

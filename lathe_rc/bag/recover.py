@@ -5,6 +5,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from lathe_rc.bag import story
 from lathe_rc.bag.salvage import Salvage
 from lathe_rc.bag.writer import BagWriter, refuse_existing
 
@@ -64,7 +65,7 @@ def recover(path: Path, target: Path) -> Recovery:
         for topic, said in salvage.topics.items():
             if topic not in known | refused:  # announced, without a message
                 writer.copy_topic(topic, said.type, said.qos, definition=said.definition, digest=said.digest)
-        writer.tell(salvage.about | {"lathe_rc.recovered": f"{saved} messages; {salvage.lost_bytes} B lost"})
+        writer.tell(salvage.about | {story.RECOVERED: f"{saved} messages; {salvage.lost_bytes} B lost"})
     finally:
         writer.close()
     damage = [*salvage.damage, *(f"{topic}: type {salvage.topics[topic].type} is not known" for topic in refused)]

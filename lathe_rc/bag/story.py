@@ -17,7 +17,8 @@ from lathe_rc.errors import InputError
 
 SCENARIO, NAME, VERSIONS = "lathe_rc.scenario", "lathe_rc.name", "lathe_rc.versions"
 RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"
-_FILE = "lathe_rc.file."  # and NODE.PARAM: what was in the file that the parameter names
+FILE = "lathe_rc.file."  #: and NODE.PARAM: what was in the file that the parameter names
+RECOVERED = "lathe_rc.recovered"  #: that the bag was completed, and what that cost
 _MOST_FILE = 2**19  # longest such file that is kept [B]
 _PACKAGES = ("numpy", "scipy", "numba", "mcap", "rosbags")
 
@@ -38,7 +39,7 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
         for row in type(table).rows().values():
             path = Path(str(getattr(table, row.name))) if row.is_path else Path()
             if row.is_path and path.is_file() and path.stat().st_size <= _MOST_FILE:
-                files[f"{_FILE}{name}.{row.name}"] = base64.b64encode(path.read_bytes()).decode()
+                files[f"{FILE}{name}.{row.name}"] = base64.b64encode(path.read_bytes()).decode()
     return {
         RUN_ID: scenario.shared.run_id,
         NAME: scenario.name,
@@ -71,8 +72,8 @@ def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str]
     file.write_text(about[SCENARIO], encoding="utf-8")
     sets: list[str] = []
     for key, text in about.items():
-        node, dot, name = key.removeprefix(_FILE).rpartition(".")
-        if not key.startswith(_FILE) or not dot:
+        node, dot, name = key.removeprefix(FILE).rpartition(".")
+        if not key.startswith(FILE) or not dot:
             continue
         place = folder / f"file{len(sets)}"
         place.write_bytes(base64.b64decode(text))

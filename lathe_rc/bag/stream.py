@@ -11,7 +11,6 @@ from lathe_rc.bag.source import Source
 from lathe_rc.cell import messages
 from lathe_rc.cell.engine import Sink
 from lathe_rc.cell.messages import START_NS, Signals
-from lathe_rc.cell.recording import NOT_SIGNALS
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import LatheError
@@ -132,9 +131,10 @@ class Feeder:
         """
         dense = self._dense.get(topic)
         if dense is None:
-            message = messages.decode(self.types[topic], data)
-            values = {name: value for name, value in vars(message).items() if name not in NOT_SIGNALS}
-            self._sparse[topic].append((log_ns, values))
+            try:
+                self._sparse[topic].append((log_ns, messages.values_of(self.types[topic], data)))
+            except ValueError as error:
+                raise LatheError(f"{topic}: at {log_ns} ns: {error}") from None
             return
         dense.add(data)
         if dense.end - self.first >= self._piece:

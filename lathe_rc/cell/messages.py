@@ -29,6 +29,8 @@ JOINTS = "sensor_msgs/msg/JointState"
 START_NS = 1_000_000_000  #: simulated time of sample 0 [ns]; a stamp of 0 means "not set" in ROS
 MAX_BLOCK = 8192  #: bound of the arrays of a block [sample]; the .msg files say the same
 
+NOT_SIGNALS = {"header", "run_id", "source", "__msgtype__"}  #: fields of sparse messages that digests leave out
+
 Samples = npt.NDArray[Any]
 Signals = dict[str, Samples]  #: the arrays of a block by field name
 
@@ -105,6 +107,19 @@ def encode(msgtype: str, message: Any) -> bytes:
     """CDR bytes of a message, padded to a multiple of four as DDS hands them over."""
     data = bytes(store().serialize_cdr(message, msgtype))
     return data + bytes(-len(data) % 4)
+
+
+def values_of(msgtype: str, data: bytes) -> dict[str, Any]:
+    """What a message says, by field, but for its header and who sent it in which run.
+
+    Raises:
+        ValueError: the bytes are no such message.
+    """
+    try:
+        message = decode(msgtype, data)
+    except Exception as error:  # noqa: BLE001 - rosbags' generated code raises whatever broken bytes lead to
+        raise ValueError(f"{msgtype} cannot be decoded ({type(error).__name__})") from None
+    return {name: value for name, value in vars(message).items() if name not in NOT_SIGNALS}
 
 
 def decode(msgtype: str, data: bytes) -> Any:

@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lathe_rc.cell.messages import Samples, Signals
-
-NOT_SIGNALS = {"header", "run_id", "source", "__msgtype__"}
+from lathe_rc.cell.messages import NOT_SIGNALS, Samples, Signals
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from lathe_rc import part
-from lathe_rc.bag import reader
+from lathe_rc.bag import reader, story
 from lathe_rc.bag.check import check as check_bag
 from lathe_rc.bag.recover import recover as recover_bag
 from lathe_rc.bag.source import Source
@@ -79,9 +79,11 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
             f"form error: {first['rms']:.4g} µm RMS in revolution 1, {last['rms']:.4g} in {last['revolution']}"
         )
     for key, text in told["about"].items():
-        if key == "lathe_rc.scenario":
+        if key == story.SCENARIO:
             console.print("scenario:")
             console.print(Text("  " + text.strip().replace("\n", "\n  ")))
+        elif key.startswith(story.FILE):
+            console.print(Text(f"{key.removeprefix(story.FILE)}: a file, {len(text)} characters in base64"))
         else:
             console.print(Text(f"{key.removeprefix('lathe_rc.')}: {text}"))
 

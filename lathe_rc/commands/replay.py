@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``lathe replay``: the topics of a bag again, for whoever listens."""
+
+import sys
+from pathlib import Path
+
+import click
+
+from lathe_rc.errors import InputError
+
+
+@click.command()
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option("--rate", type=click.FloatRange(min=0), default=1.0, show_default=True, help="0: as fast as it goes")
+@click.option("--loop", is_flag=True, help="begin again at the end")
+@click.option("--start", type=click.FloatRange(min=0), default=0.0, help="[s] from the bag's first message on")
+@click.option("--end", type=click.FloatRange(min=0), default=0.0, help="[s] from its first message on; 0: to its end")
+@click.option("--topics", multiple=True, metavar="TOPIC", help="repeatable; default: all")
+@click.option("--as-cell", is_flag=True, help="as the nodes that made it; begins when a recorder node is ready")
+def replay(
+    bag: Path, rate: float, start: float, end: float, topics: tuple[str, ...], *, loop: bool, as_cell: bool
+) -> None:
+    """Send the messages of a BAG again, with /clock; services ~/pause, ~/resume and ~/toggle_paused."""
+    try:
+        from lathe_rc.nodes import replayer
+    except ImportError as error:
+        raise InputError(f"no ROS 2 here ({error}); run through ./lathe, or source a ROS 2 installation") from None
+    values = {
+        "bag": str(bag),
+        "rate": rate,
+        "loop": loop,
+        "start": start,
+        "end": end,
+        "topics": list(topics),
+        "as_cell": as_cell,
+    }
+    sys.exit(replayer.run(values, ["--ros-args"]))

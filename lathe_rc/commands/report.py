@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``lathe report``: a recording as one HTML page."""
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True, help="HTML file"
+)
+def report(bag: Path, output: Path) -> None:
+    """Tell what a recording holds on one page: result, figures, what was lost; it opens without network."""
+    from lathe_rc.view import report as reporting
+
+    told = reporting.write(bag, output)
+    if not told.complete:
+        click.echo(f"incomplete recording{': ' + told.stopped if told.stopped else ''}", err=True)
+    click.echo(f"report: {output}")

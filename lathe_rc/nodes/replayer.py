@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Executable: the ``replayer``, which sends again what a bag holds, whoever made it, with /clock."""
+
+import contextlib
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from builtin_interfaces.msg import Time
+from lathe_rc_msgs.msg import Member
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import Qos, QosDurability, QosReliability
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
+
+from lathe_rc.bag import story
+from lathe_rc.bag.source import Source
+from lathe_rc.cell.recorder import KIND as RECORDER
+from lathe_rc.cell.replayer import KIND, ReplayerParameters
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.wiring import Cell, remapped
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.nodes import declare
+from lathe_rc.nodes.ports import latched_qos, message_class
+
+_DEPTH = 512  # of the queues: so many may be under way before readers must have acknowledged
+_ACKNOWLEDGED = 30.0  # [s] for a reader to take what was sent to it
+_CLOCK_PERIOD = 10_000_000  # [ns] of the bag's time between messages on /clock
+_LOOK = 0.05  # [s] of wall time between looks at services and signals
+
+
+def _qos(recorded: Sequence[Qos]) -> QoSProfile:
+    """As the topic was offered; reliable if nothing is known of it."""
+    best_effort = bool(recorded) and recorded[0].reliability == QosReliability.BEST_EFFORT
+    latched = bool(recorded) and recorded[0].durability == QosDurability.TRANSIENT_LOCAL
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=_DEPTH,
+        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+class Replayer:
+    """Sends the messages of a bag in the order of their log times.
+
+    Args:
+        node: carries the services ``~/pause``, ``~/resume`` and ``~/toggle_paused``, and /clock.
+        parameters: what and how fast.
+
+    Raises:
+        InputError: no bag, a topic that it has not, or a message type that this machine has not.
+    """
+
+    def __init__(self, node: Node, parameters: ReplayerParameters) -> None:
+        self._node, self._parameters = node, parameters
+        if not parameters.bag:
+            raise InputError(f"{KIND}.bag is empty; name the bag's folder")
+        self._source = Source(Path(parameters.bag))
+        self._topics = set(parameters.topics) or set(self._source.topics)
+        if unknown := sorted(self._topics - set(self._source.topics)):
+            raise InputError(
+                f"{KIND}.topics: {', '.join(unknown)}; the bag has {', '.join(sorted(self._source.topics))}"
+            )
+        self._classes = {topic: self._class(topic) for topic in sorted(self._topics)}
+        self.paused = False
+        self.sent = 0
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
+        self._looked = 0.0
+        self._clock = node.create_publisher(Clock, "/clock", QoSProfile(depth=10))
+        self._clock_due = 0
+        for name, paused in (
+            ("pause", lambda: True),
+            ("resume", lambda: False),
+            ("toggle_paused", lambda: not self.paused),
+        ):
+            node.create_service(Trigger, f"~/{name}", self._service(paused))
+        self._members: dict[str, Node] = {}
+        self._publishers: dict[str, Publisher] = {}
+        self._waiting: dict[str, int] = {}
+
+    def _class(self, topic: str) -> Any:
+        kind = self._source.topics[topic].type
+        try:
+            return message_class(kind)
+        except (ImportError, AttributeError, ValueError):
+            raise InputError(
+                f"{topic}: message type {kind} is not installed; install its package, or name other topics"
+            ) from None
+
+    def _service(self, paused: Callable[[], bool]) -> Callable[[Any, Any], Any]:
+        def call(_request: Any, response: Any) -> Any:
+            self.paused = paused()
+            response.success, response.message = True, "paused" if self.paused else "playing"
+            return response
+
+        return call
+
+    # ---- start --------------------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Make the publishers; as a cell, wait until a recorder is ready."""
+        if self._parameters.as_cell:
+            self._join()
+            return
+        for topic in sorted(self._topics):
+            self._publish(self._node, topic)
+
+    def _publish(self, node: Node, topic: str) -> None:
+        qos = _qos(self._source.topics[topic].qos)
+        self._publishers[topic] = node.create_publisher(self._classes[topic], topic, qos)
+        self._waiting[topic] = 0
+
+    def _join(self) -> None:
+        """Announce the nodes that made the bag, each with its topics, and a recorder; begin when that is ready."""
+        ready: list[str] = []
+
+        def heard(member: Any) -> None:
+            if member.state == Member.READY:
+                ready.append(member.name)
+
+        self._node.create_subscription(Member, "/members", heard, latched_qos(256))
+        # The recorder puts the scenario's files into its bag as well, so they stay as long as the replayer.
+        self._folder = tempfile.TemporaryDirectory(prefix="lathe-replay-")
+        scenario = story.scenario_of(self._source.about, Path(self._folder.name))
+        cell = Cell(scenario.nodes)
+        announced = []
+        for name, stage in cell.stages.items():
+            member = self._members[name] = Node(name, context=self._node.context)
+            sparse = {remapped(stage.shared, topic): kind for topic, kind in stage.sparse_topics.items()}
+            dense = {remapped(stage.shared, port.topic): port.type for port in stage.outputs}
+            for topic in {**dense, **sparse}:
+                self._publish(member, f"/{topic}")
+            publisher = member.create_publisher(Member, "/members", latched_qos(1))
+            everybody = [*(f"/{other}" for other in cell.stages), f"/{RECORDER}"]
+            publisher.publish(
+                Member(
+                    run_id=scenario.shared.run_id,
+                    name=f"/{name}",
+                    stage=stage.kind,
+                    state=Member.READY,
+                    members=everybody if isinstance(stage, SpindleEncoder) else [],
+                    publishes=[f"/{topic}" for topic in (*dense, *sparse)],
+                    types=[*dense.values(), *sparse.values()],
+                    sparse=[*(False for _ in dense), *(True for _ in sparse)],
+                    parameters=json.dumps(stage.shared.model_dump()),
+                )
+            )
+            announced.append(publisher)
+        self._announced = announced
+        self._topics &= set(self._publishers)
+        self._node.get_logger().info("waiting for a recorder")
+        while f"/{RECORDER}" not in ready:
+            self._look(0.1)
+
+    # ---- run ----------------------------------------------------------------------------------------
+
+    def _look(self, wait: float = 0.0) -> None:
+        """Serve what has come."""
+        self._executor.spin_once(timeout_sec=wait)
+        self._looked = time.monotonic()
+
+    def run(self) -> None:
+        """Send everything, again and again if asked to.
+
+        Raises:
+            LatheError: a reader does not take what is sent to it.
+        """
+        self.open()
+        while True:
+            self._once()
+            if not self._parameters.loop:
+                break
+        for topic in self._publishers:
+            self._acknowledged(topic)
+
+    def _chosen(self) -> Iterator[tuple[str, int, bytes]]:
+        first = self._source.first_ns
+        start = first + round(self._parameters.start * 1e9)
+        stop = first + round(self._parameters.end * 1e9) if self._parameters.end else None
+        return self._source.messages(self._topics, start_ns=start, stop_ns=stop)
+
+    def _once(self) -> None:
+        rate, origin, began = self._parameters.rate, None, time.monotonic()
+        self._clock_due = 0
+        for topic, log_ns, data in self._chosen():
+            if origin is None:
+                origin, began = log_ns, time.monotonic()
+            due = began + (log_ns - origin) * 1e-9 / rate if rate else 0.0
+            began += self._wait_until(due)
+            if log_ns >= self._clock_due:
+                self._clock_due = log_ns + _CLOCK_PERIOD
+                self._clock.publish(Clock(clock=Time(sec=log_ns // 10**9, nanosec=log_ns % 10**9)))
+            self._publishers[topic].publish(data)
+            self.sent += 1
+            self._waiting[topic] += 1
+            if self._waiting[topic] >= _DEPTH // 2:
+                self._acknowledged(topic)
+
+    def _wait_until(self, due: float) -> float:
+        """Wait for a moment of wall time, and as long as it is paused; returns for how long it was paused [s]."""
+        held = 0.0
+        while True:
+            now = time.monotonic()
+            if self.paused:
+                self._look(_LOOK)
+                held += time.monotonic() - now
+            elif now < due + held:
+                self._look(min(due + held - now, _LOOK))
+            else:
+                if now - self._looked > _LOOK:
+                    self._look()
+                    continue
+                return held
+
+    def _acknowledged(self, topic: str) -> None:
+        """Wait until all reliable readers have what was sent."""
+        self._waiting[topic] = 0
+        if not self._publishers[topic].wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED)):
+            raise LatheError(f"{topic}: a reader has taken nothing for {_ACKNOWLEDGED:.0f} s")
+
+
+def _given(node: Node, values: Mapping[str, object]) -> ReplayerParameters:
+    named = {name: value for name, value in declare.overrides(node).items() if value is not None}
+    return ReplayerParameters.read(KIND, {**named, **values})
+
+
+def run(values: Mapping[str, object], args: Sequence[str] | None = None) -> int:
+    """Replay until the end, a failure, or Ctrl-C.
+
+    Args:
+        values: parameters; those of the command line of ROS come from ``args``.
+        args: ROS arguments; default: those of the process.
+
+    Returns:
+        The exit code.
+    """
+    rclpy.init(args=None if args is None else ["lathe", *args])
+    try:
+        node = Node(KIND, automatically_declare_parameters_from_overrides=True, allow_undeclared_parameters=True)
+        replayer = Replayer(node, _given(node, values))
+        replayer.run()
+        node.get_logger().info(f"{replayer.sent} messages sent")
+    except LatheError as error:
+        print(f"lathe: {error}", file=sys.stderr)
+        return error.exit_code
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return LatheError.exit_code
+    finally:
+        with contextlib.suppress(Exception):
+            rclpy.try_shutdown()
+    return 0
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run({}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,359 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag as one HTML page that needs nothing else.
+
+Whatever comes from the bag is somebody else's text: it is escaped by the template, cut to a length, and shown without
+characters that do not print.
+"""
+
+import json
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from lathe_rc import __version__
+from lathe_rc.bag.story import FILE, RECOVERED, SCENARIO, VERSIONS
+from lathe_rc.cell import messages
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.files import replacing
+from lathe_rc.view import report_figures as figures
+from lathe_rc.view.report_form import CUTOFF, Form
+from lathe_rc.view.report_gather import Gathered, gather
+from lathe_rc.view.report_series import Envelope
+
+_LONGEST_SCENARIO = 200_000  # characters
+_LONGEST_TEXT = 300
+_MOST_ROWS = 200
+_RPM = 60.0 / (2.0 * np.pi)
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A figure of the run, at the top."""
+
+    name: str
+    value: str
+    mood: str = ""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure with what it shows and where its formula is."""
+
+    name: str
+    image: str
+    caption: str
+    page: str
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table; ``texts`` are the columns that are no numbers."""
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str
+    page: str
+    texts: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class FormSection:
+    """What is told of one tool."""
+
+    tool: str
+    refused: str
+    metrics: Grid | None
+    figures: Sequence[Picture]
+
+
+def shown(text: str, longest: int = _LONGEST_TEXT) -> str:
+    """A text from a bag: of bounded length, and of what prints, line ends and tabs."""
+    cut = text[:longest] + (f" … ({len(text)} characters)" if len(text) > longest else "")
+    return "".join(letter if letter.isprintable() or letter in "\n\t" else "\ufffd" for letter in cut)
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if np.isfinite(value) else "–"
+
+
+def _cut(rows: Iterable[Sequence[str]], count: int) -> list[Sequence[str]]:
+    """The first rows, and how many there are more."""
+    shown_rows = list(islice(rows, _MOST_ROWS))
+    return [*shown_rows, [f"… and {count - _MOST_ROWS} more"]] if count > _MOST_ROWS else shown_rows
+
+
+def _metrics(form: Form) -> Grid:
+    columns = ("revolution", "", "RMS", "max", "P-V", "RONt", "RONq", "centre x", "centre y", "largest UPR", "Ra")
+    rows = []
+    for name, _, revolution in figures.shown_revolutions(form):
+        told = revolution.numbers
+        upr = told["largest_upr"]
+        values = [told["rms"], told["max"], told["peak_to_valley"], told["ront"], told["ronq"], *told["centre"]]
+        waves = f"{upr['upr']}: {_number(upr['amplitude'])}"
+        rows.append([str(told["revolution"]), name, *map(_number, values), waves, _number(told["ra"])])
+    caption = (
+        "In µm. RMS, max and P-V of the form error; RONt and RONq from the least-squares circle, with centre x, y; "
+        f"filters at {CUTOFF:.0f} UPR (undulations per revolution). Best is the smallest RMS of "
+        f"{form.rms.size} revolutions."
+    )
+    return Grid(columns, rows, caption, "docs/metrology.md", ("",))
+
+
+def _form(form: Form, cycles: Mapping[str, Envelope]) -> FormSection:
+    refused = shown(form.refused)
+    if form.first is None:
+        return FormSection(shown(form.tool), refused or "the bag holds no complete revolution", None, ())
+    grouped = f" Each line is the mean of {form.map.group} revolutions." if form.map.group > 1 else ""
+    page = "docs/metrology.md"
+    pictures = [
+        Picture(
+            "Error map",
+            figures.form_map(form),
+            "Radius of the part less desired radius over spindle angle and revolution; red: material left. The "
+            f"colours are linear around zero and logarithmic beyond the largest of the last quarter.{grouped}",
+            page,
+        ),
+        Picture(
+            "First and last revolution",
+            figures.polar(form),
+            "Radius deviation around the part, each in its own scale; dashed: the desired form.",
+            page,
+        ),
+        Picture(
+            "Error spectrum",
+            figures.spectrum(form),
+            "Amplitude A_n of r = Σ A_n·sin(nφ + ψ_n) by undulations per revolution n.",
+            page,
+        ),
+        Picture(
+            "Convergence",
+            figures.convergence(form, cycles),
+            "RMS over the angle and largest magnitude of the true form error by revolution; dots: what each controller "
+            "measured in its own cycles, which begin and end elsewhere.",
+            f"{page}, docs/learning.md",
+        ),
+    ]
+    return FormSection(shown(form.tool), refused, _metrics(form), pictures)
+
+
+def _signals(told: Gathered) -> list[Picture]:
+    kinds = (
+        ("speed_true", "Spindle speed", "speed [1/min]", _RPM, "docs/signals.md"),
+        ("force", "Cutting force", "main cutting force [N]", 1.0, "docs/cutting.md"),
+        ("wear", "Wear", "wear VB [µm]", 1e6, "docs/cutting.md"),
+    )
+    pictures = []
+    for field, name, unit, scale, page in kinds:
+        curves: dict[str, Envelope] = {
+            topic: series for (topic, own), series in told.curves.signals.items() if own == field and series.size
+        }
+        if curves:
+            low, high = (np.array([series.extremes for series in curves.values()]) * scale).T
+            caption = f"True values, {_number(float(low.min()))} to {_number(float(high.max()))}."
+            group = max(series.group for series in curves.values())
+            if group > 1:
+                caption += f" The band spans the extremes of {group} samples each, the line is its middle."
+            pictures.append(Picture(name, figures.against_time(told, curves, unit, scale), caption, page))
+    return pictures
+
+
+def _timing(told: Gathered) -> Picture | None:
+    host = told.host
+    if not host.pace.size:
+        return None
+    caption = (
+        f"From {host.pace.size} intervals between reports of the time master on /diagnostics. Pace: simulated time by "
+        "wall time. Lateness: how far the schedule slipped because members held it up. Latency: blocks in "
+        "flight, up to the slowest member's last acknowledgement, by the blocks sent in a second (Little's law); "
+        "members acknowledge several blocks at a time, so it is an upper estimate."
+    )
+    return Picture("Pace, lateness and latency", figures.timing(host, told.step_ns * 1e-9), caption, "docs/cell.md")
+
+
+def _nodes(told: Gathered) -> Grid | None:
+    host = told.host
+    if not host.nodes:
+        return None
+    levels = ("ok", "warning", "error", "stale")
+    rows = [
+        [
+            shown(name),
+            str(node.reports),
+            levels[node.level] if node.level < len(levels) else "?",
+            shown(node.values.get("blocks", "–"), 20),
+            shown(node.values.get("lost blocks", "–"), 20),
+            shown(node.message),
+        ]
+        for name, node in host.nodes.items()
+    ]
+    caption = "From /diagnostics: the worst level of all reports, the rest as last reported."
+    columns = ("node", "reports", "worst", "blocks", "lost", "message")
+    return Grid(columns, rows, caption, "docs/cell.md", ("node", "worst", "message"))
+
+
+def _losses(told: Gathered) -> list[str]:
+    host = told.host
+    found = [f"reading stopped: {told.stopped}"] if told.stopped else []
+    for topic, tally in islice(told.topics.items(), _MOST_ROWS):
+        if tally.open_end and not told.stopped:
+            found.append(f"{topic} does not say that the run ends with its last block: the recording was cut off")
+    found += [f"{name} lost {count} blocks" for name, count in host.lost_blocks.items()]
+    found += host.errors
+    found += [f"{form.tool}: {form.refused}" for form in told.forms if form.refused]
+    if told.about.get(RECOVERED):
+        found.append(f"the bag was cut off and has been recovered: {told.about[RECOVERED]}")
+    if host.unreadable:
+        found.append(f"{host.unreadable} messages of host topics cannot be decoded")
+    if host.left_out:
+        found.append(f"{host.left_out} lines of host topics beyond those shown")
+    return [shown(text) for text in found]
+
+
+def _topics(told: Gathered) -> Grid:
+    columns = ("topic", "type", "messages", "samples", "rate [1/s]", "from [s]", "to [s]", "kB")
+    texts = ("topic", "type")
+    dense = messages.block_types()
+
+    def at(ns: int) -> str:
+        return f"{(ns - messages.START_NS) * 1e-9:.4f}"
+
+    rows = (
+        [
+            shown(topic),
+            shown(tally.type.rpartition("/")[2]),
+            str(tally.count),
+            str(told.samples) if tally.type in dense else "",
+            _number(tally.rate),
+            *((at(tally.first_ns), at(tally.last_ns)) if tally.count else ("–", "–")),
+            f"{tally.size / 1e3:.0f}",
+        ]
+        for topic, tally in told.topics.items()
+    )
+    caption = (
+        "Counted while reading. Rate: messages by simulated time between the first and the last; times are log times "
+        "since sample 0."
+    )
+    return Grid(columns, _cut(rows, len(told.topics)), caption, "docs/bags.md", texts)
+
+
+def _events(told: Gathered) -> Grid | None:
+    if not told.curves.events:
+        return None
+    rows: list[Sequence[str]] = [
+        [shown(event.topic), str(event.index), _number(event.index * told.step_ns * 1e-9), shown(event.action)]
+        for event in told.curves.events
+    ]
+    if told.curves.event_count > len(rows):
+        rows.append([f"… and {told.curves.event_count - len(rows)} more"])
+    columns = ("topic", "sample", "time [s]", "action")
+    return Grid(columns, rows, "Time since sample 0.", "docs/cell.md", ("topic", "action"))
+
+
+def _versions(told: Gathered) -> Grid | None:
+    try:
+        given = json.loads(told.about.get(VERSIONS, ""))
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(given, dict) or not given:
+        return None
+    rows = ([shown(name), shown(str(number))] for name, number in given.items())
+    return Grid(("made with", "version"), _cut(rows, len(given)), "", "docs/bags.md", ("made with", "version"))
+
+
+def _about(told: Gathered) -> Grid | None:
+    given = {key: text for key, text in told.about.items() if key not in (SCENARIO, VERSIONS)}
+    if not given:
+        return None
+    rows = (
+        [shown(key), f"{len(text)} characters of base64" if key.startswith(FILE) else shown(text)]
+        for key, text in sorted(given.items())
+    )
+    caption = "What else the bag says of itself."
+    return Grid(("key", "text"), _cut(rows, len(given)), caption, "docs/bags.md", ("key", "text"))
+
+
+def _facts(told: Gathered) -> list[Fact]:
+    whole = Fact("recording", "complete", "good") if told.complete else Fact("recording", "incomplete", "bad")
+    facts = [whole, Fact("simulated", f"{told.seconds:.4g} s"), Fact("samples", f"{told.samples:,}".replace(",", " "))]
+    for form in told.forms[:1]:
+        if form.first and form.last:
+            facts.append(Fact("revolutions", str(form.rms.size)))
+            facts.append(Fact("RMS, first revolution", f"{_number(form.first.numbers['rms'])} µm"))
+            facts.append(Fact("RMS, last revolution", f"{_number(form.last.numbers['rms'])} µm"))
+    if told.run_id:
+        facts.append(Fact("run", shown(told.run_id, 16)))
+    return facts
+
+
+def render(told: Gathered, name: str, command: str) -> str:
+    """The page.
+
+    Args:
+        told: what was gathered.
+        name: of the bag.
+        command: that makes the page again.
+    """
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    with mpl.rc_context(figures.STYLE), np.errstate(over="ignore", invalid="ignore"):
+        cycles = {f"{topic}: {field}": found for (topic, field), found in told.curves.cycles.items() if found.size}
+        forms = [_form(form, cycles) for form in told.forms]
+        signals, timing = _signals(told), _timing(told)
+        if cycles and not any(form.figures for form in forms):
+            caption = "What each controller measured in its own cycles."
+            signals.append(Picture("Convergence", figures.convergence(None, cycles), caption, "docs/learning.md"))
+    text: str = environment.get_template("report.html.j2").render(
+        title=f"Report of {shown(name, 80)}",
+        command=shown(command),
+        version=__version__,
+        facts=_facts(told),
+        forms=forms,
+        signals=signals,
+        timing=timing,
+        nodes=_nodes(told),
+        losses=_losses(told),
+        states=[shown(state) for state in told.host.states],
+        topics=_topics(told),
+        events=_events(told),
+        versions=_versions(told),
+        about=_about(told),
+        scenario=shown(told.about.get(SCENARIO, ""), _LONGEST_SCENARIO),
+    )
+    return text
+
+
+def write(bag: Path, page: Path) -> Gathered:
+    """Write the report of a bag; an older one of the same name is replaced once the new one is whole.
+
+    Args:
+        bag: the bag.
+        page: the HTML file.
+
+    Raises:
+        InputError: not a bag, or no place for a page.
+        LatheError: the disk does not take it.
+    """
+    if page.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"-o {page}; allowed: a file name that ends in .html")
+    if page.is_dir() or not page.absolute().parent.is_dir():
+        raise InputError(f"-o {page}: {'is a folder' if page.is_dir() else 'no such folder'}; name a file")
+    told = gather(bag)
+    command = shlex.join(["lathe", "report", str(bag), "-o", str(page)])
+    text = render(told, bag.resolve().name, command)
+    try:
+        with replacing(page) as file:
+            file.write(text.encode("utf-8", "replace"))
+    except OSError as error:
+        raise LatheError(f"{page}: cannot be written ({error.strerror})") from None
+    return told

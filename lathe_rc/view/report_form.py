@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The form of the part from a stream: measured revolution by revolution as soon as each is complete."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lathe_rc import part
+from lathe_rc.analysis.metrology import POINTS, Measurement, measure
+from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.errors import InputError
+from lathe_rc.view.report_series import Envelope, MeanRows
+
+ACROSS = 512  #: angles of the map
+CUTOFF = 50.0  #: of the filters for roundness and roughness [UPR], as of `lathe measure`
+_MARGIN = 64  # samples on each side that a spline needs to be the one through the whole run, to a bit or two
+_AT_ONCE = 16  # revolutions
+_LONGEST = 2**22  # samples of one revolution
+_TURN = 2.0 * np.pi
+
+
+@dataclass(frozen=True)
+class Revolution:
+    """A revolution that is told of.
+
+    Attributes:
+        numbers: see `lathe_rc.part.numbers`.
+        profile: deviation of the radius at even angles [m], shape (points,).
+        amplitude: of its undulations [m], from 0 UPR on.
+    """
+
+    numbers: Mapping[str, Any]
+    profile: Samples
+    amplitude: Samples
+
+
+class Form:
+    """Form error of one tool, by revolution; a sink, see `lathe_rc.cell.engine.Sink`.
+
+    Args:
+        encoder: topic with the angle.
+        tool: topic with the form error.
+
+    Attributes:
+        tool: see above.
+        first, last, best: revolutions, the best by RMS; None before there is one.
+        rms, largest: envelope by revolution [m].
+        map: radius deviation [m], by revolution and angle.
+        refused: why the form, or its rest, is not measured; empty if it is.
+    """
+
+    def __init__(self, encoder: str, tool: str) -> None:
+        self._encoder, self.tool = encoder, tool
+        self._angle, self._error = np.empty(0), np.empty(0)
+        self._done = 0  # revolutions measured; the arrays go back to a margin before the next
+        self.first: Revolution | None = None
+        self.last: Revolution | None = None
+        self.best: Revolution | None = None
+        self.rms, self.largest = Envelope(), Envelope()
+        self.map = MeanRows(ACROSS)
+        self.refused = ""
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        if not self.refused:
+            self._angle = np.concatenate([self._angle, dense[self._encoder]["angle_true"]])
+            self._error = np.concatenate([self._error, dense[self.tool]["error"]])
+            self._measure(_MARGIN)
+
+    def finish(self) -> None:
+        """Measure what is left."""
+        if not self.refused:
+            self._measure(0)
+
+    def _measure(self, margin: int) -> None:
+        """Measure the complete revolutions that end ``margin`` samples or more before the newest."""
+        try:
+            self._check()
+            with np.errstate(over="ignore", invalid="ignore"):  # of absurd samples; they show in the numbers
+                while self._next(margin):
+                    pass
+        except InputError as error:
+            self.refused = f"{error} (after revolution {self._done})"
+            self._angle = self._error = np.empty(0)
+
+    def _check(self) -> None:
+        """Refuse what would take memory or give no form.
+
+        Raises:
+            InputError: says why.
+        """
+        step = np.diff(self._angle)
+        if not (np.isfinite(self._angle).all() and np.isfinite(self._error).all()):
+            raise InputError("samples that are not finite")
+        if step.size and not (step.min() > 0.0 and step.max() < _TURN / 3):
+            raise InputError("the angle does not increase, or by more than a third of a turn in a sample")
+        if self._done == 0 and self._angle.size and not 0.0 <= self._angle[0] < _TURN:
+            raise InputError(f"the angle begins at {self._angle[0]:g} rad; allowed: in the first turn")
+        if self._angle.size > _LONGEST:
+            raise InputError(f"a revolution longer than {_LONGEST} samples")
+
+    def _next(self, margin: int) -> bool:
+        """Measure some revolutions; whether there were any."""
+        angle = self._angle - self._done * _TURN
+        edges = np.searchsorted(angle, _TURN * np.arange(_AT_ONCE + 1))
+        whole = int(np.count_nonzero(edges[1:] + margin < angle.size)) if margin else _AT_ONCE
+        if not whole:
+            return False
+        stop = int(edges[whole]) + _MARGIN
+        found = measure(angle[:stop], self._error[:stop], roundness_cutoff=CUTOFF, roughness_cutoff=CUTOFF)
+        whole = min(whole, found.form.rms.size)
+        if not whole:
+            return False
+        self._take(found, whole)
+        self._done += whole
+        keep = max(0, int(np.searchsorted(angle, whole * _TURN)) - _MARGIN)
+        self._angle, self._error = self._angle[keep:], self._error[keep:]
+        return True
+
+    def _take(self, found: Measurement, whole: int) -> None:
+        for row in found.profile[:whole].reshape(whole, ACROSS, POINTS // ACROSS).mean(axis=-1):
+            self.map.add(row)
+        rms = found.form.rms[:whole]
+        self.rms.add(rms)
+        self.largest.add(found.form.largest[:whole])
+        if self.first is None:
+            self.first = self._revolution(found, 0)
+        best = int(np.argmin(rms))
+        if self.best is None or rms[best] * 1e6 < self.best.numbers["rms"]:
+            self.best = self._revolution(found, best)
+        self.last = self._revolution(found, whole - 1)
+
+    def _revolution(self, found: Measurement, k: int) -> Revolution:
+        numbers = {**part.numbers(found, k), "revolution": self._done + k + 1}
+        return Revolution(numbers, found.profile[k].copy(), found.undulations.amplitude[k].copy())

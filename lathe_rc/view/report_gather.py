@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a report tells of a bag, gathered in one pass and in memory that does not grow with the bag."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from lathe_rc.bag.source import Source
+from lathe_rc.bag.stream import Feeder
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wire import Decoder
+from lathe_rc.errors import LatheError
+from lathe_rc.view.report_form import Form
+from lathe_rc.view.report_host import TYPES as HOST_TYPES
+from lathe_rc.view.report_host import Host
+from lathe_rc.view.report_series import Envelope
+
+_MOST_OF_A_TYPE = 4  # topics that have figures
+_MOST_EVENTS = 100
+_PIECE = 65536  # samples
+_CURVES = {
+    messages.ENCODER: ("speed_true",),
+    messages.CUT: ("force", "wear"),
+}  # fields that are drawn against time
+_CYCLES = {messages.LEARNING: "rms_error", messages.PERIODIC: "max_error"}  # fields that are drawn against cycles
+
+
+@dataclass
+class Tally:
+    """Messages of a topic.
+
+    Attributes:
+        type: message type.
+        count, size: messages and their bytes.
+        first_ns, last_ns: log times.
+        open_end: it has no block that says that the run ends with it.
+    """
+
+    type: str
+    count: int = 0
+    size: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    open_end: bool = False
+
+    @property
+    def rate(self) -> float:
+        """Messages by simulated second; NaN where there is no time between them."""
+        span = self.last_ns - self.first_ns
+        return (self.count - 1) / (span * 1e-9) if span > 0 else np.nan
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that took effect at a sample."""
+
+    topic: str
+    index: int
+    action: str
+
+
+class Curves:
+    """Signals and cycles to be drawn; a sink, see `lathe_rc.cell.engine.Sink`.
+
+    Attributes:
+        signals: envelope by topic and field.
+        cycles: the same, of what a controller achieved in each cycle.
+        events: the first of them; ``event_count`` counts all.
+    """
+
+    def __init__(self, types: Mapping[str, str]) -> None:
+        self._types = types
+        self.signals = {
+            (topic, name): Envelope()
+            for kind, names in _CURVES.items()
+            for topic in of_type(types, kind)
+            for name in names
+        }
+        self.cycles = {(topic, name): Envelope() for kind, name in _CYCLES.items() for topic in of_type(types, kind)}
+        self.events: list[Event] = []
+        self.event_count = 0
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        for (topic, name), envelope in self.signals.items():
+            envelope.add(dense[topic][name])
+        for (topic, name), envelope in self.cycles.items():
+            envelope.add(np.array([message.values[name] for message in sparse.get(topic, [])], dtype=float))
+        for topic, found in sparse.items():
+            if self._types[topic] == messages.EVENT:
+                self.event_count += len(found)
+                room = max(0, _MOST_EVENTS - len(self.events))
+                self.events += [Event(topic, event.index, event.values["action"]) for event in found[:room]]
+
+
+def of_type(types: Mapping[str, str], kind: str) -> list[str]:
+    """The first topics of a type."""
+    return [topic for topic, given in sorted(types.items()) if given == kind][:_MOST_OF_A_TYPE]
+
+
+@dataclass
+class Gathered:
+    """All that a report tells.
+
+    Attributes:
+        about: what the bag says of itself.
+        topics: by name.
+        samples: of every dense topic.
+        step_ns: sampling step [ns].
+        run_id: identity of the run.
+        forms: of each tool.
+        curves: signals and cycles.
+        host: what the host topics say.
+        stopped: why the bag was not read to its end; empty if it was.
+    """
+
+    about: Mapping[str, str]
+    topics: dict[str, Tally]
+    forms: list[Form]
+    curves: Curves
+    host: Host = field(default_factory=Host)
+    samples: int = 0
+    step_ns: int = 0
+    run_id: str = ""
+    stopped: str = ""
+
+    @property
+    def complete(self) -> bool:
+        """Whether the whole bag was read and each dense topic ends with the run."""
+        dense = [tally for tally in self.topics.values() if tally.type in messages.block_types()]
+        return bool(dense) and not self.stopped and not any(tally.open_end for tally in dense)
+
+    @property
+    def seconds(self) -> float:
+        """Simulated time [s]."""
+        return self.samples * self.step_ns * 1e-9
+
+    def at(self, place: Samples) -> Samples:
+        """Time since sample 0 [s] of samples."""
+        return place * (self.step_ns * 1e-9)
+
+
+def gather(path: Path) -> Gathered:
+    """Read a bag once.
+
+    Raises:
+        InputError: not a bag.
+    """
+    with Source(path) as source:
+        types = {topic: found.type for topic, found in source.topics.items()}
+        encoders = of_type(types, messages.ENCODER)
+        forms = [Form(encoders[0], tool) for tool in of_type(types, messages.TOOL)] if encoders else []
+        curves = Curves(types)
+        told = Gathered(source.about, {topic: Tally(kind) for topic, kind in sorted(types.items())}, forms, curves)
+        feeder = Feeder(types, [*forms, curves], _PIECE)
+        try:
+            _read(source, feeder, told)
+        except LatheError as error:
+            told.stopped = str(error)
+        for form in forms:
+            form.finish()
+        told.samples, told.step_ns, told.run_id = feeder.first, feeder.step_ns, feeder.run_id
+    return told
+
+
+def _read(source: Source, feeder: Feeder, told: Gathered) -> None:
+    """Hand every message to those whom it concerns."""
+    newest: dict[str, bytes] = {}
+    for topic, log_ns, data in source.messages():
+        tally = told.topics[topic]
+        tally.first_ns = tally.first_ns if tally.count else log_ns
+        tally.count, tally.size, tally.last_ns = tally.count + 1, tally.size + len(data), log_ns
+        if topic in feeder.types:
+            feeder.add(topic, log_ns, data)
+            newest[topic] = data
+        elif tally.type in HOST_TYPES:
+            told.host.add(tally.type, data)
+    left = feeder.finish()
+    if left:
+        told.stopped = f"some topics have {left} samples more than others"
+    for topic, tally in told.topics.items():
+        if tally.type in messages.block_types():
+            tally.open_end = topic not in newest or not Decoder(tally.type).decode(newest[topic]).last

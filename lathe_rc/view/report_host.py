@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the recorded host topics say: how the nodes fared, and how late the cell was."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from lathe_rc.cell import messages
+from lathe_rc.view.report_series import Thinned
+
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+CELL_STATE = f"{messages.PACKAGE}/msg/CellState"
+TYPES = frozenset({DIAGNOSTICS, CELL_STATE})
+
+_STATES = ("waiting", "running", "ended", "failed")
+_FAILED = 3
+_ERROR = 2  # level of a status
+_MOST_NODES = 128
+_MOST_LINES = 50
+_MOST_VALUES = 64  # of a status
+
+
+@dataclass
+class Node:
+    """What a node said of itself, the newest.
+
+    Attributes:
+        reports: how many times.
+        level: the worst.
+        message: the last.
+        values: the last.
+    """
+
+    reports: int = 0
+    level: int = 0
+    message: str = ""
+    values: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """Where the time master was at a wall time [s]."""
+
+    wall: float
+    blocks: float
+    samples: float
+    slipped: float
+
+
+class Host:
+    """Takes the messages of host topics.
+
+    Attributes:
+        nodes: by name.
+        states: texts of what the time master declared.
+        errors: texts of what failed.
+        unreadable: messages that could not be decoded.
+        left_out: nodes, states and errors beyond what is shown.
+        pace: samples by wall time [1/s], between two reports of the time master.
+        slip: time that the schedule fell behind in a second [s/s], the same.
+        latency: blocks in flight over blocks by wall time: how long a block is in flight [s].
+    """
+
+    def __init__(self) -> None:
+        self.nodes: dict[str, Node] = {}
+        self.states: list[str] = []
+        self.errors: list[str] = []
+        self.unreadable = self.left_out = 0
+        self.pace, self.slip, self.latency = Thinned(), Thinned(), Thinned()
+        self._marks: dict[str, _Mark] = {}
+
+    def add(self, msgtype: str, data: bytes) -> None:
+        """Take a message of one of `TYPES`."""
+        try:
+            message = messages.decode(msgtype, data)
+        except Exception:  # noqa: BLE001 - bytes that anybody may have written; rosbags raises whatever it meets
+            self.unreadable += 1
+            return
+        if msgtype == CELL_STATE:
+            self._state(message)
+            return
+        for status in message.status:
+            self._status(messages.stamp_ns(message) * 1e-9, status)
+
+    def _line(self, lines: list[str], text: str) -> None:
+        if text in lines[-1:]:
+            return
+        if len(lines) < _MOST_LINES:
+            lines.append(text)
+        else:
+            self.left_out += 1
+
+    def _state(self, message: Any) -> None:
+        named = _STATES[message.state] if message.state < len(_STATES) else f"state {message.state}"
+        text = f"{named} from sample {message.first_index}" + (f": {message.message}" if message.message else "")
+        self._line(self.states, text)
+        if message.state == _FAILED:
+            self._line(self.errors, f"the cell failed at sample {message.first_index}: {message.message}")
+
+    def _status(self, wall: float, status: Any) -> None:
+        if status.name not in self.nodes and len(self.nodes) >= _MOST_NODES:
+            self.left_out += 1
+            return
+        node = self.nodes.setdefault(status.name, Node())
+        level = status.level if isinstance(status.level, int) else int.from_bytes(bytes(status.level), "little")
+        node.reports += 1
+        node.level = max(node.level, level)
+        node.message = status.message
+        node.values = {pair.key: pair.value for pair in status.values[:_MOST_VALUES]}
+        if level >= _ERROR:
+            self._line(self.errors, f"{status.name}: {status.message}")
+        self._measure(status.name, wall, node.values)
+
+    def _measure(self, name: str, wall: float, values: dict[str, str]) -> None:
+        """Compare a report of the time master with the one before."""
+        try:
+            in_flight = float(values["blocks in flight"])
+            mark = _Mark(wall, *(float(values[key]) for key in ("blocks", "samples", "schedule slipped [s]")))
+        except (KeyError, ValueError):
+            return
+        before = self._marks.get(name)
+        self._marks[name] = mark
+        if before is None or not before.blocks or mark.wall <= before.wall or mark.blocks <= before.blocks:
+            return  # it was not running all that time
+        seconds = mark.wall - before.wall
+        self.pace.add((mark.samples - before.samples) / seconds)
+        self.slip.add((mark.slipped - before.slipped) / seconds)
+        self.latency.add(in_flight * seconds / (mark.blocks - before.blocks))
+
+    @property
+    def lost_blocks(self) -> dict[str, int]:
+        """By node, where there are any."""
+        counts = {name: node.values.get("lost blocks", "0") for name, node in self.nodes.items()}
+        return {name: int(count) for name, count in counts.items() if count.isdecimal() and count.strip("0")}

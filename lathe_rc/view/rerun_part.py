@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shapes and colours of the three-dimensional picture: the part ring by ring, the tool, the scale of colours.
+
+The axes are those of a lathe: Z along the spindle, X from it to the tool. Lengths are in millimetres; the part is
+drawn with a radius of its own, since a recording does not hold it.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import matplotlib as mpl
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.view.rerun_revolutions import ANGLES, Revolution
+
+Array = npt.NDArray[np.float64]
+
+COLOURS: Final = "turbo"  #: Rerun has it under the same name
+LOG_RANGE = (-1.5, 2.5)  #: of the colours: log10 of |form error| in µm
+RADIUS = 50.0  #: of the part [mm]
+LENGTH = 110.0  #: of the part, if it is known how much will be turned [mm]
+_PITCH = 0.5  # between revolutions, if it is not [mm]
+_DEEPEST = 0.4 * RADIUS  # that a deviation is drawn [mm]
+_SWING = 0.24 * RADIUS  # what the deviations of a part should come to [mm]
+_LEAST = 10e-6  # that deviations are taken to come to [m]
+_STEP = 2  # of the angles, every how many-th has a vertex
+_VERTICES = ANGLES // _STEP
+_SMALLEST = 1e-9  # form error that is told from 0 [m]
+
+
+def log_um(error: Array) -> Array:
+    """Magnitude of an error [m] as log10 of micrometres."""
+    return np.asarray(np.log10(np.maximum(np.abs(error), _SMALLEST) * 1e6))
+
+
+def colours(error: Array) -> npt.NDArray[np.uint8]:
+    """RGBA colours of form errors [m], shape (n, 4)."""
+    low, high = LOG_RANGE
+    return np.asarray(mpl.colormaps[COLOURS]((log_um(error) - low) / (high - low), bytes=True))
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What is known of a run before it is drawn.
+
+    Attributes:
+        revolutions: that will be turned; 0: unknown.
+        travel: along the part [m]; 0: unknown, or the tool stays where it is.
+    """
+
+    revolutions: float = 0.0
+    travel: float = 0.0
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How the part is drawn.
+
+    Attributes:
+        deviation: of radii [mm/m].
+        height: [mm/m]; 0: revolutions are stacked instead.
+        pitch: between revolutions that are stacked [mm].
+    """
+
+    deviation: float
+    height: float
+    pitch: float
+
+    @classmethod
+    def of(cls, outlook: Outlook, reference: Array) -> "Scale":
+        """A scale for what lies ahead and the first desired deviations [m], shape (n,)."""
+        swing = float(np.ptp(reference))
+        wanted = _SWING / (max(swing if np.isfinite(swing) else 0.0, _LEAST) * 1e3)
+        decade = 10.0 ** np.floor(np.log10(wanted))
+        exaggeration = max(step * decade for step in (1.0, 2.0, 5.0) if step * decade <= wanted * (1.0 + 1e-9))
+        height = LENGTH / outlook.travel if abs(outlook.travel) > 1e-6 else 0.0
+        pitch = LENGTH / max(outlook.revolutions, 10.0) if outlook.revolutions else _PITCH
+        return cls(float(exaggeration) * 1e3, height, pitch)
+
+    def z(self, turns: Array, height: Array) -> Array:
+        """Places along the spindle [mm], by angle [revolution] and height [m]."""
+        return height * self.height if self.height else turns * self.pitch
+
+    def x(self, deviation: Array) -> Array:
+        """Distance from the spindle [mm] of radius deviations [m]."""
+        return RADIUS + np.clip(deviation * self.deviation, -_DEEPEST, _DEEPEST)
+
+    def text(self) -> str:
+        """In words."""
+        along = f"height ×{self.height / 1e3:.3g}" if self.height else "one revolution after the other"
+        return f"radius deviation ×{self.deviation / 1e3:.0f}, {along}"
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A ring of vertices, its normals and colours, each shape (vertices, 3 or 4)."""
+
+    vertices: npt.NDArray[np.float32]
+    normals: npt.NDArray[np.float32]
+    colours: npt.NDArray[np.uint8]
+
+
+def edge(revolution: Revolution, scale: Scale) -> Edge:
+    """The part in a revolution."""
+    angle = 2.0 * np.pi * (np.arange(_VERTICES) * _STEP + 0.5 * _STEP) / ANGLES
+    radius = scale.x(revolution.radius.reshape(_VERTICES, _STEP).mean(axis=1))
+    z = float(scale.z(np.array(revolution.number - 0.5), np.array(revolution.height)))
+    cosine, sine = np.cos(angle), np.sin(angle)
+    vertices = np.stack([radius * cosine, radius * sine, np.full(_VERTICES, z)], axis=1)
+    slope = (np.roll(radius, -1) - np.roll(radius, 1)) / (2.0 * (angle[1] - angle[0]))
+    normals = np.stack([radius * cosine + slope * sine, radius * sine - slope * cosine, np.zeros(_VERTICES)], axis=1)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    magnitude = np.abs(revolution.error).reshape(_VERTICES, _STEP).max(axis=1)
+    return Edge(vertices.astype(np.float32), normals.astype(np.float32), colours(magnitude))
+
+
+def strip(before: Edge, after: Edge) -> Edge:
+    """The surface between two rings; see `TRIANGLES`."""
+    return Edge(
+        np.concatenate([before.vertices, after.vertices]),
+        np.concatenate([before.normals, after.normals]),
+        np.concatenate([before.colours, after.colours]),
+    )
+
+
+def _triangles() -> npt.NDArray[np.uint32]:
+    here = np.arange(_VERTICES)
+    there = np.roll(here, -1)
+    halves = [[here, there, here + _VERTICES], [there, there + _VERTICES, here + _VERTICES]]
+    return np.concatenate([np.stack(half, axis=1) for half in halves]).astype(np.uint32)
+
+
+TRIANGLES = _triangles()  #: of a strip, shape (triangles, 3)
+STRIP = 2 * _VERTICES  #: vertices in a strip
+
+#: The tool with its tip at the origin: vertices [mm] and triangles.
+TOOL = (
+    np.array([[0, 0, 0], [14, 7, -5], [14, -7, -5], [14, -7, 5], [14, 7, 5]], dtype=np.float32),
+    np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1], [1, 4, 3], [1, 3, 2]], dtype=np.uint32),
+)
+
+
+def rotations(angle: Array) -> Array:
+    """Quaternions that turn the place under the tool at a spindle angle [rad] to it, shape (n, 4)."""
+    half = -0.5 * np.mod(angle, 4.0 * np.pi)
+    return np.stack([np.zeros_like(half), np.zeros_like(half), np.sin(half), np.cos(half)], axis=1)

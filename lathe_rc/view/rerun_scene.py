@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run in Rerun: the part, the tool, the signals and what was learned, logged in columns, piece by piece.
+
+Timelines are ``time``, simulated time from sample 0, and ``revolution``, from 1. Memory does not grow with the run.
+"""
+
+import itertools
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.errors import LatheError
+from lathe_rc.view import rerun_part as parts
+from lathe_rc.view.rerun_revolutions import ANGLES, HIGHEST, Revolution, Revolutions
+from lathe_rc.view.rerun_signals import CYCLES, curve_path, curves, envelope, full
+
+_POSES = 250.0  # of part and tool in a second
+_ROWS = 512  # of the map
+_BARS = np.arange(1, HIGHEST + 1) - 0.5  # left edges: Rerun draws bars to the right of their place
+_GROWTH = 8  # the map is sent again when it has this part more rows
+# Colours of Okabe and Ito, which most colour-blind people can tell apart.
+_PALETTE = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (240, 228, 66), (213, 94, 0))
+
+
+class Scene:
+    """Logs pieces of a run; a sink of `lathe_rc.bag.stream.feed`, or behind `lathe_rc.view.rerun_pieces.Pieces`.
+
+    A piece may lack topics, and there may be gaps between pieces. Curves have the same points however a run is cut if
+    pieces begin at multiples of ``window``.
+
+    Args:
+        recording: where to.
+        types: message type by topic.
+        step_ns: sampling step [ns].
+        outlook: on the whole run.
+        rate: points of a curve in a second, at most.
+
+    Attributes:
+        window: samples that two points of a curve stand for.
+        points: logged so far, of all curves.
+    """
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        types: Mapping[str, str],
+        step_ns: int,
+        *,
+        outlook: parts.Outlook | None = None,
+        rate: float = 2000.0,
+    ) -> None:
+        self._recording, self._step_ns = recording, step_ns
+        self._types = {full(topic): kind for topic, kind in types.items()}
+        self._curves = curves(types)
+        self._outlook = outlook or parts.Outlook()
+        self.window = max(1, int(np.ceil(2e9 / (rate * step_ns))))
+        self._pose = max(1, int(np.ceil(1e9 / (_POSES * step_ns))))
+        by_type = {kind: topic for topic, kind in reversed(self._types.items())}  # the first of each
+        self._encoder, self._tool = by_type.get(messages.ENCODER), by_type.get(messages.TOOL)
+        self._scale: parts.Scale | None = None
+        self._revolutions = Revolutions()
+        self._edge: parts.Edge | None = None
+        self._rows: list[npt.NDArray[np.float16]] = []
+        self._every = 1  # how many-th revolution has a row and a ring
+        self._sent = 0  # rows
+        self._newest: Revolution | None = None
+        self.points = 0
+        self._describe()
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`.
+
+        Raises:
+            LatheError: the recording cannot be written, or no part can have been turned with such an angle.
+        """
+        del samples
+        named = {full(topic): signals for topic, signals in dense.items()}
+        angle = named[self._encoder]["angle_true"] if self._encoder in named else None
+        turns = None if angle is None else angle / (2.0 * np.pi)
+        for topic, signals in named.items():
+            for field, curve in self._curves.get(topic, {}).items():
+                self._curve(curve_path(topic, field), first, signals[field] * curve.scale, turns)
+        for topic, found in sparse.items():
+            if found:
+                self._tell(full(topic), found)
+        if angle is not None and self._tool in named:
+            self._part(first, angle, named[self._tool])
+
+    def close(self) -> None:
+        """Log what is left; the recording stays open.
+
+        Raises:
+            LatheError: it cannot be written.
+        """
+        self._form(list(self._revolutions.finish()))
+        if self._newest and self._sent != len(self._rows):
+            self._send_map(self._newest)
+
+    # --- what never changes
+
+    def _describe(self) -> None:
+        """Colours, names and shapes."""
+        names = {"learning/form_error/rms": "part, RMS", "learning/form_error/largest": "part, largest"}
+        names |= {f"learning{t}": f"{t.strip('/')} {CYCLES[k].label}" for t, k in self._types.items() if k in CYCLES}
+        plots = {"learning": list(names)}
+        for topic, fields in self._curves.items():
+            for field, curve in fields.items():
+                path = curve_path(topic, field)
+                names[path] = f"{topic.strip('/')} {curve.label}"
+                plots.setdefault(curve.plot, []).append(path)
+        for paths in plots.values():
+            for path, colour in zip(paths, itertools.cycle(_PALETTE), strict=False):
+                self._static(
+                    path, rr.SeriesLines(names=names[path], colors=colour, widths=1.5, aggregation_policy="minmax")
+                )
+        if self._encoder and self._tool:
+            self._static("machine", rr.ViewCoordinates.RIGHT_HAND_X_UP)
+            self._static("machine/part/surface", rr.Mesh3D.from_fields(triangle_indices=parts.TRIANGLES))
+            chuck = rr.Cylinders3D(
+                lengths=[16.0],
+                radii=[1.15 * parts.RADIUS],
+                centers=[[0.0, 0.0, -9.0]],
+                colors=(120, 126, 138),
+                fill_mode="solid",
+            )
+            self._static("machine/part/chuck", chuck)
+            vertices, triangles = parts.TOOL
+            self._static(
+                "machine/tool/insert",
+                rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, albedo_factor=(230, 190, 60)),
+            )
+            self._send_legend()
+
+    def _send_legend(self) -> None:
+        """The scale of colours, as dots beside the part."""
+        dots = np.linspace(*parts.LOG_RANGE, 33)
+        decade = np.isclose(dots, np.round(dots))
+        z = np.linspace(0.0, parts.LENGTH, dots.size)
+        positions = np.stack([np.full(dots.size, -1.35 * parts.RADIUS), np.zeros(dots.size), z], axis=1)
+        self._static(
+            "machine/scale",
+            rr.Points3D(
+                positions,
+                colors=parts.colours(10.0**dots * 1e-6),
+                radii=np.where(decade, 2.6, 1.7),
+                labels=[f"{10**dot:g} µm" if whole else "" for dot, whole in zip(dots.tolist(), decade, strict=True)],
+                show_labels=True,
+            ),
+        )
+
+    def _static(self, path: str, what: rr.AsComponents) -> None:
+        self._recording.log(path, what, static=True, strict=True)
+
+    # --- pieces
+
+    def _curve(self, path: str, first: int, values: Samples, turns: Samples | None) -> None:
+        """Points of a curve."""
+        at = envelope(values, self.window)
+        self.points += at.size
+        number = None if turns is None else np.floor(turns[at]) + 1
+        self._send(path, self._when(first + at, number), rr.Scalars.columns(scalars=values[at]))
+
+    def _tell(self, topic: str, found: list[Sparse]) -> None:
+        """What controllers say of their cycles, and events."""
+        index, kind = np.array([message.index for message in found]), found[0].type
+        if kind in CYCLES:
+            cycle = CYCLES[kind]
+            values = parts.log_um(np.array([message.values[cycle.error] for message in found], dtype=np.float64))
+            number = np.array([message.values[cycle.counter] for message in found])
+            self._send(f"learning{topic}", self._when(index, number), rr.Scalars.columns(scalars=values))
+        elif kind == messages.EVENT:
+            texts = [f"{topic.strip('/')}: {message.values['action']}" for message in found]
+            self._send("events", self._when(index, None), rr.TextLog.columns(text=texts))
+
+    def _part(self, first: int, angle: Samples, tool: Signals) -> None:
+        """The part, the tool and the form error."""
+        error, reference, height = tool["error"], tool["reference"], tool["height"]
+        if self._scale is None:
+            self._scale = parts.Scale.of(self._outlook, reference)
+            note = [-1.95 * parts.RADIUS, 0.0, parts.LENGTH / 2]
+            self._static("machine/note", rr.Points3D([note], radii=0.1, labels=self._scale.text(), show_labels=True))
+        at = np.arange(-first % self._pose, angle.size, self._pose)
+        if at.size:
+            turns = angle[at] / (2.0 * np.pi)
+            when = self._when(first + at, np.floor(turns) + 1)
+            self._send("machine/part", when, rr.Transform3D.columns(quaternion=parts.rotations(angle[at])))
+            place = np.zeros((at.size, 3))
+            place[:, 0] = self._scale.x((reference - error)[at])
+            place[:, 2] = self._scale.z(turns, height[at])
+            self._send("machine/tool", when, rr.Transform3D.columns(translation=place))
+        self._form(list(self._revolutions.add(first, angle, error, reference, height)))
+
+    # --- revolutions
+
+    def _form(self, complete: list[Revolution]) -> None:
+        """Rings, rows, spectra and the learning curve of revolutions that are complete."""
+        rings: list[tuple[Revolution, parts.Edge]] = []
+        for revolution in complete:
+            self._newest = revolution
+            self._send(
+                "form_error/spectrum",
+                self._at([revolution]),
+                rr.BarChart.columns(values=revolution.harmonics()[1:] * 1e6, abscissa=_BARS),
+            )
+            if (revolution.number - 1) % self._every == 0:
+                rings.append((revolution, self._ring(revolution)))
+                self._row(revolution)
+        if complete:
+            for name in ("rms", "largest"):
+                values = parts.log_um(np.array([getattr(revolution, name) for revolution in complete]))
+                self._send(f"learning/form_error/{name}", self._at(complete), rr.Scalars.columns(scalars=values))
+        if rings:
+            strips = [strip for _, strip in rings]
+            columns = rr.Mesh3D.columns(
+                vertex_positions=np.concatenate([strip.vertices for strip in strips]),
+                vertex_normals=np.concatenate([strip.normals for strip in strips]),
+                vertex_colors=np.concatenate([strip.colours for strip in strips]),
+            )
+            when = self._at([revolution for revolution, _ in rings])
+            self._send("machine/part/surface", when, columns.partition([parts.STRIP] * len(rings)))
+
+    def _ring(self, revolution: Revolution) -> parts.Edge:
+        """The surface from the ring before to this one."""
+        assert self._scale is not None
+        after = parts.edge(revolution, self._scale)
+        strip = parts.strip(self._edge or after, after)
+        self._edge = after
+        return strip
+
+    def _row(self, revolution: Revolution) -> None:
+        """Add a row to the map; when it is full, every second one goes."""
+        self._rows.append(parts.log_um(revolution.error).astype(np.float16))
+        if len(self._rows) >= self._sent + max(1, self._sent // _GROWTH):
+            self._send_map(revolution)
+        if len(self._rows) == _ROWS:
+            self._send_map(revolution)
+            self._rows = self._rows[::2]
+            self._every *= 2
+            self._sent = len(self._rows)
+
+    def _send_map(self, revolution: Revolution) -> None:
+        self._sent = len(self._rows)
+        names = ["revolution" if self._every == 1 else f"revolution / {self._every}", f"angle / {360 // ANGLES}°"]
+        tensor = rr.encodings.TensorData(array=np.stack(self._rows), dim_names=names)
+        columns = rr.Tensor.columns(data=tensor, value_range=[parts.LOG_RANGE])
+        self._send("form_error/map", self._at([revolution]), columns)
+
+    # --- sending
+
+    def _at(self, revolutions: list[Revolution]) -> list[rr.TimeColumn]:
+        return self._when(np.array([r.end for r in revolutions]), np.array([r.number for r in revolutions]))
+
+    def _when(self, index: Samples, revolution: Samples | None) -> list[rr.TimeColumn]:
+        """Both timelines of samples, or only time where the spindle angle is not known."""
+        columns = [rr.TimeColumn("time", duration=(index * self._step_ns).astype("timedelta64[ns]"))]
+        if revolution is not None:
+            columns.append(rr.TimeColumn("revolution", sequence=revolution.astype(np.int64)))
+        return columns
+
+    def _send(self, path: str, when: list[rr.TimeColumn], columns: rr.ComponentColumnList) -> None:
+        try:
+            self._recording.send_columns(path, when, columns, strict=True)
+        except RuntimeError as error:
+            raise LatheError(f"the view cannot be written ({error}); is the disk full?") from None

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The layouts for PlotJuggler and Foxglove name what a recording of their demo holds, with numbers in it."""
+
+import json
+import math
+import re
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from lathe_rc import harness
+from lathe_rc.bag.source import Source
+from lathe_rc.cell import messages
+from lathe_rc.cell.scenario import load
+
+ROOT = Path(__file__).parents[1]
+LAYOUTS = ROOT / "config" / "layouts"
+DEMOS = ("piston", "two_channel")
+_STATUS = re.compile(r'status\[:\]\{name=="(.*)"\}\.values\[:\]\{key=="(.*)"\}\.value')
+
+
+@pytest.fixture(scope="module", params=DEMOS)
+def demo(request, tmp_path_factory):
+    """Name of a demo, and by topic the messages of a short recording that lasts longer than a diagnostics period."""
+    pytest.importorskip("rclpy")
+    bag = tmp_path_factory.mktemp(request.param) / "bag"
+    slow = ["spindle_encoder.revolutions=4", "spindle_encoder.speed_factor=0.15"]
+    harness.run(load(ROOT / "config" / f"{request.param}.yaml", slow), mode="composed", bag=bag)
+    found = {}
+    with Source(bag) as source:
+        for topic, _, data in source.messages():
+            found.setdefault(topic, []).append(messages.decode(source.topics[topic].type, data))
+    return request.param, found
+
+
+def numbers(values):
+    return [float(value) for value in values if math.isfinite(float(value))]
+
+
+def of_joint(recorded, topic, joint, field):
+    states = recorded[topic]
+    return numbers(getattr(state, field)[list(state.name).index(joint)] for state in states)
+
+
+def of_status(recorded, hardware, name, key):
+    """Values of a key in the diagnostics of a node; any hardware if it is None."""
+    found = [status for array in recorded["/diagnostics"] for status in array.status if status.name == name]
+    assert hardware is None or {status.hardware_id for status in found} == {hardware}
+    return numbers(pair.value for status in found for pair in status.values if pair.key == key)
+
+
+def of_field(recorded, topic, field):
+    return numbers(getattr(message, field) for message in recorded[topic])
+
+
+def plotjuggler(recorded, curve):
+    """The values that PlotJuggler draws as a curve of this name."""
+    if curve.startswith("/diagnostics/"):
+        hardware, name, key = re.fullmatch(r"/diagnostics/(\w+)/(/\w+)/(.*)", curve).groups()
+        return of_status(recorded, hardware, name, key)
+    if "/joint_states/" in curve:
+        topic, joint, field = curve.rsplit("/", 2)
+        return of_joint(recorded, topic, joint, field)
+    return of_field(recorded, *curve.rsplit("/", 1))
+
+
+def foxglove(recorded, path):
+    """The values of a Foxglove message path."""
+    topic, _, rest = path.partition(".")
+    if status := _STATUS.fullmatch(rest):
+        return of_status(recorded, None, *status.groups())
+    if rest.endswith("[0]"):
+        return numbers(getattr(state, rest[:-3])[0] for state in recorded[topic])
+    return of_field(recorded, topic, rest)
+
+
+def leaves(layout):
+    return [layout] if isinstance(layout, str) else [*leaves(layout["first"]), *leaves(layout["second"])]
+
+
+def test_plotjuggler_draws_only_what_is_recorded(demo):
+    name, recorded = demo
+    root = ET.parse(LAYOUTS / f"plotjuggler_{name}.xml").getroot()  # noqa: S314 - a file of our own
+    curves = [curve.get("name") for curve in root.iter("curve")]
+    assert [curve for curve in curves if not plotjuggler(recorded, curve)] == []
+    learning = {curve for curve in curves if "/learning/" in curve}
+    channels = {topic for topic in recorded if topic.endswith("/learning")}
+    assert {curve.rsplit("/", 1)[0] for curve in learning} == channels
+
+
+def test_foxglove_draws_only_what_is_recorded(demo):
+    name, recorded = demo
+    layout = json.loads((LAYOUTS / f"foxglove_{name}.json").read_text(encoding="utf-8"))
+    panels = layout["configById"]
+    assert sorted(leaves(layout["layout"])) == sorted(panels)
+    paths = [path["value"] for panel in panels.values() for path in panel.get("paths", [])]
+    assert [path for path in paths if not foxglove(recorded, path)] == []
+    joints = {path.partition(".")[0] for path in paths if "joint_states" in path}
+    assert joints == {topic for topic in recorded if topic.endswith("/joint_states")}
+    assert {panel["topicToRender"] for panel in panels.values() if "topicToRender" in panel} <= set(recorded)
+
+
+@pytest.mark.parametrize("name", DEMOS)
+def test_splitters_say_how_many_parts_they_have(name):
+    root = ET.parse(LAYOUTS / f"plotjuggler_{name}.xml").getroot()  # noqa: S314 - a file of our own
+    for splitter in root.iter("DockSplitter"):
+        assert int(splitter.get("count")) == len(splitter) == len(splitter.get("sizes").split(";"))
+    assert len(root.findall("tabbed_widget/Tab")) == 3

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Replay over real DDS: what was recorded comes again, in order and complete, and can be recorded again."""
+
+import contextlib
+import os
+import subprocess
+import sys
+import threading
+
+import pytest
+import rclpy
+from cells import scenario
+from geometry_msgs.msg import Point
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagWriter
+from rosbags.typesys import Stores, get_typestore
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
+
+from lathe_rc import harness
+from lathe_rc.bag.check import check
+from lathe_rc.bag.source import Source
+
+COUNT = 1500
+
+
+@pytest.fixture
+def domain(monkeypatch):
+    with harness.free_domain() as number:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield number
+
+
+@contextlib.contextmanager
+def started(*arguments):
+    """A process of this project; killed at the end if it has not ended by itself."""
+    command = [sys.executable, "-m", "lathe_rc", *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_a_replayed_cell_is_recorded_as_the_same_bag(domain, tmp_path):
+    first, again = tmp_path / "first", tmp_path / "again"
+    form = tmp_path / "form.csv"
+    form.write_text("angle_deg,radius_um\n0,0\n120,30\n240,-10\n")
+    loaded = scenario(spindle_encoder={"revolutions": 8.0}, tool={"profile": "csv", "profile_file": str(form)})
+    harness.run(loaded, mode="processes", bag=first)
+    with started("node", "recorder", "--ros-args", "-p", f"bag:={again}", "-p", "run_id:=test") as recorder:
+        replayed = subprocess.run(
+            [sys.executable, "-m", "lathe_rc", "replay", first, "--rate", "0", "--as-cell"],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert replayed.returncode == 0, replayed.stderr
+        assert recorder.wait() == 0, recorder.stdout.read()
+    with Source(first) as old, Source(again) as new:
+        signals = set(old.topics) - {"/diagnostics", "/cell_state"}
+        assert len(signals) == 9
+        assert list(old.messages(signals)) == list(new.messages(signals))
+        assert old.about["lathe_rc.file.tool.profile_file"] == new.about["lathe_rc.file.tool.profile_file"]
+    assert check(first).digests == check(again).digests
+
+
+@pytest.fixture
+def strange(tmp_path):
+    """A bag of another maker, in SQLite, whose messages are a millisecond apart."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    point = store.types["geometry_msgs/msg/Point"]
+    with RosbagWriter(tmp_path / "strange", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        topics = [writer.add_connection(name, point.__msgtype__, typestore=store) for name in ("/a", "/b")]
+        for number in range(COUNT):
+            data = store.serialize_cdr(point(float(number), 0.0, 0.0), point.__msgtype__)
+            writer.write(topics[number % 2], 5 * 10**9 + number * 10**6, bytes(data))
+    return tmp_path / "strange"
+
+
+class Listener:
+    """Hears the topics of that bag and /clock, in a thread."""
+
+    def __init__(self):
+        rclpy.init()
+        self.node = rclpy.create_node("listener")
+        qos = QoSProfile(depth=4096, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
+        self.heard, self.clock = {"/a": [], "/b": []}, []
+        self.news = threading.Condition()
+        for topic in self.heard:
+            self.node.create_subscription(Point, topic, self._keeper(topic), qos)
+        self.node.create_subscription(Clock, "/clock", self._on_clock, 1000)
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.thread = threading.Thread(target=self.executor.spin)
+        self.thread.start()
+
+    def _keeper(self, topic):
+        def keep(message):
+            with self.news:
+                self.heard[topic].append(message.x)
+                self.news.notify_all()
+
+        return keep
+
+    def _on_clock(self, message):
+        self.clock.append(message.clock.sec * 10**9 + message.clock.nanosec)
+
+    def wait_for(self, what):
+        with self.news:
+            assert self.news.wait_for(what, timeout=60.0)
+
+    def call(self, service):
+        client = self.node.create_client(Trigger, service)
+        assert client.wait_for_service(timeout_sec=60.0)
+        future, done = client.call_async(Trigger.Request()), threading.Event()
+        future.add_done_callback(lambda _: done.set())
+        assert done.wait(60.0)
+        return future.result()
+
+    def close(self):
+        self.executor.shutdown()
+        self.thread.join()
+        self.node.destroy_node()
+        rclpy.shutdown()
+
+
+@pytest.fixture
+def listener(domain):
+    made = Listener()
+    yield made
+    made.close()
+
+
+def test_a_bag_of_others_can_be_paused_and_comes_whole(strange, listener):
+    with started("replay", strange, "--rate", "0.05", "--loop") as process:
+        listener.wait_for(lambda: len(listener.heard["/a"]) >= 3)
+        assert listener.call("/replayer/pause").message == "paused"
+        before = len(listener.heard["/a"])
+        assert listener.call("/replayer/toggle_paused").message == "playing"
+        listener.wait_for(lambda: len(listener.heard["/a"]) >= before + 3)
+        process.kill()
+    assert listener.heard["/a"] == sorted(listener.heard["/a"])
+
+
+def test_every_message_comes_in_order_with_the_clock(strange, listener):
+    """Volatile topics reach those who are there; so the first round may lack its beginning, the second may not."""
+    with started("replay", strange, "--rate", "0", "--loop"):
+        whole = {"/a": [float(n) for n in range(0, COUNT, 2)], "/b": [float(n) for n in range(1, COUNT, 2)]}
+        listener.wait_for(lambda: all(len(heard) >= 3 * len(whole[topic]) for topic, heard in listener.heard.items()))
+    for topic, heard in listener.heard.items():
+        start = heard.index(whole[topic][0], 1)
+        assert heard[start : start + len(whole[topic])] == whole[topic]
+    rises = [b - a for a, b in zip(listener.clock, listener.clock[1:], strict=False) if b > a]
+    assert set(rises) == {10_000_000}
+
+
+def test_a_part_of_some_topics(strange, listener):
+    options = ["--topics", "/b", "--start", "0.5", "--end", "0.6", "--rate", "0", "--loop"]
+    with started("replay", strange, *options):
+        listener.wait_for(lambda: len(listener.heard["/b"]) > 200)
+    assert listener.heard["/a"] == []
+    assert set(listener.heard["/b"]) == {float(n) for n in range(501, 600, 2)}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--topics", "/c"], "replayer.topics: /c; the bag has /a, /b"),
+        (["--as-cell"], "the bag holds no scenario"),
+        (["--rate", "-1"], "-1"),
+    ],
+)
+def test_what_cannot_be_replayed_is_refused(strange, domain, arguments, said):
+    ended = subprocess.run(
+        [sys.executable, "-m", "lathe_rc", "replay", strange, *arguments],
+        capture_output=True, text=True, check=False, env=os.environ | {"ROS_LOG_DIR": str(strange)},
+    )  # fmt: skip
+    assert ended.returncode == 2
+    assert said in ended.stderr
+    assert "Traceback" not in ended.stderr

@@ -1,0 +1,370 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``lathe report``: what the page says is what was turned, and nothing from a bag can harm it."""
+
+import base64
+import re
+from html.parser import HTMLParser
+from types import SimpleNamespace
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from cells import scenario
+from click.testing import CliRunner
+from numpy.testing import assert_allclose
+
+from lathe_rc import __version__, harness, part
+from lathe_rc.bag import reader
+from lathe_rc.bag.writer import BagWriter, offered_qos
+from lathe_rc.cell import messages
+from lathe_rc.commands.report import report
+from lathe_rc.errors import InputError
+from lathe_rc.view import report as reporting
+from lathe_rc.view.report_form import Form
+from lathe_rc.view.report_gather import gather
+from lathe_rc.view.report_host import CELL_STATE, DIAGNOSTICS, Host
+from lathe_rc.view.report_series import Envelope, MeanRows, Thinned
+
+HOSTILE = "<script>alert(1)</script>$x_{$\u202e\x07"
+
+
+class Page(HTMLParser):
+    """A page's elements, texts and attributes."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.links, self.cells, self._cell = [], [], [], False
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self.links += [value for name, value in attributes if name in ("src", "href", "srcset", "action")]
+        self._cell = tag == "td"
+        if self._cell:
+            self.cells.append("")
+
+    def handle_endtag(self, tag):
+        self._cell = False
+
+    def handle_data(self, data):
+        self.text += data
+        if self._cell:
+            self.cells[-1] += data
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory):
+    """A bag of six revolutions with an event, its recording, and its page."""
+    folder = tmp_path_factory.mktemp("report")
+    nodes = {"spindle_encoder": {"revolutions": 6.2}, "learning_controller": {"events": ["revolution 4: freeze"]}}
+    harness.run(scenario(**nodes), bag=folder / "bag")
+    done = CliRunner().invoke(report, [str(folder / "bag"), "-o", str(folder / "page.html")])
+    assert done.exit_code == 0, done.output
+    return folder / "bag", reader.read(folder / "bag"), (folder / "page.html").read_text(encoding="utf-8")
+
+
+class TestPage:
+    def test_tells_the_numbers_of_the_first_best_and_last_revolution(self, turned):
+        _, recording, page = turned
+        found = part.measured(recording)
+        cells = Page(page).cells
+        best = int(np.argmin(found.form.rms))
+        for k, name in ((0, "first"), (best, "best"), (found.form.rms.size - 1, "last")):
+            told = part.numbers(found, k)
+            row = cells[cells.index(str(k + 1)) :][:11]
+            assert row[0] == str(k + 1)
+            assert name in row[1]
+            assert row[2:6] == [f"{told[key]:.4g}" for key in ("rms", "max", "peak_to_valley", "ront")]
+            cells = cells[cells.index(str(k + 1)) + 1 :] if k else cells
+
+    def test_counts_every_topic(self, turned):
+        _, recording, page = turned
+        cells = Page(page).cells
+        for topic, signals in recording.dense.items():
+            samples = next(iter(signals.values())).size
+            row = cells[cells.index(topic) :][:4]
+            assert row[2:] == [str(-(-samples // 64)), str(samples)]
+        assert cells[cells.index("/coarse/learning") + 2] == str(len(recording.sparse["/coarse/learning"].stamps))
+
+    def test_needs_nothing_else(self, turned):
+        page = Page(turned[2])
+        assert "script" not in page.tags
+        assert all(link.startswith("data:") for link in page.links)
+        assert not re.search(r"https?:|@import|url\(", re.sub(r"base64,[^\"]+", "", turned[2]))
+        assert "default-src 'none'" in turned[2]
+
+    def test_figures_are_whole_svg_without_links(self, turned):
+        images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', turned[2])
+        assert len(images) == 5  # map, polar, spectrum, convergence, speed
+        for image in images:
+            root = ET.fromstring(base64.b64decode(image))  # noqa: S314 - made here
+            assert root.tag == "{http://www.w3.org/2000/svg}svg"
+            links = [v for element in root.iter() for k, v in element.attrib.items() if k.endswith("href")]
+            assert all(link.startswith(("#", "data:image/png")) for link in links)
+
+    def test_names_its_pages_and_the_command_at_every_figure_and_table(self, turned):
+        bag, _, page = turned
+        assert page.count(f"lathe report {bag} -o {bag.parent / 'page.html'}") >= page.count("<figure>") + page.count(
+            "<table>"
+        )
+        assert page.count("docs/metrology.md") >= 5
+
+    def test_says_what_was_not_recorded(self, turned):
+        text = " ".join(Page(turned[2]).text.split())
+        assert "Not recorded: the wall time at which a single block was sent" in text
+        assert "nothing can be said of lateness" in text
+        assert "Nothing: every block is there" in text
+
+    def test_tells_scenario_and_versions(self, turned):
+        text = Page(turned[2]).text
+        assert "revolutions: 6.2" in text
+        assert f"lathe_rc{__version__}" in text
+        assert "base64" not in text  # no files here
+
+    def test_lists_events(self, turned):
+        cells = Page(turned[2]).cells
+        index = turned[1].sparse["/learning_controller/events"].values["sample_index"][0]
+        place = cells.index("freeze")
+        assert cells[place - 3 : place] == ["/learning_controller/events", str(index), f"{index / 64000:.4g}"]
+
+    def test_is_the_same_every_time(self, turned):
+        bag, _, page = turned
+        reporting.write(bag, bag.parent / "page.html")
+        assert (bag.parent / "page.html").read_text(encoding="utf-8") == page
+
+
+class TestForm:
+    """The measurement by pieces against that of the whole run."""
+
+    @pytest.mark.parametrize("piece", [700, 3840, 65536])
+    def test_equals_that_of_the_whole_run(self, turned, piece):
+        _, recording, _ = turned
+        found = part.measured(recording)
+        form = Form("/encoder", "/tool")
+        samples = recording.dense["/tool"]["error"].size
+        for first in range(0, samples, piece):
+            dense = {
+                topic: {name: array[first : first + piece] for name, array in recording.dense[topic].items()}
+                for topic in ("/encoder", "/tool")
+            }
+            form.chunk(first, dense["/tool"]["error"].size, dense, {})
+        form.finish()
+        assert form.refused == ""
+        assert_allclose(form.rms.curve()[1], found.form.rms, rtol=1e-12)
+        assert_allclose(form.largest.curve()[2], found.form.largest, rtol=1e-12)
+        for k, revolution in ((0, form.first), (int(np.argmin(found.form.rms)), form.best), (-1, form.last)):
+            assert_allclose(revolution.profile, found.profile[k], rtol=0, atol=1e-15)
+            assert_allclose(revolution.amplitude, found.undulations.amplitude[k], rtol=0, atol=1e-15)
+            assert revolution.numbers["revolution"] == part.numbers(found, k)["revolution"]
+        assert_allclose(form.map.rows()[-1], found.profile[-1].reshape(512, 8).mean(axis=-1), rtol=0, atol=1e-15)
+
+    @pytest.mark.parametrize(
+        ("angle", "said"),
+        [
+            (np.full(100, 1.0), "does not increase"),
+            (np.array([0.0, 1e300]), "more than a third of a turn"),
+            (np.array([1e9, 1e9 + 0.1]), "begins at"),
+            (np.array([0.0, np.nan]), "not finite"),
+        ],
+    )
+    def test_refuses_angles_that_would_take_memory_or_make_no_sense(self, angle, said):
+        form = Form("/encoder", "/tool")
+        form.chunk(0, angle.size, {"/encoder": {"angle_true": angle}, "/tool": {"error": np.zeros(angle.size)}}, {})
+        form.finish()
+        assert said in form.refused
+        assert form.first is None
+
+    def test_gives_up_a_revolution_that_never_ends(self):
+        form = Form("/encoder", "/tool")
+        for k in range(70):
+            angle = (k * 65536 + np.arange(65536.0)) * 1e-9
+            form.chunk(0, 65536, {"/encoder": {"angle_true": angle}, "/tool": {"error": angle}}, {})
+        assert "longer than" in form.refused
+        assert form._angle.size == 0
+
+
+class TestSeries:
+    def test_envelope_holds_the_extremes_of_its_groups(self):
+        values = np.random.default_rng(1).normal(size=5000)
+        envelope = Envelope(16)
+        for piece in np.array_split(values, [3, 4, 700, 701, 4000]):
+            envelope.add(piece)
+        place, low, high = envelope.curve()
+        groups = [values[k : k + envelope.group] for k in range(0, values.size, envelope.group)]
+        assert len(groups) <= 16 < 2 * len(groups)
+        assert low.tolist() == [group.min() for group in groups]
+        assert high.tolist() == [group.max() for group in groups]
+        assert envelope.extremes == (values.min(), values.max())
+        assert np.all(np.diff(place) > 0)
+
+    def test_envelope_leaves_out_what_is_not_finite(self):
+        envelope = Envelope(4)
+        envelope.add(np.array([np.nan, 1.0, np.inf, -2.0]))
+        assert envelope.extremes == (-2.0, 1.0)
+        assert np.isnan(Envelope(4).extremes).all()
+
+    def test_rows_are_means_of_neighbours(self):
+        rows = np.random.default_rng(2).normal(size=(37, 3))
+        found = MeanRows(3, capacity=8)
+        for row in rows:
+            found.add(row)
+        assert found.group == 8
+        assert_allclose(found.rows(), [rows[k : k + 8].mean(axis=0) for k in range(0, 37, 8)])
+
+    def test_thinned_keeps_an_even_choice(self):
+        found = Thinned()
+        for value in range(100_000):
+            found.add(float(value))
+        assert found.size == 100_000
+        assert np.all(np.diff(found.values()) == found.every)
+        assert found.values().size <= 8192
+
+
+def diagnostics(wall, name="/spindle", level=0, message="ready", **values):
+    types = messages.store().types
+    stamp = types["builtin_interfaces/msg/Time"](int(wall), int((wall % 1) * 1e9))
+    pairs = [types["diagnostic_msgs/msg/KeyValue"](key, value) for key, value in values.items()]
+    status = types["diagnostic_msgs/msg/DiagnosticStatus"](level, name, message, "spindle_encoder", pairs)
+    array = types[DIAGNOSTICS](types["std_msgs/msg/Header"](stamp, ""), [status])
+    return messages.encode(DIAGNOSTICS, array)
+
+
+def master(wall, blocks, slipped, in_flight):
+    values = {"blocks": blocks, "samples": 64 * blocks, "schedule slipped [s]": slipped, "blocks in flight": in_flight}
+    return diagnostics(wall, **{key: str(value) for key, value in values.items()}, **{"lost blocks": "2"})
+
+
+class TestHost:
+    def test_pace_lateness_and_latency_come_from_consecutive_reports(self):
+        host = Host()
+        for report_ in ((10.0, 0, 0.0, 0), (11.0, 500, 0.1, 4), (12.0, 1500, 0.1, 8), (14.0, 2500, 0.7, 6)):
+            host.add(DIAGNOSTICS, master(*report_))
+        # The first interval began before the run did.
+        assert_allclose(host.pace.values(), [64000.0, 32000.0])
+        assert_allclose(host.slip.values(), [0.0, 0.3], atol=1e-12)
+        assert_allclose(host.latency.values(), [8 / 1000, 6 / 500])
+        assert host.lost_blocks == {"/spindle": 2}
+
+    def test_failures_are_told_once_and_bounded(self):
+        host = Host()
+        for k in range(200):
+            host.add(DIAGNOSTICS, diagnostics(1.0 + k, level=2, message="broken"))
+        assert host.errors == ["/spindle: broken"]
+        state = messages.store().types[CELL_STATE]
+        for k in range(200):
+            host.add(CELL_STATE, messages.encode(CELL_STATE, state("run", 3, k, "no tool")))
+            host.add(DIAGNOSTICS, diagnostics(1.0, name=f"/n{k}"))
+        assert host.errors[1] == "the cell failed at sample 0: no tool"
+        assert len(host.errors) <= 50
+        assert len(host.nodes) <= 128
+        assert host.left_out > 0
+
+    def test_broken_messages_are_counted(self):
+        host = Host()
+        whole = master(1.0, 1, 0.0, 1)
+        for data in (b"", b"\0", whole[:40], bytes(64), b"\xff" * 64):
+            host.add(DIAGNOSTICS, data)
+        assert host.unreadable >= 4
+
+
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory):
+    """A bag whose every text is an attack, with samples as absurd as they come, and no end."""
+    path = tmp_path_factory.mktemp("hostile") / "bag"
+    texts = {"lathe_rc.run_id": "x", "lathe_rc.scenario": HOSTILE * 20_000, HOSTILE: HOSTILE * 100}
+    writer = BagWriter(path, compression="none", chunk_size=2**16, about=texts)
+    types = messages.store().types
+    qos = offered_qos(10, "volatile")
+    block_info = types[f"{messages.PACKAGE}/msg/BlockInfo"]("<b>run</b>", HOSTILE, 0, 15625, 0, 0)
+    header = messages.header(4095, 15625)
+    angle = np.arange(4096) * (2 * np.pi / 1000)
+    huge = np.full(4096, 1.7e308)
+    blocks = {
+        "/encoder": (messages.ENCODER, [angle, huge, np.zeros(4096, np.uint8), angle, huge]),
+        "/tool": (messages.TOOL, [huge] * 5),
+        "/a$b": (messages.CUT, [huge, -huge] + [np.full(4096, np.nan)] * 5),
+    }
+    for topic, (kind, arrays) in blocks.items():
+        writer.add_topic(topic, kind, qos)
+        writer.write(
+            topic,
+            messages.stamp_ns(SimpleNamespace(header=header)),
+            messages.encode(kind, types[kind](header, block_info, *arrays)),
+        )
+    writer.add_topic("/diagnostics", DIAGNOSTICS, qos)
+    for wall in (1.0, 2.0, 3.0, 1e300 % 2**31):
+        values = {
+            "blocks": str(wall * 1e200),
+            "samples": "nan",
+            "schedule slipped [s]": "1e999",
+            "blocks in flight": "-5",
+        }
+        writer.write(
+            "/diagnostics", 2 * 10**9, diagnostics(wall, name=HOSTILE, level=2, message=HOSTILE * 50, **values)
+        )
+    writer.write("/diagnostics", 2 * 10**9, b"\xff" * 64)
+    writer.close()
+    return path
+
+
+def test_a_hostile_bag_gives_a_harmless_page(hostile, tmp_path):
+    done = CliRunner().invoke(report, [str(hostile), "-o", str(tmp_path / "page.html")])
+    assert done.exit_code == 0, done.output
+    assert "incomplete recording" in done.stderr
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    page = Page(text)
+    assert "script" not in page.tags
+    assert "b" in page.tags  # ours
+    assert "<b>run" not in text
+    assert "\u202e" not in text
+    assert "\x07" not in text
+    assert len(text) < 2_000_000
+    assert "(540000 characters)" in page.text or "characters)" in page.text
+    assert "the recording was cut off" in page.text
+    assert "1 messages of host topics cannot be decoded" in page.text
+
+
+def test_a_bag_of_something_else_has_a_page_too(tmp_path):
+    writer = BagWriter(tmp_path / "bag", compression="none", chunk_size=2**16, about={})
+    writer.add_topic("/chatter", messages.JOINTS, offered_qos(10, "volatile"))
+    writer.close()
+    reporting.write(tmp_path / "bag", tmp_path / "page.html")
+    assert "no encoder and tool" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+def test_a_gap_is_told_and_what_came_before_is_shown(turned, tmp_path):
+    """The same recording without one block of the tool, in the fifth revolution."""
+    from lathe_rc.bag.source import Source
+
+    writer = BagWriter(tmp_path / "bag", compression="none", chunk_size=2**16, about={})
+    with Source(turned[0]) as source:
+        for topic, found in source.topics.items():
+            writer.add_topic(topic, found.type, offered_qos(10, "volatile"))
+        left_out = 300
+        for topic, log_ns, data in source.messages():
+            left_out -= topic == "/tool"
+            if topic != "/tool" or left_out != 0:
+                writer.write(topic, log_ns, data)
+    writer.close()
+    told = gather(tmp_path / "bag")
+    assert "/tool goes from sample 19136 to 19200" in told.stopped
+    assert not told.complete
+    page = reporting.render(told, "bag", "lathe report")
+    assert "reading stopped: " in page
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("page.txt", "ends in .html"), ("no/page.html", "no such folder"), ("dir.html", "is a folder")]
+)
+def test_places_that_are_none_are_refused(turned, tmp_path, name, said):
+    (tmp_path / "dir.html").mkdir()
+    with pytest.raises(InputError, match=said):
+        reporting.write(turned[0], tmp_path / name)
+
+
+def test_what_is_no_bag_is_refused_and_leaves_no_page(tmp_path):
+    (tmp_path / "x").mkdir()
+    with pytest.raises(InputError):
+        reporting.write(tmp_path / "x", tmp_path / "page.html")
+    assert not (tmp_path / "page.html").exists()

@@ -1,0 +1,383 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``lathe view`` and the scene behind it: what Rerun is given is what was recorded."""
+
+import importlib.util
+
+import numpy as np
+import pytest
+from cells import scenario
+from click.testing import CliRunner
+from numpy.testing import assert_allclose, assert_array_equal
+
+rr = pytest.importorskip("rerun")
+rrb = pytest.importorskip("rerun.blueprint")
+RrdReader = pytest.importorskip("rerun.chunk").RrdReader
+
+from lathe_rc import harness  # noqa: E402
+from lathe_rc.analysis import metrology  # noqa: E402
+from lathe_rc.bag import reader  # noqa: E402
+from lathe_rc.cell import messages  # noqa: E402
+from lathe_rc.cell.stage import Sparse  # noqa: E402
+from lathe_rc.cli import main  # noqa: E402
+from lathe_rc.errors import LatheError  # noqa: E402
+from lathe_rc.view import rerun_part as parts  # noqa: E402
+from lathe_rc.view.rerun_blueprint import blueprint  # noqa: E402
+from lathe_rc.view.rerun_pieces import Pieces  # noqa: E402
+from lathe_rc.view.rerun_revolutions import ANGLES, Revolutions  # noqa: E402
+from lathe_rc.view.rerun_scene import Scene  # noqa: E402
+from lathe_rc.view.rerun_signals import envelope  # noqa: E402
+
+STEP_NS = 15625
+
+
+def lathe(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def refused(*arguments, code=2):
+    """The one line that a command ends with."""
+    result = lathe(*arguments)
+    assert result.exit_code == code, result.output
+    (line,) = result.stderr.splitlines()
+    return line
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory):
+    """The bag and the recording of a run of twelve revolutions."""
+    bag = tmp_path_factory.mktemp("turned") / "bag"
+    given = {"profile": "harmonics", "harmonic_order": [1, 3], "harmonic_amplitude": [20e-6, 50e-6], "feed": 1e-4}
+    learning = {"events": ["revolution 9: freeze"]}
+    harness.run(scenario(spindle_encoder={"revolutions": 12.3}, tool=given, learning_controller=learning), bag=bag)
+    return bag, reader.read(bag)
+
+
+class View:
+    """The columns of a .rrd file."""
+
+    def __init__(self, path):
+        self.chunks = [chunk for chunk in RrdReader(path).stream() if not chunk.is_static]
+
+    def column(self, entity, name):
+        """The rows of a column, in the order in which they were logged."""
+        found = [chunk.to_record_batch() for chunk in self.chunks if chunk.entity_path == entity]
+        columns = [batch.column(name) for batch in found if name in batch.schema.names]
+        return [row for column in columns for row in (column.cast("int64") if name == "time" else column).to_pylist()]
+
+    def scalars(self, entity):
+        """Time [ns], revolution and value of a curve."""
+        values = [value for (value,) in self.column(entity, "Scalars:scalars")]
+        return tuple(np.array(one) for one in (self.column(entity, "time"), self.column(entity, "revolution"), values))
+
+    def entities(self, component):
+        return {chunk.entity_path for chunk in self.chunks if component in chunk.to_record_batch().schema.names}
+
+
+@pytest.fixture(scope="module")
+def shown(turned, tmp_path_factory):
+    """The .rrd file that the command makes of the bag."""
+    path = tmp_path_factory.mktemp("shown") / "out.rrd"
+    done = lathe("view", turned[0], "-o", path)
+    assert done.exit_code == 0, done.output
+    assert [file.name for file in path.parent.iterdir()] == ["out.rrd"]
+    return View(path)
+
+
+def form(recording):
+    angle = recording.of_type(messages.ENCODER)["angle_true"]
+    return angle, recording.of_type(messages.TOOL)["error"]
+
+
+# --- what is in a view
+
+
+def test_the_learning_curve_is_that_of_the_workshop(turned, shown):
+    expected = metrology.form_errors(*form(turned[1]))
+    for name in ("rms", "largest"):
+        time, revolution, value = shown.scalars(f"/learning/form_error/{name}")
+        assert_allclose(10**value * 1e-6, getattr(expected, name), rtol=1e-9)
+        assert_array_equal(revolution, np.arange(1, 13))
+        assert_array_equal(time, expected.starts[1:] * STEP_NS)
+
+
+def test_what_controllers_say_is_at_its_cycles(turned, shown):
+    status = turned[1].sparse["/coarse/learning"]
+    time, revolution, value = shown.scalars("/learning/coarse/learning")
+    assert_allclose(10**value * 1e-6, status.values["rms_error"])
+    assert_array_equal(revolution, status.values["cycle"])
+    assert_array_equal(time, np.array(status.stamps) - messages.START_NS)
+
+
+def test_events_are_at_their_sample(turned, shown):
+    ((topic, event),) = [(t, part) for t, part in turned[1].sparse.items() if turned[1].types[t] == messages.EVENT]
+    assert shown.column("/events", "TextLog:text") == [[f"{topic[1:]}: freeze"]]
+    assert_array_equal(shown.column("/events", "time"), np.array(event.stamps) - messages.START_NS)
+
+
+def test_the_spectrum_is_that_of_the_workshop(turned, shown):
+    expected = metrology.measure(*form(turned[1])).undulations.amplitude[:, 1:]
+    bars = np.array([row[0]["buffer"] for row in shown.column("/form_error/spectrum", "BarChart:values")])
+    assert bars.shape == (12, 50)
+    assert_allclose(bars * 1e-6, expected, rtol=2e-3, atol=5e-9)
+
+
+def test_points_of_curves_are_samples_and_no_peak_is_lost(turned, shown):
+    samples = turned[1].of_type(messages.TOOL)["error"] * 1e6
+    time, revolution, value = shown.scalars("/signals/tool/error")
+    index, rest = np.divmod(time, STEP_NS)
+    assert not rest.any()
+    assert_array_equal(value, samples[index])
+    assert_array_equal(revolution, np.floor(form(turned[1])[0][index] / (2 * np.pi)) + 1)
+    assert samples.size / 40 < index.size <= samples.size / 32 + 2  # two in 64 samples: 2 kHz
+    for start in range(0, samples.size, 64):
+        window = value[(index >= start) & (index < start + 64)]
+        assert (window.min(), window.max()) == (samples[start : start + 64].min(), samples[start : start + 64].max())
+
+
+def test_the_rate_of_points_is_what_was_asked_for(turned, tmp_path):
+    path = tmp_path / "few.rrd"
+    assert lathe("view", turned[0], "-o", path, "--rate", 200).exit_code == 0
+    time, _, _ = View(path).scalars("/signals/tool/error")
+    assert 150 * 0.72 < time.size <= 200 * 0.74
+
+
+def test_the_last_map_holds_all_revolutions(turned, shown):
+    angle, error = form(turned[1])
+    last = shown.column("/form_error/map", "Tensor:data")[-1][0]
+    assert (last["shape"], last["names"]) == ([12, ANGLES], ["revolution", "angle / 1°"])
+    rows = np.array(last["buffer"]).reshape(12, ANGLES)
+    for k in (0, 11):
+        inside = (angle >= 2 * np.pi * (k + 40 / 360)) & (angle < 2 * np.pi * (k + 41 / 360))
+        assert rows[k, 40] == pytest.approx(np.log10(np.abs(error[inside].mean()) * 1e6), abs=2e-3)
+
+
+def test_the_surface_grows_by_a_strip_a_revolution(shown):
+    strips = np.array(shown.column("/machine/part/surface", "Mesh3D:vertex_positions"))
+    assert strips.shape == (12, parts.STRIP, 3)
+    half = parts.STRIP // 2
+    assert_array_equal(strips[1:, :half], strips[:-1, half:])
+    z = strips[:, half, 2]
+    assert_allclose(np.diff(z), parts.LENGTH / 12.3, rtol=1e-3)
+    assert parts.TRIANGLES.max() == parts.STRIP - 1
+
+
+def test_the_tool_touches_what_it_has_turned(turned, shown):
+    """Turned by the spindle angle, the surface is where the tip is."""
+    strips = np.array(shown.column("/machine/part/surface", "Mesh3D:vertex_positions"))
+    tips = np.array([row[0] for row in shown.column("/machine/tool", "Transform3D:translation")])
+    poses = np.array([row[0] for row in shown.column("/machine/part", "Transform3D:quaternion")])
+    revolution = np.array(shown.column("/machine/tool", "revolution"))
+    assert tips.shape[0] == poses.shape[0] == pytest.approx(250 * 0.74, abs=2)
+    for tip, pose in zip(tips[revolution == 9], poses[revolution == 9], strict=True):
+        turn = 2 * np.arctan2(pose[2], pose[3])
+        ring = strips[8, parts.STRIP // 2 :]
+        angle = np.arctan2(ring[:, 1], ring[:, 0]) + turn
+        nearest = np.argmin(np.abs(np.angle(np.exp(1j * angle))))
+        assert np.hypot(*ring[nearest, :2]) == pytest.approx(tip[0], abs=0.2)
+    assert np.ptp(tips[revolution == 9, 0]) > 5.0
+
+
+def test_every_curve_and_picture_has_a_view(turned, shown):
+    """What nobody would see was logged in vain."""
+
+    def contents(part):
+        if isinstance(part, rrb.View):
+            given = [part.contents] if isinstance(part.contents, str) else part.contents
+            return [line.replace("$origin", part.origin) for line in given]
+        return [line for inner in part.contents for line in contents(inner)]
+
+    layout = contents(blueprint(turned[1].types).root_container)
+    trees = tuple(line.removesuffix("**") for line in layout if line.endswith("**"))
+    for component in ("TextLog:text", "Scalars:scalars", "Mesh3D:vertex_positions", "Tensor:data", "BarChart:values"):
+        entities = shown.entities(component)
+        assert entities
+        assert all(entity in layout or f"{entity}/".startswith(trees) for entity in entities)
+    assert {line for line in layout if line.startswith("/signals")} == {
+        entity for entity in shown.entities("Scalars:scalars") if entity.startswith("/signals")
+    }
+
+
+def test_a_bag_without_a_tool_has_only_curves():
+    types = {"/encoder": messages.ENCODER, "/x/state": messages.STATE, "/x/command": messages.SERVO}
+    names = [view.name for view in blueprint(types).root_container.contents[-1].contents]
+    assert names == ["spindle speed [1/min]", "slides [mm]", "servo [own units]"]
+
+
+# --- revolutions
+
+
+def test_revolutions_do_not_depend_on_the_pieces(turned):
+    angle, error = form(turned[1])
+    tool = turned[1].of_type(messages.TOOL)
+
+    def collected(size):
+        found = Revolutions()
+        revolutions = []
+        for a in range(0, angle.size, size):
+            cut = slice(a, a + size)
+            revolutions += found.add(a, angle[cut], error[cut], tool["reference"][cut], tool["height"][cut])
+        return [*revolutions, *found.finish()]
+
+    for one, other in zip(collected(angle.size), collected(997), strict=True):
+        assert (one.number, one.end) == (other.number, other.end)
+        for name in ("error", "radius", "height", "rms", "largest"):
+            assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-12)
+
+
+def test_a_revolution_with_a_gap_is_left_out():
+    angle = 2 * np.pi * np.arange(4000) / 500
+    zeros = np.zeros(4000)
+    found = Revolutions()
+    before = list(found.add(0, *(values[:1700] for values in (angle, zeros, zeros, zeros))))
+    after = list(found.add(1900, *(values[1900:] for values in (angle, zeros, zeros, zeros))))
+    assert [revolution.number for revolution in before] == [1, 2, 3]
+    assert [revolution.number for revolution in [*after, *found.finish()]] == [5, 6, 7, 8]
+
+
+def test_few_samples_a_revolution_leave_no_holes():
+    angle = 2 * np.pi * np.arange(2000) / 97.3
+    error = 1e-6 * np.cos(angle)
+    (*_, last) = Revolutions().add(0, angle, error, 0 * angle, 0 * angle)
+    assert_allclose(last.error, 1e-6 * np.cos(2 * np.pi * (np.arange(ANGLES) + 0.5) / ANGLES), atol=5e-8)
+    assert_array_equal(last.radius, -last.error)
+
+
+@pytest.mark.parametrize("jump", [-1e-3, 1e12, np.nan])
+def test_an_angle_that_no_spindle_has_is_refused(jump):
+    angle = np.arange(100) * 0.01
+    angle[50:] += jump * 100
+    with pytest.raises(LatheError, match="after sample 149"):
+        list(Revolutions().add(100, angle, *np.zeros((3, 100))))
+
+
+def test_a_long_run_stays_small(tmp_path):
+    """2000 revolutions: the map has at most 512 rows, rings become rarer, nothing else piles up."""
+    types = {"encoder": messages.ENCODER, "tool": messages.TOOL}
+    recording = rr.RecordingStream("test")
+    recording.save(tmp_path / "long.rrd")
+    scene = Scene(recording, types, STEP_NS, rate=50.0)
+    for first in range(0, 800_000, 80_000):
+        angle = 2 * np.pi * np.arange(first, first + 80_000) / 400
+        encoder = {"angle_true": angle, "speed": angle, "speed_true": angle}
+        zeros = np.zeros(80_000)
+        tool = dict.fromkeys(messages.sample_fields(messages.TOOL), zeros)
+        scene.chunk(first, 80_000, {"encoder": encoder, "tool": tool | {"reference": 1e-5 * np.cos(angle)}}, {})
+    scene.close()
+    recording.disconnect()
+    view = View(tmp_path / "long.rrd")
+    shapes = [row[0]["shape"] for row in view.column("/form_error/map", "Tensor:data")]
+    assert max(shapes) <= [512, ANGLES]
+    assert shapes[-1] == [500, ANGLES]  # every fourth
+    assert len(shapes) < 60
+    assert len(view.column("/machine/part/surface", "Mesh3D:vertex_positions")) == 512 + 256 + 244
+
+
+# --- envelopes and pieces
+
+
+def test_an_envelope_keeps_extremes_in_their_order():
+    values = np.array([0.0, 5.0, -1.0, 2.0, 7.0, 7.0, 7.0, 7.0, 3.0, 4.0])
+    assert envelope(values, 4).tolist() == [1, 2, 4, 8, 9]
+    assert envelope(values, 2).tolist() == list(range(10))
+    assert envelope(values[:0], 4).size == 0
+
+
+class Taken(list):
+    """A sink that keeps what it is given."""
+
+    def chunk(self, first, samples, dense, sparse):
+        kept = {topic: {name: array.copy() for name, array in signals.items()} for topic, signals in dense.items()}
+        self.append((first, samples, kept, sparse))
+
+
+TWO = {"/a": messages.COMMAND, "/b": messages.COMMAND}
+
+
+def blocks(pieces, topic, *spans):
+    for first, end in spans:
+        pieces.block(topic, first, {"position": np.arange(first, end, dtype=float)})
+
+
+def test_blocks_of_different_lengths_meet_in_pieces():
+    taken = Taken()
+    pieces = Pieces(TWO, 100, taken)
+    blocks(pieces, "a", (0, 64), (64, 128), (128, 230))
+    assert not taken
+    pieces.message(Sparse("events", messages.EVENT, 150, {"action": "freeze"}))
+    blocks(pieces, "/b", (0, 7), (7, 230))
+    assert [(first, samples) for first, samples, _, _ in taken] == [(0, 100), (100, 100)]
+    pieces.close()
+    assert taken[2][:2] == (200, 30)
+    for first, samples, dense, sparse in taken:
+        assert list(dense) == ["/a", "/b"]
+        for topic in TWO:
+            assert_array_equal(dense[topic]["position"], np.arange(first, first + samples))
+        assert [m.index for found in sparse.values() for m in found] == ([150] if first == 100 else [])
+    assert pieces.lost == 0
+
+
+def test_what_is_missing_stops_nobody():
+    """A topic that is silent, has a gap or comes too late is left out of those pieces alone."""
+    taken = Taken()
+    pieces = Pieces(TWO, 100, taken)
+    blocks(pieces, "/a", (0, 50), (60, 1000))
+    blocks(pieces, "/b", (0, 1000))
+    pieces.close()
+    late = [(first, ["/a"]) for first in range(100, 600, 100)]  # after its gap; six pieces ahead of /b
+    both = [(first, ["/a", "/b"]) for first in range(600, 1000, 100)]
+    assert [(first, sorted(dense)) for first, _, dense, _ in taken] == [*late, *both]
+    assert pieces.lost == 6
+
+
+def test_a_view_does_not_depend_on_the_blocks(turned, shown, tmp_path):
+    """Fed live, in blocks of its own for each topic, it has the same points as the bag's."""
+    recording = turned[1]
+    stream = rr.RecordingStream("test")
+    stream.save(tmp_path / "live.rrd")
+    scene = Scene(stream, recording.types, STEP_NS, outlook=parts.Outlook(12.3, 1.23e-3))
+    pieces = Pieces(recording.types, 8192, scene)
+    samples = recording.of_type(messages.TOOL)["error"].size
+    for start in range(0, samples, 2048):
+        for size, (topic, signals) in zip((64, 128, 512, 2048), recording.dense.items(), strict=True):
+            for first in range(start, min(start + 2048, samples), size):
+                end = min(first + size, start + 2048)
+                pieces.block(topic, first, {name: array[first:end] for name, array in signals.items()})
+    pieces.close()
+    scene.close()
+    stream.disconnect()
+    assert pieces.lost == 0
+    live = View(tmp_path / "live.rrd")
+    for entity in shown.entities("Scalars:scalars") - {"/learning/coarse/learning"}:
+        for one, other in zip(live.scalars(entity), shown.scalars(entity), strict=True):
+            assert_allclose(one, other, rtol=1e-12)
+    surfaces = [view.column("/machine/part/surface", "Mesh3D:vertex_positions") for view in (live, shown)]
+    assert_allclose(*surfaces, atol=1e-4)
+
+
+# --- the command
+
+
+def test_without_rerun_the_command_says_how_to_get_it(turned, tmp_path, monkeypatch):
+    known = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if "rerun" in name else known(name, *rest)
+    )
+    assert "pip install rerun-sdk" in refused("view", turned[0], "-o", tmp_path / "x.rrd", code=1)
+
+
+def test_bad_input_is_refused_and_leaves_nothing(turned, tmp_path, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    (tmp_path / "empty").mkdir()
+    assert "not a readable bag" in refused("view", tmp_path / "empty", "-o", tmp_path / "x.rrd")
+    assert "there is no folder" in refused("view", turned[0], "-o", tmp_path / "none" / "x.rrd")
+    assert "--output with --web" in refused("view", turned[0], "-o", tmp_path / "x.rrd", "--web")
+    assert "-o FILE.rrd or --web" in refused("view", turned[0])
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]
+
+
+def test_a_bag_without_a_revolution_has_no_surface(tmp_path):
+    bag = tmp_path / "bag"
+    harness.run(scenario(spindle_encoder={"revolutions": 0.2}), bag=bag)
+    assert lathe("view", bag, "-o", tmp_path / "short.rrd").exit_code == 0
+    assert View(tmp_path / "short.rrd").entities("Mesh3D:vertex_positions") == set()
