@@ -24,7 +24,8 @@ from lathe_rc.errors import InputError, LatheError
 
 _REFRESH = 0.1  # [s] between updates of the progress line
 _LOG_PERIOD = 2.0  # [s] between lines where there is no terminal
-_ELSEWHERE = ("bag", "export", "fit", "measure", "replay", "report", "resim", "study", "view")  # modules of lathe_rc.commands
+# in lathe_rc.commands, imported when they are wanted
+_ELSEWHERE = ("bag", "export", "fit", "measure", "replay", "report", "resim", "study", "view")
 _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
 
 
