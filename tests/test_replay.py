@@ -169,6 +169,7 @@ def test_a_part_of_some_topics(strange, listener):
     [
         (["--topics", "/c"], "replayer.topics: /c; the bag has /a, /b"),
         (["--as-cell"], "the bag holds no scenario"),
+        (["--as-cell", "--loop"], "a cell is replayed whole and once"),
         (["--rate", "-1"], "-1"),
     ],
 )

@@ -12,7 +12,7 @@ from typing import Any
 
 import rclpy
 from builtin_interfaces.msg import Time
-from lathe_rc_msgs.msg import Member
+from lathe_rc_msgs.msg import Member, Progress
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -65,6 +65,10 @@ class Replayer:
         self._node, self._parameters = node, parameters
         if not parameters.bag:
             raise InputError(f"{KIND}.bag is empty; name the bag's folder")
+        if parameters.as_cell and (parameters.loop or parameters.start or parameters.end or parameters.topics):
+            raise InputError(
+                f"{KIND}.as_cell: a cell is replayed whole and once; leave out loop, start, end and topics"
+            )
         self._source = Source(Path(parameters.bag))
         self._topics = set(parameters.topics) or set(self._source.topics)
         if unknown := sorted(self._topics - set(self._source.topics)):
@@ -86,6 +90,8 @@ class Replayer:
         ):
             node.create_service(Trigger, f"~/{name}", self._service(paused))
         self._members: dict[str, Node] = {}
+        self._master, self._window = "", 0  # of a cell: the topic whose blocks count, and how many may be under way
+        self._blocks = self._recorded = 0
         self._publishers: dict[str, Publisher] = {}
         self._waiting: dict[str, int] = {}
 
@@ -129,7 +135,12 @@ class Replayer:
             if member.state == Member.READY:
                 ready.append(member.name)
 
+        def progressed(progress: Any) -> None:
+            if progress.name == f"/{RECORDER}":
+                self._recorded = int(progress.blocks)
+
         self._node.create_subscription(Member, "/members", heard, latched_qos(256))
+        self._node.create_subscription(Progress, "/progress", progressed, QoSProfile(depth=1000))
         # The recorder puts the scenario's files into its bag as well, so they stay as long as the replayer.
         self._folder = tempfile.TemporaryDirectory(prefix="lathe-replay-")
         scenario = story.scenario_of(self._source.about, Path(self._folder.name))
@@ -159,6 +170,8 @@ class Replayer:
             announced.append(publisher)
         self._announced = announced
         self._topics &= set(self._publishers)
+        self._window = scenario.shared.window
+        self._master = f"/{remapped(cell.master.shared, 'encoder')}"
         self._node.get_logger().info("waiting for a recorder")
         while f"/{RECORDER}" not in ready:
             self._look(0.1)
@@ -201,6 +214,8 @@ class Replayer:
             if log_ns >= self._clock_due:
                 self._clock_due = log_ns + _CLOCK_PERIOD
                 self._clock.publish(Clock(clock=Time(sec=log_ns // 10**9, nanosec=log_ns % 10**9)))
+            if topic == self._master:
+                self._hold()
             self._publishers[topic].publish(data)
             self.sent += 1
             self._waiting[topic] += 1
@@ -222,6 +237,18 @@ class Replayer:
                     self._look()
                     continue
                 return held
+
+    def _hold(self) -> None:
+        """Let no more blocks be under way than the recorder can queue; what DDS acknowledges may not have been read."""
+        self._blocks += 1
+        heard = time.monotonic()
+        while self._window and self._blocks - self._recorded > self._window:
+            before = self._recorded
+            self._look(_LOOK)
+            if self._recorded != before:
+                heard = time.monotonic()
+            elif time.monotonic() - heard > _ACKNOWLEDGED:
+                raise LatheError(f"the recorder has taken nothing for {_ACKNOWLEDGED:.0f} s")
 
     def _acknowledged(self, topic: str) -> None:
         """Wait until all reliable readers have what was sent."""
