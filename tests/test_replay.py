@@ -153,7 +153,8 @@ def test_every_message_comes_in_order_with_the_clock(strange, listener):
         start = heard.index(whole[topic][0], 1)
         assert heard[start : start + len(whole[topic])] == whole[topic]
     rises = [b - a for a, b in zip(listener.clock, listener.clock[1:], strict=False) if b > a]
-    assert set(rises) == {10_000_000}
+    assert len(rises) > 100
+    assert all(rise % 10_000_000 == 0 for rise in rises)
 
 
 def test_a_part_of_some_topics(strange, listener):
