@@ -28,10 +28,10 @@ from typing import Any, Literal
 
 from lathe_rc import part
 from lathe_rc.analysis.metrology import FormErrors, Measurement, form_errors
-from lathe_rc.bag import reader, recover, story
+from lathe_rc.bag import reader, recover
 from lathe_rc.bag.check import write_digests
-from lathe_rc.bag.record import OfflineRecorder
-from lathe_rc.bag.writer import BagWriter, refuse_existing
+from lathe_rc.bag.record import OfflineRecorder, begin
+from lathe_rc.bag.writer import refuse_existing
 from lathe_rc.cell import messages
 from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
@@ -242,13 +242,7 @@ def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[
     sinks: list[Sink] = [collector, _Watcher(watch)]
     writer = None
     if bag is not None:
-        table = next((t for t in scenario.nodes.values() if isinstance(t, RecorderParameters)), RecorderParameters())
-        writer = BagWriter(
-            bag,
-            compression=table.compression,
-            chunk_size=table.chunk_size,
-            about=story.tell(scenario, []),
-        )
+        writer = begin(bag, scenario)
         sinks.append(OfflineRecorder(cell, engine.samples, writer))
     start = time.monotonic()
     try:

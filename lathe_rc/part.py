@@ -10,7 +10,7 @@ import numpy as np
 from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.metrology import Measurement, form_errors, measure
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Signals, full
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
@@ -81,9 +81,9 @@ class ErrorsByRevolution:
         encoder, tool = self._topics
         if encoder is None or tool is None:
             return
-        names = {topic.lstrip("/"): signals for topic, signals in dense.items()}
-        self._angle = np.concatenate([self._angle, names[encoder.lstrip("/")]["angle_true"]])
-        self._error = np.concatenate([self._error, names[tool.lstrip("/")]["error"]])
+        named = {full(topic): signals for topic, signals in dense.items()}
+        self._angle = np.concatenate([self._angle, named[encoder]["angle_true"]])
+        self._error = np.concatenate([self._error, named[tool]["error"]])
         if self._angle[-1] - self._angle[0] > _TOGETHER * 2.0 * np.pi:
             # A start two samples from the end may still move: it stays for the next piece.
             found = form_errors(self._angle, self._error, self._done)

@@ -14,7 +14,7 @@ from lathe_rc.bag.formats import FORMATS, Format, Rows
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.stream import feed
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.messages import Samples, Signals, full
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError, LatheError
 
@@ -80,10 +80,10 @@ class Exporter:
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
         for topic, signals in dense.items():
-            if table := self._tables.get(_full(topic)):
+            if table := self._tables.get(full(topic)):
                 table.add(dense_rows(first, signals, self._step_ns))
         for topic, found in sparse.items():
-            table = self._tables.get(_full(topic))
+            table = self._tables.get(full(topic))
             if table and found:
                 table.add(sparse_rows(table.columns, found, self._step_ns))
 
@@ -99,20 +99,16 @@ class Exporter:
         return {topic: table.rows for topic, table in self._tables.items()}
 
 
-def _full(topic: str) -> str:
-    return f"/{topic.lstrip('/')}"
-
-
 def _selected(source: Source, wanted: Sequence[str]) -> dict[str, str]:
     """Message types of the topics to export, by name."""
-    known = messages.block_types() | messages.sparse_types()
-    types = {topic: found.type for topic, found in sorted(source.topics.items()) if found.type in known}
+    found = sorted(source.topics.items())
+    types = {topic: said.type for topic, said in found if said.type in messages.signal_types()}
     if not types:
         raise InputError(f"{source.path}: no signal topics of lathe_rc; nothing to export")
-    for topic in map(_full, wanted):
+    for topic in map(full, wanted):
         if topic not in types:
             raise InputError(f"--topics {topic}: not in the bag; allowed: {', '.join(types)[:2000]}")
-    chosen = {topic: types[topic] for topic in dict.fromkeys(map(_full, wanted))} or types
+    chosen = {topic: types[topic] for topic in dict.fromkeys(map(full, wanted))} or types
     for topic in chosen:
         if not _TOPIC.fullmatch(topic) or len(topic) > _LONGEST_TOPIC:
             raise InputError(

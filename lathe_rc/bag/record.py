@@ -2,13 +2,17 @@
 """Recording an offline run: the messages that a cell of ROS nodes would have sent, in the same order."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
+from lathe_rc.bag import story
 from lathe_rc.bag.order import Merger
 from lathe_rc.bag.writer import BagWriter, offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.cell.framing import Framer
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import SharedParameters
+from lathe_rc.cell.recorder import RecorderParameters
+from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cell.wiring import Cell
@@ -22,6 +26,16 @@ def signal_depth(shared: SharedParameters) -> int:
     A reader of a feedback edge may be a window behind itself, and the publisher a window ahead of it.
     """
     return 2 * (shared.window or _FREE_RUNNING) + _SPARE
+
+
+def begin(path: Path, scenario: Scenario) -> BagWriter:
+    """A bag for an offline run of a scenario, as its recorder would write it.
+
+    Raises:
+        InputError: the folder exists or cannot be made.
+    """
+    table = next((t for t in scenario.nodes.values() if isinstance(t, RecorderParameters)), RecorderParameters())
+    return BagWriter(path, compression=table.compression, chunk_size=table.chunk_size, about=story.tell(scenario, []))
 
 
 class OfflineRecorder:

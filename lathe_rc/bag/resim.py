@@ -13,21 +13,20 @@ from itertools import islice
 from pathlib import Path
 
 from lathe_rc.bag import check, story
-from lathe_rc.bag.record import OfflineRecorder
+from lathe_rc.bag.record import OfflineRecorder, begin
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.stream import Tape, feed
-from lathe_rc.bag.writer import BagWriter, refuse_existing
+from lathe_rc.bag.writer import refuse_existing
 from lathe_rc.cell import messages, ros_yaml
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import SharedParameters
-from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell, remapped
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.part import ErrorsByRevolution
 
 
@@ -130,7 +129,6 @@ def resimulate(
     *,
     controller: Path | None = None,
     output: Path | None = None,
-    sinks: Sequence[Sink] = (),
 ) -> Resimulation:
     """Run the cell of a bag again behind its recorded spindle.
 
@@ -139,7 +137,6 @@ def resimulate(
         overrides: ``NODE.PARAM=VALUE``; not of the spindle.
         controller: parameter file whose nodes replace those of the bag.
         output: folder of a bag to write the result to; must not exist; None: none is written.
-        sinks: get the signals as they are computed.
 
     Raises:
         InputError: the bag has no scenario or no encoder, the changes cannot work.
@@ -169,8 +166,8 @@ def resimulate(
                 stage.schedule(action, index)
         digests = _Digests(cell)
         errors = ErrorsByRevolution({f"/{name}": said.type for name, said in cell.dense.items()})
-        writer = _writer(output, scenario) if output is not None else None
-        all_sinks: list[Sink] = [digests, errors, *sinks]
+        writer = begin(output, scenario) if output is not None else None
+        all_sinks: list[Sink] = [digests, errors]
         if writer is not None:
             all_sinks.append(OfflineRecorder(cell, samples, writer))
         engine = Engine(cell)
@@ -203,11 +200,6 @@ def recorded_digests(path: Path) -> dict[str, str]:
     return check.recorded(path) or check.check(path).digests
 
 
-def _writer(output: Path, scenario: Scenario) -> BagWriter:
-    table = next((t for t in scenario.nodes.values() if isinstance(t, RecorderParameters)), RecorderParameters())
-    return BagWriter(output, compression=table.compression, chunk_size=table.chunk_size, about=story.tell(scenario, []))
-
-
 def _samples(source: Source, topic: str) -> int:
     """Samples of a dense topic: its last block says."""
     if topic not in source.topics or source.topics[topic].type != messages.ENCODER:
@@ -223,7 +215,10 @@ def _events(source: Source) -> dict[str, list[tuple[int, str]]]:
     """Sample and action of the events of each node, as they took effect."""
     topics = {topic for topic, said in source.topics.items() if said.type == messages.EVENT}
     found: dict[str, list[tuple[int, str]]] = {}
-    for _, _, data in source.messages(topics):
-        event = messages.decode(messages.EVENT, data)
+    for topic, _, data in source.messages(topics):
+        try:
+            event = messages.decode(messages.EVENT, data)
+        except ValueError as error:
+            raise LatheError(f"{source.path}: {topic}: {error}") from None
         found.setdefault(event.source.strip("/").rpartition("/")[2], []).append((int(event.sample_index), event.action))
     return found

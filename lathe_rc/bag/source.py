@@ -39,13 +39,11 @@ class Topic:
 
     Attributes:
         type: message type.
-        definition: its text.
         qos: offered by the publishers.
         count: messages.
     """
 
     type: str
-    definition: str
     qos: tuple[Qos, ...]
     count: int
 
@@ -216,9 +214,7 @@ class Source:
             ext: Any = connection.ext
             known = self.topics.get(connection.topic)
             count = connection.msgcount + (known.count if known else 0)
-            self.topics[connection.topic] = Topic(
-                connection.msgtype, connection.msgdef.data, tuple(ext.offered_qos_profiles), count
-            )
+            self.topics[connection.topic] = Topic(connection.msgtype, tuple(ext.offered_qos_profiles), count)
         custom: Any = getattr(self._reader.storage.metadata, "custom", None) or {}
         texts = {key: text for key, text in custom.items() if isinstance(key, str) and isinstance(text, str)}
         self.about: Mapping[str, str] = {key[:256]: text[:MOST_TEXT] for key, text in texts.items()}

@@ -28,7 +28,6 @@ class BagHeader:
         left: samples that some topics have beyond that: the recording was interrupted; 0 if it was not.
         step_ns: sampling step [ns]; 0 if the bag has no dense topic.
         run_id: identity of the run.
-        sources: node that made it, by topic.
         about: texts that the bag says of itself.
     """
 
@@ -37,7 +36,6 @@ class BagHeader:
     left: int
     step_ns: int
     run_id: str
-    sources: Mapping[str, str]
     about: Mapping[str, str]
 
 
@@ -100,8 +98,7 @@ class Feeder:
     """
 
     def __init__(self, types: Mapping[str, str], sinks: Iterable[Sink], piece: int) -> None:
-        known = messages.block_types() | messages.sparse_types()
-        self.types = {topic: msgtype for topic, msgtype in types.items() if msgtype in known}
+        self.types = {topic: msgtype for topic, msgtype in types.items() if msgtype in messages.signal_types()}
         self._dense = {t: _Dense(t, kind) for t, kind in self.types.items() if kind in messages.block_types()}
         self._sparse: dict[str, list[tuple[int, Mapping[str, Any]]]] = {
             topic: [] for topic in self.types if topic not in self._dense
@@ -118,10 +115,6 @@ class Feeder:
     def run_id(self) -> str:
         """Identity of the run."""
         return next((dense.newest.run_id for dense in self._dense.values() if dense.newest), "")
-
-    def sources(self) -> dict[str, str]:
-        """The node that made each dense topic."""
-        return {topic: dense.newest.source for topic, dense in self._dense.items() if dense.newest}
 
     def add(self, topic: str, log_ns: int, data: bytes) -> None:
         """Take a message.
@@ -227,6 +220,4 @@ def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536) -> BagHeader:
         except LatheError as error:
             raise type(error)(f"{path}: {error}") from None
         left = feeder.finish()
-        return BagHeader(
-            feeder.types, feeder.first, left, feeder.step_ns, feeder.run_id, feeder.sources(), dict(source.about)
-        )
+        return BagHeader(feeder.types, feeder.first, left, feeder.step_ns, feeder.run_id, dict(source.about))

@@ -68,6 +68,12 @@ def sparse_types() -> frozenset[str]:
 
 
 @cache
+def signal_types() -> frozenset[str]:
+    """Message types of all signal topics."""
+    return block_types() | sparse_types()
+
+
+@cache
 def sample_fields(msgtype: str) -> dict[str, np.dtype[Any]]:
     """The array fields of a block type, in order, with their element types."""
     fields = {}
@@ -76,6 +82,11 @@ def sample_fields(msgtype: str) -> dict[str, np.dtype[Any]]:
             ((_, (element, _)), _) = cast("tuple[tuple[Any, tuple[str, int]], int]", detail)
             fields[name] = np.dtype(element)
     return fields
+
+
+def full(topic: str) -> str:
+    """The fully qualified name of a topic; results of the engine come without the slash."""
+    return "/" + topic.lstrip("/")
 
 
 def allocate(msgtype: str, samples: int) -> Signals:
@@ -115,13 +126,16 @@ def values_of(msgtype: str, data: bytes) -> dict[str, Any]:
     Raises:
         ValueError: the bytes are no such message.
     """
-    try:
-        message = decode(msgtype, data)
-    except Exception as error:  # noqa: BLE001 - rosbags' generated code raises whatever broken bytes lead to
-        raise ValueError(f"{msgtype} cannot be decoded ({type(error).__name__})") from None
-    return {name: value for name, value in vars(message).items() if name not in NOT_SIGNALS}
+    return {name: value for name, value in vars(decode(msgtype, data)).items() if name not in NOT_SIGNALS}
 
 
 def decode(msgtype: str, data: bytes) -> Any:
-    """A message from CDR bytes; arrays are views of the bytes."""
-    return store().deserialize_cdr(data, msgtype)
+    """A message from CDR bytes; arrays are views of the bytes.
+
+    Raises:
+        ValueError: the bytes are no such message.
+    """
+    try:
+        return store().deserialize_cdr(data, msgtype)
+    except Exception as error:  # noqa: BLE001 - rosbags' generated code raises whatever broken bytes lead to
+        raise ValueError(f"{msgtype} cannot be decoded ({type(error).__name__})") from None

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +22,7 @@ from lathe_rc.bag import stream
 from lathe_rc.bag.source import Source
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import START_NS
-from lathe_rc.cell.wire import Block, Decoder
+from lathe_rc.cell.wire import Block
 from lathe_rc.errors import InputError, LatheError
 
 if TYPE_CHECKING:
@@ -46,38 +47,35 @@ def require() -> None:
     os.environ.setdefault("RUST_LOG", "off")  # what goes wrong is told by the command
 
 
-def _first(source: Source, topic: str, msgtype: str) -> Block:
+def _first(source: Source, topic: str) -> Block:
     """The first block of a topic."""
     try:
-        return Decoder(msgtype).decode(next(source.messages({topic}))[2])
-    except (StopIteration, ValueError) as error:
+        return next(source.blocks(topic))
+    except (StopIteration, LatheError) as error:
         raise InputError(f"{source.path}: {topic} has no whole block ({error})") from None
 
 
-def _last(source: Source, topic: str, msgtype: str) -> Block | None:
+def _last(source: Source, topic: str) -> Block | None:
     """The last block of a topic, if it is near the end of the bag."""
-    decode, last = Decoder(msgtype).decode, None
     try:
-        for _, _, data in source.messages({topic}, start_ns=source.last_ns - _END_NS):
-            last = decode(data)
-    except ValueError as error:
+        newest = deque(source.blocks(topic, start_ns=source.last_ns - _END_NS), maxlen=1)
+    except LatheError as error:
         raise InputError(f"{source.path}: {topic} has no whole block ({error})") from None
-    return last
+    return newest[0] if newest else None
 
 
 def _foresee(path: Path) -> tuple[dict[str, str], int, float, "Outlook"]:
     """Signal topics with their types, step [ns], length [s] and outlook of a bag."""
     from lathe_rc.view.rerun_part import Outlook
 
-    known = messages.block_types() | messages.sparse_types()
     with Source(path) as source:
-        types = {topic: kind.type for topic, kind in source.topics.items() if kind.type in known}
+        types = {topic: kind.type for topic, kind in source.topics.items() if kind.type in messages.signal_types()}
         filled = {kind: t for t, kind in reversed(types.items()) if source.topics[t].count}  # first topic of each type
         blocks = [kind for kind in filled if kind in messages.block_types()]
         if not blocks:
             raise InputError(f"{path}: nothing to show: the bag has no blocks of a cell")
-        first = {kind: _first(source, filled[kind], kind) for kind in blocks}
-        last = {kind: _last(source, filled[kind], kind) for kind in (messages.ENCODER, messages.TOOL) if kind in first}
+        first = {kind: _first(source, filled[kind]) for kind in blocks}
+        last = {kind: _last(source, filled[kind]) for kind in (messages.ENCODER, messages.TOOL) if kind in first}
         turned = travel = 0.0
         if encoder := last.get(messages.ENCODER):
             turned = float(encoder.signals["angle_true"][-1]) / (2.0 * np.pi)

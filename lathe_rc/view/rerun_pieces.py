@@ -9,9 +9,9 @@ from collections.abc import Mapping
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.engine import Sink
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.messages import Samples, Signals, full
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.view.rerun_signals import full, wanted
+from lathe_rc.view.rerun_signals import wanted
 
 _AHEAD = 4  # pieces that wait for the topics that are late
 

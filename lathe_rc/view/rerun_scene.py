@@ -12,12 +12,12 @@ import numpy.typing as npt
 import rerun as rr
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.messages import Samples, Signals, full
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import LatheError
 from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.rerun_revolutions import ANGLES, HIGHEST, Revolution, Revolutions
-from lathe_rc.view.rerun_signals import CYCLES, curve_path, curves, envelope, full
+from lathe_rc.view.rerun_signals import CYCLES, curve_path, curves, envelope
 
 _POSES = 250.0  # of part and tool in a second
 _ROWS = 512  # of the map

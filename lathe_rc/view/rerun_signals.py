@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc.cell.messages import Samples, full
 
 
 @dataclass(frozen=True)
@@ -82,11 +82,6 @@ def curves(types: Mapping[str, str]) -> dict[str, dict[str, Curve]]:
 def wanted(msgtype: str) -> set[str]:
     """The fields of a block type that a scene uses."""
     return set(_CURVES.get(msgtype, {})) | _PART.get(msgtype, set())
-
-
-def full(topic: str) -> str:
-    """The fully qualified name of a topic; results of the engine come without the slash."""
-    return "/" + topic.lstrip("/")
 
 
 def curve_path(topic: str, field: str) -> str:
