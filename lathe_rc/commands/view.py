@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command ``lathe view``: a recorded run in Rerun."""
 
-import contextlib
-import importlib.util
+import json
 import os
-import socket
-import subprocess
-import sys
 import tempfile
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import quote
 
 import click
 import numpy as np
@@ -22,29 +17,19 @@ from lathe_rc.bag import stream
 from lathe_rc.bag.source import Source
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import START_NS
+from lathe_rc.cell.rerun_bridge import PORT, RATE, Kind
 from lathe_rc.cell.wire import Block
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.view.rerun_output import Viewer, end, require, viewer
 
 if TYPE_CHECKING:
     import rerun as rr
 
     from lathe_rc.view.rerun_part import Outlook
 
-RATE = 2000.0  #: points of a curve in a second
 _PIECE = 65536  # samples
 _END_NS = 1_000_000_000  # before the end of a bag, where its last blocks are looked for
 _POINTS = 300_000  # of a curve: a long bag gets fewer in a second
-
-
-def require() -> None:
-    """Check that Rerun is there.
-
-    Raises:
-        LatheError: it is not.
-    """
-    if importlib.util.find_spec("rerun_bindings") is None:
-        raise LatheError("rerun is not installed; install it with: pip install rerun-sdk")
-    os.environ.setdefault("RUST_LOG", "off")  # what goes wrong is told by the command
 
 
 def _first(source: Source, topic: str) -> Block:
@@ -151,31 +136,36 @@ def write(bag: Path, output: Path, *, rate: float = RATE) -> int:
     return samples
 
 
-def _show(bag: Path, rate: float, options: Sequence[str], said: str) -> None:
-    """Show a bag with Rerun's own program until it ends; options are for that, ``said`` for the user."""
+def _show(bag: Path, rate: float, shown: Viewer) -> None:
+    """Show a bag with Rerun's own program until it ends."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{bag.resolve().name}.rrd"
         write(bag, file, rate=rate)
-        click.echo(said)
-        environment = os.environ | {"RUST_LOG": "error"}
-        with contextlib.suppress(KeyboardInterrupt):
-            ended = subprocess.call([sys.executable, "-m", "rerun", *options, str(file)], env=environment)
-            if ended:
-                raise LatheError(f"Rerun ended with code {ended}")
+        click.echo(shown.said)
+        with shown.start(file) as process:
+            try:
+                if process.wait():
+                    raise LatheError(f"Rerun ended with code {process.returncode}")
+            except KeyboardInterrupt:
+                end(process)
 
 
-def _free_port() -> int:
-    """A port that nobody listens on now."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return int(listener.getsockname()[1])
+def _live(values: Mapping[str, object], *, as_json: bool) -> None:
+    """Show what runs in this domain until Ctrl-C."""
+    try:
+        from lathe_rc.nodes import rerun_bridge
+    except ImportError as error:
+        raise InputError(f"no ROS 2 here ({error}); run through ./lathe, or source a ROS 2 installation") from None
+    runs = rerun_bridge.run(values, ["--ros-args"])
+    if as_json:
+        click.echo(json.dumps({"runs": [vars(run) | {"file": run.file and str(run.file)} for run in runs]}))
 
 
 @click.command()
-@click.argument("bag", type=click.Path(path_type=Path))
+@click.argument("bag", type=click.Path(path_type=Path), required=False)
 @click.option("-o", "--output", type=click.Path(path_type=Path, dir_okay=False), help="write a .rrd file, show nothing")
 @click.option("--web", is_flag=True, help="show it in a browser")
-@click.option("--port", type=click.IntRange(1, 65535), default=9090, show_default=True, help="of the web page")
+@click.option("--port", type=click.IntRange(1, 65535), default=PORT, show_default=True, help="of the web page")
 @click.option(
     "--rate",
     type=click.FloatRange(min=1),
@@ -183,21 +173,38 @@ def _free_port() -> int:
     show_default=True,
     help="points of a curve in a second, at most: smallest and largest values in turn",
 )
-def view(bag: Path, output: Path | None, port: int, rate: float, *, web: bool) -> None:
+@click.option("--live", is_flag=True, help="no BAG: what runs in this ROS domain, one run after the other")
+@click.option("--connect", metavar="URL", help="live: in a viewer that runs already, rerun+http://HOST:PORT/proxy")
+@click.option("--once", is_flag=True, help="live: end with the first run")
+@click.option("--json", "as_json", is_flag=True, help="live: print one JSON object at the end")
+def view(
+    bag: Path | None,
+    output: Path | None,
+    port: int,
+    rate: float,
+    connect: str | None,
+    *,
+    web: bool,
+    live: bool,
+    once: bool,
+    as_json: bool,
+) -> None:
     """Show a BAG in Rerun: the part in three dimensions, form error, signals, learning, revolution by revolution."""
-    if output and web:
-        raise InputError("--output with --web; allowed: one of them")
+    places = {"--output": output, "--web": web, "--connect": connect}
+    if len(given := [name for name, value in places.items() if value]) > 1:
+        raise InputError(f"{' with '.join(given)}; allowed: one of them")
+    if (bag is None) != live:
+        raise InputError("a BAG with --live; allowed: one of them" if bag else "no BAG; name one, or --live")
+    if not live and (connect or once or as_json):
+        raise InputError("--connect, --once and --json are for --live")
     require()
-    if output:
+    if bag is None:
+        where: Kind = "save" if output else "serve" if web else "connect" if connect else "spawn"
+        values = {"output": where, "file": str(output or ""), "url": connect or "", "port": port, "rate": rate}
+        _live({**values, "once": once}, as_json=as_json)
+    elif output:
         write(bag, output, rate=rate)
         size = output.stat().st_size
         Console().print(f"view: {output} ({size / 1e6:.1f} MB)", highlight=False, soft_wrap=True)
-    elif web:
-        data = _free_port()
-        page = f"http://127.0.0.1:{port}/?url={quote(f'rerun+http://127.0.0.1:{data}/proxy', safe='')}"
-        options = ["--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(port), "--port", str(data)]
-        _show(bag, rate, options, f"{page}  (Ctrl-C ends it)")
-    elif os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
-        _show(bag, rate, ["--new"], "the view opens in a window; close it to go on")
     else:
-        raise InputError("no display for a window; use -o FILE.rrd or --web")
+        _show(bag, rate, viewer("serve" if web else "spawn", port))

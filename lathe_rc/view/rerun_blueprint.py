@@ -99,7 +99,7 @@ def blueprint(types: Mapping[str, str], *, live: bool = False) -> rrb.Blueprint:
     rows: list[rrb.View | rrb.Container] = [rrb.Horizontal(*top)] if top else []
     rows += first
     tabs: list[rrb.View] = list(plots.values())
-    if messages.EVENT in kinds:
+    if live or messages.EVENT in kinds:  # live, what had to be left out stands there
         tabs.append(rrb.TextLogView(origin="/events", name="events"))
     if tabs:
         rows.append(rrb.Tabs(*tabs, active_tab=0))

@@ -45,17 +45,28 @@ class Pieces:
         sink: gets them, by fully qualified topic.
 
     Attributes:
+        first: sample that the first piece begins with. Who joins amid a run begins where all topics are there whole.
         lost: pieces that were handed on without some topic, or not at all.
     """
 
     def __init__(self, types: Mapping[str, str], size: int, sink: Sink) -> None:
-        named = {full(topic): msgtype for topic, msgtype in types.items()}
-        self._types = {topic: kind for topic, kind in named.items() if wanted(kind)}
+        self._types: dict[str, str] = {}
         self._size, self._sink = size, sink
         self._waiting: dict[int, dict[str, _Part]] = {}
+        self._ends: dict[str, int] = {}  # sample after the newest of each topic
         self._sparse: list[Sparse] = []
         self._next = 0
-        self.lost = 0
+        self._begun = False
+        self._late: set[str] = set()  # topics that pieces have been handed on without, uncounted
+        self.first = self.lost = 0
+        self.learn(types)
+
+    def learn(self, types: Mapping[str, str]) -> None:
+        """Wait for these topics as well from now on."""
+        new = {full(topic): kind for topic, kind in types.items() if wanted(kind)}
+        if self._begun:
+            self._late |= new.keys() - self._types.keys()
+        self._types |= new
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
@@ -77,6 +88,11 @@ class Pieces:
         msgtype = self._types.get(topic)
         if msgtype is None:
             return
+        if topic not in self._ends and not self._begun:
+            self._join(first)
+        if topic in self._late:
+            self._late.remove(topic)
+            self.lost += max(0, self._next - first // self._size)
         samples, taken = next(iter(signals.values())).size, 0
         while taken < samples:
             piece, start = divmod(first + taken, self._size)
@@ -86,8 +102,9 @@ class Pieces:
                 if topic not in parts:
                     parts[topic] = _Part(msgtype, self._size)
                 parts[topic].add(start, signals, slice(taken, taken + count))
-                self._hand_on(piece)
             taken += count
+        self._ends[topic] = first + samples
+        self._hand_on()
 
     def message(self, message: Sparse) -> None:
         """Take a message at a chosen sample."""
@@ -96,19 +113,23 @@ class Pieces:
     def close(self) -> None:
         """Hand on what is left."""
         while self._waiting:
-            self._give(min(self._waiting))
+            self._give(min(self._waiting), closing=True)
         if self._sparse:
             self._sink.chunk(self._next * self._size, 0, {}, self._messages(None))
 
-    def _hand_on(self, changed: int) -> None:
-        parts = self._waiting[changed]
-        full = len(parts) == len(self._types) and all(p.end == self._size and not p.broken for p in parts.values())
-        if full and changed == min(self._waiting):
-            self._give(changed)
-        while len(self._waiting) > _AHEAD:
-            self._give(min(self._waiting))
+    def _join(self, first: int) -> None:
+        """Begin no earlier than with the piece after a sample."""
+        self._next = max(self._next, -(-first // self._size))
+        self.first = self._next * self._size
+        self._waiting = {piece: parts for piece, parts in self._waiting.items() if piece >= self._next}
 
-    def _give(self, piece: int) -> None:
+    def _hand_on(self) -> None:
+        """Hand on what nothing more can come for, and what has waited long enough."""
+        complete = min(self._ends.get(topic, 0) for topic in self._types) // self._size
+        while self._waiting and ((oldest := min(self._waiting)) < complete or len(self._waiting) > _AHEAD):
+            self._give(oldest)
+
+    def _give(self, piece: int, *, closing: bool = False) -> None:
         whole = {topic: part for topic, part in self._waiting.pop(piece).items() if not part.broken}
         samples = max((part.end for part in whole.values()), default=0)
         dense = {
@@ -116,8 +137,9 @@ class Pieces:
             for topic, part in whole.items()
             if part.end == samples
         }
-        self._next = piece + 1
-        self.lost += len(dense) < len(self._types)
+        cut = samples < self._size and not (closing and not self._waiting)  # only the last may be short
+        self.lost += piece - self._next + (cut or len(dense) < len(self._types))
+        self._next, self._begun = piece + 1, True
         if samples:
             self._sink.chunk(piece * self._size, samples, dense, self._messages(piece * self._size + samples))
 

@@ -4,8 +4,9 @@
 Timelines are ``time``, simulated time from sample 0, and ``revolution``, from 1. Memory does not grow with the run.
 """
 
+import contextlib
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +44,7 @@ class Scene:
     Attributes:
         window: samples that two points of a curve stand for.
         points: logged so far, of all curves.
+        revolutions: logged so far.
     """
 
     def __init__(
@@ -55,13 +57,10 @@ class Scene:
         rate: float = 2000.0,
     ) -> None:
         self._recording, self._step_ns = recording, step_ns
-        self._types = {full(topic): kind for topic, kind in types.items()}
-        self._curves = curves(types)
+        self._types: dict[str, str] = {}
         self._outlook = outlook or parts.Outlook()
         self.window = max(1, int(np.ceil(2e9 / (rate * step_ns))))
         self._pose = max(1, int(np.ceil(1e9 / (_POSES * step_ns))))
-        by_type = {kind: topic for topic, kind in reversed(self._types.items())}  # the first of each
-        self._encoder, self._tool = by_type.get(messages.ENCODER), by_type.get(messages.TOOL)
         self._scale: parts.Scale | None = None
         self._revolutions = Revolutions()
         self._edge: parts.Edge | None = None
@@ -69,7 +68,19 @@ class Scene:
         self._every = 1  # how many-th revolution has a row and a ring
         self._sent = 0  # rows
         self._newest: Revolution | None = None
-        self.points = 0
+        self.points = self.revolutions = 0
+        self.learn(types)
+
+    def learn(self, types: Mapping[str, str]) -> None:
+        """Draw these topics as well from now on.
+
+        Raises:
+            LatheError: the recording cannot be written.
+        """
+        self._types |= {full(topic): kind for topic, kind in types.items()}
+        self._curves = curves(self._types)
+        by_type = {kind: topic for topic, kind in reversed(self._types.items())}  # the first of each
+        self._encoder, self._tool = by_type.get(messages.ENCODER), by_type.get(messages.TOOL)
         self._describe()
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
@@ -100,6 +111,10 @@ class Scene:
         self._form(list(self._revolutions.finish()))
         if self._newest and self._sent != len(self._rows):
             self._send_map(self._newest)
+
+    def note(self, index: int, text: str) -> None:
+        """Write a line at a sample among the events."""
+        self._send("events", self._when(np.array([index]), None), rr.TextLog.columns(text=[text], level=["WARN"]))
 
     # --- what never changes
 
@@ -154,7 +169,8 @@ class Scene:
         )
 
     def _static(self, path: str, what: rr.AsComponents) -> None:
-        self._recording.log(path, what, static=True, strict=True)
+        with _written():
+            self._recording.log(path, what, static=True, strict=True)
 
     # --- pieces
 
@@ -202,6 +218,7 @@ class Scene:
         rings: list[tuple[Revolution, parts.Edge]] = []
         for revolution in complete:
             self._newest = revolution
+            self.revolutions += 1
             self._send(
                 "form_error/spectrum",
                 self._at([revolution]),
@@ -263,7 +280,13 @@ class Scene:
         return columns
 
     def _send(self, path: str, when: list[rr.TimeColumn], columns: rr.ComponentColumnList) -> None:
-        try:
+        with _written():
             self._recording.send_columns(path, when, columns, strict=True)
-        except RuntimeError as error:
-            raise LatheError(f"the view cannot be written ({error}); is the disk full?") from None
+
+
+@contextlib.contextmanager
+def _written() -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:
+        raise LatheError(f"the view cannot be written ({error}); is the disk full?") from None

@@ -84,6 +84,11 @@ def wanted(msgtype: str) -> set[str]:
     return set(_CURVES.get(msgtype, {})) | _PART.get(msgtype, set())
 
 
+def drawn(msgtype: str) -> bool:
+    """Whether a scene has any use for messages of a type."""
+    return bool(wanted(msgtype)) or msgtype in CYCLES or msgtype == messages.EVENT
+
+
 def curve_path(topic: str, field: str) -> str:
     """Where a curve is in the view."""
     return f"signals{full(topic)}/{field}"

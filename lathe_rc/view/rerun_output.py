@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a view goes: a file, a window, a page for the browser, or a viewer that runs already."""
+
+import contextlib
+import importlib.util
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import quote, urlsplit
+
+from lathe_rc.cell.rerun_bridge import PORT, Kind
+from lathe_rc.errors import InputError, LatheError
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+_HOST = "127.0.0.1"
+_START = 30.0  # [s] for a viewer to come up
+_LOOK = 0.05  # [s] between looks whether it has
+
+
+def require() -> None:
+    """Check that Rerun is there.
+
+    Raises:
+        LatheError: it is not.
+    """
+    if importlib.util.find_spec("rerun_bindings") is None:
+        raise LatheError("rerun is not installed; install it with: pip install rerun-sdk")
+    os.environ.setdefault("RUST_LOG", "off")  # what goes wrong is told by the command
+
+
+def _free_port() -> int:
+    """A port that nobody listens on now."""
+    with socket.socket() as listener:
+        listener.bind((_HOST, 0))
+        return int(listener.getsockname()[1])
+
+
+def _answers(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port), timeout=1.0).close()
+    except OSError:
+        return False
+    return True
+
+
+@dataclass(frozen=True)
+class Viewer:
+    """Rerun's own program, as it is to be started.
+
+    Attributes:
+        options: of its command line.
+        port: where it takes recordings.
+        said: what the user is told.
+    """
+
+    options: list[str]
+    port: int
+    said: str
+
+    def start(self, *files: Path) -> "subprocess.Popen[bytes]":
+        """Start it, with files to show; it gets no Ctrl-C of its own."""
+        return subprocess.Popen(
+            [sys.executable, "-m", "rerun", *self.options, *map(str, files)],
+            env=os.environ | {"RUST_LOG": "error"},
+            stdout=sys.stderr,
+            start_new_session=True,
+        )
+
+
+def end(process: "subprocess.Popen[bytes]") -> None:
+    """End a viewer that was started: what Python started is but the parent of the viewer itself."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGTERM)
+    process.wait()
+
+
+def viewer(kind: Kind, port: int = PORT) -> Viewer:
+    """The viewer for ``spawn`` or ``serve``.
+
+    Args:
+        kind: a window, or a page.
+        port: of the page.
+
+    Raises:
+        InputError: a window without a display.
+    """
+    data = _free_port()
+    if kind == "serve":
+        page = f"http://{_HOST}:{port}/?url={quote(f'rerun+http://{_HOST}:{data}/proxy', safe='')}"
+        options = ["--serve-web", "--bind", _HOST, "--web-viewer-port", str(port), "--port", str(data)]
+        return Viewer(options, data, f"{page}  (Ctrl-C ends it)")
+    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        return Viewer(["--port", str(data)], data, "the view opens in a window; close it to go on")
+    raise InputError("no display for a window; use -o FILE.rrd or --web")
+
+
+class Output:
+    """Takes the recordings of a live view, one a run; a context manager.
+
+    Args:
+        kind: see the module.
+        file: of the first recording, for ``save``; those after it have a number in their names. None is overwritten.
+        url: of a viewer, for ``connect``, as rerun+http://127.0.0.1:9876/proxy.
+        port: of the page, for ``serve``.
+
+    Raises:
+        InputError: a file that cannot be made, a URL that is none, or no display.
+    """
+
+    def __init__(self, kind: Kind, *, file: Path, url: str, port: int) -> None:
+        self._kind, self._file, self._url = kind, file, url
+        self._viewer = viewer(kind, port) if kind in ("spawn", "serve") else None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._recordings = 0
+        if kind == "save":
+            if file.suffix != ".rrd":
+                raise InputError(f"{file}: a live view is saved to a file; allowed: a name that ends in .rrd")
+            if not file.parent.is_dir():
+                raise InputError(f"{file}: there is no folder {file.parent}")
+            if file.exists():
+                raise InputError(f"{file} exists; a live view is never overwritten")
+
+    def __enter__(self) -> "Output":
+        """Start the viewer and wait until it answers.
+
+        Raises:
+            LatheError: it does not.
+        """
+        if self._kind == "connect":
+            self._reach(self._url)
+        if self._viewer:
+            self._process = self._viewer.start()
+            due = time.monotonic() + _START
+            while not _answers(_HOST, self._viewer.port):
+                if self.ended or time.monotonic() > due:
+                    self.__exit__()
+                    raise LatheError("Rerun does not start")
+                time.sleep(_LOOK)
+            self._url = f"rerun+http://{_HOST}:{self._viewer.port}/proxy"
+            print(self._viewer.said, file=sys.stderr)
+        return self
+
+    @staticmethod
+    def _reach(url: str) -> None:
+        """Refuse what is no viewer's URL, or one where nobody answers."""
+        try:
+            parts = urlsplit(url)
+            host, port = parts.hostname, parts.port
+        except ValueError:
+            host = port = None
+        if not host or not port or parts.scheme not in ("rerun", "rerun+http", "rerun+https") or parts.path != "/proxy":
+            raise InputError(f"url = {url!r}; allowed: rerun+http://HOST:PORT/proxy")
+        if not _answers(host, port):
+            raise LatheError(f"no viewer answers at {url}; start one with: rerun")
+
+    def __exit__(self, *exception: object) -> None:
+        """End the viewer that was started."""
+        if self._process:
+            end(self._process)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the viewer that was started is gone: its window was closed."""
+        return self._process is not None and self._process.poll() is not None
+
+    def open(self, name: str) -> tuple["rr.RecordingStream", Path | None]:
+        """The recording of one more run, and the file that it goes to, if it does.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        import rerun as rr
+
+        self._recordings += 1
+        recording = rr.RecordingStream("lathe_rc")
+        file = None
+        if self._kind == "save":
+            file = self._file if self._recordings == 1 else self._free_name()
+            try:
+                recording.save(file)
+            except RuntimeError as error:
+                raise InputError(f"{file}: cannot be written ({error})") from None
+        else:
+            recording.connect_grpc(self._url)
+        recording.send_recording_name(name)
+        return recording, file
+
+    def _free_name(self) -> Path:
+        while (file := self._file.with_stem(f"{self._file.stem}-{self._recordings}")).exists():
+            self._recordings += 1
+        return file

@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``lathe view --live``: what is heard is shown, what is left out is said, and nobody waits for who only watches."""
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cells import scenario
+from numpy.testing import assert_allclose, assert_array_equal
+
+pytest.importorskip("rerun")
+
+from test_view import TWO, Taken, View, blocks, refused
+
+from lathe_rc import harness
+from lathe_rc.bag import reader
+from lathe_rc.bag.source import Source
+from lathe_rc.cell import messages
+from lathe_rc.cell.scenario import load
+from lathe_rc.errors import LatheError
+from lathe_rc.view.rerun_heard import Backlog, Order
+from lathe_rc.view.rerun_live import Live
+from lathe_rc.view.rerun_output import Output
+from lathe_rc.view.rerun_pieces import Pieces
+from lathe_rc.view.rerun_signals import drawn
+
+PISTON = Path(__file__).parents[1] / "config" / "piston.yaml"
+STEP_NS = 15625
+DRAWN = 6  # topics of the piston
+LENGTH = 16.0  # revolutions
+
+
+# --- without ROS: the backlog, the order, the pieces
+
+
+def test_a_full_backlog_is_left_out_as_a_whole():
+    backlog = Backlog(100)
+    for number in range(7):
+        backlog.put(("/a", "", bytes([number]) * 40))
+    backlog.put(None)
+    backlog.close()
+    assert [message and message[2][0] for message in backlog] == [6, None]
+
+
+def test_what_is_taken_makes_room():
+    backlog = Backlog(100)
+    taken = iter(backlog)
+    for number in range(7):
+        backlog.put(("/a", "", bytes([number]) * 80))
+        assert next(taken)[2][0] == number
+
+
+@pytest.mark.parametrize(
+    ("heard", "places"),
+    [
+        pytest.param("a:x0 b:x0 a:x1 b:x9", "new same same same", id="one run, with a gap"),
+        pytest.param("a:x5 b:x5 a:y0 b:x6 b:y0", "new same new old same", id="the next, while one is late"),
+        pytest.param("a:x5 b:x5 a:x0 b:x6 b:x0 b:x1", "new same new old same same", id="the same again"),
+        pytest.param("a:x5 a:x0 b:x3 a:x1 a:x9 b:x7", "new new same same same same", id="a topic that was silent"),
+        pytest.param("a:x3 b:x3 a:x0 b:x5 a:x8 b:x9", "new same new old same same", id="it lost its beginning"),
+        pytest.param("a:x3 a:y0 a:x0 a:y1 a:z0", "new new new old new", id="back and forth"),
+        pytest.param("a:x1 b:y1 a:x2 b:y2 a:x3 b:y3", "new new old same old same", id="two cells at once"),
+    ],
+)
+def test_runs_are_told_apart(heard, places):
+    order = Order()
+    steps = [(topic, text[0], int(text[1:])) for topic, _, text in (part.partition(":") for part in heard.split())]
+    assert [order.place(topic, run, first, first + 1) for topic, run, first in steps] == places.split()
+
+
+def test_pieces_of_which_nothing_came_are_counted():
+    taken = Taken()
+    pieces = Pieces(TWO, 100, taken)
+    for topic in ("/a", "/b"):
+        blocks(pieces, topic, (0, 100))
+    for topic in ("/a", "/b"):
+        blocks(pieces, topic, (150, 200), (530, 600), (600, 800))
+    assert [first for first, *_ in taken] == [0, 600, 700]
+    assert pieces.lost == 5
+
+
+def test_a_piece_whose_end_is_missing_everywhere_is_counted():
+    taken = Taken()
+    pieces = Pieces(TWO, 100, taken)
+    for topic in TWO:
+        blocks(pieces, topic, (0, 80), (100, 250))
+    pieces.close()
+    assert [(first, samples) for first, samples, *_ in taken] == [(0, 80), (100, 100), (200, 50)]
+    assert pieces.lost == 1
+
+
+def test_what_was_shown_without_a_topic_that_nobody_knew_of_is_counted():
+    pieces = Pieces({"/a": messages.COMMAND}, 100, Taken())
+    blocks(pieces, "/a", (0, 300))
+    pieces.learn(TWO)
+    blocks(pieces, "/b", (0, 100), (100, 400))
+    blocks(pieces, "/a", (300, 400))
+    assert pieces.lost == 3
+
+
+def test_who_comes_late_begins_where_all_topics_are_whole():
+    taken = Taken()
+    pieces = Pieces({"/a": messages.COMMAND}, 100, taken)
+    blocks(pieces, "/a", (130, 200))
+    pieces.learn(TWO)
+    blocks(pieces, "/a", (200, 400))
+    blocks(pieces, "/b", (210, 500))
+    blocks(pieces, "/a", (400, 500))
+    assert [(first, samples, sorted(dense)) for first, samples, dense, _ in taken] == [
+        (300, 100, ["/a", "/b"]),
+        (400, 100, ["/a", "/b"]),
+    ]
+    assert (pieces.first, pieces.lost) == (300, 0)
+
+
+# --- without ROS: a bag stands for what is heard
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory):
+    """The bag of a run of twelve revolutions, and what would be heard of it."""
+    bag = tmp_path_factory.mktemp("turned") / "bag"
+    given = {"profile": "harmonics", "harmonic_order": [1], "harmonic_amplitude": [20e-6]}
+    learning = {"events": ["revolution 9: freeze"]}
+    harness.run(scenario(spindle_encoder={"revolutions": 12.3}, tool=given, learning_controller=learning), bag=bag)
+    with Source(bag) as source:
+        types = {topic: kind.type for topic, kind in source.topics.items() if drawn(kind.type)}
+        return bag, [(topic, types[topic], data) for topic, _, data in source.messages(set(types))], types
+
+
+class Watched:
+    """A live view to files."""
+
+    def __init__(self, folder, types):
+        self.said = []
+        output = Output("save", file=folder / "live.rrd", url="", port=0)
+        self.live = Live(output.open, rate=2000.0, say=self.said.append)
+        self.live.present = types
+
+    def hear(self, heard):
+        for message in heard:
+            self.live.take(*message)
+
+    def end(self):
+        self.live.end()
+        return self.live.shown
+
+
+def test_a_run_and_its_repetition_are_a_recording_each(turned, tmp_path):
+    bag, heard, types = turned
+    watched = Watched(tmp_path, types)
+    watched.hear([*heard[: len(heard) // 2], *heard])
+    first, second = watched.end()
+    assert (first.file.name, first.complete, first.left_out) == ("live.rrd", False, 1)  # cut amid a round of blocks
+    assert (second.file.name, second.complete, second.left_out) == ("live-2.rrd", True, 0)
+    assert (first.revolutions < 12, second.revolutions) == (True, 12)
+    recording = reader.read(bag)
+    view = View(second.file)
+    assert view.column("/events", "TextLog:text") == [["learning_controller/events: freeze"]]
+    assert view.scalars("/learning/coarse/learning")[1].tolist() == recording.sparse["/coarse/learning"].values["cycle"]
+    assert "its end was not heard" in watched.said[2]
+
+
+def test_topics_that_nobody_knew_of_are_taken_in(turned, tmp_path):
+    _, heard, _ = turned
+    watched = Watched(tmp_path, {})
+    watched.hear(heard)
+    (shown,) = watched.end()
+    assert (shown.revolutions, shown.left_out) == (12, 0)
+    assert {entity.split("/")[2] for entity in View(shown.file).entities("Scalars:scalars")} > {"coarse", "tool"}
+
+
+def test_who_is_too_slow_leaves_out_whole_pieces_and_says_so(turned, tmp_path):
+    bag, heard, types = turned
+    watched = Watched(tmp_path, types)
+    watched.hear(heard[: len(heard) // 3])
+    backlog = Backlog(2**20)  # a fraction of the rest, of which nothing is taken while the run goes on
+    for message in heard[len(heard) // 3 :]:
+        backlog.put(message)
+    backlog.close()
+    watched.hear(backlog)
+    (shown,) = watched.end()
+    samples = reader.read(bag).of_type(messages.TOOL)["error"] * 1e6
+    view = View(shown.file)
+    time, _, value = view.scalars("/signals/tool/error")
+    assert_array_equal(value, samples[time // STEP_NS])
+    pieces = set((time // STEP_NS // 6400).tolist())
+    assert 0 < shown.left_out == -(-samples.size // 6400) - len(pieces)
+    assert (shown.complete, shown.end) == (True, samples.size)
+    notes = [text for (text,) in view.column("/events", "TextLog:text") if text.startswith("left out")]
+    assert sum(int(re.search(r"(\d+) pieces of 0.1 s", note)[1]) for note in notes) == shown.left_out
+    assert all(any(note in line for line in watched.said) for note in notes)
+
+
+def test_who_comes_late_shows_the_rest(turned, tmp_path):
+    _, heard, types = turned
+    watched = Watched(tmp_path, types)
+    watched.hear(heard[len(heard) // 2 :])
+    (shown,) = watched.end()
+    assert (shown.complete, shown.left_out) == (True, 0)
+    assert 0 < shown.first < shown.end
+    _, revolution, _ = View(shown.file).scalars("/learning/form_error/rms")
+    assert_array_equal(revolution, np.arange(13 - shown.revolutions, 13))
+    assert "s on" in watched.said[0]
+
+
+def test_broken_bytes_are_named(turned, tmp_path):
+    _, heard, types = turned
+    topic, msgtype, data = heard[0]
+    with pytest.raises(LatheError, match=f"^{topic}: "):
+        Watched(tmp_path, types).live.take(topic, msgtype, data[:100])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--live", "-o", "x.mcap"], "allowed: a name that ends in .rrd"),
+        (["--live", "-o", "none/x.rrd"], "there is no folder none"),
+        (["--live", "--web", "--connect", "x"], "--web with --connect; allowed: one of them"),
+        (["--live", "--connect", "localhost:9876"], "url = 'localhost:9876'; allowed: rerun+http://HOST:PORT/proxy"),
+        (["--live", "a_bag"], "a BAG with --live; allowed: one of them"),
+        (["-o", "x.rrd"], "no BAG; name one, or --live"),
+        (["a_bag", "--once"], "--connect, --once and --json are for --live"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(options, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with harness.free_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        assert said in refused("view", *options)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- a real cell
+
+
+@pytest.fixture(scope="module")
+def offline():
+    return harness.run(load(PISTON, [f"spindle_encoder.revolutions={LENGTH}"])).digest
+
+
+@contextlib.contextmanager
+def watching(domain, folder, *options):
+    """A bridge as a process of its own, which saves; killed at the end if it has not ended by itself."""
+    environment = os.environ | {
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOG_DIR": str(folder),
+    }
+    command = [sys.executable, "-m", "lathe_rc", "view", "--live", "--json", "-o", folder / "live.rrd", *options]
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@contextlib.contextmanager
+def cell(folder, domain, *overrides):
+    """The processes of a cell whose recorder is held until somebody calls ``begin``; without it, no block goes out."""
+    piston = load(PISTON, [f"spindle_encoder.revolutions={LENGTH}", *overrides])
+    complete = harness.with_recorder(piston, folder / "bag", keep=True)
+    with harness.Processes(complete, [[name] for name in complete.nodes], domain=domain) as processes:
+        recorder = processes.pids["recorder"]
+        os.kill(recorder, signal.SIGSTOP)
+        yield processes, lambda: os.kill(recorder, signal.SIGCONT)
+
+
+def listens(bridge):
+    """Wait until a bridge listens to every topic."""
+    topics = 0
+    while topics < DRAWN:
+        line = bridge.stderr.readline()
+        assert line, "the bridge has ended"
+        topics += "listens to" in line
+
+
+def told(bridge):
+    """What it says of the one run that it has shown."""
+    out, errors = bridge.communicate()
+    assert bridge.returncode == 0, errors
+    assert "Traceback" not in errors
+    (run,) = json.loads(out)["runs"]
+    return run, errors
+
+
+def test_a_running_cell_is_shown_as_its_bag(offline, tmp_path):
+    with harness.free_domain() as domain, watching(domain, tmp_path, "--once") as bridge:
+        with cell(tmp_path, domain, "spindle_encoder.speed_factor=0.3") as (processes, begin):
+            listens(bridge)
+            begin()
+            processes.wait_for_end()
+        run, _ = told(bridge)
+    recording = reader.read(tmp_path / "bag")
+    assert recording.digests() == offline
+    samples = recording.of_type(messages.TOOL)["error"] * 1e6
+    expected = {"first": 0, "end": samples.size, "revolutions": int(LENGTH), "left_out": 0, "complete": True}
+    assert {name: run[name] for name in expected} == expected
+    view = View(tmp_path / "live.rrd")
+    time, _, value = view.scalars("/signals/tool/error")
+    assert_array_equal(value, samples[time // STEP_NS])
+    assert time[-1] // STEP_NS >= samples.size - 64
+    learned = recording.sparse["/coarse/learning"].values["rms_error"]
+    assert_allclose(10 ** view.scalars("/learning/coarse/learning")[2] * 1e-6, learned)
+
+
+@pytest.mark.parametrize("until_the_end", [False, True])
+def test_a_bridge_that_is_stuck_holds_nobody_up(until_the_end, offline, tmp_path):
+    with harness.free_domain() as domain, watching(domain, tmp_path) as bridge:
+        with cell(tmp_path, domain, "spindle_encoder.speed_factor=0.5") as (processes, begin):
+            listens(bridge)
+            begin()
+            processes.wait_for("cycle", cycle=2.0)
+            bridge.send_signal(signal.SIGSTOP)
+            processes.wait_for("cycle", cycle=12.0)
+            if not until_the_end:
+                bridge.send_signal(signal.SIGCONT)
+            processes.wait_for_end()
+        bridge.send_signal(signal.SIGCONT)
+        bridge.send_signal(signal.SIGINT)
+        run, errors = told(bridge)
+    recording = reader.read(tmp_path / "bag")
+    assert recording.digests() == offline
+    samples = recording.of_type(messages.TOOL)["error"] * 1e6
+    time, _, value = View(tmp_path / "live.rrd").scalars("/signals/tool/error")
+    assert_array_equal(value, samples[time // STEP_NS])
+    assert run["revolutions"] < LENGTH
+    if until_the_end:
+        assert not run["complete"]
+        assert "its end was not heard" in errors
+    else:
+        assert run["left_out"] > 0
+        assert "left out, wholly or in part" in errors
