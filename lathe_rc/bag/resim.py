@@ -3,21 +3,30 @@
 
 With nothing changed every bit must come out as it was recorded. With another controller the run shows what that
 controller would have made of the same spindle, disturbances and form.
+
+A bag that does not say what made it is served with a scenario beside it: the spindle is the recorded one, the rest
+is the scenario's, with the drive identified from the recorded command and position if that is asked for.
 """
 
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 
-from lathe_rc.bag import check, story
+import numpy as np
+
+from lathe_rc import resources
+from lathe_rc.bag import check, identify, story
+from lathe_rc.bag.identify import Identified
+from lathe_rc.bag.played import asked_for, wire
 from lathe_rc.bag.record import OfflineRecorder, begin
+from lathe_rc.bag.recorded import Recorded
 from lathe_rc.bag.source import Source
-from lathe_rc.bag.stream import Tape, feed
+from lathe_rc.bag.stream import feed
 from lathe_rc.bag.writer import refuse_existing
 from lathe_rc.cell import messages, ros_yaml
+from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import SharedParameters
@@ -25,8 +34,8 @@ from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
-from lathe_rc.cell.wiring import Cell, remapped
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError
 from lathe_rc.part import ErrorsByRevolution
 
 
@@ -36,13 +45,17 @@ class Resimulation:
 
     Attributes:
         scenario: what ran.
-        changed: whether it is another than that of the bag.
+        changed: whether it is another than that of the bag, or the bag has none.
         samples: length of the run.
         wall_s: it took [s].
         digest: of each signal topic.
         recorded: the same of the bag; empty if the recording is not complete.
         rms: form error by revolution [m], shape (revolutions,); empty without a tool.
         recorded_rms: the same of the bag.
+        between_rms: difference of the recorded and the re-simulated tool position by revolution, RMS [m], where
+            the recorded error is not in the bag but made from them; otherwise empty.
+        positions: topics and fields of the bag that this position is; otherwise empty.
+        drives: that were identified.
     """
 
     scenario: Scenario
@@ -53,32 +66,24 @@ class Resimulation:
     recorded: Mapping[str, str]
     rms: Samples = field(repr=False)
     recorded_rms: Samples = field(repr=False)
+    between_rms: Samples = field(repr=False)
+    positions: list[tuple[str, str]]
+    drives: list[Identified]
 
     @property
     def different(self) -> list[str]:
         """Topics that are not as they were recorded."""
-        topics = sorted({*self.digest, *self.recorded})
-        return [topic for topic in topics if self.digest.get(topic) != self.recorded.get(topic)]
+        return [topic for topic in sorted(self.recorded) if self.digest.get(topic) != self.recorded[topic]]
+
+    @property
+    def missing(self) -> list[str]:
+        """Topics that were not recorded."""
+        return sorted(self.digest.keys() - self.recorded.keys())
 
     @property
     def simulated_s(self) -> float:
         """Simulated time [s]."""
         return self.samples * self.scenario.shared.step
-
-
-class _PlayedSpindle(SpindleEncoder):
-    """The spindle as it was recorded."""
-
-    def __init__(self, made: SpindleEncoder, tape: Tape, samples: int) -> None:
-        super().__init__(made.name, made.parameters)
-        self._tape, self.samples = tape, samples
-
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
-        """See `Stage`."""
-        (signals,) = outputs
-        for name, array in self._tape.take(next(iter(signals.values())).size).items():
-            signals[name][:] = array
-        return []
 
 
 class _Digests:
@@ -127,47 +132,58 @@ def resimulate(
     path: Path,
     overrides: Sequence[str] = (),
     *,
+    scenario: Path | None = None,
     controller: Path | None = None,
+    topics: Mapping[str, str] | None = None,
+    identified: bool = False,
+    parameters: Path | None = None,
     output: Path | None = None,
 ) -> Resimulation:
     """Run the cell of a bag again behind its recorded spindle.
 
     Args:
         path: the bag.
-        overrides: ``NODE.PARAM=VALUE``; not of the spindle.
-        controller: parameter file whose nodes replace those of the bag.
+        overrides: ``NODE.PARAM=VALUE``; not of the spindle, if the scenario is the bag's.
+        scenario: parameter file that takes the place of the bag's scenario; None: the bag has one.
+        controller: parameter file whose nodes replace those of the scenario.
+        topics: topic of the bag by relative topic of the cell, where they are called otherwise.
+        identified: the electrodynamic drives are those identified from the bag.
+        parameters: file to write the scenario to that runs; None: none is written.
         output: folder of a bag to write the result to; must not exist; None: none is written.
 
     Raises:
-        InputError: the bag has no scenario or no encoder, the changes cannot work.
-        LatheError: samples of the encoder are missing.
+        InputError: the bag has no encoder, or no scenario and none is given; the changes cannot work; a drive
+            cannot be identified.
+        LatheError: samples that are needed are missing or not finite.
     """
     if output is not None:
         refuse_existing(output)
     with Source(path) as source, tempfile.TemporaryDirectory(prefix="lathe-resim-") as folder:
-        original = story.scenario_of(source.about, Path(folder))
-        spindle = original.of_kind(SpindleEncoder.kind)[0]
-        for text in overrides:
-            if text.partition(".")[0].strip() == spindle or "." not in text.partition("=")[0]:
-                raise InputError(f"--set {text!r}: the spindle and what all nodes share come from the bag; set others")
-        scenario = story.scenario_of(source.about, Path(folder), overrides) if overrides else original
+        recorded = Recorded(source, topics or {})
+        original = None if scenario is not None else _of_bag(recorded, source, Path(folder))
+        if scenario is not None:
+            chosen = scenarios.load(resources.find(scenario), overrides)
+        else:
+            assert original is not None, "it is the other source of a scenario"
+            _refuse_spindle(original, overrides)
+            chosen = story.scenario_of(source.about, Path(folder), overrides) if overrides else original
         if controller is not None:
-            scenario = with_controller(scenario, controller)
-        changed = scenario.nodes != original.nodes
-        events = _events(source)
-        nodes = {name: table.model_copy(update={"events": []}) for name, table in scenario.nodes.items()}
-        cell = Cell(nodes)
-        topic = f"/{remapped(cell.master.shared, 'encoder')}"
-        samples = _samples(source, topic)
-        cell.stages[spindle] = _PlayedSpindle(cell.master, Tape(path, topic), samples)
-        cell.check()
+            chosen = with_controller(chosen, controller)
+        drives = identify.drives(recorded, chosen) if identified else []
+        chosen = identify.with_identified(chosen, drives)
+        if parameters is not None:
+            identify.write_parameters(parameters, chosen, drives)
+        changed = original is None or chosen.nodes != original.nodes
+        cell, compared, events = wire(chosen, original, recorded, source)
         for name, stage in cell.stages.items():
             for index, action in events.get(name, []):
                 stage.schedule(action, index)
         digests = _Digests(cell)
         errors = ErrorsByRevolution({f"/{name}": said.type for name, said in cell.dense.items()})
-        writer = begin(output, scenario) if output is not None else None
-        all_sinks: list[Sink] = [digests, errors]
+        samples = cell.master.samples
+        assert samples is not None, "a bag has an end"
+        writer = begin(output, chosen) if output is not None else None
+        all_sinks: list[Sink] = [digests, errors, *([compared] if compared else [])]
         if writer is not None:
             all_sinks.append(OfflineRecorder(cell, samples, writer))
         engine = Engine(cell)
@@ -178,47 +194,44 @@ def resimulate(
             if writer is not None:
                 writer.close()
         wall = time.monotonic() - start
-    recorded = recorded_digests(path)
+    digest_of_bag = recorded_digests(path) if original is not None else {}
     before = errors
-    if changed:
+    if changed and compared is None:
         before = ErrorsByRevolution({name: said.type for name, said in source.topics.items()})
         feed(path, [before])
     return Resimulation(
-        scenario=scenario,
+        scenario=chosen,
         changed=changed,
         samples=samples,
         wall_s=wall,
         digest=digests.result(),
-        recorded=recorded,
+        recorded=digest_of_bag,
         rms=errors.rms(),
-        recorded_rms=before.rms(),
+        recorded_rms=compared.recorded_rms() if compared else before.rms(),
+        between_rms=compared.between_rms() if compared else np.empty(0),
+        positions=compared.topics if compared else [],
+        drives=drives,
     )
+
+
+def _of_bag(recorded: Recorded, source: Source, folder: Path) -> Scenario:
+    """The bag's scenario.
+
+    Raises:
+        InputError: it has none; says what it has and what is asked for.
+    """
+    if story.SCENARIO not in source.about:
+        raise InputError(f"{source.path}: {asked_for(recorded)}")
+    return story.scenario_of(source.about, folder)
+
+
+def _refuse_spindle(original: Scenario, overrides: Sequence[str]) -> None:
+    spindle = original.of_kind(SpindleEncoder.kind)[0]
+    for text in overrides:
+        if text.partition(".")[0].strip() == spindle or "." not in text.partition("=")[0]:
+            raise InputError(f"--set {text!r}: the spindle and what all nodes share come from the bag; set others")
 
 
 def recorded_digests(path: Path) -> dict[str, str]:
     """Digests of a bag: those that were recorded, or made now from all of it; empty if it is not complete."""
     return check.recorded(path) or check.check(path).digests
-
-
-def _samples(source: Source, topic: str) -> int:
-    """Samples of a dense topic: its last block says."""
-    if topic not in source.topics or source.topics[topic].type != messages.ENCODER:
-        raise InputError(f"{source.path}: no encoder on {topic}; a re-simulation needs the recorded spindle")
-    step_ns = next((block.step_ns for block in islice(source.blocks(topic), 1)), 0)
-    if not step_ns:
-        raise InputError(f"{source.path}: {topic} has no block")
-    *_, last = source.blocks(topic, start_ns=source.last_ns - 2 * messages.MAX_BLOCK * step_ns)
-    return last.first_index + last.samples
-
-
-def _events(source: Source) -> dict[str, list[tuple[int, str]]]:
-    """Sample and action of the events of each node, as they took effect."""
-    topics = {topic for topic, said in source.topics.items() if said.type == messages.EVENT}
-    found: dict[str, list[tuple[int, str]]] = {}
-    for topic, _, data in source.messages(topics):
-        try:
-            event = messages.decode(messages.EVENT, data)
-        except ValueError as error:
-            raise LatheError(f"{source.path}: {topic}: {error}") from None
-        found.setdefault(event.source.strip("/").rpartition("/")[2], []).append((int(event.sample_index), event.action))
-    return found

@@ -2,35 +2,124 @@
 """The command ``lathe resim``: a recorded run again, behind the same spindle, as it was or with another controller."""
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 from rich.console import Console
 from rich.table import Table as RichTable
 
+from lathe_rc.analysis import drive_fit
+from lathe_rc.bag import identify, story
+from lathe_rc.bag.identify import Identified
+from lathe_rc.bag.played import asked_for
+from lathe_rc.bag.recorded import Recorded
 from lathe_rc.bag.resim import Resimulation, resimulate
+from lathe_rc.bag.source import Source
+from lathe_rc.errors import InputError
 
 _SHOWN = 10  # revolutions
 _DIFFERENT = 1  # exit code if an unchanged run does not come out as recorded
+_UNITS = {"natural_frequency": ("rad/s", 1.0), "damping": ("1", 1.0), "delay": ("ms", 1e3)}  # and factor for it
 
 
 def _table(found: Resimulation) -> RichTable:
     """Recorded and re-simulated form error side by side."""
     table = RichTable(title="form error, RMS [µm]", title_justify="left", show_edge=False, header_style="bold")
-    for column in ("revolution", "recorded", "re-simulated", "ratio"):
+    positions = found.between_rms.size > 0
+    for column in ("revolution", "recorded", "re-simulated", "ratio", *(["positions differ by"] if positions else [])):
         table.add_column(column, justify="right")
     whole = min(found.rms.size, found.recorded_rms.size)
     for k in sorted(set(np.unique(np.geomspace(1, whole, _SHOWN).round().astype(int) - 1).tolist())):
         old, new = found.recorded_rms[k] * 1e6, found.rms[k] * 1e6
-        table.add_row(str(k + 1), f"{old:#.4g}", f"{new:#.4g}", f"{new / old:.3g}" if old else "")
+        between = [f"{found.between_rms[k] * 1e6:#.4g}"] if positions else []
+        table.add_row(str(k + 1), f"{old:#.4g}", f"{new:#.4g}", f"{new / old:.3g}" if old else "", *between)
     return table
+
+
+def _drive_table(drive: Identified) -> RichTable:
+    """Identified parameters beside those of the scenario."""
+    title = f"{drive.node} from {drive.command} and {drive.position[0]}"
+    table = RichTable(title=title, title_justify="left", show_edge=False, header_style="bold")
+    scenario = ["scenario"] if drive.before else []
+    for column in ("parameter", "unit", "identified", "standard error", *scenario):
+        table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
+    for name in drive_fit.PARAMETERS:
+        unit, factor = _UNITS[name]
+        values = [f"{drive.fit.values[name] * factor:.6g}", f"{drive.fit.errors[name] * factor:.2g}"]
+        before = [f"{drive.before[name] * factor:.6g}"] if drive.before else []
+        table.add_row(name, unit, *values, *before)
+    return table
+
+
+def _drive_lines(drive: Identified) -> list[str]:
+    fit = drive.fit
+    good = f"R² = {fit.r_squared:.8g}, NRMSE = {100.0 * fit.nrmse:.3g} %, residual {fit.residual_rms * 1e6:.3g} µm RMS"
+    lines = [f"{good}; {fit.samples} samples, condition number {fit.condition:.3g}"]
+    if fit.vague:
+        lines.append(f"warning: the command hardly tells {' and '.join(fit.vague)} apart; record one that moves more")
+    return lines
+
+
+def _told(drive: Identified) -> dict[str, Any]:
+    """A drive for JSON, in SI units."""
+    fit = drive.fit
+    return {
+        "node": drive.node,
+        "command": drive.command,
+        "position": list(drive.position),
+        "identified": dict(fit.values),
+        "standard_error": dict(fit.errors),
+        "linear_start": dict(fit.linear),
+        "scenario": dict(drive.before) if drive.before else None,
+        "r_squared": fit.r_squared,
+        "nrmse": fit.nrmse,
+        "residual_rms_m": fit.residual_rms,
+        "condition": fit.condition,
+        "vague": list(fit.vague),
+        "samples": fit.samples,
+    }
+
+
+def _topics(given: Sequence[str]) -> dict[str, str]:
+    found = {}
+    for text in given:
+        name, equals, topic = text.partition("=")
+        if not equals or not name or not topic.startswith("/"):
+            raise InputError(f"--topic {text!r}; allowed: NAME=/TOPIC, like encoder=/spindle/encoder")
+        found[name.lstrip("/")] = topic
+    return found
+
+
+def _identified_alone(bag: Path, topics: Mapping[str, str], parameters: Path | None) -> tuple[list[Identified], str]:
+    """The drives of a bag without a scenario, and what is asked for beyond them."""
+    with Source(bag) as source:
+        recorded = Recorded(source, topics)
+        recorded.check_names(["encoder", "tool", "coarse/command", "coarse/state"])
+        found = identify.drives(recorded, None)
+        if parameters:
+            identify.write_parameters(parameters, None, found)
+        return found, f"not re-simulated: {asked_for(recorded, identified=True)}"
+
+
+def _has_scenario(bag: Path) -> bool:
+    with Source(bag) as source:
+        return story.SCENARIO in source.about
 
 
 @click.command()
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("--set", "overrides", multiple=True, metavar="NODE.PARAM=VALUE", help="repeatable; not of the spindle")
 @click.option("--controller", type=click.Path(path_type=Path), help="parameter file whose nodes replace the bag's")
+@click.option("--scenario", type=click.Path(path_type=Path), help="parameter file in place of the bag's scenario")
+@click.option(
+    "--topic", multiple=True, metavar="NAME=/TOPIC", help="what the bag calls a topic of the cell; repeatable"
+)
+@click.option("--identify", "identified", is_flag=True, help="electrodynamic drives as the bag shows them")
+@click.option("--write-parameters", type=click.Path(path_type=Path), help="file for the scenario, or the drive, found")
+@click.option("--write-form", type=click.Path(path_type=Path), help="CSV file for the tool's position by angle")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="folder of a bag for the result; must not exist")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 @click.pass_context
@@ -39,40 +128,111 @@ def resim(
     bag: Path,
     overrides: tuple[str, ...],
     controller: Path | None,
+    scenario: Path | None,
+    topic: tuple[str, ...],
+    write_parameters: Path | None,
+    write_form: Path | None,
     output: Path | None,
     *,
+    identified: bool,
     as_json: bool,
 ) -> None:
-    """Run the cell of a BAG again behind its recorded spindle; unchanged, every bit must come out as recorded."""
-    found = resimulate(bag, overrides, controller=controller, output=output)
-    told = {
+    """Run the cell of a BAG again behind its recorded spindle; unchanged, every bit must come out as recorded.
+
+    A BAG that holds no scenario needs --scenario; its drive can be identified without (docs/resim.md).
+    """
+    topics = _topics(topic)
+    console = Console(highlight=False, soft_wrap=True)
+    if write_form:
+        _form(bag, topics, write_form, console, quiet=as_json)
+    if identified and scenario is None and not _has_scenario(bag):
+        if overrides or controller or output:
+            raise InputError(
+                "--set, --controller and -o need a cell, and the bag holds no scenario; give --scenario FILE"
+            )
+        drives, rest = _identified_alone(bag, topics, write_parameters)
+        if as_json:
+            click.echo(json.dumps({"bag": str(bag), "drives": [_told(drive) for drive in drives], "asked_for": rest}))
+            return
+        _show_drives(console, drives, write_parameters)
+        console.print(rest, markup=False)
+        return
+    found = resimulate(
+        bag,
+        overrides,
+        scenario=scenario,
+        controller=controller,
+        topics=topics,
+        identified=identified,
+        parameters=write_parameters,
+        output=output,
+    )
+    wrong = bool(found.different) and not found.changed
+    if as_json:
+        click.echo(json.dumps(_summary(found, bag, output)))
+    else:
+        _show_drives(console, found.drives, write_parameters)
+        _show(console, found, output)
+    ctx.exit(_DIFFERENT if wrong else 0)
+
+
+def _summary(found: Resimulation, bag: Path, output: Path | None) -> dict[str, Any]:
+    return {
         "bag": str(bag),
         "changed": found.changed,
-        "equal": not found.different,
+        "equal": bool(found.recorded) and not found.different,
         "different": found.different,
+        "not_recorded": found.missing,
+        "drives": [_told(drive) for drive in found.drives],
         "simulated_s": found.simulated_s,
         "wall_s": found.wall_s,
         "real_time_factor": found.simulated_s / found.wall_s,
         "rms_um": (found.rms * 1e6).tolist(),
         "recorded_rms_um": (found.recorded_rms * 1e6).tolist(),
+        "positions": [list(position) for position in found.positions],
+        "positions_differ_rms_um": (found.between_rms * 1e6).tolist(),
         "output": str(output) if output else None,
         "digest": dict(found.digest),
     }
-    wrong = bool(found.different) and not found.changed and bool(found.recorded)
-    if as_json:
-        click.echo(json.dumps(told))
-        ctx.exit(_DIFFERENT if wrong else 0)
-    console = Console(highlight=False, soft_wrap=True)
-    if found.changed and found.rms.size:
+
+
+def _show_drives(console: Console, drives: Sequence[Identified], parameters: Path | None) -> None:
+    for drive in drives:
+        console.print(_drive_table(drive))
+        for line in _drive_lines(drive):
+            console.print(line, markup=False)
+    if parameters:
+        console.print(f"parameters: {parameters}", markup=False)
+
+
+def _show(console: Console, found: Resimulation, output: Path | None) -> None:
+    if found.changed and min(found.rms.size, found.recorded_rms.size):
         console.print(_table(found))
-    if not found.recorded:
+    if found.positions:
+        told = " + ".join(f"{topic} {name}" for topic, name in found.positions)
+        console.print(f"recorded: {told}, against the scenario's form", markup=False)
+    elif not found.recorded:
         console.print("the recording is not complete: nothing to compare the whole with")
-    elif not found.different:
-        console.print(f"equal to the recording to the bit: {len(found.digest)} topics, {found.samples} samples")
-    else:
+    if found.recorded and not found.different:
+        equal = len(found.recorded)
+        console.print(f"equal to the recording to the bit: {equal} topics, {found.samples} samples")
+    elif found.recorded:
         console.print(f"different from the recording: {', '.join(found.different)}")
     factor = found.simulated_s / found.wall_s
     console.print(f"{found.simulated_s:.2f} s simulated in {found.wall_s:.2f} s: {factor:.1f}x real time")
     if output:
         console.print(f"bag: {output}")
-    ctx.exit(_DIFFERENT if wrong else 0)
+
+
+def _form(bag: Path, topics: Mapping[str, str], path: Path, console: Console, *, quiet: bool) -> None:
+    """Write the tool's recorded position by angle."""
+    with Source(bag) as source:
+        found = identify.form(Recorded(source, topics))
+    identify.write_form(path, found)
+    first, last = found.revolutions
+    if not quiet:
+        console.print(
+            f"form: {path}, the tool's position in revolutions {first} to {last}, which differ from it by "
+            f"{found.scatter * 1e6:.4g} µm RMS",
+            markup=False,
+        )

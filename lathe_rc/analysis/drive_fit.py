@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The electrodynamic drive's model from a recorded command u and position x.
+
+    Wi(p) = e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²)        (papers 000 and 001)
+
+Two steps. The start is linear least squares, for each of some delays τ, of u(t - τ) = x + a1·dx/dt + a2·d²x/dt²
+behind a low-pass (`lathe_rc.control.identification`). From there the mean square of the simulation error is made least:
+the recorded position less what the difference equation, with which the cell runs, makes of the recorded command. The
+sensor's noise is in the position alone, so this error is that noise when the model is right; in the equation error of
+the first step it stands in the regressors, and biases them.
+
+The motion before the record is not known: the state where the comparison begins is found along, and it is linear.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+from lathe_rc.control.identification import DriveIdentifier
+from lathe_rc.errors import InputError
+from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
+from lathe_rc.plants.linear import Discretisation
+
+Array = npt.NDArray[np.float64]
+
+PARAMETERS = ("natural_frequency", "damping", "delay")  #: in this order wherever they are an array
+MOST = 2**19  #: samples that are used; a longer record is cut
+
+_LEAST = 512  # samples, for a fit
+_LONGEST_DELAY = 0.1  # [s], as the drive's parameter allows
+_DAMPINGS = (0.01, 20.0)
+_STILL = 1e-9  # [m] RMS about its mean: what moves less does not move
+_FAR = 10.0  # [m]
+_START = 2**17  # samples that the start looks at: where the command moves most
+_FORGOTTEN = 40.0  # time constants after which a state is no more to be seen
+_PIECE = 8192
+_BANDWIDTHS = (500.0, 2000.0, 8000.0)  # [rad/s] of the low-pass
+_DELAYS = 40  # that are tried
+_MOST_STEPS = 60  # of the search
+_STRETCHES = 32  # of the residual, between which its correlation is neglected
+_SINGULAR = 1e6  # condition number from which parameters cannot be told apart at all
+_ILL = 1000.0  # and from which there is a warning
+_UNKNOWN, _VAGUE = 0.25, 0.05  # standard error over the parameter: refused, warned of
+_TOGETHER = 0.3  # part of a parameter in the direction that is known worst, to be named
+
+
+@dataclass(frozen=True)
+class DriveFit:
+    """A drive's model and how well it is known; parameters by name as in `PARAMETERS`, in rad/s, 1, s.
+
+    Attributes:
+        values: of the model.
+        errors: their standard errors, of a residual whatever its correlation.
+        linear: what the linear start found.
+        residual_rms: of the simulation error [m].
+        nrmse: the same over the RMS of the position about its mean [1].
+        condition: condition number of the position's sensitivities to the parameters, each of length 1.
+        vague: parameters that the command hardly tells apart, or that are known to 5 % and worse; should be none.
+        samples: that were compared.
+    """
+
+    values: Mapping[str, float]
+    errors: Mapping[str, float]
+    linear: Mapping[str, float]
+    residual_rms: float
+    nrmse: float
+    condition: float
+    vague: tuple[str, ...]
+    samples: int
+
+    @property
+    def r_squared(self) -> float:
+        """Part of the position's variance that the model explains."""
+        return 1.0 - self.nrmse**2
+
+
+def _named(values: Array) -> dict[str, float]:
+    return dict(zip(PARAMETERS, values.tolist(), strict=True))
+
+
+class _Record:
+    """Command and position, and how far a drive with given parameters is off."""
+
+    def __init__(self, command: Array, position: Array, step: float, method: Discretisation, stroke: float) -> None:
+        self.command, self.position = command, position
+        self._step, self._method, self._stroke = step, method, stroke
+        self._room = np.empty((3, command.size))
+
+    def residual(self, values: Array, skip: int) -> Array:
+        """Simulation error with ωn, ζ, τ from sample ``skip`` on [m], shape (n - skip,).
+
+        The drive is simulated from rest before the record. By superposition, another state at ``skip`` adds two
+        solutions of the homogeneous difference equation, a pulse response of its poles and the same a sample later:
+        what they explain is left out.
+        """
+        drive = ElectrodynamicDrive(
+            natural_frequency=float(values[0]),
+            damping=float(values[1]),
+            delay=float(values[2]),
+            stroke=self._stroke,
+            moving_mass=1.0,
+            force_constant=1.0,
+            step=self._step,
+            method=self._method,
+        )
+        drive.block(0, self.command, *self._room)
+        error: Array = self.position[skip:] - self._room[0, skip:]
+        transition = drive.plant.transition
+        slowest = float(np.abs(np.linalg.eigvals(transition)).max())
+        length = min(error.size, int(_FORGOTTEN / -np.log(slowest)) + 2)
+        pulse = np.zeros((2, length))
+        pulse[0, 0] = pulse[1, 1] = 1.0
+        poles = [1.0, -np.trace(transition), np.linalg.det(transition)]
+        base, _ = np.linalg.qr(lfilter([1.0], poles, pulse).T)
+        error[:length] -= base @ (base.T @ error[:length])
+        return error
+
+
+def _busiest(command: Array) -> slice:
+    """Where in the record the command moves most."""
+    if command.size <= _START:
+        return slice(0, command.size)
+    travel = np.append(0.0, np.cumsum(np.diff(command) ** 2))
+    begin = int(np.argmax(travel[_START - 1 :] - travel[: travel.size - _START + 1]))
+    return slice(begin, begin + _START)
+
+
+def _linear(record: _Record, step: float) -> list[Array]:
+    """ωn, ζ, τ by linear least squares, the best of all delays for each low-pass, shape (3,) each."""
+    part = _busiest(record.command)
+    # The gain is 1, so a common level may go: the low-passes begin at 0.
+    level = record.position[part][0]
+    command, position = record.command[part] - level, record.position[part] - level
+    longest = min(_LONGEST_DELAY, command.size * step / 4.0)
+    starts = []
+    for bandwidth in _BANDWIDTHS:
+        found = []
+        for delay in longest * np.linspace(0.0, 1.0, _DELAYS) ** 2:
+            identifier = DriveIdentifier(
+                model_delay=float(delay), feedback_delay=0, bandwidth=bandwidth, forgetting=0.0, step=step, block=_PIECE
+            )
+            for first in range(0, command.size, _PIECE):
+                piece = command[first : first + _PIECE]
+                identifier.commanded(first, piece)
+                identifier.block(first, 0, piece.size, position[first : first + _PIECE])
+            fit = identifier.fit()
+            if fit is not None:
+                found.append((fit.residual, np.array([fit.natural_frequency, fit.damping, float(delay)])))
+        if found:
+            starts.append(min(found, key=lambda pair: pair[0])[1])
+    return starts
+
+
+def fit(
+    command: Array, position: Array, step: float, *, method: Discretisation = "foh", stroke: float = np.inf
+) -> DriveFit:
+    """Identify a drive.
+
+    Args:
+        command: set points [m], shape (n,); of more than `MOST` the first are used.
+        position: as measured [m], shape (n,).
+        step: sampling step [s].
+        method: discretisation of the model.
+        stroke: end stops at ± this displacement [m].
+
+    Raises:
+        InputError: arrays that are too short or not finite, a command that does not move, or one that leaves a
+            parameter open, which is named.
+    """
+    if command.size != position.size or command.size < _LEAST:
+        raise InputError(
+            f"{command.size} samples of the command, {position.size} of the position; allowed: as many of each, "
+            f"{_LEAST} or more"
+        )
+    for name, values in (("command", command), ("position", position)):
+        if not np.all(np.abs(values) <= _FAR):
+            bad = int(np.flatnonzero(~(np.abs(values) <= _FAR))[0])
+            raise InputError(f"{name} = {values[bad]} m at sample {bad}; allowed: from {-_FAR:g} to {_FAR:g} m")
+    record = _Record(command[:MOST], position[:MOST], step, method, stroke)
+    for name, values in (("command", record.command), ("position", record.position)):
+        if np.std(values) < _STILL:
+            raise InputError(
+                f"the {name} does not move: {np.std(values):.3g} m RMS about its mean; nothing to identify"
+            )
+    starts = _linear(record, step)
+    if not starts:
+        raise InputError("the position does not follow the command as a stable drive would; nothing to identify")
+    return _polished(record, starts, step)
+
+
+def _polished(record: _Record, starts: list[Array], step: float) -> DriveFit:
+    """The least simulation error, from the best start."""
+    longest = max(float(start[2] + 2.0 * (start[2] + 2.0 * start[1] / start[0])) for start in starts)
+    longest = min(longest, _LONGEST_DELAY, record.command.size * step / 4.0)
+    skip = int(np.ceil(longest / step)) + 3
+    spread = float(np.std(record.position[skip:]))
+    if spread < _STILL:
+        raise InputError("the position does not move after its first samples; nothing to identify")
+    low = np.array([2.0 / (record.command.size * step), _DAMPINGS[0], 0.0])
+    high = np.array([np.pi / step, _DAMPINGS[1], longest])
+    inside = [np.clip(start, low, high) for start in starts]
+    linear = min(inside, key=lambda start: float(np.mean(record.residual(start, skip) ** 2)))
+    scale = 1.0 / linear[0]  # of the delay
+
+    def values(x: Array) -> Array:
+        return np.array([np.exp(x[0]), np.exp(x[1]), x[2] * scale])
+
+    def place(of: Array) -> Array:
+        return np.array([np.log(of[0]), np.log(of[1]), of[2] / scale])
+
+    def residual(x: Array) -> Array:
+        return record.residual(values(x), skip) / spread
+
+    found = least_squares(
+        residual,
+        np.clip(place(linear), place(low), place(high)),
+        bounds=(place(low), place(high)),
+        jac="3-point",
+        method="dogbox",
+        x_scale="jac",
+        xtol=1e-12,
+        ftol=1e-13,
+        gtol=1e-14,
+        max_nfev=_MOST_STEPS,
+    )
+    best, jacobian = values(found.x), np.asarray(found.jac)
+    lengths = np.linalg.norm(jacobian, axis=0)
+    lengths[lengths == 0.0] = np.inf
+    _, sizes, directions = np.linalg.svd(jacobian / lengths, full_matrices=False)
+    condition = float(sizes[0] / sizes[2]) if sizes[2] > 0.0 else np.inf
+    worst = tuple(name for name, part in zip(PARAMETERS, directions[2], strict=True) if abs(part) > _TOGETHER)
+    if condition > _SINGULAR:
+        raise InputError(f"the command does not tell {' and '.join(worst)} apart (condition number {condition:.3g})")
+    errors = _standard_errors(jacobian, found.fun, lengths, sizes, directions) * np.array([best[0], best[1], scale])
+    # What matters of a delay is its part of the whole lag.
+    relative = errors / np.array([best[0], best[1], best[2] + 2.0 * best[1] / best[0]])
+    unknown = [name for name, error in zip(PARAMETERS, relative, strict=True) if not error < _UNKNOWN]
+    if unknown:
+        said = ", ".join(
+            f"{name} = {best[PARAMETERS.index(name)]:.4g} ± {errors[PARAMETERS.index(name)]:.2g}" for name in unknown
+        )
+        raise InputError(f"the command leaves {' and '.join(unknown)} open ({said}; condition number {condition:.3g})")
+    vague = {name for name, error in zip(PARAMETERS, relative, strict=True) if error > _VAGUE}
+    # A search that has not ended creeps along what hardly changes the position.
+    vague |= set(worst) if condition > _ILL or found.status == 0 else set()
+    rms = float(np.sqrt(np.mean(found.fun**2)))
+    return DriveFit(
+        values=_named(best),
+        errors=_named(errors),
+        linear=_named(linear),
+        residual_rms=rms * spread,
+        nrmse=rms,
+        condition=condition,
+        vague=tuple(name for name in PARAMETERS if name in vague),
+        samples=record.command.size - skip,
+    )
+
+
+def _standard_errors(jacobian: Array, residual: Array, lengths: Array, sizes: Array, directions: Array) -> Array:
+    """Standard errors, shape (3,): the larger of those of a white residual and of one that is correlated.
+
+    White: σ²·(JᵀJ)⁻¹. Correlated within stretches of the record: (JᵀJ)⁻¹·(Σ g·gᵀ)·(JᵀJ)⁻¹ with g the sum of
+    J·residual over a stretch; that says too little where one stretch alone tells of the drive, as after a step.
+    """
+    inverse = (directions.T / sizes**2) @ directions / np.outer(lengths, lengths)
+    edges = np.arange(_STRETCHES) * residual.size // _STRETCHES
+    sums = np.add.reduceat(jacobian * residual[:, None], edges)
+    spread = sums.T @ sums * (_STRETCHES / (_STRETCHES - 3.0))
+    white = np.diag(inverse) * (residual @ residual) / (residual.size - 3.0)
+    return np.asarray(np.sqrt(np.maximum(white, np.diag(inverse @ spread @ inverse))))

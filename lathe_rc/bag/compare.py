@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The recorded tool position beside the re-simulated one."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from lathe_rc.bag.recorded import Recorded
+from lathe_rc.bag.stream import Tape
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.tool import Tool
+from lathe_rc.cell.wiring import Cell, remapped
+from lathe_rc.part import ErrorsByRevolution
+
+_TYPES = {"/encoder": messages.ENCODER, "/tool": messages.TOOL}
+
+
+def positions(recorded: Recorded, tool: Tool) -> list[tuple[str, str]]:
+    """Topics and fields of a bag whose sum is the tool's position; empty if not all of them are there.
+
+    The tool's own topic, or the measured positions of the drives that move it.
+    """
+    own = recorded.find(remapped(tool.shared, tool.outputs[0].topic), messages.TOOL)
+    if own is not None:
+        return [(own, "displacement")]
+    names = [remapped(tool.shared, f"{drive}/state") for drive in tool.parameters.drives]
+    topics = [recorded.find(name, messages.STATE) for name in names]
+    return [(topic, "measured_position") for topic in topics if topic is not None] if all(topics) else []
+
+
+class Comparison:
+    """Form errors of the recorded and of the re-simulated tool position, by revolution; a sink of the engine.
+
+    The recorded one is that of the re-simulation with the recorded position in place of the simulated: same desired
+    form, same cross slide, same deflection.
+
+    Args:
+        recorded: the bag.
+        cell: that runs.
+        tool: its tool.
+        topics: see `positions`.
+
+    Attributes:
+        topics: see above.
+    """
+
+    def __init__(self, recorded: Recorded, cell: Cell, tool: Tool, topics: list[tuple[str, str]]) -> None:
+        self.topics = topics
+        self._encoder = remapped(cell.master.shared, "encoder")
+        self._tool = remapped(tool.shared, tool.outputs[0].topic)
+        self._tapes = [(Tape(recorded.path, topic), field) for topic, field in topics]
+        self._recorded, self._simulated, self._between = (ErrorsByRevolution(_TYPES) for _ in range(3))
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        tool, encoder = dense[self._tool], dense[self._encoder]
+        between: Samples = tool["displacement"] - sum(tape.take(samples)[field] for tape, field in self._tapes)
+        for sink, error in (
+            (self._recorded, tool["error"] + between),
+            (self._simulated, tool["error"]),
+            (self._between, between),
+        ):
+            sink.chunk(first, samples, {"encoder": encoder, "tool": {"error": error}}, {})
+
+    def recorded_rms(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """Form error of the recorded position by revolution, RMS [m], shape (revolutions,)."""
+        return self._recorded.rms()
+
+    def rms(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """The same of the re-simulated one."""
+        return self._simulated.rms()
+
+    def between_rms(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """Difference of the two positions by revolution, RMS [m], shape (revolutions,)."""
+        return self._between.rms()
