@@ -59,7 +59,10 @@ setup(
     entry_points={
         "console_scripts": [
             "lathe = lathe_rc.cli:main",
-            *(f"{node} = lathe_rc.nodes.{node}:main" for node in [*NODES, "container", "replayer"]),
+            *(
+                f"{node} = lathe_rc.nodes.{node}:main"
+                for node in [*NODES, "container", "replayer", "rerun_bridge", "topic_recorder"]
+            ),
         ],
     },
     zip_safe=False,

@@ -25,7 +25,7 @@ from lathe_rc.errors import InputError, LatheError
 _REFRESH = 0.1  # [s] between updates of the progress line
 _LOG_PERIOD = 2.0  # [s] between lines where there is no terminal
 # in lathe_rc.commands, imported when they are wanted
-_ELSEWHERE = ("bag", "export", "fit", "measure", "replay", "report", "resim", "study", "view")
+_ELSEWHERE = ("bag", "export", "fit", "measure", "record", "replay", "report", "resim", "study", "view")
 _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
 
 
@@ -148,9 +148,16 @@ def _facts(result: harness.Result) -> list[str]:
     ]
 
 
-def _run(scenario: Scenario, *, mode: harness.Mode, groups: list[list[str]] | None, bag: Path | None) -> harness.Result:
+def _run(
+    scenario: Scenario,
+    *,
+    mode: harness.Mode,
+    groups: list[list[str]] | None,
+    bag: Path | None,
+    domain: int | None = None,
+) -> harness.Result:
     with _Watch(Console(stderr=True)) as watch:
-        return harness.run(scenario, mode=mode, groups=groups, bag=bag, watch=watch)
+        return harness.run(scenario, mode=mode, groups=groups, bag=bag, watch=watch, domain=domain)
 
 
 @main.command()
@@ -168,6 +175,7 @@ def _run(scenario: Scenario, *, mode: harness.Mode, groups: list[list[str]] | No
 @click.option("--bag", type=click.Path(path_type=Path), help="folder to record to; must not exist")
 @click.option("--profile", type=click.Path(path_type=Path), help="CSV file to write the last revolution's profile to")
 @click.option("--set", "overrides", multiple=True, metavar="NODE.PARAM=VALUE", help="also PARAM=VALUE if shared")
+@click.option("--domain", type=click.IntRange(0, 232), help="ROS domain, for others to listen; default: a free one")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def run(
     scenario: str,
@@ -178,6 +186,7 @@ def run(
     bag: Path | None,
     profile: Path | None,
     overrides: tuple[str, ...],
+    domain: int | None,
     *,
     as_json: bool,
 ) -> None:
@@ -192,7 +201,9 @@ def run(
     loaded.processes(split, "--group")
     if groups and mode != "processes":
         raise InputError(f"--group with --mode {mode}; allowed: --mode processes")
-    result = _run(loaded, mode=mode, groups=split if groups else None, bag=bag)
+    if domain is not None and mode == "offline":
+        raise InputError(f"--domain {domain} with --mode offline; allowed: --mode processes or composed")
+    result = _run(loaded, mode=mode, groups=split if groups else None, bag=bag, domain=domain)
     if profile:
         part.write_profile(profile, result.recording, result.part, [result.errors.rms.size - 1])
     if as_json:

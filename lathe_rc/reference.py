@@ -10,10 +10,16 @@ from importlib.resources import files
 
 from lathe_rc.bag.record import signal_depth
 from lathe_rc.cell import messages
-from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters
+from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Table
+from lathe_rc.cell.replayer import KIND as REPLAYER
+from lathe_rc.cell.replayer import ReplayerParameters
+from lathe_rc.cell.rerun_bridge import KIND as RERUN_BRIDGE
+from lathe_rc.cell.rerun_bridge import RerunBridgeParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stage import Input, Stage
 from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.topic_recorder import KIND as TOPIC_RECORDER
+from lathe_rc.cell.topic_recorder import TopicRecorderParameters
 
 _TYPES = {bool: "bool", int: "integer", float: "double", str: "string"}
 _WHEN = {
@@ -97,10 +103,17 @@ HOST_TOPICS = (
     ),
 )
 
+#: nodes that are no members of a cell
+BESIDE: dict[str, type[Table]] = {
+    REPLAYER: ReplayerParameters,
+    RERUN_BRIDGE: RerunBridgeParameters,
+    TOPIC_RECORDER: TopicRecorderParameters,
+}
+
 
 def page() -> str:
     """The whole page."""
-    parts = [_introduction(), _shared(), *map(_node, TABLES), _host(), _messages()]
+    parts = [_introduction(), _shared(), *map(_node, TABLES), *map(_beside, BESIDE), _host(), _messages()]
     return "\n\n".join(parts) + "\n"
 
 
@@ -168,6 +181,15 @@ def _node(kind: str) -> str:
     parts += _ports(stage) if stage else ["It subscribes to every signal topic that the members announce."]
     parts += ["Parameters, own:", _parameters(_only(table, NodeParameters))]
     return "\n\n".join(parts)
+
+
+def _beside(kind: str) -> str:
+    about = inspect.getdoc(BESIDE[kind]) or ""
+    return f"""## {kind}
+
+{about} It is no member of the cell: nobody waits for it, and the parameters of all nodes are not its own.
+
+{_parameters(BESIDE[kind].rows())}"""
 
 
 def _ports(stage: Stage) -> Iterator[str]:

@@ -18,7 +18,8 @@ class ReplayerParameters(Table):
     loop: bool = parameter(default=False, doc="begin again at the end")
     start: Annotated[float, Ge(0)] = parameter(0.0, "where to begin, counted from the bag's first message", "s")
     end: Annotated[float, Ge(0)] = parameter(0.0, "where to end, counted from the bag's first message; 0: its end", "s")
-    topics: list[str] = parameter([], "fully qualified; none: all")
+    topics: list[str] = parameter([], "fully qualified; none: all but /clock")
+    wait: Annotated[int, Ge(0)] = parameter(0, "readers that each topic must have before the first message is sent")
     as_cell: bool = parameter(
         default=False,
         doc="send each topic from a node of its own name, as members of the cell, and wait for a recorder",

@@ -16,9 +16,10 @@ from lathe_rc.errors import InputError
 @click.option("--start", type=click.FloatRange(min=0), default=0.0, help="[s] from the bag's first message on")
 @click.option("--end", type=click.FloatRange(min=0), default=0.0, help="[s] from its first message on; 0: to its end")
 @click.option("--topics", multiple=True, metavar="TOPIC", help="repeatable; default: all")
+@click.option("--wait", type=click.IntRange(min=0), default=0, metavar="N", help="begin when each topic has N readers")
 @click.option("--as-cell", is_flag=True, help="as the nodes that made it; begins when a recorder node is ready")
 def replay(
-    bag: Path, rate: float, start: float, end: float, topics: tuple[str, ...], *, loop: bool, as_cell: bool
+    bag: Path, rate: float, start: float, end: float, topics: tuple[str, ...], wait: int, *, loop: bool, as_cell: bool
 ) -> None:
     """Send the messages of a BAG again, with /clock; services ~/pause, ~/resume and ~/toggle_paused."""
     try:
@@ -32,6 +33,7 @@ def replay(
         "start": start,
         "end": end,
         "topics": list(topics),
+        "wait": wait,
         "as_cell": as_cell,
     }
     sys.exit(replayer.run(values, ["--ros-args"]))

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Executable: the ``replayer``, which sends again what a bag holds, whoever made it, with /clock."""
 
-import contextlib
 import json
 import sys
 import tempfile
@@ -10,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from builtin_interfaces.msg import Time
 from lathe_rc_msgs.msg import Member, Progress
 from rclpy.duration import Duration
@@ -29,12 +27,17 @@ from lathe_rc.cell.replayer import KIND, ReplayerParameters
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell, remapped
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes import declare
+from lathe_rc.nodes import alone
 from lathe_rc.nodes.ports import latched_qos, message_class
 
 _DEPTH = 512  # of the queues: so many may be under way before readers must have acknowledged
 _ACKNOWLEDGED = 30.0  # [s] for a reader to take what was sent to it
-_CLOCK_PERIOD = 10_000_000  # [ns] of the bag's time between messages on /clock
+_CLOCK = "/clock"
+_CLOCK_END = 2**31 * 10**9  # [ns] that it cannot tell any more
+# [ns] of wall time until a message must have been acknowledged if others are to follow: a reader that puts messages in
+# the order of their publication need not wait much longer for one that is late
+_PROMPT = 100_000_000
+_SETBACK = 1_000_000_000  # [ns] by which the computer's clock may be set back without harm
 _LOOK = 0.05  # [s] of wall time between looks at services and signals
 
 
@@ -70,19 +73,21 @@ class Replayer:
                 f"{KIND}.as_cell: a cell is replayed whole and once; leave out loop, start, end and topics"
             )
         self._source = Source(Path(parameters.bag))
-        self._topics = set(parameters.topics) or set(self._source.topics)
+        self._topics = set(parameters.topics) or set(self._source.topics) - {_CLOCK}
         if unknown := sorted(self._topics - set(self._source.topics)):
             raise InputError(
                 f"{KIND}.topics: {', '.join(unknown)}; the bag has {', '.join(sorted(self._source.topics))}"
             )
+        if _CLOCK in self._topics:
+            raise InputError(f"{KIND}.topics: {_CLOCK} is the replayer's own and tells the log times of the bag")
+        if not 0 <= self._source.first_ns <= self._source.last_ns < _CLOCK_END:
+            raise InputError(f"{parameters.bag}: log times up to {self._source.last_ns} ns; {_CLOCK} ends in 2038")
         self._classes = {topic: self._class(topic) for topic in sorted(self._topics)}
         self.paused = False
         self.sent = 0
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._looked = 0.0
-        self._clock = node.create_publisher(Clock, "/clock", QoSProfile(depth=10))
-        self._clock_due = 0
         for name, paused in (
             ("pause", lambda: True),
             ("resume", lambda: False),
@@ -92,8 +97,12 @@ class Replayer:
         self._members: dict[str, Node] = {}
         self._master, self._window = "", 0  # of a cell: the topic whose blocks count, and how many may be under way
         self._blocks = self._recorded = 0
-        self._publishers: dict[str, Publisher] = {}
-        self._waiting: dict[str, int] = {}
+        # Reliable and with a queue, unlike other clocks: readers may want every time.
+        self._publishers: dict[str, Publisher] = {
+            _CLOCK: node.create_publisher(Clock, _CLOCK, QoSProfile(depth=_DEPTH))
+        }
+        self._waiting: dict[str, int] = {_CLOCK: 0}  # messages of a topic that may not have been acknowledged
+        self._sent_ns = self._settled_ns = 0  # wall time of the newest message, and when all were acknowledged
 
     def _class(self, topic: str) -> Any:
         kind = self._source.topics[topic].type
@@ -115,12 +124,20 @@ class Replayer:
     # ---- start --------------------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Make the publishers; as a cell, wait until a recorder is ready."""
+        """Make the publishers, and wait for readers; as a cell, until a recorder is ready."""
         if self._parameters.as_cell:
             self._join()
-            return
-        for topic in sorted(self._topics):
-            self._publish(self._node, topic)
+        else:
+            for topic in sorted(self._topics):
+                self._publish(self._node, topic)
+        if _CLOCK in self._source.topics:
+            self._node.get_logger().info(f"{_CLOCK} of the bag is left out: the replayer's tells the log times")
+        while lonely := [topic for topic in sorted(self._topics) if self._readers(topic) < self._parameters.wait]:
+            self._node.get_logger().info(f"waiting for readers of {', '.join(lonely)}", throttle_duration_sec=5.0)
+            self._look(_LOOK)
+
+    def _readers(self, topic: str) -> int:
+        return int(self._publishers[topic].get_subscription_count())
 
     def _publish(self, node: Node, topic: str) -> None:
         qos = _qos(self._source.topics[topic].qos)
@@ -205,22 +222,39 @@ class Replayer:
 
     def _once(self) -> None:
         rate, origin, began = self._parameters.rate, None, time.monotonic()
-        self._clock_due = 0
+        told: int | None = None
         for topic, log_ns, data in self._chosen():
             if origin is None:
                 origin, began = log_ns, time.monotonic()
             due = began + (log_ns - origin) * 1e-9 / rate if rate else 0.0
             began += self._wait_until(due)
-            if log_ns >= self._clock_due:
-                self._clock_due = log_ns + _CLOCK_PERIOD
-                self._clock.publish(Clock(clock=Time(sec=log_ns // 10**9, nanosec=log_ns % 10**9)))
+            if log_ns != told:
+                told = log_ns
+                self._send(_CLOCK, Clock(clock=Time(sec=log_ns // 10**9, nanosec=log_ns % 10**9)))
             if topic == self._master:
                 self._hold()
-            self._publishers[topic].publish(data)
+            self._send(topic, data)
             self.sent += 1
-            self._waiting[topic] += 1
-            if self._waiting[topic] >= _DEPTH // 2:
-                self._acknowledged(topic)
+
+    def _send(self, topic: str, message: Any) -> None:
+        """Publish later than everything before, by the wall clock that stamps messages: it tells readers the order."""
+        if time.time_ns() - self._settled_ns > _PROMPT:
+            for other in self._publishers:
+                self._acknowledged(other)
+            self._settled_ns = time.time_ns()
+        while (back := self._sent_ns - time.time_ns()) >= 0:
+            if back > _SETBACK:
+                raise LatheError(f"the computer's clock was set back by {back * 1e-9:.1f} s")
+        try:
+            self._publishers[topic].publish(message)
+        except RuntimeError:
+            if not self._node.context.ok():
+                raise ExternalShutdownException from None
+            raise InputError(f"{topic}: message {self.sent + 1} that is sent is none of its type") from None
+        self._sent_ns = time.time_ns()
+        self._waiting[topic] += 1
+        if self._waiting[topic] >= _DEPTH // 2:
+            self._acknowledged(topic)
 
     def _wait_until(self, due: float) -> float:
         """Wait for a moment of wall time, and as long as it is paused; returns for how long it was paused [s]."""
@@ -252,41 +286,20 @@ class Replayer:
 
     def _acknowledged(self, topic: str) -> None:
         """Wait until all reliable readers have what was sent."""
-        self._waiting[topic] = 0
-        if not self._publishers[topic].wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED)):
+        if self._waiting[topic] and not self._publishers[topic].wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED)):
             raise LatheError(f"{topic}: a reader has taken nothing for {_ACKNOWLEDGED:.0f} s")
+        self._waiting[topic] = 0
 
 
-def _given(node: Node, values: Mapping[str, object]) -> ReplayerParameters:
-    named = {name: value for name, value in declare.overrides(node).items() if value is not None}
-    return ReplayerParameters.read(KIND, {**named, **values})
+def _work(node: Node, parameters: ReplayerParameters) -> None:
+    replayer = Replayer(node, parameters)
+    replayer.run()
+    node.get_logger().info(f"{replayer.sent} messages sent")
 
 
 def run(values: Mapping[str, object], args: Sequence[str] | None = None) -> int:
-    """Replay until the end, a failure, or Ctrl-C.
-
-    Args:
-        values: parameters; those of the command line of ROS come from ``args``.
-        args: ROS arguments; default: those of the process.
-
-    Returns:
-        The exit code.
-    """
-    rclpy.init(args=None if args is None else ["lathe", *args])
-    try:
-        node = Node(KIND, automatically_declare_parameters_from_overrides=True, allow_undeclared_parameters=True)
-        replayer = Replayer(node, _given(node, values))
-        replayer.run()
-        node.get_logger().info(f"{replayer.sent} messages sent")
-    except LatheError as error:
-        print(f"lathe: {error}", file=sys.stderr)
-        return error.exit_code
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return LatheError.exit_code
-    finally:
-        with contextlib.suppress(Exception):
-            rclpy.try_shutdown()
-    return 0
+    """Replay until the end, a failure, or Ctrl-C; see `alone.run`."""
+    return alone.run(KIND, ReplayerParameters, _work, values, args)
 
 
 def main() -> None:

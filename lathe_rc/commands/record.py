@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``lathe record``: any topics into a bag."""
+
+import sys
+from pathlib import Path
+
+import click
+
+from lathe_rc.errors import InputError
+
+
+@click.command()
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option("--topics", multiple=True, metavar="TOPIC", help="repeatable; default: all but those of ROS itself")
+@click.option("--all", "everything", is_flag=True, help="hidden topics, /rosout and /parameter_events as well")
+@click.option("--sim-time", is_flag=True, help="log times from /clock; default: the wall time of publication")
+@click.option("--once", is_flag=True, help="end when all publishers are gone")
+@click.option("--hold", type=click.FloatRange(min=0, min_open=True, max=60), help="[s] that messages wait for others")
+def record(
+    bag: Path, topics: tuple[str, ...], hold: float | None, *, everything: bool, sim_time: bool, once: bool
+) -> None:
+    """Record any topics into a new BAG, in the order of their publication; Ctrl-C ends it.
+
+    Exit code 3: messages are missing.
+    """
+    try:
+        from lathe_rc.nodes import topic_recorder
+    except ImportError as error:
+        raise InputError(f"no ROS 2 here ({error}); run through ./lathe, or source a ROS 2 installation") from None
+    values = {"bag": str(bag), "topics": list(topics), "all": everything, "sim_time": sim_time, "once": once}
+    if hold is not None:
+        values["hold"] = hold
+    sys.exit(topic_recorder.run(values, ["--ros-args"]))

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes that are members of no cell: start, parameters, signals, exit code."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+
+from lathe_rc.cell.parameters import Table
+from lathe_rc.errors import LatheError
+from lathe_rc.nodes import declare
+
+T = TypeVar("T", bound=Table)
+
+
+def run(
+    kind: str,
+    table: type[T],
+    work: Callable[[Node, T], None],
+    values: Mapping[str, object],
+    args: Sequence[str] | None = None,
+) -> int:
+    """Run a node until its work ends or fails, or Ctrl-C.
+
+    Args:
+        kind: name of the node.
+        table: its parameters.
+        work: what it does.
+        values: parameters; those of the command line of ROS come from ``args``.
+        args: ROS arguments; default: those of the process.
+
+    Returns:
+        The exit code.
+    """
+    os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("fastdds.xml")))
+    rclpy.init(args=None if args is None else ["lathe", *args])
+    try:
+        # What the replayed system told on /rosout must not be mixed with what this node tells.
+        node = Node(
+            kind,
+            automatically_declare_parameters_from_overrides=True,
+            allow_undeclared_parameters=True,
+            enable_rosout=False,
+        )
+        given = {name: value for name, value in declare.overrides(node).items() if value is not None}
+        work(node, table.read(kind, {**given, **values}))
+    except LatheError as error:
+        print(f"lathe: {error}", file=sys.stderr)
+        return error.exit_code
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return LatheError.exit_code
+    finally:
+        with contextlib.suppress(Exception):
+            rclpy.try_shutdown()
+    return 0

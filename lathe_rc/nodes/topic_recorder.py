@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Executable: the ``topic_recorder``, which records any topics in the order in which they were published."""
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import uninstall_signal_handlers
+from rclpy.subscription import Subscription
+
+from lathe_rc.bag.publication_order import Continuity, PublicationOrder, Recorded
+from lathe_rc.bag.writer import BagWriter
+from lathe_rc.cell import messages
+from lathe_rc.cell.recorder import RecorderParameters
+from lathe_rc.cell.topic_recorder import KIND, TopicRecorderParameters
+from lathe_rc.errors import InputError, LossyRunError
+from lathe_rc.nodes import alone, offered
+from lathe_rc.nodes.ports import message_class
+
+_CLOCK = "/clock"
+_OWN = {"/rosout", "/parameter_events"}  # of ROS itself, this node's among them
+_LOOK = 0.05  # [s] of wall time between looks at the graph and at signals
+_FLUSH = 0.5  # [s] of wall time after which messages are written out even if they fill no chunk
+_DISCOVERY = 3.0  # [s] of wall time after which publishers that were there before have been discovered
+_SILENCE = 10.0  # [s] without a message after which no one published before is under way any more
+_AT_ONCE = 10_000  # messages of a topic that are taken before the others have their turn
+
+
+class TopicRecorder:
+    """Records topics into a bag.
+
+    Args:
+        node: that subscribes.
+        parameters: what to record, and where.
+
+    Raises:
+        InputError: no bag, or a place where none can be begun.
+    """
+
+    def __init__(self, node: Node, parameters: TopicRecorderParameters) -> None:
+        self._node, self._parameters = node, parameters
+        if not parameters.bag:
+            raise InputError(f"{KIND}.bag is empty; name the bag's folder")
+        if parameters.topics and parameters.all:
+            raise InputError(f"{KIND}.all: {', '.join(parameters.topics)} are named; give one or the other")
+        if parameters.sim_time and _CLOCK in parameters.topics:
+            raise InputError(f"{KIND}.topics: {_CLOCK} tells the log times; record it with the wall time")
+        chunks = RecorderParameters()  # as the cell's recorder has them
+        self._writer = BagWriter(
+            Path(parameters.bag), compression=chunks.compression, chunk_size=chunks.chunk_size, about={}
+        )
+        self._order = PublicationOrder(
+            hold_ns=round(parameters.hold * 1e9), sim_time=parameters.sim_time, began_ns=time.time_ns()
+        )
+        self._inlets: dict[str, Subscription] = {}
+        self._continuity: dict[str, Continuity] = {}
+        self._refused: dict[str, str] = {}  # topic -> why it is not recorded
+        self._present: set[str] = set()  # topics that may have begun before the recording
+        self._settled = False
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
+        self._began = self._newest = self._flushed = time.monotonic()
+        self._taken = 0
+        self.written = 0
+        self.stopped = threading.Event()  #: set from outside to end it
+
+    # ---- topics -------------------------------------------------------------------------------------
+
+    def _graph(self) -> Mapping[str, Sequence[str]]:
+        """Message types by topic, of those that have publishers."""
+        return {
+            topic: types
+            for topic, types in self._node.get_topic_names_and_types()
+            if self._node.count_publishers(topic)
+        }
+
+    def _wanted(self, topic: str) -> bool:
+        if self._parameters.topics:
+            return topic in self._parameters.topics
+        if self._parameters.sim_time and topic == _CLOCK:
+            return False
+        return self._parameters.all or not (topic in _OWN or any(part[:1] == "_" for part in topic.split("/")))
+
+    def _discover(self) -> None:
+        """Subscribe to what has appeared; with simulated time, to /clock before anything else."""
+        graph = self._graph()
+        if not self._settled:
+            self._present |= graph.keys()
+            if time.monotonic() - self._began > _DISCOVERY:
+                self._settled = True
+                self._node.get_logger().info("recording; what begins from now on is heard from its first message on")
+        if self._parameters.sim_time and _CLOCK not in self._inlets:
+            if _CLOCK in graph:
+                self._subscribe(_CLOCK, graph[_CLOCK])
+            return
+        for topic in sorted(graph):
+            if self._wanted(topic) and topic not in self._inlets and topic not in self._refused:
+                try:
+                    self._subscribe(topic, graph[topic])
+                except InputError as error:
+                    if topic in self._parameters.topics:
+                        raise
+                    self._refused[topic] = str(error)
+                    self._node.get_logger().error(str(error))
+
+    def _subscribe(self, topic: str, types: Sequence[str]) -> None:
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        if not publishers:
+            return  # gone again
+        if len(types) != 1:
+            raise InputError(f"{topic} has several types: {', '.join(sorted(types))}")
+        (msgtype,) = types
+        try:
+            kind, store = message_class(msgtype), offered.installed(msgtype)
+            definition, _ = store.generate_msgdef(msgtype, ros_version=2)
+        except (InputError, ImportError, AttributeError, ValueError):
+            raise InputError(f"{topic}: message type {msgtype} is not installed; install its package") from None
+        digest = store.hash_rihs01(msgtype)
+        if any(str(publisher.topic_type_hash) != digest for publisher in publishers):
+            raise InputError(f"{topic}: {msgtype} is defined otherwise by the publisher than it is installed here")
+        if topic != _CLOCK or not self._parameters.sim_time:
+            self._writer.copy_topic(
+                topic, msgtype, [*map(offered.offered, publishers)], definition=definition, digest=digest
+            )
+        self._continuity[topic] = Continuity(whole=topic not in self._present)
+        self._inlets[topic] = self._node.create_subscription(
+            kind,
+            topic,
+            cast("Any", partial(self._take, topic)),  # its types know of no callback with the message's info
+            offered.asked(publishers),
+            raw=True,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=lambda _: self._mismatch(topic)),
+        )
+        self._node.get_logger().info(f"{topic}: {msgtype}")
+
+    def _mismatch(self, topic: str) -> None:
+        self._refused[topic] = f"{topic}: a later publisher offers less than the first; its messages are not recorded"
+
+    # ---- messages -----------------------------------------------------------------------------------
+
+    def _take(self, topic: str, data: bytes, info: Mapping[str, Any]) -> None:
+        sequence, source_ns = info["publication_sequence_number"], info["source_timestamp"]
+        if not sequence or not source_ns:
+            raise InputError("this ROS middleware does not number and stamp messages; use rmw_fastrtps_cpp")
+        self._taken += 1
+        self._continuity[topic].take(sequence, self._inlets[topic].get_publisher_count)
+        if topic == _CLOCK and self._parameters.sim_time:
+            try:
+                clock = messages.decode("rosgraph_msgs/msg/Clock", data).clock
+            except ValueError as error:
+                raise InputError(f"{topic}: {error}") from None
+            self._order.add_clock(source_ns, sequence, clock.sec * 10**9 + clock.nanosec)
+        else:
+            # DDS fills up to a multiple of four what it sends in one piece; large messages come as they were.
+            self._order.add(topic, source_ns, sequence, data + bytes(-len(data) % 4))
+
+    def _take_all(self) -> bool:
+        """Take what has arrived; returns whether that is all."""
+        emptied = True
+        for topic, inlet in self._inlets.items():
+            with inlet.handle:
+                for _ in range(_AT_ONCE):
+                    found = inlet.handle.take_message(inlet.msg_type, True)  # noqa: FBT003 - raw
+                    if found is None:
+                        break
+                    self._take(topic, *found)
+                else:
+                    emptied = False
+        return emptied
+
+    def _write(self, ready: Iterable[Recorded]) -> None:
+        for topic, log_ns, data in ready:
+            self._writer.write(topic, log_ns, data)
+            self.written += 1
+
+    def _step(self) -> int:
+        """Wait a moment for messages, take and write them; returns how many came."""
+        before = self._taken
+        # The executor wakes up for one message; the rest of a burst is taken without it, ten times as fast.
+        self._executor.spin_once(timeout_sec=_LOOK)
+        seen_ns = self._order.newest_ns
+        emptied = self._take_all()
+        now = time.monotonic()
+        if self._taken > before:
+            self._newest = now
+            if emptied:
+                self._write(self._order.release(seen_ns))
+        elif now - self._newest > _SILENCE:
+            self._write(self._order.rest())
+        if now - self._flushed > _FLUSH:
+            self._flushed = now
+            self._writer.flush()
+        return self._taken - before
+
+    # ---- run ----------------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Record until it is stopped, or all publishers are gone; then close the bag.
+
+        Raises:
+            InputError: a topic that is named cannot be recorded.
+            LatheError: the disk does not take it, or /clock is of no use.
+            LossyRunError: messages are missing, or not where they belong.
+        """
+        looked = 0.0
+        try:
+            while not self.stopped.is_set():
+                if time.monotonic() - looked > _LOOK:
+                    self._discover()
+                    looked = time.monotonic()
+                if not self._step() and self._parameters.once and self._left():
+                    break
+            while self._step():
+                pass
+            self._write(self._order.rest())
+            self._order.finish()
+        finally:
+            self._writer.close()
+        self._tell()
+
+    def _left(self) -> bool:
+        """Whether somebody was there, and nobody is."""
+        return bool(self._taken) and not any(inlet.get_publisher_count() for inlet in self._inlets.values())
+
+    def _tell(self) -> None:
+        say = self._node.get_logger().info
+        if self._order.left_out:
+            say(f"{self._order.left_out} messages from before the first time on {_CLOCK} are left out")
+        for topic, heard in self._continuity.items():
+            if topic in self._present and heard.first > 1:
+                say(f"{topic} is heard from its message {heard.first} on")
+        say(f"bag {self._parameters.bag} closed: {self.written} messages")
+        wrong = [f"{c.missing} messages of {topic} are missing" for topic, c in self._continuity.items() if c.missing]
+        if self._order.late:
+            wrong.append(f"{self._order.late} messages came too late for their place, hold = {self._parameters.hold} s")
+        wrong += self._refused.values()
+        if wrong:
+            raise LossyRunError(f"{self._parameters.bag}: {'; '.join(wrong)}")
+
+
+def _work(node: Node, parameters: TopicRecorderParameters) -> None:
+    recorder = TopicRecorder(node, parameters)
+    # ROS would end its context at once, with messages still to be taken.
+    uninstall_signal_handlers()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: recorder.stopped.set())
+    recorder.run()
+
+
+def run(values: Mapping[str, object], args: Sequence[str] | None = None) -> int:
+    """Record until it is stopped; see `alone.run`."""
+    return alone.run(KIND, TopicRecorderParameters, _work, values, args)
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run({}))
+
+
+if __name__ == "__main__":
+    main()

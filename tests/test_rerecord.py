@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recording what is replayed over real DDS gives the same bag again: messages, order and log times."""
+
+import contextlib
+import itertools
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import rclpy
+from cells import scenario
+from rclpy.qos import QoSProfile
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import Reader, StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagWriter
+from rosbags.typesys import Stores, get_typestore
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
+
+from lathe_rc import harness
+from lathe_rc.bag.check import check
+from lathe_rc.bag.source import Source
+from lathe_rc.errors import InputError
+
+FOREVER = QosTime(9223372036, 854775807)
+STORE = get_typestore(Stores.ROS2_JAZZY)
+LATCHED = QosDurability.TRANSIENT_LOCAL
+TOPICS = {
+    "/note": ("std_msgs/msg/String", QosDurability.VOLATILE),
+    "/robot/point": ("geometry_msgs/msg/Point", QosDurability.VOLATILE),
+    "/robot/joints": ("sensor_msgs/msg/JointState", QosDurability.VOLATILE),
+    "/description": ("std_msgs/msg/String", LATCHED),
+    "/silent": ("geometry_msgs/msg/Point", QosDurability.VOLATILE),
+}
+
+
+@pytest.fixture
+def domain(monkeypatch):
+    with harness.free_domain() as number:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield number
+
+
+def qos(durability):
+    return Qos(
+        QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, durability, FOREVER, FOREVER, QosLiveliness.AUTOMATIC,
+        FOREVER, avoid_ros_namespace_conventions=False,
+    )  # fmt: skip
+
+
+def filled(data):
+    """As DDS hands messages over: filled up to a multiple of four."""
+    return bytes(data) + bytes(-len(data) % 4)
+
+
+def message(topic, number, chance):
+    kind = TOPICS[topic][0]
+    made = STORE.types[kind]
+    if kind == "std_msgs/msg/String":
+        size = 1_500_000 if number % 400 == 399 else int(chance.integers(40))
+        return STORE.serialize_cdr(made("x" * size + str(number)), kind)
+    if kind == "geometry_msgs/msg/Point":
+        return STORE.serialize_cdr(made(float(number), 0.5, -1.0), kind)
+    stamp = STORE.types["builtin_interfaces/msg/Time"](number, 17)  # not the log time
+    header = STORE.types["std_msgs/msg/Header"](stamp, "base")
+    values = np.arange(number % 3, dtype=np.float64)
+    return STORE.serialize_cdr(made(header, ["axis"] * values.size, values, values, values), kind)
+
+
+@pytest.fixture(params=[StoragePlugin.MCAP, StoragePlugin.SQLITE3], ids=["mcap", "sqlite"])
+def foreign(request, tmp_path):
+    """A bag of another maker: equal log times on several topics, irregular intervals, small and large messages."""
+    chance = np.random.default_rng(5)
+    path, log_ns, sent = tmp_path / "foreign", 0, []
+    with RosbagWriter(path, version=9, storage_plugin=request.param) as writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=STORE, offered_qos_profiles=[qos(durability)])
+            for topic, (kind, durability) in TOPICS.items()
+        }
+        for number in range(1200):
+            log_ns += int(chance.choice([0, 0, 1, 1000, 1_000_000, 30_000_000]))
+            topic = "/description" if number == 0 else str(chance.choice(["/note", "/robot/point", "/robot/joints"]))
+            data = bytes(message(topic, number, chance))
+            writer.write(connections[topic], log_ns, data)
+            sent.append((topic, log_ns, filled(data)))
+    return path, sent
+
+
+@contextlib.contextmanager
+def recorder(*arguments):
+    """A recording process, once it says what it hears of or waits for; killed if it has not ended by itself."""
+    command = [sys.executable, "-m", "lathe_rc", "record", *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def replay(bag, *arguments):
+    command = [sys.executable, "-m", "lathe_rc", "replay", bag, "--rate", "0", "--wait", "1", *arguments]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    return ended
+
+
+def messages(path):
+    with Source(path) as source:
+        return list(source.messages())
+
+
+def described(path):
+    """Type, definition's hash, reliability and durability of each topic."""
+    with Reader(path) as reader:
+        return {
+            c.topic: (c.msgtype, c.digest, [(q.reliability, q.durability) for q in c.ext.offered_qos_profiles])
+            for c in reader.connections
+        }
+
+
+def test_a_bag_of_others_is_recorded_again_as_it_was(foreign, domain, tmp_path):
+    path, sent = foreign
+    again = tmp_path / "again"
+    with recorder(again, "--sim-time", "--once") as recording:
+        replay(path)
+        said, _ = recording.communicate()
+        assert recording.returncode == 0, said
+    assert messages(again) == sent
+    assert described(again) == described(path)
+    with AnyReader([again]) as reader:  # with the definitions in the bag alone
+        known = {c.topic: c for c in reader.connections}
+        ((_, log_ns, data),) = reader.messages([known["/description"]])
+        assert log_ns == sent[0][1]
+        assert reader.deserialize(data, "std_msgs/msg/String").data.endswith("x0")
+
+
+def test_a_bag_of_the_cell_is_recorded_again_as_it_was(domain, tmp_path):
+    first, again = tmp_path / "first", tmp_path / "again"
+    harness.run(scenario(spindle_encoder={"revolutions": 6.0}), mode="processes", bag=first)
+    with recorder(again, "--sim-time", "--once") as recording:
+        replay(first)
+        said, _ = recording.communicate()
+        assert recording.returncode == 0, said
+    assert messages(again) == [(topic, log_ns, filled(data)) for topic, log_ns, data in messages(first)]
+    assert described(again) == described(first)
+    assert check(again).digests == check(first).digests
+
+
+@pytest.mark.parametrize("foreign", [StoragePlugin.MCAP], indirect=True)
+def test_without_simulated_time_the_order_is_that_of_publication(foreign, domain, tmp_path):
+    path, sent = foreign
+    with recorder(tmp_path / "again", "--once", "--topics", "/note", "--topics", "/robot/point") as recording:
+        replay(path, "--topics", "/note", "--topics", "/robot/point")
+        said, _ = recording.communicate()
+        assert recording.returncode == 0, said
+    found = messages(tmp_path / "again")
+    wanted = [(topic, data) for topic, _, data in sent if topic in ("/note", "/robot/point")]
+    assert [(topic, data) for topic, _, data in found] == wanted
+    assert all(a[1] < b[1] for a, b in itertools.pairwise(found))
+
+
+@pytest.fixture
+def node(domain):
+    rclpy.init()
+    made = rclpy.create_node("talker")
+    yield made
+    made.destroy_node()
+    rclpy.shutdown()
+
+
+def matched(node, publisher):
+    while not publisher.get_subscription_count():
+        rclpy.spin_once(node, timeout_sec=0.02)
+
+
+def test_what_was_missed_is_told(node, tmp_path):
+    """The recorder was there first, and the publisher did not wait for it."""
+    with recorder(tmp_path / "bag", "--once") as recording:
+        assert any("what begins from now on is heard from its first message on" in line for line in recording.stdout)
+        recording.send_signal(signal.SIGSTOP)
+        talker = node.create_publisher(String, "/talk", 10)
+        for _ in range(3):
+            talker.publish(String(data="nobody hears"))
+        recording.send_signal(signal.SIGCONT)
+        matched(node, talker)
+        talker.publish(String(data="heard"))
+        assert talker.wait_for_all_acked()
+        node.destroy_node()
+        said, _ = recording.communicate()
+    assert recording.returncode == 3
+    assert f"lathe: {tmp_path / 'bag'}: 3 messages of /talk are missing" in said
+    assert len(messages(tmp_path / "bag")) == 1
+
+
+def test_what_was_before_it_is_told_and_no_loss(node, tmp_path):
+    talker = node.create_publisher(String, "/talk", 10)
+    for _ in range(3):
+        talker.publish(String(data="nobody hears"))
+    with recorder(tmp_path / "bag", "--once") as recording:
+        matched(node, talker)
+        talker.publish(String(data="heard"))
+        assert talker.wait_for_all_acked()
+        node.destroy_node()
+        said, _ = recording.communicate()
+    assert recording.returncode == 0
+    assert "/talk is heard from its message 4 on" in said
+
+
+def test_it_ends_with_a_whole_bag_when_told_to(node, tmp_path):
+    talker = node.create_publisher(String, "/talk", QoSProfile(depth=10))
+    with recorder(tmp_path / "bag") as recording:
+        matched(node, talker)
+        for number in range(5):
+            talker.publish(String(data=f"{number:03d}"))
+        assert talker.wait_for_all_acked()
+        recording.send_signal(signal.SIGTERM)
+        said, _ = recording.communicate()
+    assert recording.returncode == 0, said
+    assert [data[8:11] for _, _, data in messages(tmp_path / "bag")] == [b"000", b"001", b"002", b"003", b"004"]
+    assert check(tmp_path / "bag").exit_code == 0
+
+
+def test_simulated_time_that_nobody_tells_is_no_success(node, tmp_path):
+    talker, _clock = node.create_publisher(String, "/talk", 10), node.create_publisher(Clock, "/clock", 10)
+    with recorder(tmp_path / "bag", "--sim-time", "--once") as recording:
+        matched(node, talker)
+        talker.publish(String(data="when?"))
+        assert talker.wait_for_all_acked()
+        node.destroy_node()
+        said, _ = recording.communicate()
+    assert recording.returncode == 1
+    assert "/clock told no time: 1 messages are not recorded" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["here"], "here exists; a bag is never overwritten"),
+        (["new", "--topics", "/a", "--all"], "topic_recorder.all: /a are named; give one or the other"),
+        (["new", "--sim-time", "--topics", "/clock"], "/clock tells the log times"),
+        (["new", "--hold", "0"], "0"),
+    ],
+)
+def test_what_cannot_be_recorded_is_refused(domain, tmp_path, arguments, said):
+    (tmp_path / "here").mkdir()
+    ended = subprocess.run(
+        [sys.executable, "-m", "lathe_rc", "record", *arguments],
+        capture_output=True, text=True, check=False, cwd=tmp_path,
+    )  # fmt: skip
+    assert ended.returncode == 2
+    assert said in ended.stderr
+    assert "Traceback" not in ended.stderr
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_type_that_is_not_installed_is_refused():
+    from lathe_rc.nodes import offered
+
+    with pytest.raises(InputError, match="message type nowhere_msgs/msg/Thing is not installed"):
+        offered.installed("nowhere_msgs/msg/Thing")
+    store = offered.installed("sensor_msgs/msg/JointState")
+    assert store.hash_rihs01("sensor_msgs/msg/JointState") == STORE.hash_rihs01("sensor_msgs/msg/JointState")
