@@ -40,7 +40,7 @@ def test_a_member_that_completes_a_block_at_once_does_not_get_it_twice(spindle):
     seen = []
 
     def complete(delivery):
-        seen.append(delivery.block.first_index)
+        seen.append(delivery.first_index)
         spindle.exchange.master(Progress(name="/eager", blocks=len(seen), samples=64 * len(seen)))
 
     spindle.exchange.listen("/encoder", "/eager", complete)
@@ -53,22 +53,12 @@ def test_a_member_that_completes_a_block_at_once_does_not_get_it_twice(spindle):
 
 def test_what_is_handed_over_is_not_written_to_again(spindle):
     blocks = []
-    spindle.exchange.listen("/encoder", "/eager", lambda delivery: blocks.append(delivery.block))
+    spindle.exchange.listen("/encoder", "/eager", blocks.append)
     spindle.trigger_activate()
     spindle._begin()
     angle = np.concatenate([block.signals["angle_true"] for block in blocks])
     assert len(blocks) == 3  # the window
     assert np.all(np.diff(angle) > 0.0)
-
-
-def test_bytes_are_made_for_those_who_want_them(spindle):
-    given = []
-    spindle.exchange.listen("/encoder", "/eager", given.append)
-    spindle.trigger_activate()
-    spindle._begin()
-    decoded = messages.decode(messages.ENCODER, given[1].data)
-    assert decoded.block.first_index == 64
-    assert np.array_equal(decoded.angle_true, given[1].block.signals["angle_true"])
 
 
 def test_a_sample_that_is_not_finite_is_refused_where_it_is_made(spindle, monkeypatch):

@@ -2,16 +2,20 @@
 """MCAP files, chunk by chunk.
 
 The records are those of the mcap library; its own writer takes 14 µs for a message, as much as a stage of the cell
-needs for a block. Here a message costs a header and two appends, and the rest of the work is done once a chunk.
+needs for a block. Here a message costs a header and two appends, a row of
+blocks one append, and the rest of the work is done once a chunk.
 """
 
 import os
 import struct
 import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
+import numpy as np
+import numpy.typing as npt
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -32,6 +36,7 @@ from mcap.writer import MCAP0_MAGIC
 
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _AFTER_LENGTH = _MESSAGE.size - 9  # bytes of it that the length counts
+TIMES = (16, 8)  #: where log time and publish time stand ahead of a message's bytes [B]
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of what follows: log time and place in pairs
 _FOOTER = struct.Struct("<BQQQ")
 _ROOM, _ROOM_PER_CHUNK = 2**17, 1024  # kept of the disk for index and metadata [B]
@@ -43,6 +48,67 @@ class _Record(Protocol):
 
     def write(self, stream: RecordBuilder, /) -> None:
         """Append it."""
+
+
+class RowPlan(NamedTuple):
+    """Messages that come again and again in the same order, with the same lengths: rows, see `lathe_rc.bag.rows`.
+
+    Attributes:
+        places: where the bytes of each channel's message begin in a row.
+        size: of a row [B].
+        period_ns: log time between rows.
+    """
+
+    places: Mapping[int, int]
+    size: int
+    period_ns: int
+
+
+@dataclass
+class _Run:
+    """Rows one after the other in a chunk.
+
+    Attributes:
+        plan: their contents.
+        start: place of the first in the chunk.
+        first_ns: its log time.
+        count: how many.
+    """
+
+    plan: RowPlan
+    start: int
+    first_ns: int
+    count: int
+
+    @property
+    def end(self) -> int:
+        """Place after the last."""
+        return self.start + self.count * self.plan.size
+
+    @property
+    def next_ns(self) -> int:
+        """Log time after the last."""
+        return self.first_ns + self.count * self.plan.period_ns
+
+    def index(self, channel: int) -> npt.NDArray[np.uint64]:
+        """Log time and place of the messages of a channel, shape (count, 2)."""
+        found = np.empty((self.count, 2), np.uint64)
+        found[:, 0] = self.first_ns + np.arange(self.count) * self.plan.period_ns
+        found[:, 1] = self.start + self.plan.places[channel] - _MESSAGE.size + np.arange(self.count) * self.plan.size
+        return found
+
+
+def message_head(channel: int, log_ns: int, length: int) -> bytes:
+    """What stands in a file ahead of the ``length`` bytes of a message."""
+    return _MESSAGE.pack(Opcode.MESSAGE, length + _AFTER_LENGTH, channel, 0, log_ns, log_ns)
+
+
+def _in_order(parts: list[npt.NDArray[np.uint64]]) -> npt.NDArray[np.uint64]:
+    """One index of several, by place."""
+    if len(parts) == 1:
+        return parts[0]
+    whole = np.concatenate(parts)
+    return whole[np.argsort(whole[:, 1])]
 
 
 def _encoded(*records: _Record) -> bytes:
@@ -61,7 +127,7 @@ class McapFile:
         compress: with zstd.
 
     Attributes:
-        counts: messages by channel.
+        counts: messages by channel, of the chunks that have been written.
         first_ns, last_ns: smallest and largest log time so far; None before the first message.
 
     Raises:
@@ -89,7 +155,8 @@ class McapFile:
     def _begin_chunk(self) -> None:
         self._parts: list[bytes | memoryview] = []
         self._size = 0
-        self._indexes: dict[int, list[int]] = {}  # log time and place of each message, by channel
+        self._singles: dict[int, list[int]] = {}  # log time and place of each message that is not in a row, by channel
+        self._runs: list[_Run] = []
 
     def _put(self, data: bytes) -> None:
         """Write at the end; what does not fit leaves no trace."""
@@ -144,39 +211,56 @@ class McapFile:
 
     def add_message(self, channel: int, log_ns: int, data: bytes | memoryview) -> None:
         """Append a message."""
-        index = self._indexes.get(channel)
+        index = self._singles.get(channel)
         if index is None:
-            index = self._indexes[channel] = []
+            index = self._singles[channel] = []
         index += (log_ns, self._size)
-        self.counts[channel] += 1
-        length = len(data) + _AFTER_LENGTH
-        self._parts += (_MESSAGE.pack(Opcode.MESSAGE, length, channel, 0, log_ns, log_ns), data)
-        self._size += length + 9
+        head = message_head(channel, log_ns, len(data))
+        self._parts += (head, data)
+        self._size += len(data) + len(head)
+        if self._size > self._chunk_size:
+            self.flush()
+
+    def add_rows(self, plan: RowPlan, first_ns: int, data: bytes) -> None:
+        """Append rows, the first with log time ``first_ns``."""
+        run = self._runs[-1] if self._runs else None
+        if run is None or run.plan is not plan or run.end != self._size or run.next_ns != first_ns:
+            run = _Run(plan, self._size, first_ns, 0)
+            self._runs.append(run)
+        run.count += len(data) // plan.size
+        self._parts.append(data)
+        self._size += len(data)
         if self._size > self._chunk_size:
             self.flush()
 
     def flush(self) -> None:
         """Hand every message so far to the operating system, as a chunk; if it does not take it, they are lost."""
-        if not self._indexes:
+        if not self._singles and not self._runs:
             return
         try:
             if self._refused:
                 raise self._refused  # what follows a gap is not recorded either
-            self._write_chunk(self._indexes)
+            self._write_chunk(self._index())
         except OSError as error:
             self._refused = error
-            for channel, index in self._indexes.items():
-                self.counts[channel] -= len(index) // 2
             raise
         finally:
             self._begin_chunk()
 
-    def _write_chunk(self, indexes: Mapping[int, list[int]]) -> None:
+    def _index(self) -> dict[int, npt.NDArray[np.uint64]]:
+        """Log time and place of each message of the chunk, shape (messages, 2), by channel."""
+        found: dict[int, list[npt.NDArray[np.uint64]]] = {
+            channel: [np.array(index, np.uint64).reshape(-1, 2)] for channel, index in self._singles.items()
+        }
+        for run in self._runs:
+            for channel in run.plan.places:
+                found.setdefault(channel, []).append(run.index(channel))
+        return {channel: _in_order(parts) for channel, parts in found.items()}
+
+    def _write_chunk(self, indexes: Mapping[int, npt.NDArray[np.uint64]]) -> None:
         self._keep_room()
-        first = min(min(index[::2]) for index in indexes.values())
-        last = max(max(index[::2]) for index in indexes.values())
-        self.first_ns = first if self.first_ns is None else min(first, self.first_ns)
-        self.last_ns = last if self.last_ns is None else max(last, self.last_ns)
+        first = min(int(index[:, 0].min()) for index in indexes.values())
+        last = max(int(index[:, 0].max()) for index in indexes.values())
         whole = b"".join(self._parts)
         chunk = Chunk(
             compression="zstd" if self._compressor else "",
@@ -191,10 +275,14 @@ class McapFile:
         end = start + len(record)
         for channel, index in indexes.items():
             offsets[channel] = end
-            text = struct.pack(f"<{len(index)}Q", *index)
+            text = index.astype("<u8", copy=False).tobytes()
             parts += (_INDEX.pack(Opcode.MESSAGE_INDEX, len(text) + _INDEX.size - 9, channel, len(text)), text)
             end += _INDEX.size + len(text)
         self._put(b"".join(parts))
+        for channel, index in indexes.items():
+            self.counts[channel] += len(index)
+        self.first_ns = first if self.first_ns is None else min(first, self.first_ns)
+        self.last_ns = last if self.last_ns is None else max(last, self.last_ns)
         self._chunks.append(
             ChunkIndex(
                 message_start_time=first,

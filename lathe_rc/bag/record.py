@@ -4,6 +4,8 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from lathe_rc.bag import story
 from lathe_rc.bag.order import Merger
 from lathe_rc.bag.writer import BagWriter, offered_qos
@@ -14,7 +16,6 @@ from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wire import Encoder
 from lathe_rc.cell.wiring import Cell
 
 _SPARE, _FREE_RUNNING = 32, 1024  # messages
@@ -51,39 +52,34 @@ class OfflineRecorder:
         shared = cell.master.shared
         self._cell, self._samples, self._writer = cell, samples, writer
         self._block, self._step_ns = shared.block_size, shared.step_ns
-        self._encoders = {
-            topic: Encoder(source.type, shared.run_id, f"/{source.node}", shared.step_ns)
-            for topic, source in cell.dense.items()
-        }
         self._framers = {name: Framer(shared.run_id, f"/{name}", shared.step_ns) for name in cell.stages}
-        self._merger = Merger(
-            {f"/{topic}": source.node for topic, source in cell.dense.items()},
-            {f"/{topic}": source.node for topic, source in cell.sparse.items()},
-        )
         qos = offered_qos(signal_depth(shared), "transient_local")
         for topic, source in sorted({**cell.dense, **cell.sparse}.items()):
             writer.add_topic(f"/{topic}", source.type, qos)
 
+        self._merger = Merger(
+            writer,
+            {f"/{topic}": (source.type, f"/{source.node}") for topic, source in cell.dense.items()},
+            {f"/{topic}": f"/{source.node}" for topic, source in cell.sparse.items()},
+            run_id=shared.run_id,
+            step_ns=shared.step_ns,
+            samples=shared.block_size,
+        )
+
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
-        pending = {topic: list(found) for topic, found in sparse.items()}
-        for start in range(0, samples, self._block):
-            stop = min(start + self._block, samples)
-            for topic, found in pending.items():
-                while found and found[0].index < first + stop:
-                    self._add_sparse(topic, found.pop(0))
-            for topic, signals in dense.items():
-                part = {name: array[start:stop] for name, array in signals.items()}
-                self._add_block(topic, first + start, part, last=first + stop == self._samples)
-            for entries in self._merger.release():
-                for entry in entries:
-                    self._writer.write(entry.topic, entry.log_ns, entry.data)
-
-    def _add_sparse(self, topic: str, message: Sparse) -> None:
-        framed = self._framers[self._cell.sparse[topic].node].sparse(message)
-        self._merger.add_sparse(f"/{topic}", messages.stamp_ns(framed), messages.encode(message.type, framed))
-
-    def _add_block(self, topic: str, first: int, signals: Signals, *, last: bool) -> None:
-        companions = self._framers[self._cell.dense[topic].node].companions
-        stamp, data = self._encoders[topic].encode(first, signals, last=last, companions=companions)
-        self._merger.add_block(f"/{topic}", stamp, data, first=first, companions=companions, last=last)
+        ends = first + np.minimum(np.arange(self._block, samples + self._block, self._block), samples)
+        before = {name: framer.companions for name, framer in self._framers.items()}
+        sent: dict[str, list[int]] = {}  # samples of the sparse messages of each node
+        for topic, found in sparse.items():
+            node = self._cell.sparse[topic].node
+            for message in found:
+                framed = self._framers[node].sparse(message)
+                self._merger.add_sparse(f"/{topic}", messages.stamp_ns(framed), messages.encode(message.type, framed))
+            sent.setdefault(node, []).extend(message.index for message in found)
+        for topic, signals in dense.items():
+            node = self._cell.dense[topic].node
+            companions = before[node] + np.searchsorted(np.sort(sent.get(node, [])), ends)
+            last = first + samples == self._samples
+            self._merger.add_blocks(f"/{topic}", first, signals, companions, last=last)
+        self._merger.release()

@@ -24,7 +24,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin, WriterError
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-from lathe_rc.bag.mcap_file import McapFile
+from lathe_rc.bag.mcap_file import McapFile, RowPlan
 from lathe_rc.cell import messages
 from lathe_rc.errors import InputError, LatheError
 
@@ -190,6 +190,21 @@ class BagWriter:
         """
         try:
             self._file.add_message(self._channels[topic], log_ns, data)
+        except OSError as error:
+            raise self._full(error) from None
+
+    def channel(self, topic: str) -> int:
+        """The number of a topic in the file."""
+        return self._channels[topic]
+
+    def write_rows(self, plan: RowPlan, first_ns: int, data: bytes) -> None:
+        """Append rows of blocks, the first with log time ``first_ns``; see `lathe_rc.bag.rows`.
+
+        Raises:
+            LatheError: the disk does not take it.
+        """
+        try:
+            self._file.add_rows(plan, first_ns, data)
         except OSError as error:
             raise self._full(error) from None
 

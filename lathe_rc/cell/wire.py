@@ -9,7 +9,8 @@ does not match the layout is decoded by rosbags and learned anew: CDR itself is 
 
 import struct
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +20,12 @@ from lathe_rc.cell.messages import MAX_BLOCK, START_NS, Samples, Signals
 _BILLION = 1_000_000_000
 _MOST_FIELDS = 16
 _ZEROS = np.zeros(_MOST_FIELDS * (MAX_BLOCK + 1))
+_AT_ONCE = 16  # blocks for which memory is made at once
 _SHIFT = 4  # CDR aligns to what follows its first four bytes: with so many before, to memory as well
 # What differs from block to block, but for the samples: the stamp, and what follows the texts of a BlockInfo.
 _STAMP = struct.Struct("<iI")  # sec, nanosec
 _INFO = struct.Struct("<QI?3xQ")  # first_index, step_ns, last, companions
+NUMBERS = ("sec", "nanosec", "first_index", "step_ns", "last", "companions")  #: what differs, by name
 _NOTHING, _ANYTHING = (0, 0, 0, 0, False, 0), (0x01010101, 0x01010101, 2**56 + 1, 0x01010101, True, 2**56 + 1)
 _Numbers = tuple[int, int, int, int, bool, int]
 
@@ -39,8 +42,16 @@ def _message(msgtype: str, run_id: str, source: str, samples: int, numbers: _Num
     return messages.encode(msgtype, types[msgtype](types["std_msgs/msg/Header"](stamp, ""), info, *arrays))
 
 
-class _Layout:
-    """Where everything stands in the blocks of one type, length and source."""
+class Layout:
+    """Where everything stands in the blocks of one type, length and source.
+
+    Attributes:
+        run_id, source, samples: see `Block`.
+        template: a message with all its numbers and samples 0.
+        stamp, info: places of the stamp and of the numbers of a BlockInfo.
+        fields: element type and place of the samples by name.
+        constant: begin, end and content of what is the same in every block.
+    """
 
     def __init__(self, msgtype: str, run_id: str, source: str, samples: int) -> None:
         self.run_id, self.source, self.samples = run_id, source, samples
@@ -67,6 +78,20 @@ class _Layout:
         bounds = np.flatnonzero(np.diff(changing.astype(np.int8), prepend=1, append=1))
         self.constant = [(int(a), int(b), self.template[a:b]) for a, b in zip(bounds[::2], bounds[1::2], strict=True)]
 
+    @cached_property
+    def dtype(self) -> np.dtype[Any]:
+        """The message as a numpy type, not aligned: `NUMBERS`, and by name the fields with all their samples."""
+        info = [self.info + place for place in (0, 8, 12, 16)]
+        fields = [(dtype, (self.samples,)) for dtype, _ in self.fields.values()]
+        return np.dtype(
+            {
+                "names": [*NUMBERS, *self.fields],
+                "formats": ["<i4", "<u4", "<u8", "<u4", "?", "<u8", *fields],
+                "offsets": [self.stamp, self.stamp + 4, *info, *(place for _, place in self.fields.values())],
+                "itemsize": len(self.template),
+            }
+        )
+
     def fits(self, data: bytes) -> bool:
         """Whether a message has this layout."""
         if len(data) != len(self.template):
@@ -77,45 +102,51 @@ class _Layout:
         return True
 
 
-class Room(NamedTuple):
-    """Memory of a message, for the samples of a block to be computed into.
+class _Scratch:
+    """A message of one length in memory, to be changed from block to block."""
 
-    Attributes:
-        signals: its arrays by field; zero at first.
-        message: the whole, shape (bytes,).
-        reals: all float64 arrays and the lengths between them as one array; None where a type has others too.
+    def __init__(self, layout: Layout) -> None:
+        memory = np.empty(len(layout.template) + _SHIFT, np.uint8)
+        memory[_SHIFT:] = np.frombuffer(layout.template, np.uint8)
+        self._message, self._layout = memory[_SHIFT:], layout
+        self.signals = {
+            name: np.frombuffer(memory, dtype, layout.samples, place + _SHIFT)
+            for name, (dtype, place) in layout.fields.items()
+        }
+
+    def message(self, log_ns: int, first: int, step_ns: int, *, last: bool, companions: int) -> bytes:
+        """The whole, once the samples have been set."""
+        data = self._message.data
+        _STAMP.pack_into(data, self._layout.stamp, *divmod(log_ns, _BILLION))
+        _INFO.pack_into(data, self._layout.info, first, step_ns, last, companions)
+        return data.tobytes()
+
+
+class Pool:
+    """Memory for the samples of blocks of one type.
+
+    What is handed to readers in the same process is theirs as long as they want it, so each block needs memory of its
+    own; to make it for some blocks at once takes a quarter of the time.
+
+    Args:
+        msgtype: message type.
     """
 
-    signals: Signals
-    message: Samples
-    reals: Samples | None
+    def __init__(self, msgtype: str) -> None:
+        self._fields = messages.sample_fields(msgtype)
+        self._uniform = set(self._fields.values()) == {np.dtype(np.float64)}
+        self._samples = 0
+        self._free: list[Samples] = []
 
-
-class _Form:
-    """How blocks of one length are made."""
-
-    def __init__(self, layout: _Layout) -> None:
-        self.template, self.samples = np.frombuffer(layout.template, np.uint8), layout.samples
-        self.stamp, self.info = layout.stamp, layout.info
-        self.fields = [(name, dtype, place + _SHIFT) for name, (dtype, place) in layout.fields.items()]
-        places = [place for _, dtype, place in self.fields if dtype == np.float64]
-        gaps = set(np.diff(places).tolist()) or {8 * layout.samples}
-        # Evenly spaced, the arrays are rows of one.
-        self.rows = (len(places), layout.samples) if len(places) == len(self.fields) and len(gaps) == 1 else None
-        self.names, self.start, self.strides = [name for name, _, _ in self.fields], places[0], (min(gaps), 8)
-        self.reals = min(gaps) // 8 * (len(places) - 1) + layout.samples
-
-    def room(self) -> Room:
-        """Memory for one more."""
-        memory = np.empty(self.template.size + _SHIFT, np.uint8)
-        message = memory[_SHIFT:]
-        message[:] = self.template
-        if self.rows is None:
-            signals = {name: np.frombuffer(memory, dtype, self.samples, place) for name, dtype, place in self.fields}
-            return Room(signals, message, None)
-        rows = np.ndarray(self.rows, np.float64, memory, self.start, self.strides)
-        reals = np.frombuffer(memory, np.float64, self.reals, self.start)
-        return Room(dict(zip(self.names, rows, strict=True)), message, reals)
+    def take(self, samples: int) -> tuple[Signals, Samples | None]:
+        """Arrays of shape (samples,) by field, not zeroed; and all of them as one, if they are all of one type."""
+        if not self._uniform:
+            return {name: np.empty(samples, dtype) for name, dtype in self._fields.items()}, None
+        if not self._free or samples != self._samples:
+            self._samples = samples
+            self._free = list(np.empty((_AT_ONCE, len(self._fields), samples)))
+        whole = self._free.pop()
+        return dict(zip(self._fields, whole, strict=True)), whole
 
 
 @dataclass(slots=True)
@@ -126,6 +157,8 @@ class Block:
         run_id, source, first_index, step_ns, last, companions: see BlockInfo.msg.
         samples: its length.
         log_ns: its stamp [ns].
+        signals: arrays of shape (samples,) by field.
+        whole: the same as one array of shape (fields, samples), where it was computed in this process.
     """
 
     run_id: str
@@ -137,6 +170,7 @@ class Block:
     samples: int
     log_ns: int
     signals: Signals
+    whole: Samples | None = None
 
     def copy_to(self, signals: Signals, *, check: bool = True) -> None:
         """Copy samples into arrays of shape (samples,), by field.
@@ -149,13 +183,13 @@ class Block:
             if check:
                 self._check(name, array)
 
-    def check(self, reals: Samples | None) -> None:
-        """Refuse samples that no reader could use; ``reals`` are all of them at once, see `Room`.
+    def check(self) -> None:
+        """Refuse samples that no reader could use.
 
         Raises:
             ValueError: a sample is NaN or infinite.
         """
-        if reals is None or np.dot(reals, _ZEROS[: reals.size]) != 0.0:
+        if self.whole is None or np.dot(self.whole.ravel(), _ZEROS[: self.whole.size]) != 0.0:
             for name, array in self.signals.items():
                 self._check(name, array)
 
@@ -180,52 +214,43 @@ class Encoder:
 
     def __init__(self, msgtype: str, run_id: str, source: str, step_ns: int) -> None:
         self._type, self._run_id, self._source, self._step_ns = msgtype, run_id, source, step_ns
-        self._forms: dict[int, _Form] = {}
+        self._scratches: dict[int, _Scratch] = {}
 
     def prepare(self, samples: int) -> None:
         """Learn the layout for a length ahead of its first block."""
-        self._form(samples)
+        self._scratch(samples)
 
-    def _form(self, samples: int) -> _Form:
-        form = self._forms[samples] = _Form(_Layout(self._type, self._run_id, self._source, samples))
-        return form
+    def _scratch(self, samples: int) -> _Scratch:
+        scratch = self._scratches.get(samples)
+        if scratch is None:
+            scratch = self._scratches[samples] = _Scratch(Layout(self._type, self._run_id, self._source, samples))
+        return scratch
 
-    def room(self, samples: int) -> Room:
-        """Memory for a block's message."""
-        return (self._forms.get(samples) or self._form(samples)).room()
-
-    def block(self, first: int, signals: Signals, *, last: bool, companions: int) -> Block:
-        """The same block as readers find it who need no bytes; it holds ``signals`` themselves."""
+    def block(self, first: int, signals: Signals, whole: Samples | None, *, last: bool, companions: int) -> Block:
+        """A block as readers find it who need no bytes; it holds the arrays themselves, see `Pool`."""
         samples = next(iter(signals.values())).size
         log_ns = START_NS + (first + samples - 1) * self._step_ns
-        return Block(self._run_id, self._source, first, self._step_ns, last, companions, samples, log_ns, signals)
+        run_id, source, step_ns = self._run_id, self._source, self._step_ns
+        return Block(run_id, source, first, step_ns, last, companions, samples, log_ns, signals, whole)
 
-    def stamp(self, room: Room, first: int, samples: int, *, last: bool, companions: int) -> int:
-        """Complete a message whose samples have been computed, with the time of its last sample.
+    def encode(self, first: int, signals: Signals, *, last: bool, companions: int) -> tuple[int, bytes]:
+        """The message of a block.
 
         Args:
-            room: its memory.
             first: index of its first sample.
-            samples: its length.
+            signals: its samples, arrays of shape (n,) by field.
             last: the run ends with it.
             companions: see BlockInfo.msg.
 
         Returns:
-            The stamp [ns].
+            The stamp [ns], which is that of its last sample, and the bytes.
         """
-        log_ns = START_NS + (first + samples - 1) * self._step_ns
-        form, data = self._forms[samples], room.message.data
-        _STAMP.pack_into(data, form.stamp, *divmod(log_ns, _BILLION))
-        _INFO.pack_into(data, form.info, first, self._step_ns, last, companions)
-        return log_ns
-
-    def encode(self, first: int, signals: Signals, *, last: bool, companions: int) -> tuple[int, bytes]:
-        """A block of arrays that are elsewhere; stamp [ns] and bytes. See `stamp`."""
         samples = next(iter(signals.values())).size
-        room = self.room(samples)
-        for name, array in room.signals.items():
+        scratch = self._scratch(samples)
+        for name, array in scratch.signals.items():
             array[:] = signals[name]
-        return self.stamp(room, first, samples, last=last, companions=companions), room.message.tobytes()
+        log_ns = START_NS + (first + samples - 1) * self._step_ns
+        return log_ns, scratch.message(log_ns, first, self._step_ns, last=last, companions=companions)
 
 
 class Decoder:
@@ -239,7 +264,7 @@ class Decoder:
     def __init__(self, msgtype: str, fields: list[str] | None = None) -> None:
         self._type = msgtype
         self._fields = list(messages.sample_fields(msgtype)) if fields is None else fields
-        self._layout: _Layout | None = None
+        self._layout: Layout | None = None
 
     def prepare(self) -> None:
         """Let rosbags build its codec of the type ahead of the first block."""
@@ -270,13 +295,13 @@ class Decoder:
             {name: np.frombuffer(data, fields[name][0], samples, fields[name][1]) for name in self._fields},
         )
 
-    def _learn(self, data: bytes) -> _Layout:
+    def _learn(self, data: bytes) -> Layout:
         message = messages.decode(self._type, data)
         lengths = sorted({getattr(message, name).size for name in messages.sample_fields(self._type)})
         info = message.block
         if len(lengths) != 1 or lengths[0] == 0:
             raise ValueError(f"{info.source} sends arrays of {lengths} samples in one block")
-        layout = _Layout(self._type, info.run_id, info.source, lengths[0])
+        layout = Layout(self._type, info.run_id, info.source, lengths[0])
         if not layout.fits(data):
             raise ValueError(f"{info.source} sends a block that is not encoded as little-endian CDR with no frame_id")
         return layout

@@ -3,26 +3,16 @@
 
 Which topics stay inside is settled once, when the nodes of a process have been configured and before any of them is
 activated. Nodes that are configured later, and those in other processes, use DDS. What is handed over is the same:
-the arrays that the publisher computed, which nobody writes to afterwards, and for a recorder the bytes of the message.
+the arrays that the publisher computed, which nobody writes to afterwards, or the bytes of a message at a chosen sample.
 """
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 from lathe_rc.cell.wire import Block
 
-
-class Delivery(NamedTuple):
-    """A message of a topic.
-
-    Attributes:
-        block: its content; None for a message at a chosen sample.
-        data: its bytes.
-    """
-
-    block: Block | None
-    data: bytes | memoryview
+Delivery = Block | bytes  #: a block, or an encoded message at a chosen sample
 
 
 class Exchange:
@@ -35,7 +25,7 @@ class Exchange:
     def __init__(self) -> None:
         self.master: Callable[[Any], None] | None = None
         self._inside: set[str] = set()
-        self._readers: dict[str, dict[str, Callable[[Delivery], None]]] = defaultdict(dict)
+        self._readers: dict[str, dict[str, Callable[[Any], None]]] = defaultdict(dict)
 
     def join(self, published: Iterable[str]) -> None:
         """Take in the fully qualified topics that a configured node publishes."""
@@ -45,8 +35,8 @@ class Exchange:
         """Whether a node of this process publishes a topic."""
         return topic in self._inside
 
-    def listen(self, topic: str, member: str, callback: Callable[[Delivery], None]) -> None:
-        """Let a node read a topic that `has`."""
+    def listen(self, topic: str, member: str, callback: Callable[[Any], None]) -> None:
+        """Let a node read a topic that `has`; its callback gets every `Delivery`."""
         self._readers[topic][member] = callback
 
     def read(self, topic: str) -> bool:

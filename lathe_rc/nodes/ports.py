@@ -13,7 +13,6 @@ from lathe_rc.bag.record import signal_depth
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import LatheError
-from lathe_rc.nodes.exchange import Delivery
 
 
 def message_class(msgtype: str) -> Any:
@@ -87,14 +86,12 @@ class BlockQueue:
             raise LatheError(f"{self.topic}: {error}") from None
         return self.accept(block)
 
-    def take(self, delivery: Delivery) -> Block:
+    def take(self, block: Block) -> Block:
         """Queue a block that was handed over in this process.
 
         Raises:
             LatheError: see `add`.
         """
-        block = delivery.block
-        assert block is not None, "a topic of blocks carries nothing else"
         if block.first_index != self._expected or len(self.blocks) >= self._limit:
             return self.accept(block)
         # What else is checked cannot differ from block to block of a node in this process.

@@ -1,28 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recorder: every signal topic of the cell into one bag, sorted, complete, and closed whatever happens."""
 
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from lathe_rc_msgs.msg import CellState
 from rclpy.qos import QoSProfile
 
 from lathe_rc.bag import story
-from lathe_rc.bag.order import Data, Entry, Merger
+from lathe_rc.bag.order import Merger
 from lathe_rc.bag.record import signal_depth
 from lathe_rc.bag.writer import BagWriter, offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
-from lathe_rc.cell.wire import Block
+from lathe_rc.cell.wire import Block, Encoder
 from lathe_rc.errors import LatheError, LossyRunError
 from lathe_rc.nodes.ports import BlockQueue, latched_qos
 from lathe_rc.nodes.shell import CellNode
-
-T = TypeVar("T")
 
 _FLUSH_PERIOD = 0.5  # [s] of wall time after which messages are written out even if they fill no chunk
 _HOST_TOPICS = {
@@ -107,7 +105,14 @@ class RecorderNode(CellNode):
                     self._subscribe(topic, msgtype, name, sparse=sparse, in_cell=not alone)
         self._explain()
         if not alone and self.table.window:
-            self._merger = Merger({t: q.source for t, q in self._queues.items()}, self._sparse)
+            self._merger = Merger(
+                self._open,
+                {topic: (queue.type, queue.source) for topic, queue in self._queues.items()},
+                self._sparse,
+                run_id=self.table.run_id,
+                step_ns=self.table.step_ns,
+                samples=self.table.block_size,
+            )
         self.announce()
 
     def _explain(self) -> None:
@@ -122,22 +127,13 @@ class RecorderNode(CellNode):
         self._open.add_topic(topic, msgtype, offered_qos(self._depth, "transient_local"))
         if sparse:
             self._sparse[topic] = source
-            self.listen(
-                topic,
-                msgtype,
-                lambda data: self._on_sparse(topic, data),
-                lambda delivery: self._on_sparse(topic, delivery.data),
-            )
+            self.listen(topic, msgtype, *[partial(self._on_sparse, topic)] * 2)
             return
         queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
         if in_cell:
             queue.expect(source)
-        self.listen(
-            topic,
-            msgtype,
-            lambda data: self._on_block(queue, queue.add, data, data),
-            lambda delivery: self._on_block(queue, queue.take, delivery, delivery.data),
-        )
+        encoder = Encoder(msgtype, self.table.run_id, source, self.table.step_ns)
+        self.listen(topic, msgtype, partial(self._on_message, queue), partial(self._on_block, queue, encoder))
 
     # ---- data ---------------------------------------------------------------------------------------
 
@@ -148,37 +144,43 @@ class RecorderNode(CellNode):
             self._flush_due = now + _FLUSH_PERIOD
             self.attempt(self._writer.flush)
 
-    def _on_sparse(self, topic: str, data: Data) -> None:
+    def _on_sparse(self, topic: str, data: bytes) -> None:
         if self.done:
             return
         stamp = messages.stamp_of(data)
         if self._merger is None:
-            self._write(Entry(stamp, topic, 0, data))
+            self._write(stamp, topic, data)
         else:
             self._merger.add_sparse(topic, stamp, data)
             self._drain()
 
-    def _on_block(self, queue: BlockQueue, accept: Callable[[T], Block], given: T, data: Data) -> None:
+    def _on_message(self, queue: BlockQueue, data: bytes) -> None:
+        """A block of a node in another process."""
         if self.done:
             return
-        block = accept(given)
+        block = queue.add(data)
         queue.blocks.clear()
         if self._merger is None:
             self._write_unsorted(queue, block, data)
-            return
-        if self._merger.add_block(
-            queue.topic,
-            block.log_ns,
-            data,
-            first=block.first_index,
-            companions=block.companions,
-            last=block.last,
-        ):
+        elif self._merger.add_block(queue.topic, block, data):
             self._drain()
 
-    def _write_unsorted(self, queue: BlockQueue, block: Block, data: Data) -> None:
+    def _on_block(self, queue: BlockQueue, encoder: Encoder, block: Block) -> None:
+        """A block of a node in this process."""
+        if self.done:
+            return
+        queue.take(block)
+        queue.blocks.clear()
+        if self._merger is None:
+            first, last, companions = block.first_index, block.last, block.companions
+            _, data = encoder.encode(first, block.signals, last=last, companions=companions)
+            self._write_unsorted(queue, block, data)
+        elif self._merger.add_block(queue.topic, block):
+            self._drain()
+
+    def _write_unsorted(self, queue: BlockQueue, block: Block, data: bytes) -> None:
         """Free-running, blocks may be missing, so nothing can be waited for: write in the order of arrival."""
-        self._write(Entry(block.log_ns, queue.topic, 0, data))
+        self._write(block.log_ns, queue.topic, data)
         if block.last:
             self._ended.add(queue.topic)
         if self._ended == set(self._queues):
@@ -196,25 +198,16 @@ class RecorderNode(CellNode):
     def _drain(self) -> None:
         """Write every block that is complete."""
         assert self._merger is not None
-        for entries in self._merger.release():
-            for entry in entries:
-                self._open.write(entry.topic, entry.log_ns, entry.data)
-            self._log_ns = entries[-1].log_ns
-            self._blocks += 1
-            self._samples = (self._log_ns - messages.START_NS) // self.table.step_ns + 1
-            if self._merger.complete:
-                self._complete()
-            else:
-                self.progressed(self._blocks, self._samples, last=False)
+        self._merger.release()
+        self._log_ns, self._blocks, self._samples = self._merger.log_ns, self._merger.rows, self._merger.samples
+        if self._merger.complete:
+            self._complete()
+        else:
+            self.progressed(self._blocks, self._samples, last=False)
 
-    def _write(self, entry: Entry) -> None:
-        self._open.write(entry.topic, entry.log_ns, entry.data)
-        self._log_ns = max(self._log_ns, entry.log_ns)
-
-    def _write_rest(self) -> None:
-        assert self._merger is not None
-        for entry in self._merger.rest():
-            self._write(entry)
+    def _write(self, log_ns: int, topic: str, data: bytes) -> None:
+        self._open.write(topic, log_ns, data)
+        self._log_ns = max(self._log_ns, log_ns)
 
     def finish(self) -> None:
         """Write what is left and close the bag."""
@@ -222,7 +215,7 @@ class RecorderNode(CellNode):
             return
         complete = bool(self._queues) and (self._merger.complete if self._merger else self._ended == set(self._queues))
         if self._merger is not None:
-            self.attempt(self._write_rest)
+            self.attempt(self._merger.write_rest)
         try:
             self.attempt(self._open.close)
         except OSError as error:

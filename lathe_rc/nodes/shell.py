@@ -21,7 +21,7 @@ from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.wiring import remapped
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import declare
-from lathe_rc.nodes.exchange import Delivery, Exchange
+from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
 from lathe_rc.nodes.report import Reporter
 
@@ -190,7 +190,7 @@ class CellNode(LifecycleNode):
         topic: str,
         msgtype: str,
         callback: Callable[[bytes], object],
-        inside: Callable[[Delivery], object],
+        inside: Callable[[Any], object],
     ) -> None:
         """Read a signal topic.
 
@@ -198,7 +198,7 @@ class CellNode(LifecycleNode):
             topic: fully qualified.
             msgtype: message type.
             callback: gets the encoded message from DDS.
-            inside: gets what a node of this process hands over instead.
+            inside: gets the `lathe_rc.nodes.exchange.Delivery` of a node of this process instead.
         """
         if self.exchange.has(topic):
             self.exchange.listen(topic, self.full_name, self.guarded(inside))

@@ -12,9 +12,8 @@ from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.stage import Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.track import Track
-from lathe_rc.cell.wire import Block, Encoder, Room
+from lathe_rc.cell.wire import Encoder, Pool
 from lathe_rc.errors import InputError, LatheError, LossyRunError
-from lathe_rc.nodes.exchange import Delivery
 from lathe_rc.nodes.ports import BlockQueue, message_class, signal_qos
 from lathe_rc.nodes.shell import CellNode
 
@@ -49,6 +48,7 @@ class StageNode(CellNode):
         ]
         for _, encoder in self._encoders:
             encoder.prepare(self.table.block_size)
+        self._pools = [Pool(port.type) for port in self.stage.outputs]
         self._sparse_topics = {topic: self.topic(topic) for topic in self.stage.sparse_topics}
         self._queues: dict[str, BlockQueue] = {}
         self._tracks: dict[str, Track] = {}
@@ -201,43 +201,38 @@ class StageNode(CellNode):
                 queue.blocks.popleft()
             self.compute(samples, inputs, last=last)
 
-    def _send(self, topic: str, data: bytes) -> None:
-        """Publish, unless all who read the topic are in this process."""
-        if topic in self._outside or not self.exchange.read(topic):
-            self.outlets[topic].publish(data)
+    def _goes_out(self, topic: str) -> bool:
+        """Whether to publish: unless all who read the topic are in this process."""
+        return topic in self._outside or not self.exchange.read(topic)
 
     def compute(self, samples: int, inputs: Sequence[Signals], *, last: bool) -> None:
         """Compute and publish one block."""
-        rooms = [encoder.room(samples) for _, encoder in self._encoders]
-        for sparse in self.stage.advance(self.samples, inputs, [room.signals for room in rooms]):
+        memory = [pool.take(samples) for pool in self._pools]
+        for sparse in self.stage.advance(self.samples, inputs, [signals for signals, _ in memory]):
             framed = self._framer.sparse(sparse)
             topic, data = self._sparse_topics[sparse.topic], messages.encode(sparse.type, framed)
-            self._send(topic, data)
-            self.exchange.hand_over(topic, Delivery(None, data))
+            if self._goes_out(topic):
+                self.outlets[topic].publish(data)
+            self.exchange.hand_over(topic, data)
             if sparse.type == messages.LEARNING:
                 values = {key: float(value) for key, value in sparse.values.items()}
                 self.reporter("cycle", self.get_name(), sample=sparse.index, **values)
         companions = self._framer.companions
-        for (topic, encoder), room in zip(self._encoders, rooms, strict=True):
-            encoder.stamp(room, self.samples, samples, last=last, companions=companions)
-            self._publish(topic, room, encoder.block(self.samples, room.signals, last=last, companions=companions))
+        for (topic, encoder), (signals, whole) in zip(self._encoders, memory, strict=True):
+            if self._goes_out(topic):
+                self.outlets[topic].publish(encoder.encode(self.samples, signals, last=last, companions=companions)[1])
+            if self.exchange.read(topic):
+                block = encoder.block(self.samples, signals, whole, last=last, companions=companions)
+                try:
+                    block.check()
+                except ValueError as error:
+                    raise LatheError(f"{topic}: {error}") from None
+                self.exchange.hand_over(topic, block)
         self.blocks += 1
         self.samples += samples
         self.progressed(self.blocks, self.samples, last=last)
         if last:
             self.ended()
-
-    def _publish(self, topic: str, room: Room, block: Block) -> None:
-        """A block to those who read it, here and elsewhere."""
-        inside = self.exchange.read(topic)
-        if not inside or topic in self._outside:
-            self.outlets[topic].publish(room.message.tobytes())
-        if inside:
-            try:
-                block.check(room.reals)
-            except ValueError as error:
-                raise LatheError(f"{topic}: {error}") from None
-            self.exchange.hand_over(topic, Delivery(block, room.message.data))
 
     def ended(self) -> None:
         """The last block has been computed."""
