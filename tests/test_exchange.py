@@ -4,7 +4,6 @@
 import numpy as np
 import pytest
 
-from lathe_rc.cell import messages
 from lathe_rc.errors import LatheError
 
 rclpy = pytest.importorskip("rclpy")
