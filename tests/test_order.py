@@ -181,10 +181,14 @@ def block(topic, first, samples, *, run_id="run", last=False):
 def test_blocks_that_do_not_fit_together_are_refused(tmp_path, blocks, why):
     topics = {"/one": {1: "/z", 4: "/a"}, "/two": {5: "/encoder"}}
     writer, merger = merger_of(tmp_path)
-    with pytest.raises(LatheError, match=why):
+
+    def bring():
         for each in blocks:
             if merger.add_block(topics[each.source][len(each.signals)], each):
                 merger.release()
+
+    with pytest.raises(LatheError, match=why):
+        bring()
     writer.close()
 
 
