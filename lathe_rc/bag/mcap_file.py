@@ -9,7 +9,7 @@ blocks one append, and the rest of the work is done once a chunk.
 import os
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -90,12 +90,18 @@ class _Run:
         """Log time after the last."""
         return self.first_ns + self.count * self.plan.period_ns
 
-    def index(self, channel: int) -> npt.NDArray[np.uint64]:
-        """Log time and place of the messages of a channel, shape (count, 2)."""
-        found = np.empty((self.count, 2), np.uint64)
-        found[:, 0] = self.first_ns + np.arange(self.count) * self.plan.period_ns
-        found[:, 1] = self.start + self.plan.places[channel] - _MESSAGE.size + np.arange(self.count) * self.plan.size
-        return found
+    @property
+    def last_ns(self) -> int:
+        """Log time of the last."""
+        return self.next_ns - self.plan.period_ns
+
+    def indexes(self) -> Iterator[tuple[int, npt.NDArray[np.uint64]]]:
+        """Log time and place of the messages of each channel, shape (count, 2)."""
+        rows = np.arange(self.count)
+        first = np.stack([self.first_ns + rows * self.plan.period_ns, self.start + rows * self.plan.size], axis=1)
+        places = np.zeros((len(self.plan.places), 1, 2), np.int64)
+        places[:, 0, 1] = [place - _MESSAGE.size for place in self.plan.places.values()]
+        yield from zip(self.plan.places, (first + places).astype(np.uint64), strict=True)
 
 
 def message_head(channel: int, log_ns: int, length: int) -> bytes:
@@ -253,14 +259,15 @@ class McapFile:
             channel: [np.array(index, np.uint64).reshape(-1, 2)] for channel, index in self._singles.items()
         }
         for run in self._runs:
-            for channel in run.plan.places:
-                found.setdefault(channel, []).append(run.index(channel))
+            for channel, index in run.indexes():
+                found.setdefault(channel, []).append(index)
         return {channel: _in_order(parts) for channel, parts in found.items()}
 
     def _write_chunk(self, indexes: Mapping[int, npt.NDArray[np.uint64]]) -> None:
         self._keep_room()
-        first = min(int(index[:, 0].min()) for index in indexes.values())
-        last = max(int(index[:, 0].max()) for index in indexes.values())
+        singles = [times for index in self._singles.values() for times in index[::2]]
+        first = min([*singles, *(run.first_ns for run in self._runs)])
+        last = max([*singles, *(run.last_ns for run in self._runs)])
         whole = b"".join(self._parts)
         chunk = Chunk(
             compression="zstd" if self._compressor else "",
@@ -275,7 +282,7 @@ class McapFile:
         end = start + len(record)
         for channel, index in indexes.items():
             offsets[channel] = end
-            text = index.astype("<u8", copy=False).tobytes()
+            text = index.tobytes()
             parts += (_INDEX.pack(Opcode.MESSAGE_INDEX, len(text) + _INDEX.size - 9, channel, len(text)), text)
             end += _INDEX.size + len(text)
         self._put(b"".join(parts))

@@ -189,7 +189,7 @@ class Block:
         Raises:
             ValueError: a sample is NaN or infinite.
         """
-        if self.whole is None or np.dot(self.whole.ravel(), _ZEROS[: self.whole.size]) != 0.0:
+        if self.whole is None or self.whole.ravel().dot(_ZEROS[: self.whole.size]) != 0.0:
             for name, array in self.signals.items():
                 self._check(name, array)
 

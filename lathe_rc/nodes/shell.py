@@ -72,6 +72,7 @@ class CellNode(LifecycleNode):
         self._ready = False
         self._progress_step = 1
         self._reported_blocks = 0
+        self._heard_elsewhere = True  # whether anybody beside the time master reads the progress
         self._diagnostics_due = time.monotonic() + _DIAGNOSTICS_PERIOD
         self._host: dict[str, Publisher] = {}
         self.outlets: dict[str, Publisher] = {}
@@ -354,7 +355,7 @@ class CellNode(LifecycleNode):
             progress = Progress(run_id=self.table.run_id, name=self.full_name, blocks=blocks, samples=samples)
             if self.exchange.master:
                 self.exchange.master(progress)
-            if not self.exchange.master or self._host["progress"].get_subscription_count() > 1:
+            if not self.exchange.master or self._heard_elsewhere:
                 self._host["progress"].publish(progress)
 
     def end(self, acknowledged: list[Publisher]) -> None:
@@ -372,6 +373,8 @@ class CellNode(LifecycleNode):
         self.next_tick = now + _TICK if not self._ready else now + 0.1
         if self.active and not self._ready:
             self._settle()
+        if "progress" in self._host:
+            self._heard_elsewhere = self._host["progress"].get_subscription_count() > 1
         if self.active and now >= self._diagnostics_due:
             self._diagnostics_due = now + _DIAGNOSTICS_PERIOD
             self._publish_diagnostics()
