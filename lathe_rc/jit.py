@@ -14,14 +14,14 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _PACKAGE = Path(__file__).parent
-_KERNEL_FOLDERS = (".", "signals", "plants", "control", "analysis")
+_KERNELS = ("*.py", "signals/*.py", "plants/*.py", "control/*.py", "analysis/*.py", "bag/walk.py")
 
 
 def _source_hash() -> str:
     """Hash of every file that may hold a kernel."""
     digest = hashlib.sha256(Path(__file__).read_bytes())
-    for folder in _KERNEL_FOLDERS:
-        for path in sorted((_PACKAGE / folder).glob("*.py")):
+    for pattern in _KERNELS:
+        for path in sorted(_PACKAGE.glob(pattern)):
             digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 

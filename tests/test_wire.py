@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The quick codec of blocks: its bytes are those of rosbags, and what it cannot read it says."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -122,3 +124,34 @@ def test_fields_and_bounds_are_those_of_the_message_files():
         lines = messages.store().generate_msgdef(msgtype)[0].split("====")[0]
         for name in fields:
             assert f"[<={messages.MAX_BLOCK}] {name}" in lines
+
+
+@given(data=st.data(), block=st.integers(1, 9))
+def test_many_blocks_read_at_once_are_those_read_one_by_one(data, block):
+    """Lengths, sources, gaps and ends may change anywhere; what follows one another comes as one block."""
+    decoder, encoded = Decoder(messages.ENCODER), []
+    first = data.draw(st.integers(0, 2**40))
+    for _ in range(data.draw(st.integers(1, 20))):
+        samples = data.draw(st.sampled_from([block, block, block, block + 1]))
+        source = data.draw(st.sampled_from(["/a", "/a", "/a", "/b"]))
+        first += data.draw(st.sampled_from([0, 0, 0, 0, 3]))
+        signals = signals_of(messages.ENCODER, samples, first % 1000)
+        encoder = Encoder(messages.ENCODER, "run", source, 15_625)
+        last = data.draw(st.booleans())
+        encoded.append(encoder.encode(first, signals, last=last, companions=first % 7)[1])
+        first += samples
+    singles = [decoder.decode(message) for message in encoded]
+    joined = list(Decoder(messages.ENCODER).decode_all(encoded))
+    assert sum(each.samples for each in joined) == sum(each.samples for each in singles)
+    for name in singles[0].signals:
+        whole = np.concatenate([each.signals[name] for each in joined])
+        assert whole.tobytes() == b"".join(each.signals[name].tobytes() for each in singles)
+    ends = {each.first_index + each.samples: each for each in singles}
+    for each in joined:
+        end = ends[each.first_index + each.samples]
+        assert (each.source, each.last, each.log_ns) == (end.source, end.last, end.log_ns)
+        assert each.companions == end.companions
+    starts = {each.first_index for each in joined}
+    for before, after in pairwise(singles):
+        if before.first_index + before.samples != after.first_index or before.source != after.source:
+            assert after.first_index in starts

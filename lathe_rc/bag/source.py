@@ -14,12 +14,14 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 import lz4.frame
+import numpy as np
 import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import Reader, ReaderError
 
+from lathe_rc.bag.walk import walk
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import InputError, LatheError
 
@@ -27,8 +29,8 @@ MOST_BYTES = 2**28  #: longest chunk or record that is read into memory [B]
 MOST_TOPICS = 4096  #: topics of a bag
 MOST_TEXT = 2**20  #: longest text in its metadata [B]
 
+_CHANNELS = 2**16  # numbers that a channel may have
 _RECORD = struct.Struct("<BQ")  # opcode, length
-_MESSAGE = struct.Struct("<H4xQ8x")  # channel, log time
 _CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
 _BROKEN = (ReaderError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error, EOFError)
 
@@ -142,22 +144,13 @@ def _damage(path: Path) -> str:
 
 def _messages(whole: bytes, topics: Mapping[int, str]) -> list[tuple[str, int, bytes]]:
     """Topic, log time and bytes of the wanted messages among the records of a chunk, by log time."""
-    found = []
-    place, end = 0, len(whole)
-    while place < end:
-        opcode, length = _RECORD.unpack_from(whole, place)
-        place += _RECORD.size
-        if place + length > end:
-            raise ValueError("a record is longer than its chunk")
-        if opcode == Opcode.MESSAGE:
-            channel, log_ns = _MESSAGE.unpack_from(whole, place)
-            topic = topics.get(channel)
-            if topic is not None:
-                found.append((topic, log_ns, whole[place + 22 : place + length]))
-        place += length
-    if any(a[1] > b[1] for a, b in pairwise(found)):
-        found.sort(key=lambda message: message[1])
-    return found
+    found = walk(whole)
+    wanted = np.zeros(_CHANNELS, dtype=bool)
+    wanted[list(topics)] = True
+    found = found[wanted[found[:, 0]]]
+    if np.any(found[1:, 1] < found[:-1, 1]):
+        found = found[np.argsort(found[:, 1], kind="stable")]
+    return [(topics[channel], log_ns, whole[begin:end]) for channel, log_ns, begin, end in found.tolist()]
 
 
 class Source:

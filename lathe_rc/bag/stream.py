@@ -15,6 +15,7 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import LatheError
 
+_TOGETHER, _TOGETHER_BYTES = 64, 2**18  # messages of a topic that are read at once, and their size
 _AHEAD = 64  # pieces that one topic may be ahead of another
 
 
@@ -47,18 +48,37 @@ class _Dense:
         self.blocks: deque[Block] = deque()
         self.first = self.end = 0
         self.newest: Block | None = None
+        self._messages: list[bytes] = []
+        self._bytes = 0
         self._decoder = Decoder(msgtype)
 
-    def add(self, data: bytes) -> None:
-        """Take a message.
+    def add(self, data: bytes) -> bool:
+        """Take a message; tells whether it is worth asking for what can be handed on: messages are read some at once.
 
         Raises:
-            LatheError: samples are missing or repeated, or the block is broken.
+            LatheError: see `read`.
         """
+        self._messages.append(data)
+        self._bytes += len(data)
+        if len(self._messages) < _TOGETHER and self._bytes < _TOGETHER_BYTES:
+            return False
+        self.read()
+        return True
+
+    def read(self) -> None:
+        """Read the messages that have been taken.
+
+        Raises:
+            LatheError: samples are missing or repeated, or a block is broken.
+        """
+        messages, self._messages, self._bytes = self._messages, [], 0
         try:
-            block = self._decoder.decode(data)
+            for block in self._decoder.decode_all(messages):
+                self._append(block)
         except ValueError as error:
             raise LatheError(f"{self.topic}: {error}") from None
+
+    def _append(self, block: Block) -> None:
         if block.first_index != self.end:
             raise LatheError(f"{self.topic} goes from sample {self.end} to {block.first_index}")
         if self.newest and block.step_ns != self.newest.step_ns:
@@ -129,8 +149,7 @@ class Feeder:
             except ValueError as error:
                 raise LatheError(f"{topic}: at {log_ns} ns: {error}") from None
             return
-        dense.add(data)
-        if dense.end - self.first >= self._piece:
+        if dense.add(data) and dense.end - self.first >= self._piece:
             self._hand_on(self._piece)
 
     def _hand_on(self, samples: int) -> None:
@@ -164,7 +183,11 @@ class Feeder:
         """
         if not self._dense:
             return 0
+        for dense in self._dense.values():
+            dense.read()
         ends = [dense.end for dense in self._dense.values()]
+        while min(ends) - self.first > self._piece:
+            self._give(self._piece)
         if min(ends) > self.first:
             self._give(min(ends) - self.first)
         return max(ends) - min(ends)
@@ -193,10 +216,12 @@ class Tape:
             LatheError: there are not so many, or some are missing.
         """
         while self._dense.end - self._dense.first < samples:
-            found = next(self._messages, None)
-            if found is None:
-                raise LatheError(f"{self._dense.topic} ends at sample {self._dense.end}")
-            self._dense.add(found[2])
+            end = self._dense.end
+            while (found := next(self._messages, None)) and not self._dense.add(found[2]):
+                pass
+            self._dense.read()
+            if self._dense.end == end:
+                raise LatheError(f"{self._dense.topic} ends at sample {end}")
         return self._dense.take(samples)
 
 

@@ -8,7 +8,8 @@ does not match the layout is decoded by rosbags and learned anew: CDR itself is 
 """
 
 import struct
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -293,6 +294,46 @@ class Decoder:
             samples,
             sec * _BILLION + nanosec,
             {name: np.frombuffer(data, fields[name][0], samples, fields[name][1]) for name in self._fields},
+        )
+
+    def decode_all(self, data: Sequence[bytes]) -> Iterator[Block]:
+        """Blocks from their bytes, those that follow one another joined to one: a fraction of the time that each takes.
+
+        Raises:
+            ValueError: see `decode`.
+        """
+        start = 0
+        while start < len(data):
+            first = self.decode(data[start])
+            assert self._layout is not None, "that has been learned"
+            lengths = np.fromiter(map(len, data[start:]), np.int64)
+            alike = np.flatnonzero(lengths != lengths[0])
+            stop = start + int(alike[0]) if alike.size else len(data)
+            records = np.frombuffer(b"".join(data[start:stop]), self._layout.dtype)
+            count = self._following(records, first)
+            yield self._joined(records[:count], first)
+            start += count
+
+    def _following(self, records: Samples, first: Block) -> int:
+        """How many of the records, from the first on, are blocks that follow one another."""
+        assert self._layout is not None, "that has been learned"
+        plain = records.view(np.uint8).reshape(records.size, -1)
+        counts = np.arange(records.size, dtype=np.uint64) * np.uint64(first.samples)
+        fits = records["first_index"] == np.uint64(first.first_index) + counts
+        fits &= records["step_ns"] == first.step_ns
+        for begin, end, text in self._layout.constant:
+            fits &= (plain[:, begin:end] == np.frombuffer(text, np.uint8)).all(axis=1)
+        return int(np.argmin(fits)) if not fits.all() else records.size
+
+    def _joined(self, records: Samples, first: Block) -> Block:
+        last = records[-1]
+        return replace(
+            first,
+            last=bool(last["last"]),
+            companions=int(last["companions"]),
+            samples=records.size * first.samples,
+            log_ns=int(last["sec"]) * _BILLION + int(last["nanosec"]),
+            signals={name: records[name].reshape(-1) for name in self._fields},
         )
 
     def _learn(self, data: bytes) -> Layout:
