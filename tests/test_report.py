@@ -11,12 +11,15 @@ import numpy as np
 import pytest
 from cells import scenario
 from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lathe_rc import __version__, harness, part
 from lathe_rc.bag import reader
 from lathe_rc.bag.writer import BagWriter, offered_qos
 from lathe_rc.cell import messages
+from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
 from lathe_rc.commands.report import report
 from lathe_rc.errors import InputError
 from lathe_rc.view import report as reporting
@@ -112,9 +115,7 @@ class TestPage:
 
     def test_says_what_was_not_recorded(self, turned):
         text = " ".join(Page(turned[2]).text.split())
-        assert "Not recorded: the wall time at which a single block was sent" in text
-        assert "nothing can be said of lateness" in text
-        assert "Nothing: every block is there" in text
+        assert "nothing can be said of lateness and latency" in text
 
     def test_tells_scenario_and_versions(self, turned):
         text = Page(turned[2]).text
@@ -230,20 +231,47 @@ def diagnostics(wall, name="/spindle", level=0, message="ready", **values):
     return messages.encode(DIAGNOSTICS, array)
 
 
-def master(wall, blocks, slipped, in_flight):
-    values = {"blocks": blocks, "samples": 64 * blocks, "schedule slipped [s]": slipped, "blocks in flight": in_flight}
+def master(wall, blocks, lateness="", latency=""):
+    values = {
+        "blocks": blocks,
+        "samples": 64 * blocks,
+        "schedule slipped [s]": 0.0,
+        LATENESS: lateness,
+        LATENCY: latency,
+    }
     return diagnostics(wall, **{key: str(value) for key, value in values.items()}, **{"lost blocks": "2"})
 
 
+@given(st.lists(st.floats(0.0, 5000.0), max_size=50))
+def test_durations_are_counted_in_bins_of_a_factor_of_two(seconds):
+    found = Durations()
+    for value in seconds:
+        found.add(value)
+    assert sum(found.counts) == len(seconds)
+    for place, count in enumerate(found.counts):
+        low, high = (0.0 if place == 0 else 2.0 ** (place - 1)), (np.inf if place == 31 else 2.0**place)
+        assert count == sum(low <= int(value * 1e6) < high for value in seconds)
+    assert Durations.parse(str(found)).counts == found.counts
+
+
+@pytest.mark.parametrize("text", ["x", "1:", "1:2 ", "40:1", "1:-2", "1:2,3:4", "1:" + "9" * 20, "nan"])
+def test_what_is_no_count_of_durations_is_refused(text):
+    with pytest.raises(ValueError, match=r"no list of|allowed"):
+        Durations.parse(text)
+
+
 class TestHost:
-    def test_pace_lateness_and_latency_come_from_consecutive_reports(self):
+    def test_pace_comes_from_consecutive_reports_and_durations_from_the_last(self):
         host = Host()
-        for report_ in ((10.0, 0, 0.0, 0), (11.0, 500, 0.1, 4), (12.0, 1500, 0.1, 8), (14.0, 2500, 0.7, 6)):
-            host.add(DIAGNOSTICS, master(*report_))
+        for wall, blocks in ((10.0, 0), (11.0, 500), (12.0, 1500), (14.0, 2500)):
+            host.add(DIAGNOSTICS, master(wall, blocks))
+            host.add(DIAGNOSTICS, diagnostics(wall, name="/tool", blocks=str(blocks), samples=str(blocks)))
         # The first interval began before the run did.
         assert_allclose(host.pace.values(), [64000.0, 32000.0])
-        assert_allclose(host.slip.values(), [0.0, 0.3], atol=1e-12)
-        assert_allclose(host.latency.values(), [8 / 1000, 6 / 500])
+        host.add(DIAGNOSTICS, master(15.0, 3000, "3:2900", "9:2900 12:100"))
+        assert (str(host.lateness["/spindle"]), str(host.latency["/spindle"])) == ("3:2900", "9:2900 12:100")
+        host.add(DIAGNOSTICS, master(16.0, 3500, "3:x", "9:2900"))  # broken: the one before counts
+        assert str(host.latency["/spindle"]) == "9:2900 12:100"
         assert host.lost_blocks == {"/spindle": 2}
 
     def test_failures_are_told_once_and_bounded(self):
@@ -262,7 +290,7 @@ class TestHost:
 
     def test_broken_messages_are_counted(self):
         host = Host()
-        whole = master(1.0, 1, 0.0, 1)
+        whole = master(1.0, 1)
         for data in (b"", b"\0", whole[:40], bytes(64), b"\xff" * 64):
             host.add(DIAGNOSTICS, data)
         assert host.unreadable >= 4
@@ -298,7 +326,8 @@ def hostile(tmp_path_factory):
             "blocks": str(wall * 1e200),
             "samples": "nan",
             "schedule slipped [s]": "1e999",
-            "blocks in flight": "-5",
+            LATENESS: "31:999999999999999 0:1",
+            LATENCY: HOSTILE,
         }
         writer.write(
             "/diagnostics", 2 * 10**9, diagnostics(wall, name=HOSTILE, level=2, message=HOSTILE * 50, **values)

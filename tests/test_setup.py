@@ -19,6 +19,7 @@ import preconditions
 import recipe
 import ros
 import steps
+import system
 import workplace
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -424,8 +425,8 @@ def checkers(monkeypatch):
         seen.ran.append(name)
         return name not in seen.failing
 
-    def run_pytest(arguments, plugins):
-        seen.pytest, seen.verdicts = arguments, plugins[0]._lines
+    def run_pytest(arguments, plugins=()):
+        seen.pytest, seen.verdicts = arguments, plugins[0]._lines if plugins else None
         return pytest.ExitCode.TESTS_FAILED if "pytest" in seen.failing else pytest.ExitCode.OK
 
     monkeypatch.setattr(check, "lint", lint)
@@ -444,13 +445,37 @@ def test_all_checkers_run_and_any_failure_counts(checkers, failing):
         assert f"{name} FAILED: see above" in checkers.verdicts
 
 
-def test_system_tests_run_only_when_asked_for(checkers):
+def test_system_tests_run_only_when_asked_for(checkers, monkeypatch):
+    monkeypatch.setattr(system, "provide", lambda: "")
     check.main(["-k", "cell"])
     assert checkers.pytest == ["-m", "not system", "-k", "cell"]
     assert any("--system" in line for line in checkers.verdicts)
-    check.main(["--system", "-k", "cell"])
-    assert checkers.pytest == ["-k", "cell"]
-    assert checkers.verdicts == []
+    checkers.ran.clear()
+    assert check.main(["--system", "-k", "cell"]) == 0
+    assert checkers.pytest == ["-m", "system", "tests/system", "-k", "cell"]
+    assert checkers.ran == []
+
+
+@pytest.mark.parametrize(
+    ("root", "installed", "exit_code", "said"),
+    [(False, True, 0, "must be root"), (True, True, 0, ""), (True, False, 0, ""), (True, False, 100, "exit code 100")],
+)
+def test_what_the_machine_lacks_is_installed_or_said(monkeypatch, root, installed, exit_code, said):
+    ran = []
+
+    def run(command, **_options):
+        ran.append(command[0])
+        if command[0] == "dpkg-query":
+            return SimpleNamespace(stdout="installed" if installed else "")
+        return SimpleNamespace(returncode=exit_code)
+
+    monkeypatch.setattr(system.os, "geteuid", lambda: 0 if root else 1000)
+    monkeypatch.setattr(system.shutil, "which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr(system, "subprocess", SimpleNamespace(run=run))
+    against = system.provide()
+    assert said in against
+    assert bool(said) == bool(against)
+    assert ("apt-get" in ran) == (root and not installed)
 
 
 def test_mypy_judges_only_the_locked_numpy(checkers, monkeypatch):

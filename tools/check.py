@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""./lathe test: the linters, then the tests; all of them run, whatever the others find."""
+"""./lathe test: the linters, then the tests, all of them, whatever the others find; --system: those of the machine."""
 
 import os
 import re
@@ -11,6 +11,7 @@ from importlib.metadata import version
 
 import pytest
 
+import system
 from workplace import REQUIREMENTS, ROOT
 
 LINTERS = {
@@ -54,21 +55,22 @@ def locked_numpy() -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Run everything on the whole checkout and return the exit code."""
+    """Run everything on the whole checkout and return the exit code; with --system, only what needs the machine."""
     os.chdir(ROOT)
+    if "--system" in arguments:
+        arguments.remove("--system")
+        if against := system.provide():
+            print(f"lathe: {against}", file=sys.stderr)
+            return 1
+        return int(pytest.main(["-m", "system", "tests/system", *arguments]))
     linters, verdicts = dict(LINTERS), []
     if (here := version("numpy")) != (locked := locked_numpy()):
         del linters["mypy"]
         verdicts.append(f"not run: mypy, because its verdict is for the types of NumPy {locked}, not {here}")
     failed = [name for name, command in linters.items() if not lint(name, command)]
     verdicts += [f"{name} FAILED: see above" for name in failed]
-    if "--system" in arguments:
-        arguments.remove("--system")
-        selection = []
-    else:
-        selection = ["-m", "not system"]
-        verdicts.append("not run: the tests that need system packages or privileges (./lathe test --system)")
-    code = pytest.main([*selection, *arguments], plugins=[Verdicts(verdicts)])
+    verdicts.append("not run: the tests that need system packages or privileges (./lathe test --system)")
+    code = pytest.main(["-m", "not system", *arguments], plugins=[Verdicts(verdicts)])
     return int(code) or int(bool(failed))
 
 

@@ -9,6 +9,7 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from lathe_rc.cell import messages
+from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
@@ -50,6 +51,8 @@ class SpindleNode(StageNode):
         self._stalled = ""
         self._report_due = 0.0
         self.slipped = 0.0
+        self._released: deque[float] = deque()  # monotonic times at which the blocks in flight were let go
+        self._lateness, self._latency = Durations(), Durations()
 
     def activate_part(self) -> None:
         """See `StageNode`."""
@@ -71,6 +74,8 @@ class SpindleNode(StageNode):
             "blocks in flight": self.blocks - self._least,
             "slowest member": self._slowest,
             "schedule slipped [s]": round(self.slipped, 3),
+            LATENESS: self._lateness,
+            LATENCY: self._latency,
         }
 
     def _say(self, state: int, first: int, why: str = "") -> None:
@@ -123,6 +128,8 @@ class SpindleNode(StageNode):
         self._heard = time.monotonic()
         self._stalled = ""
         if least > before:
+            for _ in range(least - before):
+                self._latency.add(self._heard - self._released.popleft())
             samples = min(least * self.table.block_size, self.samples)
             stamp = messages.header(max(samples - 1, 0), self.table.step_ns).stamp
             clock = Clock()
@@ -158,12 +165,15 @@ class SpindleNode(StageNode):
                     self.next_tick = min(self.next_tick, due)
                     return
                 late = now - due
+                self._lateness.add(late)
                 if late > size * step / factor:
                     # The schedule slips by the time lost: no burst to catch up.
                     self._schedule += late
                     self.slipped += late
             rest = size if self.stage.samples is None else self.stage.samples - self.samples
             samples = min(size, rest)
+            if self._completed:
+                self._released.append(time.monotonic())
             self.compute(samples, [], last=samples == rest and self.stage.samples is not None)
         self.next_tick = time.monotonic()
 

@@ -168,10 +168,10 @@ def _timing(told: Gathered) -> Picture | None:
     if not host.pace.size:
         return None
     caption = (
-        f"From {host.pace.size} intervals between reports of the time master on /diagnostics. Pace: simulated time by "
-        "wall time. Lateness: how far the schedule slipped because members held it up. Latency: blocks in "
-        "flight, up to the slowest member's last acknowledgement, by the blocks sent in a second (Little's law); "
-        "members acknowledge several blocks at a time, so it is an upper estimate."
+        f"Pace: simulated time by wall time, in {host.pace.size} intervals between reports of the time master on "
+        "/diagnostics. Lateness: from the moment at which a block was due to that at which the time master let it go; "
+        "only where the speed is given. Latency: from there until the time master had heard that every member had "
+        "completed the block; members tell of several blocks at a time."
     )
     return Picture("Pace, lateness and latency", figures.timing(host, told.step_ns * 1e-9), caption, "docs/cell.md")
 

@@ -3,7 +3,7 @@
 
 import base64
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from lathe_rc.cell.messages import Samples
 from lathe_rc.view.report_form import Form, Revolution
 from lathe_rc.view.report_gather import Gathered
 from lathe_rc.view.report_host import Host
-from lathe_rc.view.report_series import Envelope, Thinned
+from lathe_rc.view.report_series import Envelope
 
 FIRST, LAST, BEST = "#c0392b", "#1f6f8b", "#d08a1d"
 _GREY = "#999999"
@@ -186,19 +186,26 @@ def against_time(told: Gathered, curves: Mapping[str, Envelope], unit: str, scal
 
 
 def timing(host: Host, step: float) -> str:
-    """Histograms of pace, lateness and latency; ``step`` in s."""
+    """Histograms of pace, and of lateness and latency of blocks where there are any; ``step`` in s."""
     figure = _figure(2.8)
-    parts: Sequence[tuple[Thinned, float, str, str]] = (
-        (host.pace, step, "pace", "simulated by wall time [s/s]"),
-        (host.slip, 1e3, "lateness", "schedule slipped, by wall time [ms/s]"),
-        (host.latency, 1e3, "latency", "time in flight of a block [ms]"),
-    )
-    for axes, (values, scale, title, label), colour in zip(
-        figure.subplots(1, len(parts)), parts, (_GREY, BEST, LAST), strict=True
-    ):
-        numbers = np.clip(values.values(), -_MOST_VALUE, _MOST_VALUE) * scale
-        axes.hist(numbers, bins=min(30, max(5, numbers.size // 3)), color=colour, edgecolor="white", lw=0.5)
-        axes.set(xlabel=label, ylabel="reports", title=title)
-        axes.yaxis.get_major_locator().set_params(integer=True)
+    counted = [
+        (title, label, np.sum([each.counts for each in found.values()], axis=0), colour)
+        for title, label, found, colour in (
+            ("lateness", "let go after it was due [ms]", host.lateness, BEST),
+            ("latency", "until completed by all [ms]", host.latency, LAST),
+        )
+        if any(any(each.counts) for each in found.values())
+    ]
+    pace, *others = figure.subplots(1, 1 + len(counted), squeeze=False)[0]
+    numbers = np.clip(host.pace.values(), -_MOST_VALUE, _MOST_VALUE) * step
+    pace.hist(numbers, bins=min(30, max(5, numbers.size // 3)), color=_GREY, edgecolor="white", lw=0.5)
+    pace.set(xlabel="simulated by wall time [s/s]", ylabel="reports", title="pace")
+    pace.yaxis.get_major_locator().set_params(integer=True)
+    for axes, (title, label, counts, colour) in zip(others, counted, strict=True):
+        used = np.flatnonzero(counts)
+        edges = 2.0 ** np.arange(used[0] - 1, used[-1] + 1) * 1e-3
+        axes.stairs(counts[used[0] : used[-1] + 1], edges, fill=True, color=colour, edgecolor="white", lw=0.5)
+        axes.set(xscale="log", xlabel=label, ylabel="blocks", title=title)
+    for axes in (pace, *others):
         _grid(axes)
     return _svg(figure)

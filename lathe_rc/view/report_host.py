@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lathe_rc.cell import messages
+from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
 from lathe_rc.view.report_series import Thinned
 
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
@@ -43,7 +44,6 @@ class _Mark:
     wall: float
     blocks: float
     samples: float
-    slipped: float
 
 
 class Host:
@@ -56,8 +56,7 @@ class Host:
         unreadable: messages that could not be decoded.
         left_out: nodes, states and errors beyond what is shown.
         pace: samples by wall time [1/s], between two reports of the time master.
-        slip: time that the schedule fell behind in a second [s/s], the same.
-        latency: blocks in flight over blocks by wall time: how long a block is in flight [s].
+        lateness, latency: of blocks, as the time master last reported them; by its name.
     """
 
     def __init__(self) -> None:
@@ -65,7 +64,9 @@ class Host:
         self.states: list[str] = []
         self.errors: list[str] = []
         self.unreadable = self.left_out = 0
-        self.pace, self.slip, self.latency = Thinned(), Thinned(), Thinned()
+        self.pace = Thinned()
+        self.lateness: dict[str, Durations] = {}
+        self.latency: dict[str, Durations] = {}
         self._marks: dict[str, _Mark] = {}
 
     def add(self, msgtype: str, data: bytes) -> None:
@@ -112,19 +113,19 @@ class Host:
 
     def _measure(self, name: str, wall: float, values: dict[str, str]) -> None:
         """Compare a report of the time master with the one before."""
+        if "schedule slipped [s]" not in values:
+            return  # of another node
         try:
-            in_flight = float(values["blocks in flight"])
-            mark = _Mark(wall, *(float(values[key]) for key in ("blocks", "samples", "schedule slipped [s]")))
+            mark = _Mark(wall, *(float(values[key]) for key in ("blocks", "samples")))
+            durations = [Durations.parse(values.get(key, "")) for key in (LATENESS, LATENCY)]
         except (KeyError, ValueError):
             return
+        self.lateness[name], self.latency[name] = durations
         before = self._marks.get(name)
         self._marks[name] = mark
         if before is None or not before.blocks or mark.wall <= before.wall or mark.blocks <= before.blocks:
             return  # it was not running all that time
-        seconds = mark.wall - before.wall
-        self.pace.add((mark.samples - before.samples) / seconds)
-        self.slip.add((mark.slipped - before.slipped) / seconds)
-        self.latency.add(in_flight * seconds / (mark.blocks - before.blocks))
+        self.pace.add((mark.samples - before.samples) / (mark.wall - before.wall))
 
     @property
     def lost_blocks(self) -> dict[str, int]:
