@@ -98,6 +98,45 @@ class ErrorsByRevolution:
         return np.concatenate([*self._rms, form_errors(self._angle, self._error, self._done).rms])
 
 
+class FirstAndLast:
+    """The first and the last revolution of a run that comes in pieces, with some around them; a sink.
+
+    Args:
+        types: message type by fully qualified topic; with an encoder and a tool.
+    """
+
+    def __init__(self, types: Mapping[str, str]) -> None:
+        kinds = {kind: topic for topic, kind in reversed(list(types.items()))}
+        self._encoder, self._tool = kinds[messages.ENCODER], kinds[messages.TOOL]
+        self._head = self._tail = np.empty((2, 0))  # angle and error
+        self._before = 0  # revolutions before the tail
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        named = {full(topic): signals for topic, signals in dense.items()}
+        piece = np.stack([named[self._encoder]["angle_true"], named[self._tool]["error"]])
+        if self._head.size == 0 or np.ptp(self._head[0]) < _TOGETHER * 2.0 * np.pi:
+            self._head = np.concatenate([self._head, piece], axis=1)
+        self._tail = np.concatenate([self._tail, piece], axis=1)
+        past = int(self._tail[0, -1] / (2.0 * np.pi)) - _TOGETHER
+        if past > self._before:
+            self._before = past
+            self._tail = self._tail[:, int(np.searchsorted(self._tail[0], past * 2.0 * np.pi)) :]
+
+    def numbers(self) -> dict[str, Any] | None:
+        """Revolutions, and what is told of the first and the last; None if there is no complete one."""
+        head = measure(*self._head, roundness_cutoff=50.0)
+        if not head.form.rms.size:
+            return None
+        tail = measure(self._tail[0] - self._before * 2.0 * np.pi, self._tail[1], roundness_cutoff=50.0)
+        revolutions = self._before + int(tail.form.rms.size)
+        return {
+            "revolutions": revolutions,
+            "first": numbers(head, 0),
+            "last": numbers(tail, -1) | {"revolution": revolutions},
+        }
+
+
 def write_profile(path: Path, recording: Recording, found: Measurement, revolutions: list[int]) -> None:
     """Write radius deviations as CSV, with the heights along the part if it was fed."""
     heights = None

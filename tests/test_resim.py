@@ -10,7 +10,7 @@ from cells import scenario
 from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
-from lathe_rc import harness
+from lathe_rc import harness, part
 from lathe_rc.analysis.metrology import form_errors
 from lathe_rc.bag import reader, story
 from lathe_rc.bag.resim import resimulate
@@ -155,3 +155,19 @@ def test_errors_by_revolution_are_those_of_the_whole(processes, piece):
     whole = result.recording
     angle, error = whole.dense["/encoder"]["angle_true"], whole.dense["/tool"]["error"]
     assert np.array_equal(sink.rms(), form_errors(angle, error).rms)
+
+
+@pytest.mark.parametrize("piece", [64, 1000, 65536])
+@pytest.mark.parametrize("together", [2, 16])
+def test_first_and_last_revolution_are_those_of_the_whole(processes, piece, together, monkeypatch):
+    path, result = processes
+    monkeypatch.setattr(part, "_TOGETHER", together)
+    ends = part.FirstAndLast(result.recording.types)
+    feed(path, [ends], piece=piece)
+    told, whole = ends.numbers(), part.measured(result.recording)
+    assert told["revolutions"] == whole.form.rms.size
+    for name, revolution in (("first", 0), ("last", -1)):
+        for key, value in part.numbers(whole, revolution).items():
+            # Splines of a piece differ from those of the whole by what the far ends do.
+            if key != "largest_upr":
+                assert_allclose(told[name][key], value, rtol=1e-6, atol=1e-9, err_msg=f"{name} {key}")

@@ -2,6 +2,7 @@
 """The command group ``lathe bag``: what a bag holds, whether it is whole, and making it whole."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from lathe_rc import part
-from lathe_rc.bag import reader, story
+from lathe_rc.bag import story, stream
 from lathe_rc.bag.check import check as check_bag
 from lathe_rc.bag.recover import recover as recover_bag
 from lathe_rc.bag.source import Source
@@ -28,12 +29,13 @@ def bag() -> None:
     """Ask bags: what is in them, are they whole, and save what is left of a broken one."""
 
 
-def _metrics(path: Path, types: set[str]) -> dict[str, Any] | None:
-    """First and last revolution of the part, if the bag has one."""
-    if not {messages.TOOL, messages.ENCODER} <= types:
+def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
+    """First and last revolution of the part, if the bag has one; in memory that does not grow with the bag."""
+    if not {messages.TOOL, messages.ENCODER} <= set(types.values()):
         return None
-    found = part.measured(reader.read(path))
-    return {"revolutions": int(found.form.rms.size), "first": part.numbers(found, 0), "last": part.numbers(found, -1)}
+    ends = part.FirstAndLast(types)
+    stream.feed(path, [ends])
+    return ends.numbers()
 
 
 @bag.command()
@@ -44,7 +46,7 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
     """Topics, rates, span, scenario and the form error of the part."""
     with Source(path) as source:
         span = (source.last_ns - source.first_ns) * 1e-9
-        types = {said.type for said in source.topics.values()}
+        types = {topic: said.type for topic, said in source.topics.items()}
         topics: dict[str, dict[str, Any]] = {
             topic: {
                 "type": said.type,
