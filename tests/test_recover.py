@@ -3,6 +3,7 @@
 
 import json
 import shutil
+import sqlite3
 import struct
 
 import numpy as np
@@ -265,3 +266,23 @@ def test_where_there_is_no_bag_it_says_so(tmp_path):
         recover(tmp_path, tmp_path / "new")
     assert lathe("bag", "check", tmp_path / "none").exit_code == 2
     assert not list(tmp_path.iterdir())
+
+
+def test_a_message_that_unpacks_to_gigabytes_is_refused(tmp_path):
+    path = tmp_path / "bag"
+    strange_bag(path, StoragePlugin.SQLITE3, CompressionMode.MESSAGE)
+    bomb = zstandard.compress(bytes(MOST_BYTES + 1))
+    with sqlite3.connect(next(path.glob("*.db3"))) as database:
+        database.execute("UPDATE messages SET data = ? WHERE id = 1", (bomb,))
+    refused = pytest.raises(InputError, match=f"{MOST_BYTES + 1} B when unpacked; allowed: up to {MOST_BYTES}")
+    with Source(path) as source, refused:
+        list(source.messages())
+
+
+def test_a_file_that_unpacks_to_more_than_allowed_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "bag"
+    strange_bag(path, StoragePlugin.SQLITE3, CompressionMode.FILE)
+    Source(path).__exit__(None, None, None)
+    monkeypatch.setattr("lathe_rc.bag.source.MOST_UNPACKED", 1000)
+    with pytest.raises(InputError, match="unpacks to more than 1000 B"):
+        Source(path)

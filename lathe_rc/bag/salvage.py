@@ -20,12 +20,10 @@ from mcap.writer import MCAP0_MAGIC
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
-from lathe_rc.bag.source import MOST_BYTES, MOST_TOPICS, read_chunk, read_record, unpack, unpacked_size
+from lathe_rc.bag.source import MOST_BYTES, MOST_TOPICS, read_chunk, read_record, unpack, unpack_file, unpacked_size
 from lathe_rc.errors import InputError
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_MOST_UNPACKED = 2**36  # of a file that is compressed as a whole [B]
-_BLOCK = 2**20  # bytes unpacked at once
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message that is compressed by itself; CDR begins with a zero
 _UNREADABLE = (McapError, ValueError, KeyError, IndexError, EOFError, struct.error, TypeError)
 
@@ -93,15 +91,11 @@ class Salvage:
 
     def _unpack(self, file: Path, unpacked: Path) -> None:
         """Unpack a file that is compressed as a whole, as far as it goes."""
-        size = 0
-        with file.open("rb") as stream, unpacked.open("wb") as out:
-            reader = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
+        with unpacked.open("wb") as out:
             try:
-                while piece := reader.read(_BLOCK):
-                    size += len(piece)
-                    if size > _MOST_UNPACKED:
-                        raise InputError(f"{file}: unpacks to more than {_MOST_UNPACKED} B, which is not allowed")
-                    out.write(piece)
+                out.writelines(unpack_file(file))
+            except ValueError as error:
+                raise InputError(f"{file}: {error}") from None
             except zstandard.ZstdError as error:
                 self.damage.append(f"{file.name}: {error}")
 

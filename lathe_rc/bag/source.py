@@ -28,11 +28,24 @@ from lathe_rc.errors import InputError, LatheError
 MOST_BYTES = 2**28  #: longest chunk or record that is read into memory [B]
 MOST_TOPICS = 4096  #: topics of a bag
 MOST_TEXT = 2**20  #: longest text in its metadata [B]
+MOST_UNPACKED = 2**36  # of a file that is compressed as a whole [B]
 
+_PIECE = 2**20  # of a file that is unpacked [B]
 _CHANNELS = 2**16  # numbers that a channel may have
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
-_BROKEN = (ReaderError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error, EOFError)
+_BROKEN = (
+    ReaderError,
+    OSError,
+    ValueError,
+    KeyError,
+    IndexError,
+    TypeError,
+    AttributeError,
+    struct.error,
+    EOFError,
+    zstandard.ZstdError,
+)
 
 
 @dataclass(frozen=True)
@@ -81,6 +94,23 @@ def unpacked_size(data: bytes) -> int:
         return int(zstandard.frame_content_size(data))
     except zstandard.ZstdError:
         return -1
+
+
+def unpack_file(path: Path) -> Iterator[bytes]:
+    """The content of a file that is compressed as a whole, piece by piece.
+
+    Raises:
+        ValueError: it is longer than allowed.
+        ZstdError: it is broken.
+    """
+    size = 0
+    with path.open("rb") as stream:
+        reader = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
+        while piece := reader.read(_PIECE):
+            size += len(piece)
+            if size > MOST_UNPACKED:
+                raise ValueError(f"{path.name} unpacks to more than {MOST_UNPACKED} B, which is not allowed")
+            yield piece
 
 
 def read_record(stream: BinaryIO, limit: int) -> tuple[int, bytes] | None:
@@ -174,6 +204,9 @@ class Source:
         files = [path] if path.is_file() else sorted(path.glob("*.mcap"))
         try:
             self._check_metadata()
+            for file in path.glob("*.zstd"):
+                for _ in unpack_file(file):  # rosbags would write it out, however long it is
+                    pass
             self._reader = Reader(path)
             self._reader.open()
         except _BROKEN as error:
@@ -231,7 +264,13 @@ class Source:
         self._storage: Any = storages[0]
         chunks = getattr(self._storage, "chunks", [])
         followed = all(a.message_end_time <= b.message_start_time for a, b in pairwise(chunks))
-        self._in_order = len(storages) == 1 and bool(chunks) and followed and not self._reader.compression_mode
+        mode = self._reader.compression_mode
+        self._in_order = len(storages) == 1 and bool(chunks) and followed and not mode
+        self._packed = mode == "message"
+        if self._packed:
+            # rosbags would unpack each message to whatever size it says.
+            storage: Any = self._reader.storage
+            storage.metadata = storage.metadata._replace(compression_mode=None)
 
     def _chunks(self, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, bytes]]:
         """Messages of the wanted connections, chunk by chunk."""
@@ -285,7 +324,8 @@ class Source:
                 yield from self._chunks(channels, start_ns or 0, stop_ns or 2**63)
                 return
             for connection, log_ns, data in self._reader.messages(wanted, start=start_ns, stop=stop_ns):
-                yield connection.topic, log_ns, bytes(data)
+                whole = unpack("zstd", data, unpacked_size(data[:18])) if self._packed else bytes(data)
+                yield connection.topic, log_ns, whole
         except _BROKEN as error:
             raise InputError(f"{self.path}: broken ({_line(error)}); lathe bag check says more") from None
 
