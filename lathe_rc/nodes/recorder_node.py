@@ -29,6 +29,15 @@ _HOST_TOPICS = {
 }
 
 
+class _Encoders(dict[tuple[str, str, str, int], Encoder]):
+    """By message type, run, source and step [ns]."""
+
+    def __missing__(self, key: tuple[str, str, str, int]) -> Encoder:
+        """Make it."""
+        encoder = self[key] = Encoder(*key)
+        return encoder
+
+
 class RecorderNode(CellNode):
     """See the module. It subscribes to what the members announce; alone, to what anybody announces."""
 
@@ -46,6 +55,7 @@ class RecorderNode(CellNode):
         self._depth = signal_depth(self.table)
         self._queues: dict[str, BlockQueue] = {}
         self._sparse: dict[str, str] = {}  # topic -> source
+        self._encoders = _Encoders()
         self._merger: Merger | None = None
         self._ended: set[str] = set()  # topics whose last block has come
         self._blocks = self._samples = 0
@@ -132,8 +142,7 @@ class RecorderNode(CellNode):
         queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
         if in_cell:
             queue.expect(source)
-        encoder = Encoder(msgtype, self.table.run_id, source, self.table.step_ns)
-        self.listen(topic, msgtype, partial(self._on_message, queue), partial(self._on_block, queue, encoder))
+        self.listen(topic, msgtype, partial(self._on_message, queue), partial(self._on_block, queue))
 
     # ---- data ---------------------------------------------------------------------------------------
 
@@ -165,13 +174,14 @@ class RecorderNode(CellNode):
         elif self._merger.add_block(queue.topic, block, data):
             self._drain()
 
-    def _on_block(self, queue: BlockQueue, encoder: Encoder, block: Block) -> None:
+    def _on_block(self, queue: BlockQueue, block: Block) -> None:
         """A block of a node in this process."""
         if self.done:
             return
         queue.take(block)
         queue.blocks.clear()
         if self._merger is None:
+            encoder = self._encoders[queue.type, block.run_id, block.source, block.step_ns]
             first, last, companions = block.first_index, block.last, block.companions
             _, data = encoder.encode(first, block.signals, last=last, companions=companions)
             self._write_unsorted(queue, block, data)
