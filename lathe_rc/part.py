@@ -15,10 +15,11 @@ from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
 
+_CUTOFF = 50.0  # of the filters for roundness and roughness [undulations per revolution]
 _TOGETHER = 16  # revolutions that are looked at at once
 
 
-def measured(recording: Recording, *, cutoff: float = 50.0) -> Measurement:
+def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
     """The part that a run has turned; see `lathe_rc.analysis.metrology.measure`.
 
     Args:
@@ -60,6 +61,12 @@ def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
     }
 
 
+def _encoder_and_tool(types: Mapping[str, str]) -> list[str | None]:
+    """The first topic of each of the two types, where there is one."""
+    kinds = (messages.ENCODER, messages.TOOL)
+    return [next((topic for topic, found in types.items() if found == kind), None) for kind in kinds]
+
+
 class ErrorsByRevolution:
     """Form error by revolution of a run that comes in pieces; a sink of the engine and of `lathe_rc.bag.stream`.
 
@@ -68,10 +75,7 @@ class ErrorsByRevolution:
     """
 
     def __init__(self, types: Mapping[str, str]) -> None:
-        self._topics = [
-            next((topic for topic, found in types.items() if found == kind), None)
-            for kind in (messages.ENCODER, messages.TOOL)
-        ]
+        self._topics = _encoder_and_tool(types)
         self._angle, self._error = np.empty(0), np.empty(0)
         self._rms: list[np.ndarray] = []
         self._done = 0  # revolutions
@@ -106,8 +110,10 @@ class FirstAndLast:
     """
 
     def __init__(self, types: Mapping[str, str]) -> None:
-        kinds = {kind: topic for topic, kind in reversed(list(types.items()))}
-        self._encoder, self._tool = kinds[messages.ENCODER], kinds[messages.TOOL]
+        encoder, tool = _encoder_and_tool(types)
+        assert encoder is not None, "its caller has looked"
+        assert tool is not None, "its caller has looked"
+        self._encoder, self._tool = encoder, tool
         self._head = self._tail = np.empty((2, 0))  # angle and error
         self._before = 0  # revolutions before the tail
 
@@ -125,10 +131,10 @@ class FirstAndLast:
 
     def numbers(self) -> dict[str, Any] | None:
         """Revolutions, and what is told of the first and the last; None if there is no complete one."""
-        head = measure(*self._head, roundness_cutoff=50.0)
+        head = measure(*self._head, roundness_cutoff=_CUTOFF)
         if not head.form.rms.size:
             return None
-        tail = measure(self._tail[0] - self._before * 2.0 * np.pi, self._tail[1], roundness_cutoff=50.0)
+        tail = measure(self._tail[0] - self._before * 2.0 * np.pi, self._tail[1], roundness_cutoff=_CUTOFF)
         revolutions = self._before + int(tail.form.rms.size)
         return {
             "revolutions": revolutions,

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells for the tests: scenarios without files, and arrays cut into blocks."""
+"""Cells for the tests: scenarios without files, arrays cut into blocks, and processes."""
 
+import contextlib
 import itertools
+import subprocess
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -64,3 +67,14 @@ def in_blocks(lengths: Sequence[int], block: Callable[..., object], *arrays: mes
 def same(a: messages.Signals, b: messages.Signals) -> bool:
     """Whether two sets of signals are equal to the bit."""
     return a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
+
+
+@contextlib.contextmanager
+def started(*arguments):
+    """A process of this project; killed at the end if it has not ended by itself."""
+    command = [sys.executable, "-m", "lathe_rc", *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings that all tests share."""
 
+import pytest
 from hypothesis import HealthCheck, settings
+
+from lathe_rc import harness
 
 # The same examples on every machine; --hypothesis-profile=explore looks for new ones.
 settings.register_profile(
@@ -10,3 +13,12 @@ settings.register_profile(
 )  # fmt: skip
 settings.register_profile("explore", settings.get_profile("steady"), derandomize=False, max_examples=1000)
 settings.load_profile("steady")
+
+
+@pytest.fixture
+def domain(monkeypatch):
+    """A ROS domain of its own, for this process and those that it starts."""
+    with harness.free_domain() as number:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield number

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Replay over real DDS: what was recorded comes again, in order and complete, and can be recorded again."""
 
-import contextlib
 import os
 import subprocess
 import sys
@@ -9,7 +8,7 @@ import threading
 
 import pytest
 import rclpy
-from cells import scenario
+from cells import scenario, started
 from geometry_msgs.msg import Point
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -24,25 +23,6 @@ from lathe_rc.bag.check import check
 from lathe_rc.bag.source import Source
 
 COUNT = 1500
-
-
-@pytest.fixture
-def domain(monkeypatch):
-    with harness.free_domain() as number:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        yield number
-
-
-@contextlib.contextmanager
-def started(*arguments):
-    """A process of this project; killed at the end if it has not ended by itself."""
-    command = [sys.executable, "-m", "lathe_rc", *map(str, arguments)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
 
 
 def test_a_replayed_cell_is_recorded_as_the_same_bag(domain, tmp_path):

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recording what is replayed over real DDS gives the same bag again: messages, order and log times."""
 
-import contextlib
 import itertools
 import signal
 import subprocess
@@ -10,17 +9,9 @@ import sys
 import numpy as np
 import pytest
 import rclpy
-from cells import scenario
+from cells import scenario, started
 from rclpy.qos import QoSProfile
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
 from rosbags.rosbag2 import Reader, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
@@ -30,33 +21,18 @@ from std_msgs.msg import String
 from lathe_rc import harness
 from lathe_rc.bag.check import check
 from lathe_rc.bag.source import Source
+from lathe_rc.bag.writer import offered_qos
 from lathe_rc.errors import InputError
 
-FOREVER = QosTime(9223372036, 854775807)
 STORE = get_typestore(Stores.ROS2_JAZZY)
-LATCHED = QosDurability.TRANSIENT_LOCAL
+LATCHED = "transient_local"
 TOPICS = {
-    "/note": ("std_msgs/msg/String", QosDurability.VOLATILE),
-    "/robot/point": ("geometry_msgs/msg/Point", QosDurability.VOLATILE),
-    "/robot/joints": ("sensor_msgs/msg/JointState", QosDurability.VOLATILE),
+    "/note": ("std_msgs/msg/String", "volatile"),
+    "/robot/point": ("geometry_msgs/msg/Point", "volatile"),
+    "/robot/joints": ("sensor_msgs/msg/JointState", "volatile"),
     "/description": ("std_msgs/msg/String", LATCHED),
-    "/silent": ("geometry_msgs/msg/Point", QosDurability.VOLATILE),
+    "/silent": ("geometry_msgs/msg/Point", "volatile"),
 }
-
-
-@pytest.fixture
-def domain(monkeypatch):
-    with harness.free_domain() as number:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        yield number
-
-
-def qos(durability):
-    return Qos(
-        QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, durability, FOREVER, FOREVER, QosLiveliness.AUTOMATIC,
-        FOREVER, avoid_ros_namespace_conventions=False,
-    )  # fmt: skip
 
 
 def filled(data):
@@ -85,7 +61,9 @@ def foreign(request, tmp_path):
     path, log_ns, sent = tmp_path / "foreign", 0, []
     with RosbagWriter(path, version=9, storage_plugin=request.param) as writer:
         connections = {
-            topic: writer.add_connection(topic, kind, typestore=STORE, offered_qos_profiles=[qos(durability)])
+            topic: writer.add_connection(
+                topic, kind, typestore=STORE, offered_qos_profiles=[offered_qos(10, durability)]
+            )
             for topic, (kind, durability) in TOPICS.items()
         }
         for number in range(1200):
@@ -95,17 +73,6 @@ def foreign(request, tmp_path):
             writer.write(connections[topic], log_ns, data)
             sent.append((topic, log_ns, filled(data)))
     return path, sent
-
-
-@contextlib.contextmanager
-def recorder(*arguments):
-    """A recording process, once it says what it hears of or waits for; killed if it has not ended by itself."""
-    command = [sys.executable, "-m", "lathe_rc", "record", *map(str, arguments)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
 
 
 def replay(bag, *arguments):
@@ -132,7 +99,7 @@ def described(path):
 def test_a_bag_of_others_is_recorded_again_as_it_was(foreign, domain, tmp_path):
     path, sent = foreign
     again = tmp_path / "again"
-    with recorder(again, "--sim-time", "--once") as recording:
+    with started("record", again, "--sim-time", "--once") as recording:
         replay(path)
         said, _ = recording.communicate()
         assert recording.returncode == 0, said
@@ -148,7 +115,7 @@ def test_a_bag_of_others_is_recorded_again_as_it_was(foreign, domain, tmp_path):
 def test_a_bag_of_the_cell_is_recorded_again_as_it_was(domain, tmp_path):
     first, again = tmp_path / "first", tmp_path / "again"
     harness.run(scenario(spindle_encoder={"revolutions": 6.0}), mode="processes", bag=first)
-    with recorder(again, "--sim-time", "--once") as recording:
+    with started("record", again, "--sim-time", "--once") as recording:
         replay(first)
         said, _ = recording.communicate()
         assert recording.returncode == 0, said
@@ -160,7 +127,7 @@ def test_a_bag_of_the_cell_is_recorded_again_as_it_was(domain, tmp_path):
 @pytest.mark.parametrize("foreign", [StoragePlugin.MCAP], indirect=True)
 def test_without_simulated_time_the_order_is_that_of_publication(foreign, domain, tmp_path):
     path, sent = foreign
-    with recorder(tmp_path / "again", "--once", "--topics", "/note", "--topics", "/robot/point") as recording:
+    with started("record", tmp_path / "again", "--once", "--topics", "/note", "--topics", "/robot/point") as recording:
         replay(path, "--topics", "/note", "--topics", "/robot/point")
         said, _ = recording.communicate()
         assert recording.returncode == 0, said
@@ -184,20 +151,25 @@ def matched(node, publisher):
         rclpy.spin_once(node, timeout_sec=0.02)
 
 
+def last_word(node, talker, word, recording):
+    """Let the talker say a word that is heard, and go; what the recorder told until it ended."""
+    matched(node, talker)
+    talker.publish(String(data=word))
+    assert talker.wait_for_all_acked()
+    node.destroy_node()
+    return recording.communicate()[0]
+
+
 def test_what_was_missed_is_told(node, tmp_path):
     """The recorder was there first, and the publisher did not wait for it."""
-    with recorder(tmp_path / "bag", "--once") as recording:
+    with started("record", tmp_path / "bag", "--once") as recording:
         assert any("what begins from now on is heard from its first message on" in line for line in recording.stdout)
         recording.send_signal(signal.SIGSTOP)
         talker = node.create_publisher(String, "/talk", 10)
         for _ in range(3):
             talker.publish(String(data="nobody hears"))
         recording.send_signal(signal.SIGCONT)
-        matched(node, talker)
-        talker.publish(String(data="heard"))
-        assert talker.wait_for_all_acked()
-        node.destroy_node()
-        said, _ = recording.communicate()
+        said = last_word(node, talker, "heard", recording)
     assert recording.returncode == 3
     assert f"lathe: {tmp_path / 'bag'}: 3 messages of /talk are missing" in said
     assert len(messages(tmp_path / "bag")) == 1
@@ -207,19 +179,15 @@ def test_what_was_before_it_is_told_and_no_loss(node, tmp_path):
     talker = node.create_publisher(String, "/talk", 10)
     for _ in range(3):
         talker.publish(String(data="nobody hears"))
-    with recorder(tmp_path / "bag", "--once") as recording:
-        matched(node, talker)
-        talker.publish(String(data="heard"))
-        assert talker.wait_for_all_acked()
-        node.destroy_node()
-        said, _ = recording.communicate()
+    with started("record", tmp_path / "bag", "--once") as recording:
+        said = last_word(node, talker, "heard", recording)
     assert recording.returncode == 0
     assert "/talk is heard from its message 4 on" in said
 
 
 def test_it_ends_with_a_whole_bag_when_told_to(node, tmp_path):
     talker = node.create_publisher(String, "/talk", QoSProfile(depth=10))
-    with recorder(tmp_path / "bag") as recording:
+    with started("record", tmp_path / "bag") as recording:
         matched(node, talker)
         for number in range(5):
             talker.publish(String(data=f"{number:03d}"))
@@ -233,12 +201,8 @@ def test_it_ends_with_a_whole_bag_when_told_to(node, tmp_path):
 
 def test_simulated_time_that_nobody_tells_is_no_success(node, tmp_path):
     talker, _clock = node.create_publisher(String, "/talk", 10), node.create_publisher(Clock, "/clock", 10)
-    with recorder(tmp_path / "bag", "--sim-time", "--once") as recording:
-        matched(node, talker)
-        talker.publish(String(data="when?"))
-        assert talker.wait_for_all_acked()
-        node.destroy_node()
-        said, _ = recording.communicate()
+    with started("record", tmp_path / "bag", "--sim-time", "--once") as recording:
+        said = last_word(node, talker, "when?", recording)
     assert recording.returncode == 1
     assert "/clock told no time: 1 messages are not recorded" in said
 

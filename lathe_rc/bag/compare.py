@@ -32,7 +32,7 @@ def positions(recorded: Recorded, tool: Tool) -> list[tuple[str, str]]:
 
 
 class Comparison:
-    """Form errors of the recorded and of the re-simulated tool position, by revolution; a sink of the engine.
+    """Form error of the recorded tool position, and how far the re-simulated one is off, by revolution; a sink.
 
     The recorded one is that of the re-simulation with the recorded position in place of the simulated: same desired
     form, same cross slide, same deflection.
@@ -52,26 +52,18 @@ class Comparison:
         self._encoder = remapped(cell.master.shared, "encoder")
         self._tool = remapped(tool.shared, tool.outputs[0].topic)
         self._tapes = [(Tape(recorded.path, topic), field) for topic, field in topics]
-        self._recorded, self._simulated, self._between = (ErrorsByRevolution(_TYPES) for _ in range(3))
+        self._recorded, self._between = ErrorsByRevolution(_TYPES), ErrorsByRevolution(_TYPES)
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
         tool, encoder = dense[self._tool], dense[self._encoder]
         between: Samples = tool["displacement"] - sum(tape.take(samples)[field] for tape, field in self._tapes)
-        for sink, error in (
-            (self._recorded, tool["error"] + between),
-            (self._simulated, tool["error"]),
-            (self._between, between),
-        ):
+        for sink, error in ((self._recorded, tool["error"] + between), (self._between, between)):
             sink.chunk(first, samples, {"encoder": encoder, "tool": {"error": error}}, {})
 
     def recorded_rms(self) -> np.ndarray[Any, np.dtype[np.float64]]:
         """Form error of the recorded position by revolution, RMS [m], shape (revolutions,)."""
         return self._recorded.rms()
-
-    def rms(self) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """The same of the re-simulated one."""
-        return self._simulated.rms()
 
     def between_rms(self) -> np.ndarray[Any, np.dtype[np.float64]]:
         """Difference of the two positions by revolution, RMS [m], shape (revolutions,)."""

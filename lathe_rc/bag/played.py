@@ -3,7 +3,6 @@
 
 from collections import deque
 from collections.abc import Sequence
-from itertools import islice
 
 from lathe_rc.bag.compare import Comparison, positions
 from lathe_rc.bag.recorded import Recorded, Spindle
@@ -118,7 +117,7 @@ def _samples(source: Source, topic: str) -> int:
     """Samples of a dense topic: its last block says."""
     if topic not in source.topics or source.topics[topic].type != messages.ENCODER:
         raise InputError(f"{source.path}: no encoder on {topic}; a re-simulation needs the recorded spindle")
-    step_ns = next((block.step_ns for block in islice(source.blocks(topic), 1)), 0)
+    step_ns = source.step_ns(topic)
     if not step_ns:
         raise InputError(f"{source.path}: {topic} has no block")
     # Log times may be those of another clock: then all blocks are looked at.

@@ -3,7 +3,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 import numpy as np
 
@@ -96,7 +95,7 @@ class Recorded:
 
     def step_ns(self, topic: str) -> int:
         """Sampling step [ns]; 0 if there is no block."""
-        return next((block.step_ns for block in islice(self._source.blocks(topic), 1)), 0)
+        return self._source.step_ns(topic)
 
     def pieces(self, topic: str, fields: Sequence[str]) -> Iterator[tuple[int, Signals]]:
         """First sample and some fields of each block, arrays of shape (n,).

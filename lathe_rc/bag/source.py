@@ -28,7 +28,7 @@ from lathe_rc.errors import InputError, LatheError
 MOST_BYTES = 2**28  #: longest chunk or record that is read into memory [B]
 MOST_TOPICS = 4096  #: topics of a bag
 MOST_TEXT = 2**20  #: longest text in its metadata [B]
-MOST_UNPACKED = 2**36  # of a file that is compressed as a whole [B]
+MOST_UNPACKED = 2**36  #: of a file that is compressed as a whole [B]
 
 _PIECE = 2**20  # of a file that is unpacked [B]
 _CHANNELS = 2**16  # numbers that a channel may have
@@ -260,7 +260,8 @@ class Source:
 
     def _find_chunks(self) -> None:
         """See whether the file is chunks one after the other, which are read faster than messages one by one."""
-        storages: Any = getattr(self._reader.storage, "storages", [self._reader.storage])
+        whole: Any = self._reader.storage
+        storages = getattr(whole, "storages", [whole])
         self._storage: Any = storages[0]
         chunks = getattr(self._storage, "chunks", [])
         followed = all(a.message_end_time <= b.message_start_time for a, b in pairwise(chunks))
@@ -269,8 +270,7 @@ class Source:
         self._packed = mode == "message"
         if self._packed:
             # rosbags would unpack each message to whatever size it says.
-            storage: Any = self._reader.storage
-            storage.metadata = storage.metadata._replace(compression_mode=None)
+            whole.metadata = whole.metadata._replace(compression_mode=None)
 
     def _chunks(self, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, bytes]]:
         """Messages of the wanted connections, chunk by chunk."""
@@ -300,6 +300,15 @@ class Source:
                 yield decoder.decode(data)
             except ValueError as error:
                 raise LatheError(f"{self.path}: {topic}: {error}") from None
+
+    def step_ns(self, topic: str) -> int:
+        """Sampling step of a dense topic [ns], as its first block says; 0 if it has none.
+
+        Raises:
+            InputError: see `messages`.
+            LatheError: the block is broken.
+        """
+        return next((block.step_ns for block in self.blocks(topic)), 0)
 
     def messages(
         self, topics: set[str] | None = None, *, start_ns: int | None = None, stop_ns: int | None = None

@@ -31,6 +31,7 @@ from lathe_rc.errors import InputError, LatheError
 Compression = Literal["zstd", "none"]
 Durability = Literal["volatile", "transient_local"]
 
+FLUSH_PERIOD = 0.5  #: [s] of wall time after which a recorder writes messages out even if they fill no chunk
 _FOREVER = QosTime(9223372036, 854775807)
 
 

@@ -4,19 +4,58 @@
 import contextlib
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from lathe_rc.cell.parameters import Table
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes import declare
 
 T = TypeVar("T", bound=Table)
+
+
+@contextlib.contextmanager
+def member_of_none(
+    kind: str,
+    table: type[T],
+    values: Mapping[str, object],
+    args: Sequence[str] | None = None,
+    *,
+    signals: SignalHandlerOptions | None = None,
+    rosout: bool = True,
+) -> Iterator[tuple[Node, T]]:
+    """A node and its parameters, as long as the context lasts.
+
+    Args:
+        kind: name of the node.
+        table: its parameters.
+        values: parameters; those of the command line of ROS come from ``args``.
+        args: ROS arguments; default: those of the process.
+        signals: that ROS handles; default: all.
+        rosout: whether what it tells goes to /rosout as well.
+
+    Raises:
+        InputError: a parameter that is refused.
+    """
+    rclpy.init(args=None if args is None else ["lathe", *args], signal_handler_options=signals)
+    try:
+        node = Node(
+            kind,
+            automatically_declare_parameters_from_overrides=True,
+            allow_undeclared_parameters=True,
+            enable_rosout=rosout,
+        )
+        given = {name: value for name, value in declare.overrides(node).items() if value is not None}
+        yield node, table.read(kind, {**given, **values})
+    finally:
+        with contextlib.suppress(Exception):
+            rclpy.try_shutdown()
 
 
 def run(
@@ -39,23 +78,13 @@ def run(
         The exit code.
     """
     os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("fastdds.xml")))
-    rclpy.init(args=None if args is None else ["lathe", *args])
     try:
         # What the replayed system told on /rosout must not be mixed with what this node tells.
-        node = Node(
-            kind,
-            automatically_declare_parameters_from_overrides=True,
-            allow_undeclared_parameters=True,
-            enable_rosout=False,
-        )
-        given = {name: value for name, value in declare.overrides(node).items() if value is not None}
-        work(node, table.read(kind, {**given, **values}))
+        with member_of_none(kind, table, values, args, rosout=False) as (node, parameters):
+            work(node, parameters)
     except LatheError as error:
         print(f"lathe: {error}", file=sys.stderr)
         return error.exit_code
     except (KeyboardInterrupt, ExternalShutdownException):
         return LatheError.exit_code
-    finally:
-        with contextlib.suppress(Exception):
-            rclpy.try_shutdown()
     return 0

@@ -12,7 +12,7 @@ from rclpy.qos import QoSProfile
 from lathe_rc.bag import story
 from lathe_rc.bag.order import Merger
 from lathe_rc.bag.record import signal_depth
-from lathe_rc.bag.writer import BagWriter, offered_qos
+from lathe_rc.bag.writer import FLUSH_PERIOD, BagWriter, offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
@@ -22,7 +22,6 @@ from lathe_rc.errors import LatheError, LossyRunError
 from lathe_rc.nodes.ports import BlockQueue, latched_qos
 from lathe_rc.nodes.shell import CellNode
 
-_FLUSH_PERIOD = 0.5  # [s] of wall time after which messages are written out even if they fill no chunk
 _HOST_TOPICS = {
     "/diagnostics": (DiagnosticArray, QoSProfile(depth=100)),
     "cell_state": (CellState, latched_qos(4)),
@@ -150,7 +149,7 @@ class RecorderNode(CellNode):
         """See `CellNode`; what a crash may lose is bounded in time as well."""
         super().tick(now)
         if self._writer is not None and now >= self._flush_due:
-            self._flush_due = now + _FLUSH_PERIOD
+            self._flush_due = now + FLUSH_PERIOD
             self.attempt(self._writer.flush)
 
     def _on_sparse(self, topic: str, data: bytes) -> None:

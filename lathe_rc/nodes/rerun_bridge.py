@@ -17,7 +17,6 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
-import rclpy
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
@@ -25,7 +24,7 @@ from rclpy.subscription import Subscription
 
 from lathe_rc.cell.rerun_bridge import KIND, RerunBridgeParameters
 from lathe_rc.errors import LatheError
-from lathe_rc.nodes import declare
+from lathe_rc.nodes import alone
 from lathe_rc.nodes.ports import message_class
 from lathe_rc.view.rerun_heard import Backlog
 from lathe_rc.view.rerun_live import Live, Shown
@@ -162,22 +161,14 @@ def run(values: Mapping[str, object], args: Sequence[str] | None = None) -> list
         LatheError: a parameter, Rerun, or a broken message.
     """
     require()
-    rclpy.init(
-        args=None if args is None else ["lathe", *args],
-        signal_handler_options=SignalHandlerOptions.NO,
-    )
-    try:
-        node = Node(KIND, automatically_declare_parameters_from_overrides=True, allow_undeclared_parameters=True)
-        given = {name: value for name, value in declare.overrides(node).items() if value is not None}
-        parameters = RerunBridgeParameters.read(KIND, {**given, **values})
+    signals = SignalHandlerOptions.NO
+    with alone.member_of_none(KIND, RerunBridgeParameters, values, args, signals=signals) as (node, parameters):
         output = Output(parameters.output, file=Path(parameters.file), url=parameters.url, port=parameters.port)
         with output:
             bridge = RerunBridge(node, parameters, output)
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, bridge.stop)
             return bridge.run()
-    finally:
-        rclpy.try_shutdown()
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ from rclpy.signals import uninstall_signal_handlers
 from rclpy.subscription import Subscription
 
 from lathe_rc.bag.publication_order import Continuity, PublicationOrder, Recorded
-from lathe_rc.bag.writer import BagWriter
+from lathe_rc.bag.writer import FLUSH_PERIOD, BagWriter
 from lathe_rc.cell import messages
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.topic_recorder import KIND, TopicRecorderParameters
@@ -28,7 +28,6 @@ from lathe_rc.nodes.ports import message_class
 _CLOCK = "/clock"
 _OWN = {"/rosout", "/parameter_events"}  # of ROS itself, this node's among them
 _LOOK = 0.05  # [s] of wall time between looks at the graph and at signals
-_FLUSH = 0.5  # [s] of wall time after which messages are written out even if they fill no chunk
 _DISCOVERY = 3.0  # [s] of wall time after which publishers that were there before have been discovered
 _SILENCE = 10.0  # [s] without a message after which no one published before is under way any more
 _AT_ONCE = 10_000  # messages of a topic that are taken before the others have their turn
@@ -195,7 +194,7 @@ class TopicRecorder:
                 self._write(self._order.release(seen_ns))
         elif now - self._newest > _SILENCE:
             self._write(self._order.rest())
-        if now - self._flushed > _FLUSH:
+        if now - self._flushed > FLUSH_PERIOD:
             self._flushed = now
             self._writer.flush()
         return self._taken - before
