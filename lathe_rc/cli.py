@@ -25,7 +25,7 @@ from lathe_rc.errors import InputError, LatheError
 _REFRESH = 0.1  # [s] between updates of the progress line
 _LOG_PERIOD = 2.0  # [s] between lines where there is no terminal
 # in lathe_rc.commands, imported when they are wanted
-_ELSEWHERE = ("bag", "export", "fit", "measure", "record", "replay", "report", "resim", "study", "view")
+_ELSEWHERE = ("bag", "bench", "export", "fit", "measure", "record", "replay", "report", "resim", "study", "view")
 _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
 
 
