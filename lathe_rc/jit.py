@@ -40,3 +40,12 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """
     compiled = numba.njit(cache=True, error_model="numpy")(function)
     return cast("Callable[P, R]", compiled)
+
+
+def inlined(function: Callable[P, R]) -> Callable[P, R]:
+    """A `kernel` that is copied into the kernels that call it.
+
+    For what is called once a sample: to hand over an array costs as much as ten operations.
+    """
+    compiled = numba.njit(cache=True, error_model="numpy", forceinline=True)(function)
+    return cast("Callable[P, R]", compiled)

@@ -27,6 +27,20 @@ def read(ring: Array, i: int, u: float) -> float:
 
 
 @kernel
+def read_along(ring: Array, per_radian: float, back: int, angle: Array, lead: Array, value: Array) -> None:
+    """Fill ``value`` with `read` at the place of ``angle`` + ``lead`` [rad], ``back`` points before it; shape (n,)."""
+    mask = np.uint64(ring.size - 1)  # without a sign there is no look whether an index counts from the end
+    one, two = np.uint64(1), np.uint64(2)
+    for k in range(value.size):
+        place = (angle[k] + lead[k]) * per_radian - back
+        left = np.floor(place)
+        i = np.uint64(np.int64(left))
+        value[k] = cubic(
+            ring[(i - one) & mask], ring[i & mask], ring[(i + one) & mask], ring[(i + two) & mask], place - left
+        )
+
+
+@kernel
 def read_derivatives(ring: Array, i: int, u: float) -> tuple[float, float, float]:
     """Value and first two derivatives [1/point, 1/point²] at ``i`` + ``u``; looks at the points i-3 to i+4.
 
@@ -46,25 +60,28 @@ def read_derivatives(ring: Array, i: int, u: float) -> tuple[float, float, float
     return cubic(c, d, e, f, u), first / 12.0, second / 12.0
 
 
+# Gauss points between two grid points, their weights, the weights of the four points there and their distances.
+_U = (np.polynomial.legendre.leggauss(8)[0] + 1.0) / 2.0
+_WEIGHT = np.polynomial.legendre.leggauss(8)[1] / 2.0
+_TAPS = np.stack(
+    (
+        -_U * (1 - _U) * (2 - _U) / 6,
+        (1 - _U * _U) * (2 - _U) / 2,
+        _U * (1 + _U) * (2 - _U) / 2,
+        -_U * (1 - _U * _U) / 6,
+    )
+)
+_DISTANCE = np.arange(-1, 3)[:, None] - _U
+
+
 def cubic_response(radians: Array) -> Array:
     """Response of `read` at ``radians`` per point, mean over the place between points; shape (n,).
 
     The interpolator also makes images at multiples of the sampling rate less this frequency; the drive
     attenuates those and they are left out here.
     """
-    u, weight = np.polynomial.legendre.leggauss(8)
-    u, weight = (u + 1.0) / 2.0, weight / 2.0
-    taps = np.stack(
-        (
-            -u * (1 - u) * (2 - u) / 6,
-            (1 - u * u) * (2 - u) / 2,
-            u * (1 + u) * (2 - u) / 2,
-            -u * (1 - u * u) / 6,
-        )
-    )
-    distance = np.arange(-1, 3)[:, None] - u
-    phase = np.cos(distance[None] * radians[:, None, None])
-    return np.asarray((phase * taps * weight).sum(axis=(1, 2)))
+    phase = np.cos(_DISTANCE[None] * radians[:, None, None])
+    return np.asarray((phase * _TAPS * _WEIGHT).sum(axis=(1, 2)))
 
 
 def derivative_responses(radians: Array) -> tuple[Array, Complex, Array]:

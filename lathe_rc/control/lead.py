@@ -46,24 +46,32 @@ def _look_ahead(
     rate: Array,
     bend: Array,
 ) -> None:
+    wanted = rate.size > 0
+    if law < 2 and not wanted:
+        for k in range(speed.size):
+            lead[k] = lead_time * (nominal if law == 0 else speed[k]) + constant
+        return
     window = history.size
+    place = first % window
     for k in range(speed.size):
-        n = first + k
         # The oldest speed of the ring stands where the new one goes; NaN before it was written.
-        oldest = history[n % window]
+        oldest = history[place]
         acceleration = 0.0 if np.isnan(oldest) else (speed[k] - oldest) / (window * step)
-        history[n % window] = speed[k]
+        history[place] = speed[k]
+        place = place + 1 if place + 1 < window else 0
         if law == 3:
-            here, _, _ = evaluate(n * step, nominal, lines, tachogram)
-            there, rate[k], bend[k] = evaluate(n * step + lead_time, nominal, lines, tachogram)
-            lead[k] = there - here
+            t = (first + k) * step
+            here, _, _ = evaluate(t, nominal, lines, tachogram)
+            there, moving, bending = evaluate(t + lead_time, nominal, lines, tachogram)
+            ahead = there - here
         else:
-            lead[k] = lead_time * (nominal if law == 0 else speed[k])
+            ahead = lead_time * (nominal if law == 0 else speed[k])
             if law == 2:
-                lead[k] += 0.5 * lead_time**2 * acceleration
-            rate[k] = speed[k] + lead_time * acceleration
-            bend[k] = acceleration
-        lead[k] += constant
+                ahead += 0.5 * lead_time**2 * acceleration
+            moving, bending = speed[k] + lead_time * acceleration, acceleration
+        lead[k] = ahead + constant
+        if wanted:
+            rate[k], bend[k] = moving, bending
 
 
 class Preview:
@@ -85,9 +93,13 @@ class Preview:
         self._constant = constant
         self._history = np.full(window, np.nan)
 
-    def block(self, first: int, speed: Array) -> tuple[Array, Array, Array]:
-        """Lead [rad], dψ/dt [rad/s] and d²ψ/dt² [rad/s²] for the measured ``speed`` [rad/s], shape (n,) each."""
-        lead, rate, bend = np.empty(speed.size), np.empty(speed.size), np.empty(speed.size)
+    def block(self, first: int, speed: Array, *, rates: bool = True) -> tuple[Array, Array, Array]:
+        """Lead [rad], dψ/dt [rad/s] and d²ψ/dt² [rad/s²] for the measured ``speed`` [rad/s], shape (n,) each.
+
+        The latter two are left empty unless ``rates`` are wanted: in all blocks, or in none.
+        """
+        lead = np.empty(speed.size)
+        rate, bend = (np.empty(speed.size), np.empty(speed.size)) if rates else (np.empty(0), np.empty(0))
         known = self._speed_law
         _look_ahead(
             first, self._step, int(self._law), self._lead_time, self._constant, known.nominal, known.lines,

@@ -41,10 +41,13 @@ class QFilter(ABC):
     Attributes:
         reach: see above.
         chunk: grid points that `smooth` yields at a time.
+        ratio: of the recursions of `Exponential`, which kernels run themselves; below 0 for all others.
 
     Raises:
         InputError: it is wider than the memory can hold.
     """
+
+    ratio = -1.0
 
     def __init__(self, reach: int, cycle: int) -> None:
         if 2 * reach >= cycle:
@@ -81,19 +84,20 @@ class Unity(QFilter):
 
 
 @kernel
-def _two_sided(ratio: float, reach: int, points: Array, smoothed: Array) -> None:
+def two_sided(ratio: float, reach: int, points: Array, scratch: Array, smoothed: Array) -> None:
+    """Both recursions of `Exponential` at once; ``scratch`` is as long as ``points``."""
     gain = (1.0 - ratio) / (1.0 + ratio)
-    forward = 0.0
+    last = points.size - 1
+    forward = backward = 0.0
     for k in range(points.size - reach):
         forward = ratio * forward + points[k]
+        # What came from the right so far excludes the point itself, which the forward pass has.
+        scratch[last - k] = backward
+        backward = ratio * backward + points[last - k]
         if k >= reach:
             smoothed[k - reach] = forward
-    backward = 0.0
-    for k in range(points.size - 1, reach - 1, -1):
-        # What came from the right so far excludes the point itself, which the forward pass has.
-        if k < points.size - reach:
-            smoothed[k - reach] = gain * (smoothed[k - reach] + ratio * backward)
-        backward = ratio * backward + points[k]
+    for k in range(smoothed.size):
+        smoothed[k] = gain * (smoothed[k] + ratio * scratch[k + reach])
 
 
 class Exponential(QFilter):
@@ -106,12 +110,12 @@ class Exponential(QFilter):
 
     def __init__(self, width: float, cycle: int) -> None:
         self._square = width**2
-        self._ratio = 2.0 * self._square / (1.0 + 2.0 * self._square + np.sqrt(1.0 + 4.0 * self._square))
-        super().__init__(ceil(np.log(_TAIL) / np.log(self._ratio)) if self._ratio > 0.0 else 0, cycle)
+        self.ratio = 2.0 * self._square / (1.0 + 2.0 * self._square + np.sqrt(1.0 + 4.0 * self._square))
+        super().__init__(ceil(np.log(_TAIL) / np.log(self.ratio)) if self.ratio > 0.0 else 0, cycle)
 
     def smooth(self, points: Array, smoothed: Array) -> None:
         """See `QFilter`."""
-        _two_sided(self._ratio, self.reach, points, smoothed)
+        two_sided(self.ratio, self.reach, points, np.empty_like(points), smoothed)
 
     def response(self, radians: Array) -> Array:
         """See `QFilter`."""

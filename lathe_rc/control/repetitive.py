@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.control.correction import Correction, CorrectionLaw, invariant
-from lathe_rc.control.interpolation import cubic, read, read_derivatives
+from lathe_rc.control.interpolation import cubic, read, read_along, read_derivatives
 from lathe_rc.control.lead import Preview
-from lathe_rc.control.q_filter import QFilter
+from lathe_rc.control.q_filter import QFilter, two_sided
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import kernel
 
@@ -50,44 +50,12 @@ def _soft(u: float) -> float:
 
 
 @kernel
-def _learn(
-    grid: int,
-    cycle: int,
-    learning: int,
-    gain: float,
-    ramp: float,
-    chunk: Array,
-    memory: Array,
-    whole: Integers,
-    real: Array,
-) -> bool:
-    """Learn the grid points between the middle two of the last four errors; False if it needs the next chunk."""
+def _smooth_ahead(base: int, cycle: int, reach: int, ratio: float, memory: Array, scratch: Array, chunk: Array) -> None:
+    """Fill ``chunk``, the grid points ``base`` on, with what Q makes of the cycle before; see `Exponential`."""
     mask = memory.size - 1
-    per_radian = grid / _TURN
-    angles, errors = real[_ANGLES : _ANGLES + 4], real[_ERRORS : _ERRORS + 4]
-    if not angles[2] > angles[1]:
-        return True
-    rate = 1.0 / (angles[2] - angles[1])
-    while whole[_NEXT] / per_radian <= angles[2]:
-        g = whole[_NEXT]
-        if learning and not 0 <= g - whole[_CHUNK] < chunk.size:
-            return False
-        u = (g / per_radian - angles[1]) * rate
-        delta = cubic(errors[0], errors[1], errors[2], errors[3], u)
-        y = memory[(g - cycle) & mask]
-        if learning:
-            y = chunk[g - whole[_CHUNK]]
-            if g >= whole[_FROM]:
-                y += delta * (gain if ramp == 0.0 else gain * _soft((g - whole[_FROM]) / ramp))
-        memory[g & mask] = y
-        real[_SQUARES] += delta * delta
-        real[_LARGEST] = max(real[_LARGEST], abs(delta))
-        whole[_NEXT] = g + 1
-        if (g + 1) % cycle == 0:
-            whole[_ENDED] = 1
-            real[_CYCLE_SQUARES], real[_CYCLE_LARGEST] = real[_SQUARES], real[_LARGEST]
-            real[_SQUARES] = real[_LARGEST] = 0.0
-    return True
+    for k in range(chunk.size + 2 * reach):
+        scratch[0, k] = memory[(base - cycle - reach + k) & mask]
+    two_sided(ratio, reach, scratch[0, : chunk.size + 2 * reach], scratch[1], chunk)
 
 
 @kernel
@@ -137,8 +105,11 @@ def _run(
     ramp: float,
     law: int,
     looks_ahead: int,
+    ratio: float,
+    reach: int,
     settings: Array,
     chunk: Array,
+    scratch: Array,
     memory: Array,
     whole: Integers,
     real: Array,
@@ -152,37 +123,82 @@ def _run(
 ) -> tuple[int, int]:
     """Step from sample ``start`` of the block until something has to be done outside; returns (reached, reason)."""
     per_radian = grid / _TURN
-    angles, errors = real[_ANGLES : _ANGLES + 4], real[_ERRORS : _ERRORS + 4]
+    mask = memory.size - 1
     if whole[_REPLACED] and start < angle.size:
         # Errors that are still on their way belong to the memory that was replaced.
         whole[_REPLACED] = 0
         whole[_FROM] = int(np.ceil(angle[start] * per_radian))
+    if whole[_SEEN] == 0 and first + angle.size > delay and start < angle.size:
+        k = max(start, delay - first)
+        real[_ANGLES : _ANGLES + 4] = past_angle[k]
+        real[_ERRORS : _ERRORS + 4] = error[k]
+        whole[_NEXT] = int(np.ceil(past_angle[k] * per_radian))
+        whole[_FROM] = max(whole[_FROM], whole[_NEXT])
+    # What changes from sample to sample is kept in registers, and put back at the end.
+    a0, a1, a2, a3 = real[_ANGLES], real[_ANGLES + 1], real[_ANGLES + 2], real[_ANGLES + 3]
+    e0, e1, e2, e3 = real[_ERRORS], real[_ERRORS + 1], real[_ERRORS + 2], real[_ERRORS + 3]
+    squares, largest = real[_SQUARES], real[_LARGEST]
+    point, seen, half, base, learn_from = whole[_NEXT], whole[_SEEN], whole[_HALF], whole[_CHUNK], whole[_FROM]
+    ended = whole[_ENDED]
+    reached, reason = angle.size, _DONE
     for k in range(start, angle.size):
         if first + k >= delay:
-            new_angle, new_error = past_angle[k], error[k]
-            if whole[_SEEN] == 0:
-                angles[:] = new_angle
-                errors[:] = new_error
-                whole[_NEXT] = int(np.ceil(new_angle * per_radian))
-                whole[_FROM] = max(whole[_FROM], whole[_NEXT])
-            elif whole[_HALF] == 0:
-                angles[0], angles[1], angles[2], angles[3] = angles[1], angles[2], angles[3], new_angle
-                errors[0], errors[1], errors[2], errors[3] = errors[1], errors[2], errors[3], new_error
-            whole[_SEEN] += 1 - whole[_HALF]
-            if abs(angles[3] - angles[2]) > np.pi:
-                return k, _JUMPED
-            whole[_HALF] = 1
-            if not _learn(grid, cycle, learning, gain, ramp, chunk, memory, whole, real):
-                return k, _SMOOTH
-            whole[_HALF] = 0
-        place = (angle[k] + lead[k]) * per_radian - cycle
-        if whole[_SEEN] > 0 and np.floor(place) + looks_ahead >= whole[_NEXT]:
-            return k, _AHEAD
-        command[k] = _command(law, per_radian, place, rate[k], bend[k], settings, memory, real)
-        if whole[_ENDED]:
-            whole[_ENDED] = 0
-            return k + 1, _CYCLE_ENDED
-    return angle.size, _DONE
+            if half == 0:
+                a0, a1, a2, a3 = a1, a2, a3, past_angle[k]
+                e0, e1, e2, e3 = e1, e2, e3, error[k]
+                seen += 1
+            half = 0
+            if abs(a3 - a2) > np.pi:
+                reached, reason = k, _JUMPED
+                break
+            if a2 > a1:
+                per_angle = 1.0 / (a2 - a1)
+                while True:
+                    place = point / per_radian
+                    if place > a2:
+                        break
+                    y = memory[(point - cycle) & mask]
+                    u = (place - a1) * per_angle
+                    delta = cubic(e0, e1, e2, e3, u)
+                    if learning:
+                        if not 0 <= point - base < chunk.size:
+                            if ratio < 0.0:
+                                half, reached, reason = 1, k, _SMOOTH
+                                break
+                            base = point // chunk.size * chunk.size
+                            _smooth_ahead(base, cycle, reach, ratio, memory, scratch, chunk)
+                        y = chunk[point - base]
+                        if point >= learn_from:
+                            y += delta * (gain if ramp == 0.0 else gain * _soft((point - learn_from) / ramp))
+                    memory[point & mask] = y
+                    squares += delta * delta
+                    largest = max(largest, abs(delta))
+                    point += 1
+                    if point % cycle == 0:
+                        ended = 1
+                        real[_CYCLE_SQUARES], real[_CYCLE_LARGEST] = squares, largest
+                        squares = largest = 0.0
+            if reason != _DONE:
+                break
+        if seen > 0 and np.floor((angle[k] + lead[k]) * per_radian - cycle) + looks_ahead >= point:
+            reached, reason = k, _AHEAD
+            break
+        if ended:
+            ended, reached, reason = 0, k + 1, _CYCLE_ENDED
+            break
+    real[_ANGLES], real[_ANGLES + 1], real[_ANGLES + 2], real[_ANGLES + 3] = a0, a1, a2, a3
+    real[_ERRORS], real[_ERRORS + 1], real[_ERRORS + 2], real[_ERRORS + 3] = e0, e1, e2, e3
+    real[_SQUARES], real[_LARGEST] = squares, largest
+    whole[_NEXT], whole[_SEEN], whole[_HALF], whole[_CHUNK], whole[_ENDED] = (
+        point, seen, half, base, ended,
+    )  # fmt: skip
+    if law == 0:
+        read_along(memory, per_radian, cycle, angle[start:reached], lead[start:reached], command[start:reached])
+    else:
+        for k in range(start, reached):
+            place = (angle[k] + lead[k]) * per_radian - cycle
+            command[k] = _command(law, per_radian, place, rate[k], bend[k], settings, memory, real)
+    return reached, reason
 
 
 @dataclass(frozen=True)
@@ -240,6 +256,7 @@ class RepetitiveController:
         # A power of two, so that a mask wraps the index; it holds a cycle and what Q needs before it.
         self._memory = np.zeros(1 << (self._cycle + q.chunk + q.reach + 8).bit_length())
         self._chunk = np.empty(q.chunk)
+        self._scratch = np.empty((2, q.chunk + 2 * q.reach))
         self._whole = np.zeros(8, dtype=np.int64)
         self._real = np.zeros(_REALS)
         self._real[_PLACE] = np.nan
@@ -317,13 +334,14 @@ class RepetitiveController:
             LatheError: the spindle turned so fast that the memory would have been read where nothing is
                 learned yet, or its angle jumped.
         """
-        lead, rate, bend = self._preview.block(first, speed)
+        rates = self._correction.law is not CorrectionLaw.NONE
+        lead, rate, bend = self._preview.block(first, speed, rates=rates)
         reached, reason = 0, _SMOOTH
         while reason in (_CYCLE_ENDED, _SMOOTH):
             reached, reason = _run(
                 first, reached, self._delay, self._grid, self._cycle, self.learning and self.joined, self._gain,
-                self._ramp, int(self._correction.law), self._correction.looks_ahead, self._settings, self._chunk,
-                self._memory, self._whole, self._real, angle, lead, rate, bend, past_angle, error, command,
+                self._ramp, int(self._correction.law), self._correction.looks_ahead, self._q.ratio, self._q.reach,
+                self._settings, self._chunk, self._scratch, self._memory, self._whole, self._real, angle, lead, rate, bend, past_angle, error, command,
             )  # fmt: skip
             if reason == _SMOOTH:
                 self._smooth()

@@ -20,7 +20,6 @@ Array = npt.NDArray[np.float64]
 def _advance(
     transition: Array,
     weights: Array,
-    delay: int,
     part: float,
     spring: float,
     damper: float,
@@ -28,7 +27,6 @@ def _advance(
     stroke: float,
     state: Array,
     line: Array,
-    first: int,
     command: Array,
     position: Array,
     velocity: Array,
@@ -36,15 +34,13 @@ def _advance(
 ) -> int:
     """Step the drive through a block; returns the number of samples at an end stop.
 
-    ``line`` is a ring of past commands: sample n stands at n modulo its length.
+    ``line`` holds the commands before this block that are still on their way, the oldest first.
     """
     x, v = state[0], state[1]
-    size = line.size
     stopped = 0
+    sent = np.concatenate((line, command))
     for k in range(command.size):
-        n = first + k
-        line[n % size] = command[k]
-        u0, u1, u2 = line[(n - delay) % size], line[(n - delay - 1) % size], line[(n - delay - 2) % size]
+        u0, u1, u2 = sent[k + 2], sent[k + 1], sent[k]
         new_x = (
             transition[0, 0] * x + transition[0, 1] * v + weights[0, 0] * u0 + weights[0, 1] * u1 + weights[0, 2] * u2
         )
@@ -63,6 +59,7 @@ def _advance(
         position[k], velocity[k] = x, v
         current[k] = (spring * (delayed - x) - damper * v) * force_per_current
     state[0], state[1] = x, v
+    line[:] = sent[command.size :]
     return stopped
 
 
@@ -103,13 +100,13 @@ class ElectrodynamicDrive:
         self._force_per_current = moving_mass / force_constant
         self._stroke = stroke
         self._state = np.zeros(2)
-        self._line = np.zeros(self.plant.delay + 3)
+        self._line = np.zeros(self.plant.delay + 2)
 
     def block(self, first: int, command: Array, position: Array, velocity: Array, current: Array) -> None:
         """Step from sample ``first`` on; arrays of shape (n,) [m, m, m/s, A]. At rest at 0 before sample 0."""
         plant = self.plant
         self.stopped += _advance(
-            plant.transition, plant.weights, plant.delay, plant.fraction, self._spring, self._damper,
+            plant.transition, plant.weights, plant.fraction, self._spring, self._damper,
             self._force_per_current, self._stroke, self._state, self._line,
-            first, command, position, velocity, current,
+            command, position, velocity, current,
         )  # fmt: skip

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-from lathe_rc.plants.hysteresis import LINEAR, Hysteresis, Law, advance
+from lathe_rc.plants.hysteresis import LINEAR, Hysteresis, Law, advance, advance_along
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
 
 Array = npt.NDArray[np.float64]
@@ -79,6 +79,38 @@ def extend(stack: StackTable, state: Array, set_point: float) -> tuple[float, bo
         crept += stack.creep_gain * state[place]
     state[VOLTAGE], state[_DEMAND], state[_EXTENSION] = voltage, applied, extension
     return crept, wanted != within or abs(demand) > 1.0 + _ROUNDING
+
+
+@kernel
+def _extend_along(stack: StackTable, state: Array, set_point: Array, extension: Array, voltage: Array) -> int:
+    """`extend` for a block: fills the extension [m] and the voltage relative to full, shape (n,).
+
+    Returns the number of samples where something was cut off.
+    """
+    inverse = _MEMORIES + stack.creep.shape[0]
+    for k in range(set_point.size):
+        extension[k] = min(max(set_point[k] / stack.stroke, -1.0), 1.0)
+    advance_along(stack.inverse.kind, stack.inverse.table, state, inverse, extension, voltage)
+    amplified, before, cut = state[VOLTAGE], state[_DEMAND], 0
+    for k in range(set_point.size):
+        cut += set_point[k] / stack.stroke != extension[k] or abs(voltage[k]) > 1.0 + _ROUNDING
+        applied = min(max(voltage[k], -1.0), 1.0)
+        amplified = stack.decay * amplified + stack.now * applied + stack.before * before
+        before = applied
+        voltage[k] = amplified
+    state[VOLTAGE], state[_DEMAND] = amplified, before
+    forward = inverse + stack.inverse_size
+    advance_along(stack.forward.kind, stack.forward.table, state, forward, voltage, extension)
+    before, creep = state[_EXTENSION], stack.creep
+    for k in range(set_point.size):
+        extension[k] = now = stack.stroke * extension[k]
+        for i in range(creep.shape[0]):
+            place = _MEMORIES + i
+            state[place] = creep[i, 0] * state[place] + creep[i, 1] * now + creep[i, 2] * before
+            extension[k] += stack.creep_gain * state[place]
+        before = now
+    state[_EXTENSION] = before
+    return cut
 
 
 def _lag(time: float, step: float, method: Discretisation) -> DiscretePlant:
@@ -175,17 +207,16 @@ def _advance(
     voltage: Array,
 ) -> int:
     """Step the drive through a block; returns the number of samples in saturation."""
+    saturated = _extend_along(stack, memory, set_point, velocity, voltage)
     x, v, before = state[0], state[1], state[2]
-    saturated = 0
     for k in range(set_point.size):
-        extension, cut = extend(stack, memory, set_point[k])
-        saturated += cut
+        extension = velocity[k]
         x, v = (
             transition[0, 0] * x + transition[0, 1] * v + weights[0, 0] * extension + weights[0, 1] * before,
             transition[1, 0] * x + transition[1, 1] * v + weights[1, 0] * extension + weights[1, 1] * before,
         )
         before = extension
-        position[k], velocity[k], voltage[k] = x, v, memory[VOLTAGE] * full_voltage
+        position[k], velocity[k], voltage[k] = x, v, voltage[k] * full_voltage
     state[0], state[1], state[2] = x, v, before
     return saturated
 

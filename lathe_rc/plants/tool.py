@@ -4,7 +4,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.profile import evaluate
 
 Array = npt.NDArray[np.float64]
@@ -12,7 +12,7 @@ Array = npt.NDArray[np.float64]
 _TURN = 2.0 * np.pi
 
 
-@kernel
+@inlined
 def _height(angle: float, feed: float, start_height: float, part: int) -> float:
     turns = angle / _TURN
     if part > 0:
@@ -37,13 +37,15 @@ def desired(
 
     ``part`` is the revolutions after which the next part begins; 0 for one endless part.
     """
+    row = 0
     for k in range(angle.size):
         height[k] = _height(angle_true[k], feed, start_height, part)
-        reference[k] = evaluate(angle_true[k], height[k], heights, table)
+        reference[k], row = evaluate(angle_true[k], height[k], heights, table, row)
         if angle[k] == angle_true[k]:
             expected[k] = reference[k]
         else:
-            expected[k] = evaluate(angle[k], _height(angle[k], feed, start_height, part), heights, table)
+            measured = _height(angle[k], feed, start_height, part)
+            expected[k], row = evaluate(angle[k], measured, heights, table, row)
 
 
 @kernel
@@ -60,10 +62,11 @@ def desired_at(
     height: Array,
 ) -> None:
     """The same where a longitudinal slide makes the height [m], true and as its sensor reads it."""
+    row = 0
     for k in range(angle.size):
         height[k] = start_height + slide[k]
-        reference[k] = evaluate(angle_true[k], height[k], heights, table)
+        reference[k], row = evaluate(angle_true[k], height[k], heights, table, row)
         if angle[k] == angle_true[k] and slide[k] == slide_measured[k]:
             expected[k] = reference[k]
         else:
-            expected[k] = evaluate(angle[k], start_height + slide_measured[k], heights, table)
+            expected[k], row = evaluate(angle[k], start_height + slide_measured[k], heights, table, row)

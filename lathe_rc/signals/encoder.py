@@ -5,7 +5,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.jit import kernel
-from lathe_rc.signals.speed import SpeedLaw, evaluate
+from lathe_rc.signals.speed import SpeedLaw, evaluate_along
 
 Array = npt.NDArray[np.float64]
 
@@ -28,24 +28,29 @@ def _encode(
     angle_true: Array,
     speed_true: Array,
 ) -> None:
-    window = history.size
-    for k in range(angle.size):
-        n = first + k
-        true, rate, _ = evaluate(n * step, nominal, lines, tachogram)
-        angle_true[k], speed_true[k] = true, rate
-        if counts == 0:
-            whole = np.floor(true / _TURN)
-            angle[k], speed[k] = true, rate
-        else:
+    evaluate_along(first, step, nominal, lines, tachogram, angle_true, speed_true)
+    before = revolution[0]
+    if counts == 0:
+        for k in range(angle.size):
+            angle[k], speed[k] = angle_true[k], speed_true[k]
+            whole = np.floor(angle_true[k] / _TURN)
+            index_pulse[k] = whole > before
+            before = whole
+    else:
+        window = history.size
+        place = first % window
+        for k in range(angle.size):
             # Whole revolutions apart, so that they are exact whatever the counts are.
-            count = np.floor(true * counts / _TURN)
+            count = np.floor(angle_true[k] * counts / _TURN)
             whole = np.floor(count / counts)
             angle[k] = whole * _TURN + (count - whole * counts) * _TURN / counts
             # The oldest angle of the ring stands where the new one goes.
-            speed[k] = (angle[k] - history[n % window]) / (window * step)
-        index_pulse[k] = whole > revolution[0]
-        revolution[0] = whole
-        history[n % window] = angle[k]
+            speed[k] = (angle[k] - history[place]) / (window * step)
+            history[place] = angle[k]
+            place = place + 1 if place + 1 < window else 0
+            index_pulse[k] = whole > before
+            before = whole
+    revolution[0] = before
 
 
 class Encoder:

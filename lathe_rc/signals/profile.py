@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
 from lathe_rc.errors import InputError
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined
 from lathe_rc.signals.table import read_table
 
 Array = npt.NDArray[np.float64]
@@ -208,28 +208,31 @@ def read_csv(path: Path) -> Measured:
     return Measured(np.deg2rad(angle_deg), heights_mm * 1e-3, radius)
 
 
-@kernel
-def evaluate(angle: float, height: float, heights: Array, table: Array) -> float:
-    """Radius deviation [m] from a profile's table, shape (m, n, 4): cubic in the angle, linear in the height."""
+@inlined
+def evaluate(angle: float, height: float, heights: Array, table: Array, row: int) -> tuple[float, int]:
+    """Radius deviation [m] from a profile's table, shape (m, n, 4): cubic in the angle, linear in the height.
+
+    ``row`` is where to look for the height first; it is returned as it was found: the next is not far.
+    """
     points = table.shape[1]
     place = angle * (points / _TURN)
     whole = np.floor(place)
     u = place - whole
-    j = int(whole) % points
-    rows = heights.size
-    i = 0
+    j = np.uint64(np.int64(whole)) & np.uint64(points - 1)
     v = 0.0
-    if rows > 1 and height > heights[0]:
-        if height >= heights[rows - 1]:
-            i = rows - 1
-        else:
-            i = np.searchsorted(heights, height, side="right") - 1
-            v = (height - heights[i]) / (heights[i + 1] - heights[i])
-    value = ((table[i, j, 0] * u + table[i, j, 1]) * u + table[i, j, 2]) * u + table[i, j, 3]
+    if heights.size > 1:
+        while row > 0 and not height > heights[row]:
+            row -= 1
+        while row < heights.size - 1 and height >= heights[row + 1]:
+            row += 1
+        if height > heights[row] and row < heights.size - 1:
+            v = (height - heights[row]) / (heights[row + 1] - heights[row])
+    value = ((table[row, j, 0] * u + table[row, j, 1]) * u + table[row, j, 2]) * u + table[row, j, 3]
     if v > 0.0:
-        above = table[i + 1, j]
-        value += v * (((above[0] * u + above[1]) * u + above[2]) * u + above[3] - value)
-    return float(value)
+        above = row + 1
+        over = ((table[above, j, 0] * u + table[above, j, 1]) * u + table[above, j, 2]) * u + table[above, j, 3]
+        value += v * (over - value)
+    return float(value), row
 
 
 @dataclass(frozen=True)

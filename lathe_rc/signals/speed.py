@@ -16,14 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.errors import InputError
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
 
 _PACKED_LINES = 4  # rows of SpeedLaw.lines: amplitude [1], frequency [rad/s], phase [rad], start [s]
 
 
-@kernel
+@inlined
 def evaluate(t: float, nominal: float, lines: Array, tachogram: Array) -> tuple[float, float, float]:
     """Angle [rad], speed [rad/s] and acceleration [rad/s²] at time ``t`` [s].
 
@@ -55,6 +55,20 @@ def evaluate(t: float, nominal: float, lines: Array, tachogram: Array) -> tuple[
             speed += tachogram[1, i] + slope * since
             acceleration += slope
     return nominal * angle, nominal * speed, nominal * acceleration
+
+
+@kernel
+def evaluate_along(
+    first: int, step: float, nominal: float, lines: Array, tachogram: Array, angle: Array, speed: Array
+) -> None:
+    """Fill angle [rad] and speed [rad/s] of the samples ``first`` on, shape (n,); see `evaluate`."""
+    if lines.shape[1] == 0 and tachogram.shape[1] == 0:
+        for k in range(angle.size):
+            angle[k] = nominal * ((first + k) * step)
+            speed[k] = nominal
+    else:
+        for k in range(angle.size):
+            angle[k], speed[k], _ = evaluate((first + k) * step, nominal, lines, tachogram)
 
 
 @kernel
