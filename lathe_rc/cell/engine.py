@@ -6,7 +6,7 @@ from typing import Protocol
 
 from lathe_rc.cell.messages import MAX_BLOCK, Signals, sample_fields
 from lathe_rc.cell.stage import Sparse, Stage, compile_kernels
-from lathe_rc.cell.track import Track
+from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wiring import Cell, remapped
 from lathe_rc.errors import InputError
 
@@ -38,10 +38,11 @@ class Engine:
         self._cell = cell
         block = cell.master.shared.block_size
         self._chunk = max(block, min(cell.shortest_feedback or MAX_BLOCK, MAX_BLOCK) // block * block)
-        self._tracks = {
-            topic: Track(source.type, sample_fields(source.type), cell.longest_delay(topic), self._chunk)
-            for topic, source in cell.dense.items()
-        }
+        tracks = {}
+        for topic, source in cell.dense.items():
+            delays = dict.fromkeys(sample_fields(source.type), 0) | longest_delays(cell.inputs(topic))
+            tracks[topic] = Track(source.type, delays, self._chunk)
+        self._stages = [_Wired(stage, tracks) for stage in cell.stages.values()]
         for stage in cell.stages.values():
             compile_kernels(stage)
 
@@ -52,26 +53,33 @@ class Engine:
             samples = min(self._chunk, self.samples - first)
             dense: dict[str, Signals] = {}
             sparse: dict[str, list[Sparse]] = {}
-            for stage in self._cell.stages.values():
-                self._advance(stage, first, samples, dense, sparse)
+            for wired in self._stages:
+                wired.advance(first, samples, dense, sparse)
             for sink in receivers:
                 sink.chunk(first, samples, dense, sparse)
 
-    def _advance(
-        self,
-        stage: Stage,
-        first: int,
-        samples: int,
-        dense: dict[str, Signals],
-        sparse: dict[str, list[Sparse]],
-    ) -> None:
-        inputs = [
-            self._tracks[remapped(stage.shared, port.topic)].view(first - port.delay, samples) for port in stage.inputs
-        ]
+
+class _Wired:
+    """A stage with the tracks that it reads and writes.
+
+    Args:
+        stage: the stage.
+        tracks: of all dense topics, by relative name.
+    """
+
+    def __init__(self, stage: Stage, tracks: Mapping[str, Track]) -> None:
+        self._stage = stage
+        self._inputs = [(tracks[remapped(stage.shared, port.topic)], port.delay) for port in stage.inputs]
+        topics = [remapped(stage.shared, port.topic) for port in stage.outputs]
+        self._outputs = [(topic, tracks[topic]) for topic in topics]
+        self._sparse = {topic: remapped(stage.shared, topic) for topic in stage.sparse_topics}
+
+    def advance(self, first: int, samples: int, dense: dict[str, Signals], sparse: dict[str, list[Sparse]]) -> None:
+        """Compute a chunk and add what comes out to ``dense`` and ``sparse``."""
+        inputs = [track.view(first - delay, samples) for track, delay in self._inputs]
         outputs = []
-        for port in stage.outputs:
-            topic = remapped(stage.shared, port.topic)
-            dense[topic] = self._tracks[topic].extend(samples)
+        for topic, track in self._outputs:
+            dense[topic] = track.extend(samples)
             outputs.append(dense[topic])
-        for message in stage.advance(first, inputs, outputs):
-            sparse.setdefault(remapped(stage.shared, message.topic), []).append(message)
+        for message in self._stage.advance(first, inputs, outputs):
+            sparse.setdefault(self._sparse[message.topic], []).append(message)

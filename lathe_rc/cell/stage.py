@@ -10,7 +10,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -38,8 +38,7 @@ class Input:
     delay: int = 0
 
 
-@dataclass(frozen=True)
-class Joint:
+class Joint(NamedTuple):
     """Which fields of an output make a decimated sensor_msgs/JointState."""
 
     position: str
@@ -56,7 +55,7 @@ class Output:
     joint: Joint | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Sparse:
     """A message that comes at a chosen sample, not one a block."""
 
@@ -74,6 +73,8 @@ class Trigger:
     value: float
     action: str
 
+
+_NOTHING = np.empty(0)
 
 _EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)\s*:\s*(\S.*?)\s*")
 
@@ -233,22 +234,23 @@ class Stage(ABC):
         if start >= samples:
             return []
 
-        def value(name: str | None, k: int) -> Any:
-            return np.array([signals[name][k]]) if name else np.empty(0)
-
+        # Copies: the block's own arrays are used again.
+        position, velocity, effort = (signals[name][start::period].copy() if name else None for name in joint)
+        assert position is not None
+        topic = f"{self.name}/joint_states"
         return [
             Sparse(
-                f"{self.name}/joint_states",
+                topic,
                 messages.JOINTS,
-                first + k,
+                first + start + k * period,
                 {
                     "name": [self.name],
-                    "position": value(joint.position, k),
-                    "velocity": value(joint.velocity, k),
-                    "effort": value(joint.effort, k),
+                    "position": position[k : k + 1],
+                    "velocity": _NOTHING if velocity is None else velocity[k : k + 1],
+                    "effort": _NOTHING if effort is None else effort[k : k + 1],
                 },
             )
-            for k in range(start, samples, period)
+            for k in range(position.size)
         ]
 
     def perform(self, action: str) -> None:

@@ -118,17 +118,14 @@ class Cell:
             if any(remapped(stage.shared, port.topic) == topic for port in stage.inputs)
         ]
 
-    def longest_delay(self, topic: str) -> int:
-        """Longest feedback delay [sample] at which a topic is read."""
-        return max(
-            (
-                port.delay
-                for stage in self.stages.values()
-                for port in stage.inputs
-                if remapped(stage.shared, port.topic) == topic
-            ),
-            default=0,
-        )
+    def inputs(self, topic: str) -> list[Input]:
+        """Ports that read a relative topic."""
+        return [
+            port
+            for stage in self.stages.values()
+            for port in stage.inputs
+            if remapped(stage.shared, port.topic) == topic
+        ]
 
     @property
     def shortest_feedback(self) -> int | None:

@@ -15,190 +15,36 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.control.correction import Correction, CorrectionLaw, invariant
-from lathe_rc.control.interpolation import cubic, read, read_along, read_derivatives
+from lathe_rc.control.angle_memory import (
+    AHEAD,
+    CHUNK,
+    CYCLE_ENDED,
+    CYCLE_LARGEST,
+    CYCLE_SQUARES,
+    FROM,
+    INTEGERS,
+    JUMPED,
+    NEXT,
+    NO_CHUNK,
+    PIECE,
+    PLACE,
+    REALS,
+    REPLACED,
+    SMOOTH,
+    learn,
+    send,
+    take,
+)
+from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.lead import Preview
-from lathe_rc.control.q_filter import QFilter, two_sided
+from lathe_rc.control.q_filter import QFilter
 from lathe_rc.errors import LatheError
-from lathe_rc.jit import kernel
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 _TURN = 2.0 * np.pi
 LEARNING_DELAY = 3  #: samples from a measured error to its place in the memory: cubic interpolation looks ahead
-
-# Places in the integer state: next grid point to learn, samples seen, cycles ended, first point of the smoothed
-# chunk, grid point from which errors count, whether the sample at hand is half learned, whether a cycle ended in it,
-# whether the memory was replaced since the last sample.
-_NEXT, _SEEN, _CYCLE, _CHUNK, _FROM, _HALF, _ENDED, _REPLACED = 0, 1, 2, 3, 4, 5, 6, 7
-# Places in the real state: sum of squares and largest error of the cycle at hand and of the last one, the newest
-# four angles and errors, v and v' of Wk2, its last place and input, the lead-lag term's state and last input.
-_SQUARES, _LARGEST, _CYCLE_SQUARES, _CYCLE_LARGEST, _ANGLES, _ERRORS, _INVARIANT, _PLACE, _INPUT, _LAG = (
-    0, 1, 2, 3, 4, 8, 12, 14, 15, 16,
-)  # fmt: skip
-_REALS = 18
-_NO_CHUNK = -(1 << 62)
-
-_DONE, _CYCLE_ENDED, _AHEAD, _JUMPED, _SMOOTH = 0, 1, 2, 3, 4  # why the kernel stopped
-
-
-@kernel
-def _soft(u: float) -> float:
-    """Rises smoothly from 0 at ``u`` = 0 to 1 at ``u`` = 1."""
-    return 1.0 if u >= 1.0 else u * u * (3.0 - 2.0 * u)
-
-
-@kernel
-def _smooth_ahead(base: int, cycle: int, reach: int, ratio: float, memory: Array, scratch: Array, chunk: Array) -> None:
-    """Fill ``chunk``, the grid points ``base`` on, with what Q makes of the cycle before; see `Exponential`."""
-    mask = memory.size - 1
-    for k in range(chunk.size + 2 * reach):
-        scratch[0, k] = memory[(base - cycle - reach + k) & mask]
-    two_sided(ratio, reach, scratch[0, : chunk.size + 2 * reach], scratch[1], chunk)
-
-
-@kernel
-def _command(
-    law: int,
-    per_radian: float,
-    place: float,
-    rate: float,
-    bend: float,
-    settings: Array,
-    memory: Array,
-    real: Array,
-) -> float:
-    """Set point of the drive for the memory at ``place`` [grid point]."""
-    i = int(np.floor(place))
-    u = place - i
-    a1, a2 = settings[0], settings[1]
-    if law in (2, 3):
-        value, first, second = read_derivatives(memory, i, u)
-        slope, bow = first * per_radian, second * per_radian**2
-        turning = bend if law == 3 else 0.0
-        return value + float(a1 * rate * slope + a2 * (rate**2 * bow + turning * slope))
-    value = read(memory, i, u)
-    if law == 0:
-        return value
-    before = real[_INPUT]
-    real[_INPUT] = value
-    if law == 1:
-        # y = v + (T1 - T2)·dv/dt with T2·dv/dt + v = u, exact for u linear between samples.
-        lag = float(settings[3] * real[_LAG] + settings[4] * before + settings[5] * value)
-        real[_LAG] = lag
-        return lag + float(settings[6]) * (value - lag)
-    distance = 0.0 if np.isnan(real[_PLACE]) else (place - real[_PLACE]) / per_radian
-    real[_PLACE] = place
-    return invariant(value, before, distance, rate, bend, a1, a2, settings[2], real[_INVARIANT : _INVARIANT + 2])
-
-
-@kernel
-def _run(
-    first: int,
-    start: int,
-    delay: int,
-    grid: int,
-    cycle: int,
-    learning: int,
-    gain: float,
-    ramp: float,
-    law: int,
-    looks_ahead: int,
-    ratio: float,
-    reach: int,
-    settings: Array,
-    chunk: Array,
-    scratch: Array,
-    memory: Array,
-    whole: Integers,
-    real: Array,
-    angle: Array,
-    lead: Array,
-    rate: Array,
-    bend: Array,
-    past_angle: Array,
-    error: Array,
-    command: Array,
-) -> tuple[int, int]:
-    """Step from sample ``start`` of the block until something has to be done outside; returns (reached, reason)."""
-    per_radian = grid / _TURN
-    mask = memory.size - 1
-    if whole[_REPLACED] and start < angle.size:
-        # Errors that are still on their way belong to the memory that was replaced.
-        whole[_REPLACED] = 0
-        whole[_FROM] = int(np.ceil(angle[start] * per_radian))
-    if whole[_SEEN] == 0 and first + angle.size > delay and start < angle.size:
-        k = max(start, delay - first)
-        real[_ANGLES : _ANGLES + 4] = past_angle[k]
-        real[_ERRORS : _ERRORS + 4] = error[k]
-        whole[_NEXT] = int(np.ceil(past_angle[k] * per_radian))
-        whole[_FROM] = max(whole[_FROM], whole[_NEXT])
-    # What changes from sample to sample is kept in registers, and put back at the end.
-    a0, a1, a2, a3 = real[_ANGLES], real[_ANGLES + 1], real[_ANGLES + 2], real[_ANGLES + 3]
-    e0, e1, e2, e3 = real[_ERRORS], real[_ERRORS + 1], real[_ERRORS + 2], real[_ERRORS + 3]
-    squares, largest = real[_SQUARES], real[_LARGEST]
-    point, seen, half, base, learn_from = whole[_NEXT], whole[_SEEN], whole[_HALF], whole[_CHUNK], whole[_FROM]
-    ended = whole[_ENDED]
-    reached, reason = angle.size, _DONE
-    for k in range(start, angle.size):
-        if first + k >= delay:
-            if half == 0:
-                a0, a1, a2, a3 = a1, a2, a3, past_angle[k]
-                e0, e1, e2, e3 = e1, e2, e3, error[k]
-                seen += 1
-            half = 0
-            if abs(a3 - a2) > np.pi:
-                reached, reason = k, _JUMPED
-                break
-            if a2 > a1:
-                per_angle = 1.0 / (a2 - a1)
-                while True:
-                    place = point / per_radian
-                    if place > a2:
-                        break
-                    y = memory[(point - cycle) & mask]
-                    u = (place - a1) * per_angle
-                    delta = cubic(e0, e1, e2, e3, u)
-                    if learning:
-                        if not 0 <= point - base < chunk.size:
-                            if ratio < 0.0:
-                                half, reached, reason = 1, k, _SMOOTH
-                                break
-                            base = point // chunk.size * chunk.size
-                            _smooth_ahead(base, cycle, reach, ratio, memory, scratch, chunk)
-                        y = chunk[point - base]
-                        if point >= learn_from:
-                            y += delta * (gain if ramp == 0.0 else gain * _soft((point - learn_from) / ramp))
-                    memory[point & mask] = y
-                    squares += delta * delta
-                    largest = max(largest, abs(delta))
-                    point += 1
-                    if point % cycle == 0:
-                        ended = 1
-                        real[_CYCLE_SQUARES], real[_CYCLE_LARGEST] = squares, largest
-                        squares = largest = 0.0
-            if reason != _DONE:
-                break
-        if seen > 0 and np.floor((angle[k] + lead[k]) * per_radian - cycle) + looks_ahead >= point:
-            reached, reason = k, _AHEAD
-            break
-        if ended:
-            ended, reached, reason = 0, k + 1, _CYCLE_ENDED
-            break
-    real[_ANGLES], real[_ANGLES + 1], real[_ANGLES + 2], real[_ANGLES + 3] = a0, a1, a2, a3
-    real[_ERRORS], real[_ERRORS + 1], real[_ERRORS + 2], real[_ERRORS + 3] = e0, e1, e2, e3
-    real[_SQUARES], real[_LARGEST] = squares, largest
-    whole[_NEXT], whole[_SEEN], whole[_HALF], whole[_CHUNK], whole[_ENDED] = (
-        point, seen, half, base, ended,
-    )  # fmt: skip
-    if law == 0:
-        read_along(memory, per_radian, cycle, angle[start:reached], lead[start:reached], command[start:reached])
-    else:
-        for k in range(start, reached):
-            place = (angle[k] + lead[k]) * per_radian - cycle
-            command[k] = _command(law, per_radian, place, rate[k], bend[k], settings, memory, real)
-    return reached, reason
 
 
 @dataclass(frozen=True)
@@ -257,15 +103,17 @@ class RepetitiveController:
         self._memory = np.zeros(1 << (self._cycle + q.chunk + q.reach + 8).bit_length())
         self._chunk = np.empty(q.chunk)
         self._scratch = np.empty((2, q.chunk + 2 * q.reach))
-        self._whole = np.zeros(8, dtype=np.int64)
-        self._real = np.zeros(_REALS)
-        self._real[_PLACE] = np.nan
+        self._sample, self._work = np.empty(PIECE, dtype=np.int64), np.empty((7, PIECE + 1))
+        self._whole = np.zeros(INTEGERS, dtype=np.int64)
+        self._real = np.zeros(REALS)
+        self._real[PLACE] = np.nan
+        self._cycles = 0
         self._rms_before = np.nan
         self.learning, self.joined = True, np.isinf(join_below)
         self._join_below = join_below
         self.correction = correction
         self._smooth()  # compiles what the first chunk needs
-        self._whole[_CHUNK] = _NO_CHUNK
+        self._whole[CHUNK] = NO_CHUNK
 
     @property
     def correction(self) -> Correction:
@@ -290,19 +138,19 @@ class RepetitiveController:
         self._replaced()
 
     def _replaced(self) -> None:
-        self._whole[_CHUNK] = _NO_CHUNK
-        self._whole[_REPLACED] = 1
+        self._whole[CHUNK] = NO_CHUNK
+        self._whole[REPLACED] = 1
 
     def memory(self) -> Array:
         """The newest value at each grid point of the cycle [m], from angle 0 on, shape (cycle,)."""
-        newest = np.arange(self._whole[_NEXT] - self._cycle, self._whole[_NEXT])
+        newest = np.arange(self._whole[NEXT] - self._cycle, self._whole[NEXT])
         points = np.empty(self._cycle)
         points[newest % self._cycle] = self._memory[newest & (self._memory.size - 1)]
         return points
 
     def remember(self, points: Array) -> None:
         """Replace what was learned by ``points`` as `memory` gives them; the channel counts as joined."""
-        places = np.arange(self._memory.size) + self._whole[_NEXT] - self._memory.size
+        places = np.arange(self._memory.size) + self._whole[NEXT] - self._memory.size
         self._memory[places & (self._memory.size - 1)] = points[places % self._cycle]
         self._replaced()
         self.joined = True
@@ -336,43 +184,53 @@ class RepetitiveController:
         """
         rates = self._correction.law is not CorrectionLaw.NONE
         lead, rate, bend = self._preview.block(first, speed, rates=rates)
-        reached, reason = 0, _SMOOTH
-        while reason in (_CYCLE_ENDED, _SMOOTH):
-            reached, reason = _run(
-                first, reached, self._delay, self._grid, self._cycle, self.learning and self.joined, self._gain,
-                self._ramp, int(self._correction.law), self._correction.looks_ahead, self._q.ratio, self._q.reach,
-                self._settings, self._chunk, self._scratch, self._memory, self._whole, self._real, angle, lead, rate, bend, past_angle, error, command,
+        angles, errors = np.empty(angle.size + 3), np.empty(angle.size + 3)
+        memory, whole, real = self._memory, self._whole, self._real
+        take(first, self._delay, self._grid / _TURN, angle, past_angle, error, whole, real, angles, errors)
+        told, reached, reason = 0, 0, SMOOTH
+        while reason in (CYCLE_ENDED, SMOOTH):
+            reached, reason = learn(
+                reached, self._delay - first, self._grid, self._cycle, self._correction.looks_ahead,
+                self.learning and self.joined, self._gain, self._ramp, self._q.ratio, self._q.reach, angle, lead,
+                angles, errors, self._sample, self._work, self._chunk, self._scratch, memory, whole, real,
             )  # fmt: skip
-            if reason == _SMOOTH:
+            if reason == SMOOTH:
                 self._smooth()
-            elif reason == _CYCLE_ENDED:
+                continue
+            law = int(self._correction.law)
+            send(
+                told, reached, law, self._grid, self._cycle, self._settings, memory, real, angle, lead, rate, bend,
+                command,
+            )  # fmt: skip
+            told = reached
+            if reason == CYCLE_ENDED:
                 yield self._end_cycle(first + reached - 1)
-        if reason == _AHEAD:
+        if reason == AHEAD:
             raise LatheError(
                 f"sample {first + reached}: the memory is read at {angle[reached]:.6g} rad before it is learned; "
                 f"the spindle turns at {speed[reached]:.5g} rad/s: reduce its speed, the lead or the feedback delay"
             )
-        if reason == _JUMPED:
+        if reason == JUMPED:
             raise LatheError(f"sample {first + reached}: the spindle angle jumps to {past_angle[reached]:.6g} rad")
 
     def _smooth(self) -> None:
         """Apply Q to the cycle before, for the chunk of grid points that learning has come to."""
         size, reach = self._q.chunk, self._q.reach
-        base = int(self._whole[_NEXT]) // size * size
+        base = int(self._whole[NEXT]) // size * size
         before = np.arange(base - self._cycle - reach, base - self._cycle + size + reach)
         self._q.smooth(self._memory[before & (self._memory.size - 1)], self._chunk)
-        self._whole[_CHUNK] = base
+        self._whole[CHUNK] = base
 
     def _end_cycle(self, sample: int) -> Cycle:
-        rms = float(np.sqrt(self._real[_CYCLE_SQUARES] / self._cycle))
-        largest = float(self._real[_CYCLE_LARGEST])
+        rms = float(np.sqrt(self._real[CYCLE_SQUARES] / self._cycle))
+        largest = float(self._real[CYCLE_LARGEST])
         contraction = rms / self._rms_before if self._rms_before > 0.0 else np.nan
-        self._whole[_CYCLE] += 1
+        self._cycles += 1
         self._rms_before = rms
-        cycle = Cycle(int(self._whole[_CYCLE]), sample, rms, largest, contraction, self.learning and self.joined)
+        cycle = Cycle(self._cycles, sample, rms, largest, contraction, self.learning and self.joined)
         if not self.joined and largest <= self._join_below:
             self.joined = True
-            self._whole[_FROM] = self._whole[_NEXT]
+            self._whole[FROM] = self._whole[NEXT]
         return cycle
 
 

@@ -11,7 +11,7 @@ from lathe_rc.cell.framing import Framer
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.stage import Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
-from lathe_rc.cell.track import Track
+from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wire import Encoder, Pool
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes.ports import BlockQueue, message_class, signal_qos
@@ -54,10 +54,9 @@ class StageNode(CellNode):
         self._tracks: dict[str, Track] = {}
         ports = [(self.topic(port.topic), port) for port in self.stage.inputs]
         for topic, port in ports:
-            fields = sorted({name for other, p in ports if other == topic for name in p.fields})
-            delay = max(p.delay for other, p in ports if other == topic)
-            self._queues[topic] = BlockQueue(topic, port.type, self.table, fields)
-            self._tracks[topic] = Track(port.type, fields, delay, self.table.block_size)
+            delays = longest_delays(p for other, p in ports if other == topic)
+            self._queues[topic] = BlockQueue(topic, port.type, self.table, sorted(delays))
+            self._tracks[topic] = Track(port.type, delays, self.table.block_size)
         self._inputs = [(self._queues[topic], self._tracks[topic], port.delay) for topic, port in ports]
         self._delayed = [port for port in self._inputs if port[2]]
         self._feedback = [self._queues[topic] for topic in dict.fromkeys(t for t, p in ports if p.delay)]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
 from lathe_rc.errors import InputError
-from lathe_rc.jit import inlined
+from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.table import read_table
 
 Array = npt.NDArray[np.float64]
@@ -208,31 +208,67 @@ def read_csv(path: Path) -> Measured:
     return Measured(np.deg2rad(angle_deg), heights_mm * 1e-3, radius)
 
 
-@inlined
-def evaluate(angle: float, height: float, heights: Array, table: Array, row: int) -> tuple[float, int]:
-    """Radius deviation [m] from a profile's table, shape (m, n, 4): cubic in the angle, linear in the height.
+@kernel
+def height_along(feed: float, start: float, part: int, angle: Array, height: Array) -> None:
+    """Fill the place along the part [m] at a spindle angle [rad], shape (n,).
 
-    ``row`` is where to look for the height first; it is returned as it was found: the next is not far.
+    Args:
+        feed: [m/rev].
+        start: where the part begins [m].
+        part: revolutions after which the next part begins; 0 for one endless part.
+        angle: see above.
+        height: see above.
     """
-    points = table.shape[1]
-    place = angle * (points / _TURN)
+    for k in range(angle.size):
+        turns = angle[k] / _TURN
+        if part > 0:
+            turns -= part * np.floor(turns / part)
+        height[k] = start + feed * turns
+
+
+@inlined
+def _cubic(row: Array, place: float) -> float:
+    """A row of a table, shape (n, 4), at ``place`` [interval]; n is a power of two."""
     whole = np.floor(place)
+    j = np.uint64(np.int64(whole)) & np.uint64(row.shape[0] - 1)
     u = place - whole
-    j = np.uint64(np.int64(whole)) & np.uint64(points - 1)
-    v = 0.0
-    if heights.size > 1:
-        while row > 0 and not height > heights[row]:
+    return ((row[j, 0] * u + row[j, 1]) * u + row[j, 2]) * u + row[j, 3]
+
+
+@kernel
+def deviation_along(heights: Array, table: Array, angle: Array, height: Array, deviation: Array) -> None:
+    """Fill the radius deviation [m] at angles [rad] and heights [m], shape (n,), from a `ProfileTable`.
+
+    Cubic in the angle, linear in the height, and beyond the ends of the part as at its ends.
+    """
+    per_radian = table.shape[1] / _TURN
+    last = heights.size - 1
+    row = start = 0
+    while start < angle.size:
+        # Neighbours are mostly between the same two rows: take them together.
+        while row > 0 and not height[start] >= heights[row]:
             row -= 1
-        while row < heights.size - 1 and height >= heights[row + 1]:
+        while row < last and height[start] >= heights[row + 1]:
             row += 1
-        if height > heights[row] and row < heights.size - 1:
-            v = (height - heights[row]) / (heights[row + 1] - heights[row])
-    value = ((table[row, j, 0] * u + table[row, j, 1]) * u + table[row, j, 2]) * u + table[row, j, 3]
-    if v > 0.0:
-        above = row + 1
-        over = ((table[above, j, 0] * u + table[above, j, 1]) * u + table[above, j, 2]) * u + table[above, j, 3]
-        value += v * (over - value)
-    return float(value), row
+        stop = start + 1
+        while (
+            stop < angle.size
+            and (row == 0 or height[stop] >= heights[row])
+            and (row == last or height[stop] < heights[row + 1])
+        ):
+            stop += 1
+        below = table[row]
+        if row == last:
+            for k in range(start, stop):
+                deviation[k] = _cubic(below, angle[k] * per_radian)
+        else:
+            above, low, high = table[row + 1], heights[row], heights[row + 1]
+            for k in range(start, stop):
+                place = angle[k] * per_radian
+                v = (height[k] - low) / (high - low)
+                value = _cubic(below, place)
+                deviation[k] = value + v * (_cubic(above, place) - value) if v > 0.0 else value
+        start = stop
 
 
 @dataclass(frozen=True)
@@ -249,7 +285,7 @@ class ProfileTable:
 
     Args:
         profile: the form.
-        points: intervals of the periodic cubic spline per revolution.
+        points: intervals of the periodic cubic spline per revolution, a power of two.
 
     Attributes:
         heights: [m], shape (m,).

@@ -14,8 +14,16 @@ from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import InputError
-from lathe_rc.plants.tool import desired, desired_at
-from lathe_rc.signals.profile import Harmonics, Piston, Polygon, Profile, ProfileTable, read_csv
+from lathe_rc.signals.profile import (
+    Harmonics,
+    Piston,
+    Polygon,
+    Profile,
+    ProfileTable,
+    deviation_along,
+    height_along,
+    read_csv,
+)
 
 
 class FormParameters(NodeParameters):
@@ -100,31 +108,25 @@ class Form:
 
     def block(self, inputs: Sequence[Signals], reference: Samples, expected: Samples, height: Samples) -> None:
         """Fill the desired displacement and what a controller can know of it, and the height [m], shape (n,)."""
-        parameters = self._parameters
         encoder = inputs[0]
-        if parameters.height_from == "slide":
-            desired_at(
-                self.profile.heights,
-                self.profile.table,
-                parameters.start_height,
-                inputs[1]["position"],
-                inputs[1]["measured_position"],
-                encoder["angle"],
-                encoder["angle_true"],
-                reference,
-                expected,
-                height,
-            )
-            return
-        desired(
-            self.profile.heights,
-            self.profile.table,
-            parameters.feed,
-            parameters.start_height,
-            parameters.part_revolutions,
-            encoder["angle"],
-            encoder["angle_true"],
-            reference,
-            expected,
-            height,
-        )
+        angle, angle_true = encoder["angle"], encoder["angle_true"]
+        slides = inputs[1] if self._parameters.height_from == "slide" else None
+        self._heights(angle_true, slides["position"] if slides else None, height)
+        self._deviation(angle_true, height, reference)
+        known = np.array_equal(angle, angle_true)
+        if known and (slides is None or np.array_equal(slides["position"], slides["measured_position"])):
+            expected[:] = reference
+        else:
+            self._heights(angle, slides["measured_position"] if slides else None, expected)
+            self._deviation(angle, expected.copy(), expected)
+
+    def _heights(self, angle: Samples, slide: Samples | None, height: Samples) -> None:
+        """Fill the height [m] at an angle [rad] or place of the longitudinal slide [m]."""
+        table = self._parameters
+        if slide is None:
+            height_along(table.feed, table.start_height, table.part_revolutions, angle, height)
+        else:
+            np.add(table.start_height, slide, out=height)
+
+    def _deviation(self, angle: Samples, height: Samples, deviation: Samples) -> None:
+        deviation_along(self.profile.heights, self.profile.table, angle, height, deviation)

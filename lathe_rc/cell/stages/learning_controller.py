@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Self-learning controller of one channel."""
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -225,7 +227,7 @@ class _Margins:
 
     def __init__(self, stage: LearningController) -> None:
         self._stage = stage
-        self._speeds = stage.parameters.nominal_speed / 40 * np.arange(20, 61)
+        self._speeds: list[float] = (stage.parameters.nominal_speed / 40 * np.arange(20, 61)).tolist()
         self._responses: dict[tuple[str, ...], Response] = {}
         self._suprema: dict[tuple[object, ...], float] = {}
 
@@ -248,12 +250,14 @@ class _Margins:
 
     def at(self, speed: float, model: Identified) -> float:
         """The margin at ``speed`` [rad/s], between tabulated speeds by interpolation."""
-        after = int(np.searchsorted(self._speeds, speed))
-        if not 0 < after < self._speeds.size:
+        after = bisect_left(self._speeds, speed)
+        if not 0 < after < len(self._speeds):
             return 1.0 - self._stage.loop(self._response(model)).supremum(speed)
-        beside = self._speeds[after - 1 : after + 1]
-        return 1.0 - float(np.interp(speed, beside, [self._supremum(float(s), model) for s in beside]))
+        below, above = self._speeds[after - 1], self._speeds[after]
+        lower, upper = self._supremum(below, model), self._supremum(above, model)
+        return 1.0 - ((upper - lower) / (above - below) * (speed - below) + lower)
 
 
+@lru_cache
 def _three_digits(*numbers: float) -> tuple[str, ...]:
     return tuple(f"{number:.3g}" for number in numbers)
