@@ -2,7 +2,7 @@
 """Stepping the memory of repetitive control: what is learned at the grid points, what is read between them.
 
 Samples come as blocks, grid points as they fall between samples. So a block is taken in passes: which points fall
-between which samples (`_find`), what they learn (`_learn`), and what the drive is told (`send`). The passes do
+between which samples (`find`), what they learn (`_learn`), and what the drive is told (`send`). The passes do
 the same operations in the same order as one sample after the other would, and most of them for eight at a time.
 """
 
@@ -37,7 +37,7 @@ DONE, CYCLE_ENDED, AHEAD, JUMPED, SMOOTH = 0, 1, 2, 3, 4  #: why `learn` stopped
 
 
 @inlined
-def _soft(u: float) -> float:
+def soft(u: float) -> float:
     """Rises smoothly from 0 at ``u`` = 0 to 1 at ``u`` = 1."""
     return 1.0 if u >= 1.0 else u * u * (3.0 - 2.0 * u)
 
@@ -84,7 +84,7 @@ def take(
 
 
 @kernel
-def _find(
+def find(
     start: int,
     point: int,
     stop: int,
@@ -160,7 +160,7 @@ def _learn(
         for j in range(count):
             y = smoothed[j]
             if point + j >= whole[FROM]:
-                y += delta[j] * (gain if ramp == 0.0 else gain * _soft((point + j - whole[FROM]) / ramp))
+                y += delta[j] * (gain if ramp == 0.0 else gain * soft((point + j - whole[FROM]) / ramp))
             memory[(point + j) & mask] = y
     else:
         for j in range(count):
@@ -228,7 +228,7 @@ def learn(
                 whole[CHUNK] = point // chunk.size * chunk.size
                 _smooth(whole[CHUNK], cycle, reach, ratio, memory, scratch, chunk)
             stop = min(stop, whole[CHUNK] + chunk.size)
-        k, count, reason, whole[ENDED] = _find(
+        k, count, reason, whole[ENDED] = find(
             k, point, stop, cycle, per_radian, looks_ahead, whole[ENDED], angles, angle, lead, sample, work[6]
         )
         _learn(

@@ -99,8 +99,7 @@ class RepetitiveController:
         self._grid, self._cycle, self._q, self._gain = grid, grid * revolutions, q, gain
         self._ramp = soft_start * grid
         self._preview, self._nominal, self._delay, self._step = preview, nominal, delay, step
-        # A power of two, so that a mask wraps the index; it holds a cycle and what Q needs before it.
-        self._memory = np.zeros(1 << (self._cycle + q.chunk + q.reach + 8).bit_length())
+        self._memory = np.zeros(memory_size(self._cycle, q))
         self._chunk = np.empty(q.chunk)
         self._scratch = np.empty((2, q.chunk + 2 * q.reach))
         self._sample, self._work = np.empty(PIECE, dtype=np.int64), np.empty((7, PIECE + 1))
@@ -232,6 +231,11 @@ class RepetitiveController:
             self.joined = True
             self._whole[FROM] = self._whole[NEXT]
         return cycle
+
+
+def memory_size(cycle: int, q: QFilter) -> int:
+    """Grid points that the memory of a ``cycle`` holds: with what Q needs before it, a power of two for the index."""
+    return 1 << (cycle + q.chunk + q.reach + 8).bit_length()
 
 
 def largest_feedback_delay(

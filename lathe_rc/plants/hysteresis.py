@@ -29,7 +29,7 @@ import numpy.typing as npt
 from scipy.optimize import brentq
 
 from lathe_rc.errors import InputError
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
 
@@ -38,7 +38,7 @@ THRESHOLDS = np.arange(1, 11) / 11
 WEIGHTS = np.full(10, 0.04767)
 PROPORTIONAL = 0.7617
 
-_LINEAR, _PLAYS, _BOUC_WEN, _BOUC_WEN_INVERSE = 0, 1, 2, 3
+_LINEAR, PLAYS, _BOUC_WEN, _BOUC_WEN_INVERSE = 0, 1, 2, 3  #: kinds of a `Law`
 
 
 class Law(NamedTuple):
@@ -128,8 +128,9 @@ def _needed(h: float, target: float, shape: Array) -> float:
     return float(travel + _solve(a - (beta + gamma) * h, beta + gamma, target))
 
 
-@kernel
-def _play(position: float, threshold: float, value: float) -> float:
+@inlined
+def play(position: float, threshold: float, value: float) -> float:
+    """Where a play stands after the input ``value``."""
     return min(max(position, value - threshold), value + threshold)
 
 
@@ -146,7 +147,7 @@ def plays(thresholds: Array, start: Array, value: Array) -> Array:
     for i in range(thresholds.size):
         position = start[i]
         for k in range(value.size):
-            position = _play(position, thresholds[i], value[k])
+            position = play(position, thresholds[i], value[k])
             positions[k, i] = position
     return positions
 
@@ -162,11 +163,11 @@ def advance(kind: int, table: Array, state: Array, start: int, value: float) -> 
         start: place of the operator's own state.
         value: relative input.
     """
-    if kind == _PLAYS:
+    if kind == PLAYS:
         result = table[1, 0] * value
         for i in range(1, table.shape[1]):
             place = start + i - 1
-            state[place] = _play(state[place], table[0, i], value)
+            state[place] = play(state[place], table[0, i], value)
             result += table[1, i] * state[place]
         return float(result)
     if kind in (_BOUC_WEN, _BOUC_WEN_INVERSE):
@@ -198,14 +199,14 @@ def _plays_along(table: Array, state: Array, start: int, value: Array, result: A
         pa, pb, pc, pd, pe = p[i], p[i + 1], p[i + 2], p[i + 3], p[i + 4]
         for k in range(value.size):
             u = value[k]
-            a, b, c, d, e = _play(a, ra, u), _play(b, rb, u), _play(c, rc, u), _play(d, rd, u), _play(e, re, u)
+            a, b, c, d, e = play(a, ra, u), play(b, rb, u), play(c, rc, u), play(d, rd, u), play(e, re, u)
             result[k] = result[k] + pa * a + pb * b + pc * c + pd * d + pe * e
         state[j], state[j + 1], state[j + 2], state[j + 3], state[j + 4] = a, b, c, d, e
         i += 5
     while i < r.size:
         a, ra, pa = state[start + i - 1], r[i], p[i]
         for k in range(value.size):
-            a = _play(a, ra, value[k])
+            a = play(a, ra, value[k])
             result[k] += pa * a
         state[start + i - 1] = a
         i += 1
@@ -214,7 +215,7 @@ def _plays_along(table: Array, state: Array, start: int, value: Array, result: A
 @kernel
 def advance_along(kind: int, table: Array, state: Array, start: int, value: Array, result: Array) -> None:
     """`advance` for a block: fills ``result`` from ``value``, shape (n,), two arrays of their own."""
-    if kind == _PLAYS:
+    if kind == PLAYS:
         _plays_along(table, state, start, value, result)
     else:
         for k in range(value.size):
@@ -244,7 +245,7 @@ def check_thresholds(thresholds: Array) -> None:
 
 def _weighted(thresholds: Array, weights: Array, proportional: float, state: Array) -> tuple[Law, Array, float]:
     table = np.stack((np.append(0.0, thresholds), np.append(proportional, weights)))
-    return Law(_PLAYS, table), state, float(np.cumsum(table[1]).max())
+    return Law(PLAYS, table), state, float(np.cumsum(table[1]).max())
 
 
 class PrandtlIshlinskii(_Operator):

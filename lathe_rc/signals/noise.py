@@ -27,10 +27,14 @@ class Sensor:
         resolution: quantisation step, in the unit of the signal.
         seed: the scenario's seed.
         name: who measures; makes the noise of each sensor its own.
+
+    Attributes:
+        disturbs: False if it measures what is true.
     """
 
     def __init__(self, noise_rms: float, resolution: float, seed: int, name: str) -> None:
         self._noise_rms, self._resolution = noise_rms, resolution
+        self.disturbs = noise_rms > 0.0 or resolution > 0.0
         # A stream of normal numbers does not depend on the lengths in which it is drawn.
         self._random = np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
 

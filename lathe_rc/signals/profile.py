@@ -232,7 +232,7 @@ def _cubic(row: Array, place: float) -> float:
     whole = np.floor(place)
     j = np.uint64(np.int64(whole)) & np.uint64(row.shape[0] - 1)
     u = place - whole
-    return ((row[j, 0] * u + row[j, 1]) * u + row[j, 2]) * u + row[j, 3]
+    return float(((row[j, 0] * u + row[j, 1]) * u + row[j, 2]) * u + row[j, 3])
 
 
 @kernel

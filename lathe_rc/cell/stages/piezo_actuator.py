@@ -124,6 +124,7 @@ class PiezoActuator(Drive):
     Attributes:
         parameters: its table.
         drive: the machine.
+        set_point: what it is asked for.
     """
 
     kind = "piezo_actuator"
@@ -140,10 +141,10 @@ class PiezoActuator(Drive):
             step=parameters.step,
             method=parameters.discretisation,
         )
-        self._set_point = SetPoint(name, parameters)
+        self.set_point = SetPoint(name, parameters)
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         self.declare(
-            inputs=self._set_point.inputs,
+            inputs=self.set_point.inputs,
             outputs=[Output("fine/state", messages.STATE, Joint("position", "velocity", "effort"))],
         )
 
@@ -155,7 +156,7 @@ class PiezoActuator(Drive):
         """See `Stage`."""
         (state,) = outputs
         set_point = np.empty_like(state["position"])
-        self._set_point.fill(inputs, set_point)
+        self.set_point.fill(inputs, set_point)
         self.drive.block(set_point, state["position"], state["velocity"], state["effort"])
         self._sensor.measure(state["position"], state["measured_position"])
         return []
