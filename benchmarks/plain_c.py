@@ -129,7 +129,7 @@ class PlainC:
 
     def __init__(self, library: ctypes.CDLL, cell: Cell, chunk: int) -> None:
         self._library, self._chunk = library, chunk
-        self._arrays: list[Array] = []  # keeps alive what the structures point to
+        self._arrays: list[npt.NDArray[Any]] = []  # keeps alive what the structures point to
         stages = cell.stages
         coarse, fine = stages["learning_controller"], stages["fine_controller"]
         drive, piezo, tool = stages["electrodynamic_actuator"], stages["piezo_actuator"], stages["tool"]
@@ -151,9 +151,9 @@ class PlainC:
             piezo=self._piezo(piezo),
             form=self._form(tool),
         )
-        self.signals: dict[tuple[str, str], Array] = {}
+        self.signals: dict[tuple[str, str], npt.NDArray[Any]] = {}
         for key in _NAMES:
-            whole = np.zeros(delay + chunk, np.uint8 if key[1] == "index_pulse" else np.float64)
+            whole: npt.NDArray[Any] = np.zeros(delay + chunk, np.uint8 if key[1] == "index_pulse" else np.float64)
             self._arrays.append(whole)
             self.signals[key] = whole[delay:]
             setattr(self._cell.signals, ".".join(key), whole.ctypes.data + delay * whole.itemsize)

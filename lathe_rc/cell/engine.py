@@ -42,7 +42,10 @@ class Engine:
         for topic, source in cell.dense.items():
             delays = dict.fromkeys(sample_fields(source.type), 0) | longest_delays(cell.inputs(topic))
             tracks[topic] = Track(source.type, delays, self._chunk)
-        self._stages = [_Wired(stage, tracks) for stage in cell.stages.values()]
+        self._stages = [
+            (stage, Ports(stage, tracks), {topic: remapped(stage.shared, topic) for topic in stage.sparse_topics})
+            for stage in cell.stages.values()
+        ]
         for stage in cell.stages.values():
             compile_kernels(stage)
 
@@ -53,14 +56,15 @@ class Engine:
             samples = min(self._chunk, self.samples - first)
             dense: dict[str, Signals] = {}
             sparse: dict[str, list[Sparse]] = {}
-            for wired in self._stages:
-                wired.advance(first, samples, dense, sparse)
+            for stage, ports, topics in self._stages:
+                for message in stage.advance(first, *ports.open(first, samples, dense)):
+                    sparse.setdefault(topics[message.topic], []).append(message)
             for sink in receivers:
                 sink.chunk(first, samples, dense, sparse)
 
 
-class _Wired:
-    """A stage with the tracks that it reads and writes.
+class Ports:
+    """The tracks that a stage reads and writes.
 
     Args:
         stage: the stage.
@@ -68,18 +72,15 @@ class _Wired:
     """
 
     def __init__(self, stage: Stage, tracks: Mapping[str, Track]) -> None:
-        self._stage = stage
         self._inputs = [(tracks[remapped(stage.shared, port.topic)], port.delay) for port in stage.inputs]
         topics = [remapped(stage.shared, port.topic) for port in stage.outputs]
         self._outputs = [(topic, tracks[topic]) for topic in topics]
-        self._sparse = {topic: remapped(stage.shared, topic) for topic in stage.sparse_topics}
 
-    def advance(self, first: int, samples: int, dense: dict[str, Signals], sparse: dict[str, list[Sparse]]) -> None:
-        """Compute a chunk and add what comes out to ``dense`` and ``sparse``."""
+    def open(self, first: int, samples: int, dense: dict[str, Signals]) -> tuple[list[Signals], list[Signals]]:
+        """Inputs and outputs of the samples ``first`` on; the outputs are added to ``dense`` too."""
         inputs = [track.view(first - delay, samples) for track, delay in self._inputs]
         outputs = []
         for topic, track in self._outputs:
             dense[topic] = track.extend(samples)
             outputs.append(dense[topic])
-        for message in self._stage.advance(first, inputs, outputs):
-            sparse.setdefault(self._sparse[message.topic], []).append(message)
+        return inputs, outputs

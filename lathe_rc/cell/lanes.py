@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.cell.engine import Ports
 from lathe_rc.cell.messages import MAX_BLOCK, Signals, sample_fields
 from lathe_rc.cell.stages.lanes import LaneStage, lane_stage, same
 from lathe_rc.cell.track import Track, longest_delays
@@ -52,7 +53,7 @@ class Lanes:
         block = first.master.shared.block_size
         room = max(_SAMPLES // len(cells), block)
         self._chunk = max(block, min(first.shortest_feedback or MAX_BLOCK, MAX_BLOCK, room) // block * block)
-        self._stages: list[_Wired] = []
+        self._stages: dict[str, LaneStage[Any]] = {}
         tracks: dict[str, Track] = {}
         shared: set[str] = set()
         for name, stage in first.stages.items():
@@ -64,9 +65,8 @@ class Lanes:
                 tracks[topic] = Track(port.type, delays, self._chunk, len(cells), lanes.shared)
                 if set(fields) <= set(lanes.shared):
                     shared.add(topic)
-            self._stages.append(_Wired(name, lanes))
-        for wired in self._stages:
-            wired.connect(tracks)
+            self._stages[name] = lanes
+        self._ports = {name: Ports(stage, tracks) for name, stage in first.stages.items()}
 
     def run(self, sinks: Iterable[LaneSink] = ()) -> None:
         """Run to the end."""
@@ -74,17 +74,17 @@ class Lanes:
         for first in range(0, self.samples, self._chunk):
             samples = min(self._chunk, self.samples - first)
             dense: dict[str, Signals] = {}
-            for wired in self._stages:
-                wired.advance(first, samples, dense)
+            for name, stage in self._stages.items():
+                stage.process(first, *self._ports[name].open(first, samples, dense))
             for sink in receivers:
                 sink.chunk(first, samples, dense)
 
     def curves(self) -> dict[str, tuple[Array, Array]]:
         """Learning curves so far, by controller: RMS and largest error of each cycle [m], shape (cycles, lanes)."""
         return {
-            wired.name: (np.array([rms for rms, _ in wired.stage.curve]), np.array([m for _, m in wired.stage.curve]))
-            for wired in self._stages
-            if wired.stage.curve
+            name: (np.array([rms for rms, _ in stage.curve]), np.array([largest for _, largest in stage.curve]))
+            for name, stage in self._stages.items()
+            if stage.curve
         }
 
 
@@ -99,28 +99,3 @@ def _check(lane: int, first: Cell, cell: Cell) -> None:
             raise InputError(f"lane {lane}: {name} has another remap or block_size than in lane 0; run it by itself")
     if not same(first.master.shared, cell.master.shared):
         raise InputError(f"lane {lane}: {first.master.name} differs from lane 0; lanes turn on one spindle")
-
-
-class _Wired:
-    """A stage in all lanes with the tracks that it reads and writes."""
-
-    def __init__(self, name: str, stage: LaneStage[Any]) -> None:
-        self.name, self.stage = name, stage
-        self._inputs: list[tuple[Track, int]] = []
-        self._outputs: list[tuple[str, Track]] = []
-
-    def connect(self, tracks: Mapping[str, Track]) -> None:
-        """Find the tracks, when all are there."""
-        one = self.stage.stages[0]
-        self._inputs = [(tracks[remapped(one.shared, port.topic)], port.delay) for port in one.inputs]
-        topics = [remapped(one.shared, port.topic) for port in one.outputs]
-        self._outputs = [(topic, tracks[topic]) for topic in topics]
-
-    def advance(self, first: int, samples: int, dense: dict[str, Signals]) -> None:
-        """Compute a chunk and add what comes out to ``dense``."""
-        inputs = [track.view(first - delay, samples) for track, delay in self._inputs]
-        outputs = []
-        for topic, track in self._outputs:
-            dense[topic] = track.extend(samples)
-            outputs.append(dense[topic])
-        self.stage.process(first, inputs, outputs)

@@ -7,7 +7,7 @@ and those with options that the kernels leave out, run lane by lane (`Separate`)
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -349,5 +349,5 @@ def lane_stage(stages: Sequence[Stage], *, shared: bool) -> LaneStage[Any]:
         return Shared(stages)
     for kind, lanes, fits in _LANES:
         if isinstance(stages[0], kind) and fits(stages):
-            return lanes(stages)
+            return cast("LaneStage[Any]", lanes(stages))
     return Separate(stages)

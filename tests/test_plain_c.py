@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The engine's arithmetic written a second time, in plain C."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks import engine
+
+
+def test_plain_c_gives_the_same_bits():
+    assert engine.difference(25.0) == ""
