@@ -3,7 +3,7 @@
 
 The same arithmetic stands in benchmarks/c/cell.c, one sample after the other, compiled with -O3 -march=native; with
 -ffp-contract=off it gives the same bits, which is checked here. Sides take turns on the same run: the engine, C, C with
-contraction, and 16 cells in lanes. A ratio is the speed of the engine over that of C, so 1 is as fast as C. The engine
+contraction, and 32 cells in lanes. A ratio is the speed of the engine over that of C, so 1 is as fast as C. The engine
 also makes its joint states, learning status and stability margins, which C does not.
 """
 
@@ -23,7 +23,7 @@ from lathe_rc.cell.lanes import Lanes
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
 
-LANES = 16
+LANES = 32
 _CHUNK = 3200
 #: beside config/two_channel.yaml: what the C has too, and what it leaves out
 OVERRIDES = (

@@ -235,23 +235,19 @@ class Stage(ABC):
             return []
 
         # Copies: the block's own arrays are used again.
-        position, velocity, effort = (signals[name][start::period].copy() if name else None for name in joint)
-        assert position is not None
-        topic = f"{self.name}/joint_states"
-        return [
-            Sparse(
-                topic,
-                messages.JOINTS,
-                first + start + k * period,
-                {
-                    "name": [self.name],
-                    "position": position[k : k + 1],
-                    "velocity": _NOTHING if velocity is None else velocity[k : k + 1],
-                    "effort": _NOTHING if effort is None else effort[k : k + 1],
-                },
-            )
-            for k in range(position.size)
-        ]
+        position = signals[joint.position][start::period].copy()
+        velocity = signals[joint.velocity][start::period].copy() if joint.velocity else None
+        effort = signals[joint.effort][start::period].copy() if joint.effort else None
+        topic, found = f"{self.name}/joint_states", []
+        for k in range(position.size):
+            values = {
+                "name": [self.name],
+                "position": position[k : k + 1],
+                "velocity": _NOTHING if velocity is None else velocity[k : k + 1],
+                "effort": _NOTHING if effort is None else effort[k : k + 1],
+            }
+            found.append(Sparse(topic, messages.JOINTS, first + start + k * period, values))
+        return found
 
     def perform(self, action: str) -> None:
         """Carry out an event; the samples from now on feel it.

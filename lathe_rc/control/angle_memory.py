@@ -2,7 +2,7 @@
 """Stepping the memory of repetitive control: what is learned at the grid points, what is read between them.
 
 Samples come as blocks, grid points as they fall between samples. So a block is taken in passes: which points fall
-between which samples (`find`), what they learn (`_learn`), and what the drive is told (`send`). The passes do
+between which samples (`find`), what they learn (`_learn_piece`), and what the drive is told (`_send`). The passes do
 the same operations in the same order as one sample after the other would, and most of them for eight at a time.
 """
 
@@ -43,7 +43,7 @@ def soft(u: float) -> float:
 
 
 @kernel
-def take(
+def _take(
     first: int,
     delay: int,
     per_radian: float,
@@ -128,7 +128,7 @@ def find(
 
 
 @kernel
-def _learn(
+def _learn_piece(
     point: int,
     count: int,
     cycle: int,
@@ -187,7 +187,7 @@ def _smooth(base: int, cycle: int, reach: int, ratio: float, memory: Array, scra
 
 
 @kernel
-def learn(
+def _learn(
     start: int,
     arrives: int,
     grid: int,
@@ -210,11 +210,7 @@ def learn(
     whole: Integers,
     real: Array,
 ) -> tuple[int, int]:
-    """Learn from sample ``start`` of the block until something has to be done outside.
-
-    Returns the sample that is reached and why: `DONE` at the end of the block, `CYCLE_ENDED` after the sample in
-    which one ended, `SMOOTH` where the next chunk of the smoothed cycle is wanted, and the errors.
-    """
+    """Learn from sample ``start`` of the block until something has to be done outside; see `step`."""
     per_radian = grid / _TURN
     k = max(start, min(arrives, angle.size))
     reason = DONE
@@ -231,7 +227,7 @@ def learn(
         k, count, reason, whole[ENDED] = find(
             k, point, stop, cycle, per_radian, looks_ahead, whole[ENDED], angles, angle, lead, sample, work[6]
         )
-        _learn(
+        _learn_piece(
             point, count, cycle, learning, gain, ramp, sample, work[6], angles, errors, work, chunk, memory, whole, real
         )
         whole[NEXT] += count
@@ -274,7 +270,7 @@ def _command(
 
 
 @kernel
-def send(
+def _send(
     start: int,
     stop: int,
     law: int,
@@ -287,6 +283,7 @@ def send(
     lead: Array,
     rate: Array,
     bend: Array,
+    work: Array,
     told: Array,
 ) -> None:
     """Fill the set points of the drive ``told`` of some samples of the block.
@@ -295,8 +292,57 @@ def send(
     """
     per_radian = grid / _TURN
     if law == 0:
-        read_along(memory, per_radian, cycle, angle[start:stop], lead[start:stop], told[start:stop])
+        read_along(memory, per_radian, cycle, angle[start:stop], lead[start:stop], work, told[start:stop])
         return
     for k in range(start, stop):
         place = (angle[k] + lead[k]) * per_radian - cycle
         told[k] = _command(law, per_radian, place, rate[k], bend[k], settings, memory, real)
+
+
+@kernel
+def step(
+    first: int,
+    start: int,
+    begins: bool,  # noqa: FBT001 - kernels take their arguments by position
+    delay: int,
+    grid: int,
+    cycle: int,
+    looks_ahead: int,
+    learning: bool,  # noqa: FBT001
+    gain: float,
+    ramp: float,
+    ratio: float,
+    reach: int,
+    law: int,
+    settings: Array,
+    angle: Array,
+    lead: Array,
+    rate: Array,
+    bend: Array,
+    past_angle: Array,
+    error: Array,
+    windows: Array,
+    sample: Integers,
+    work: Array,
+    chunk: Array,
+    scratch: Array,
+    memory: Array,
+    whole: Integers,
+    real: Array,
+    told: Array,
+) -> tuple[int, int]:
+    """Step from sample ``start`` of a block, whose first one is sample ``first`` of the run, until it needs help.
+
+    Returns the sample that is reached and why: `DONE` at the end of the block, `CYCLE_ENDED` after the sample in
+    which one ended, `SMOOTH` where the next chunk of the smoothed cycle is wanted, and the errors. The block
+    ``begins`` in the first call for it.
+    """
+    angles, errors = windows[0, : angle.size + 3], windows[1, : angle.size + 3]
+    if begins:
+        _take(first, delay, grid / _TURN, angle, past_angle, error, whole, real, angles, errors)
+    reached, reason = _learn(
+        start, delay - first, grid, cycle, looks_ahead, learning, gain, ramp, ratio, reach, angle, lead, angles,
+        errors, sample, work, chunk, scratch, memory, whole, real,
+    )  # fmt: skip
+    _send(start, reached, law, grid, cycle, settings, memory, real, angle, lead, rate, bend, work, told)
+    return reached, reason

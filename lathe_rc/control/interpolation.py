@@ -27,17 +27,24 @@ def read(ring: Array, i: int, u: float) -> float:
 
 
 @kernel
-def read_along(ring: Array, per_radian: float, back: int, angle: Array, lead: Array, value: Array) -> None:
-    """Fill ``value`` with `read` at the place of ``angle`` + ``lead`` [rad], ``back`` points before it; shape (n,)."""
+def read_along(ring: Array, per_radian: float, back: int, angle: Array, lead: Array, tile: Array, value: Array) -> None:
+    """Fill ``value`` with `read` at the place of ``angle`` + ``lead`` [rad], ``back`` points before it; shape (n,).
+
+    ``tile``, shape (5 or more, m), is scratch: the points are fetched m at a time and then interpolated as vectors.
+    """
     mask = np.uint64(ring.size - 1)  # without a sign there is no look whether an index counts from the end
     one, two = np.uint64(1), np.uint64(2)
-    for k in range(value.size):
-        place = (angle[k] + lead[k]) * per_radian - back
-        left = np.floor(place)
-        i = np.uint64(np.int64(left))
-        value[k] = cubic(
-            ring[(i - one) & mask], ring[i & mask], ring[(i + one) & mask], ring[(i + two) & mask], place - left
-        )
+    for start in range(0, value.size, tile.shape[1]):
+        size = min(tile.shape[1], value.size - start)
+        for j in range(size):
+            place = (angle[start + j] + lead[start + j]) * per_radian - back
+            left = np.floor(place)
+            i = np.uint64(np.int64(left))
+            tile[0, j], tile[1, j] = ring[(i - one) & mask], ring[i & mask]
+            tile[2, j], tile[3, j] = ring[(i + one) & mask], ring[(i + two) & mask]
+            tile[4, j] = place - left
+        for j in range(size):
+            value[start + j] = cubic(tile[0, j], tile[1, j], tile[2, j], tile[3, j], tile[4, j])
 
 
 @kernel

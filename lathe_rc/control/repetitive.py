@@ -31,9 +31,7 @@ from lathe_rc.control.angle_memory import (
     REALS,
     REPLACED,
     SMOOTH,
-    learn,
-    send,
-    take,
+    step,
 )
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.lead import Preview
@@ -102,6 +100,7 @@ class RepetitiveController:
         self._memory = np.zeros(memory_size(self._cycle, q))
         self._chunk = np.empty(q.chunk)
         self._scratch = np.empty((2, q.chunk + 2 * q.reach))
+        self._windows = np.empty((2, 3))
         self._sample, self._work = np.empty(PIECE, dtype=np.int64), np.empty((7, PIECE + 1))
         self._whole = np.zeros(INTEGERS, dtype=np.int64)
         self._real = np.zeros(REALS)
@@ -183,26 +182,20 @@ class RepetitiveController:
         """
         rates = self._correction.law is not CorrectionLaw.NONE
         lead, rate, bend = self._preview.block(first, speed, rates=rates)
-        angles, errors = np.empty(angle.size + 3), np.empty(angle.size + 3)
-        memory, whole, real = self._memory, self._whole, self._real
-        take(first, self._delay, self._grid / _TURN, angle, past_angle, error, whole, real, angles, errors)
-        told, reached, reason = 0, 0, SMOOTH
+        if self._windows.shape[1] < angle.size + 3:
+            self._windows = np.empty((2, angle.size + 3))
+        reached, reason, begins = 0, SMOOTH, True
         while reason in (CYCLE_ENDED, SMOOTH):
-            reached, reason = learn(
-                reached, self._delay - first, self._grid, self._cycle, self._correction.looks_ahead,
-                self.learning and self.joined, self._gain, self._ramp, self._q.ratio, self._q.reach, angle, lead,
-                angles, errors, self._sample, self._work, self._chunk, self._scratch, memory, whole, real,
+            reached, reason = step(
+                first, reached, begins, self._delay, self._grid, self._cycle, self._correction.looks_ahead,
+                self.learning and self.joined, self._gain, self._ramp, self._q.ratio, self._q.reach,
+                int(self._correction.law), self._settings, angle, lead, rate, bend, past_angle, error, self._windows,
+                self._sample, self._work, self._chunk, self._scratch, self._memory, self._whole, self._real, command,
             )  # fmt: skip
+            begins = False
             if reason == SMOOTH:
                 self._smooth()
-                continue
-            law = int(self._correction.law)
-            send(
-                told, reached, law, self._grid, self._cycle, self._settings, memory, real, angle, lead, rate, bend,
-                command,
-            )  # fmt: skip
-            told = reached
-            if reason == CYCLE_ENDED:
+            elif reason == CYCLE_ENDED:
                 yield self._end_cycle(first + reached - 1)
         if reason == AHEAD:
             raise LatheError(

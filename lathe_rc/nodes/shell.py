@@ -4,6 +4,7 @@
 import json
 import os
 import time
+import traceback
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -103,6 +104,10 @@ class CellNode(LifecycleNode):
             step()
         except LatheError as error:
             self.fail(error)
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:  # noqa: BLE001 - rclpy would swallow it, and the cell wait for a node that is not there
+            self.get_logger().error(traceback.format_exc())
+            self.fail(LatheError(f"{self.get_name()}: {type(error).__name__}: {error}"))
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 

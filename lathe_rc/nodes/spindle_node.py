@@ -166,8 +166,8 @@ class SpindleNode(StageNode):
                     return
                 late = now - due
                 self._lateness.add(late)
-                if late > size * step / factor:
-                    # The schedule slips by the time lost: no burst to catch up.
+                if late > max(1, self.table.window // 2) * size * step / factor:
+                    # Less is made up by the next blocks. The schedule slips by more: no long burst to catch up.
                     self._schedule += late
                     self.slipped += late
             rest = size if self.stage.samples is None else self.stage.samples - self.samples

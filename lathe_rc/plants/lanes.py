@@ -72,36 +72,17 @@ def electrodynamic(
 
 
 @kernel
-def _plays(table: Array, state: Array, value: Array, result: Array) -> None:
-    """Plays of one sample: ``table`` is (2, m + 1, lanes), ``state`` (m, lanes), ``value`` (lanes,)."""
-    lanes = value.size
-    for lane in range(lanes):
-        result[lane] = table[1, 0, lane] * value[lane]
-    i = 0
-    while i + 4 < state.shape[0]:
+def _plays_along(table: Array, state: Array, value: Array, result: Array) -> None:
+    """Plays: ``table`` is (2, m + 1, lanes), ``state`` (m, lanes), ``value`` and ``result`` (n, lanes)."""
+    lanes = value.shape[1]
+    for k in range(value.shape[0]):
         for lane in range(lanes):
-            u = value[lane]
-            a = play(state[i, lane], table[0, i + 1, lane], u)
-            b = play(state[i + 1, lane], table[0, i + 2, lane], u)
-            c = play(state[i + 2, lane], table[0, i + 3, lane], u)
-            d = play(state[i + 3, lane], table[0, i + 4, lane], u)
-            e = play(state[i + 4, lane], table[0, i + 5, lane], u)
-            state[i, lane], state[i + 1, lane], state[i + 2, lane], state[i + 3, lane] = a, b, c, d
-            state[i + 4, lane] = e
-            result[lane] = (
-                result[lane]
-                + table[1, i + 1, lane] * a
-                + table[1, i + 2, lane] * b
-                + table[1, i + 3, lane] * c
-                + table[1, i + 4, lane] * d
-                + table[1, i + 5, lane] * e
-            )
-        i += 5
-    while i < state.shape[0]:
-        for lane in range(lanes):
-            state[i, lane] = play(state[i, lane], table[0, i + 1, lane], value[lane])
-            result[lane] += table[1, i + 1, lane] * state[i, lane]
-        i += 1
+            result[k, lane] = table[1, 0, lane] * value[k, lane]
+        for i in range(state.shape[0]):
+            for lane in range(lanes):
+                at = play(state[i, lane], table[0, i + 1, lane], value[k, lane])
+                state[i, lane] = at
+                result[k, lane] += table[1, i + 1, lane] * at
 
 
 @kernel
@@ -124,36 +105,75 @@ def piezo(
 ) -> None:
     """Step drives with plays and without creep through a block; signals have the shape (n, lanes).
 
-    ``lag`` has the rows decay, now, before; ``state`` the rows amplifier, its last input, last extension, x, v.
+    ``lag`` has the rows decay, now, before; ``state`` the rows amplifier, its last input, last extension, x, v. Each
+    loop over the lanes uses few arrays: the compiler makes vectors of it only if it can tell them apart quickly.
     """
-    lanes = set_point.shape[1]
-    value, result = np.empty(lanes), np.empty(lanes)
-    for k in range(set_point.shape[0]):
-        for lane in range(lanes):
-            value[lane] = min(max(set_point[k, lane] / stroke[lane], -1.0), 1.0)
-        _plays(inverse, inverse_state, value, result)
-        for lane in range(lanes):
-            cut = set_point[k, lane] / stroke[lane] != value[lane] or abs(result[lane]) > 1.0 + _ROUNDING
+    samples = set_point.shape[0]
+    # Row 0 holds what was before the block.
+    value, result = np.empty((samples + 1, stroke.size)), np.empty((samples + 1, stroke.size))
+    _clip(set_point, stroke, value[1:])
+    _plays_along(inverse, inverse_state, value[1:], result[1:])
+    for k in range(samples):
+        for lane in range(stroke.size):
+            cut = set_point[k, lane] / stroke[lane] != value[k + 1, lane] or abs(result[k + 1, lane]) > 1.0 + _ROUNDING
             saturated[lane] += cut
-            applied = min(max(result[lane], -1.0), 1.0)
-            value[lane] = lag[0, lane] * state[0, lane] + lag[1, lane] * applied + lag[2, lane] * state[1, lane]
-            state[0, lane], state[1, lane] = value[lane], applied
-        _plays(forward, forward_state, value, result)
-        for lane in range(lanes):
-            extension, before = stroke[lane] * result[lane], state[2, lane]
-            x, v = state[3, lane], state[4, lane]
-            new_x = (
-                transition[0, 0, lane] * x
-                + transition[0, 1, lane] * v
-                + weights[0, 0, lane] * extension
-                + weights[0, 1, lane] * before
+    value[0] = state[1]
+    _clip(result[1:], np.ones(stroke.size), value[1:])
+    result[0] = state[0]
+    _amplify(lag, value, result)
+    state[0], state[1] = result[samples], value[samples]
+    _plays_along(forward, forward_state, result[1:], value[1:])
+    _scale(result[1:], full_voltage, voltage)
+    value[0] = state[2]
+    _scale(value[1:], stroke, value[1:])
+    _resonate(transition, weights, value, state[3], state[4], position, velocity)
+    state[2] = value[samples]
+
+
+@kernel
+def _clip(signal: Array, limit: Array, within: Array) -> None:
+    """A signal relative to a limit, held within it."""
+    for k in range(signal.shape[0]):
+        for lane in range(limit.size):
+            within[k, lane] = min(max(signal[k, lane] / limit[lane], -1.0), 1.0)
+
+
+@kernel
+def _scale(signal: Array, by: Array, scaled: Array) -> None:
+    for k in range(signal.shape[0]):
+        for lane in range(by.size):
+            scaled[k, lane] = by[lane] * signal[k, lane]
+
+
+@kernel
+def _amplify(lag: Array, applied: Array, voltage: Array) -> None:
+    """The amplifier's lag; row 0 of both is what was before the block."""
+    for k in range(1, voltage.shape[0]):
+        for lane in range(voltage.shape[1]):
+            voltage[k, lane] = (
+                lag[0, lane] * voltage[k - 1, lane]
+                + lag[1, lane] * applied[k, lane]
+                + lag[2, lane] * applied[k - 1, lane]
             )
-            new_v = (
-                transition[1, 0, lane] * x
-                + transition[1, 1, lane] * v
-                + weights[1, 0, lane] * extension
-                + weights[1, 1, lane] * before
-            )
-            state[2, lane], state[3, lane], state[4, lane] = extension, new_x, new_v
-            position[k, lane], velocity[k, lane] = new_x, new_v
-            voltage[k, lane] = value[lane] * full_voltage[lane]
+
+
+@kernel
+def _resonate(
+    transition: Array, weights: Array, extension: Array, x: Array, v: Array, position: Array, velocity: Array
+) -> None:
+    """The resonance; ``extension`` has a row more before the block; ``x`` and ``v`` are changed."""
+    for k in range(position.shape[0]):
+        for lane in range(x.size):
+            position[k, lane] = transition[0, 0, lane] * x[lane] + transition[0, 1, lane] * v[lane]
+        for lane in range(x.size):
+            velocity[k, lane] = transition[1, 0, lane] * x[lane] + transition[1, 1, lane] * v[lane]
+        for lane in range(x.size):
+            now, before = extension[k + 1, lane], extension[k, lane]
+            position[k, lane] = position[k, lane] + weights[0, 0, lane] * now + weights[0, 1, lane] * before
+        for lane in range(x.size):
+            now, before = extension[k + 1, lane], extension[k, lane]
+            velocity[k, lane] = velocity[k, lane] + weights[1, 0, lane] * now + weights[1, 1, lane] * before
+        for lane in range(x.size):
+            x[lane] = position[k, lane]
+        for lane in range(x.size):
+            v[lane] = velocity[k, lane]

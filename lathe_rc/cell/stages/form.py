@@ -14,6 +14,7 @@ from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import InputError
+from lathe_rc.plants.tool import equal
 from lathe_rc.signals.profile import (
     Harmonics,
     Piston,
@@ -113,8 +114,8 @@ class Form:
         slides = inputs[1] if self._parameters.height_from == "slide" else None
         self._heights(angle_true, slides["position"] if slides else None, height)
         self._deviation(angle_true, height, reference)
-        known = np.array_equal(angle, angle_true)
-        if known and (slides is None or np.array_equal(slides["position"], slides["measured_position"])):
+        known = equal(angle, angle_true)
+        if known and (slides is None or equal(slides["position"], slides["measured_position"])):
             expected[:] = reference
         else:
             self._heights(angle, slides["measured_position"] if slides else None, expected)

@@ -4,7 +4,6 @@
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-import numpy as np
 from annotated_types import Ge, Le, MinLen
 
 from lathe_rc.cell import messages
@@ -13,6 +12,7 @@ from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
 from lathe_rc.cell.stages.form import Form, FormParameters
 from lathe_rc.errors import InputError
+from lathe_rc.plants.tool import add_drive
 
 
 class ToolParameters(FormParameters):
@@ -67,23 +67,19 @@ class Tool(Stage):
         self.declare(inputs=inputs, outputs=[Output("tool", messages.TOOL, Joint("displacement"))])
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
-        """δ = Xd - X at the true spindle angle (paper 000, Fig. 1).
-
-        What a controller can know differs: the desired form at the measured angle, less the measured motions.
-        """
+        """See `Stage` and `lathe_rc.plants.tool`."""
         (tool,), states = outputs, inputs[self._drives]
-        known, displacement = tool["measured_error"], tool["displacement"]
+        reference, known = tool["reference"], tool["measured_error"]
         if self.form is None:
             what = inputs[0]
-            tool["reference"][:], known[:], tool["height"][:] = what["reference"], what["expected"], what["height"]
+            reference[:], known[:], tool["height"][:] = what["reference"], what["expected"], what["height"]
         else:
-            self.form.block(inputs, tool["reference"], known, tool["height"])
-        displacement[:] = states[0]["position"]
-        known -= states[0]["measured_position"]
-        for state in states[1:]:
-            displacement += state["position"]
-            known -= state["measured_position"]
-        np.subtract(tool["reference"], displacement, out=tool["error"])
+            self.form.block(inputs, reference, known, tool["height"])
+        for place, state in enumerate(states):
+            add_drive(
+                place == 0, reference, known, state["position"], state["measured_position"], tool["displacement"],
+                known, tool["error"],
+            )  # fmt: skip
         if self.parameters.cross_slide:
             tool["error"] += inputs[self._drives.stop]["position"]
         if self.parameters.deflects:
