@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cell over ROS, everything recorded: how fast, at what cost, and how much faster than the obvious way.
+
+Cells of 5, 8 and 13 nodes (recorder included) run as fast as they can, one process a node, grouped in two processes
+(the piston: all but the recorder, and the recorder) and composed in one, for blocks of 64, 256 and 1024 samples. The
+loops of the 13 close within 64 samples, so they know no longer blocks. Of each run:
+
+- ``real_time_factor``: simulated over wall time from block 0 to the last block in the bag; the target beside it;
+- ``cpu_us_per_block``: processor time of each process in that span over the blocks of a topic, and
+  ``cpu_us_per_message``: of all together over all blocks of all topics;
+- ``latency_per_hop_us``: with one block in flight, wall time of a block over the hops that it makes: spindle,
+  controller, drive, tool, recorder, spindle again. It contains what the nodes compute.
+
+Against: the same cell with a message a sample (`benchmarks.naive.piston`), at the pace of a timer, which loses samples,
+and in lockstep; and lathe_rc itself with a SingleThreadedExecutor (`benchmarks.naive.container`).
+"""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+from benchmarks import sides
+from lathe_rc import harness, resources
+from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.wiring import Cell
+
+ROOT = Path(__file__).resolve().parents[1]
+PISTON = ("spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder")
+#: Simulated revolutions by scenario and block size.
+REVOLUTIONS = {
+    "piston": {64: 60, 256: 150, 1024: 300},
+    "vibration": {64: 30, 256: 75, 1024: 150},
+    "full_cell": {64: 10},
+}
+_DRIVES = ["spindle_encoder", "learning_controller", "electrodynamic_actuator"]
+#: Nodes that share a process where a cell is grouped; the others share another.
+GROUPS = {
+    "piston": [*_DRIVES, "tool"],
+    "vibration": [*_DRIVES, "profile", "vibration", "piezo_actuator"],
+    "full_cell": [*_DRIVES, "fine_controller", "piezo_actuator"],
+}
+TARGETS = {"processes": {64: 3, 256: 10, 1024: 25}, "composed": {64: 6, 256: 20, 1024: 60}}
+Say = Callable[[str], None]
+_HOPS = 5
+_RATE = 64000  # [Hz]
+_ROUNDS, _QUICK_SHARE = 3, 0.3
+_NAIVE = {"timer": (6000, 2000), "lockstep": (3000, 500)}  # samples by pace: in full, quick
+_PATIENCE = 60.0  # [s]
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run of a cell took.
+
+    Attributes:
+        wall_s: from block 0 to the last block in the bag.
+        samples: simulated, each of ``step`` seconds.
+        blocks: of a topic.
+        topics: that carry blocks.
+        cpu_s: in the same span, until the bag was closed, by process.
+    """
+
+    wall_s: float
+    samples: int
+    step: float
+    blocks: int
+    topics: int
+    cpu_s: Mapping[str, float]
+
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated over wall time."""
+        return self.samples * self.step / self.wall_s
+
+
+def load(name: str, **values: object) -> Scenario:
+    """A scenario with changes; ``node__parameter`` or a shared parameter."""
+    changes = [f"{key.replace('__', '.')}={value}" for key, value in values.items()]
+    return scenarios.load(resources.find(Path(f"{name}.yaml")), changes)
+
+
+def split(scenario: Scenario, name: str, arrangement: str) -> list[list[str]]:
+    """Names of the nodes in each process."""
+    if arrangement == "composed":
+        return [list(scenario.nodes)]
+    if arrangement == "processes":
+        return [[node] for node in scenario.nodes]
+    return [GROUPS[name], [node for node in scenario.nodes if node not in GROUPS[name]]]
+
+
+def cpu_s(pid: int) -> float:
+    """Processor time that a process has used so far [s]; Linux makes the clock's number from the process's."""
+    return time.clock_gettime(~pid << 3 | 2)
+
+
+@contextlib.contextmanager
+def container(**environment: str) -> Iterator[None]:
+    """Processes of cells that are started here run `benchmarks.naive.container`."""
+    start = subprocess.Popen
+    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+
+    def popen(command: Sequence[str], *, env: Mapping[str, str], **rest: Any) -> Any:
+        words = ["benchmarks.naive.container" if word == "lathe_rc.nodes.container" else word for word in command]
+        return start(words, env={**env, **environment, "PYTHONPATH": os.pathsep.join(paths)}, **rest)
+
+    with mock.patch.object(subprocess, "Popen", popen):
+        yield
+
+
+def run(
+    scenario: Scenario,
+    groups: Callable[[Scenario], list[list[str]]],
+    setting: Callable[[Mapping[str, int]], None] | None = None,
+) -> Run:
+    """Run a cell, recorded to a bag that is thrown away; ``setting`` is done to its processes, by node, at block 0."""
+    before: dict[int, float] = {}
+    after: dict[int, float] = {}
+    cell = Cell(scenario.nodes)
+    with tempfile.TemporaryDirectory(prefix="lathe-bench-") as folder:
+        complete = harness.with_recorder(scenario, Path(folder) / "bag", keep=True)
+        split = groups(complete)
+        with harness.Processes(complete, split) as processes:
+
+            def watch(event: harness.Event) -> None:
+                if event["event"] == "block0":
+                    if setting:
+                        setting(processes.pids)
+                    before.update({pid: cpu_s(pid) for pid in set(processes.pids.values())})
+                elif event["event"] == "done":
+                    after[processes.pids[event["node"]]] = event["cpu_s"]
+
+            events = processes.wait_for_end(watch)
+            names = {processes.pids[group[0]]: "+".join(group) for group in split}
+    assert cell.master.samples is not None, "a run that is measured has an end"
+    return Run(
+        wall_s=(events["complete"]["monotonic_ns"] - events["block0"]["monotonic_ns"]) * 1e-9,
+        samples=cell.master.samples,
+        step=scenario.shared.step,
+        blocks=-(-cell.master.samples // scenario.shared.block_size),
+        topics=len(cell.dense),
+        cpu_s={name if len(names) > 1 else "all": after[pid] - before[pid] for pid, name in names.items()},
+    )
+
+
+def figures(runs: Sequence[Run]) -> dict[str, Any]:
+    """Speed and cost of some runs of one cell."""
+    return {
+        "real_time_factor": sides.spread([run.real_time_factor for run in runs]),
+        "cpu_us_per_block": {
+            name: sides.spread([run.cpu_s[name] / run.blocks * 1e6 for run in runs]) for name in runs[0].cpu_s
+        },
+        "cpu_us_per_message": sides.spread([sum(run.cpu_s.values()) / run.blocks / run.topics * 1e6 for run in runs]),
+    }
+
+
+def _cells(
+    name: str, sizes: Sequence[int], arrangements: Sequence[str], rounds: int, say: Say, share: float = 1.0
+) -> dict[str, Any]:
+    """A scenario for some block sizes, arranged in some ways, in turn."""
+    found: dict[str, Any] = {}
+    for size in sizes:
+        scenario = load(name, block_size=size, spindle_encoder__revolutions=share * REVOLUTIONS[name][size])
+        runs: dict[str, list[Run]] = {arrangement: [] for arrangement in arrangements}
+        for arrangement in [*arrangements] * rounds:
+            done = run(scenario, partial(split, name=name, arrangement=arrangement))
+            runs[arrangement].append(done)
+            say(f"  {name}, blocks of {size}, {arrangement}: {done.real_time_factor:.2f} x real time")
+        found[f"block_{size}"] = {each: figures(runs[each]) for each in arrangements}
+        if name == "piston":
+            for each in set(arrangements) & set(TARGETS):
+                found[f"block_{size}"][each]["target_real_time_factor"] = TARGETS[each][size]
+    return found
+
+
+def _latency(rounds: int) -> dict[str, Any]:
+    """One block of the piston in flight."""
+    scenario = load("piston", window=1, spindle_encoder__revolutions=20)
+
+    def side(arrangement: str) -> float:
+        alone = run(scenario, partial(split, name="piston", arrangement=arrangement))
+        return alone.wall_s / alone.blocks / _HOPS * 1e6
+
+    found = sides.alternate({each: partial(side, each) for each in ("processes", "composed")}, rounds)
+    return {each: sides.spread(figures) for each, figures in found.items()}
+
+
+def _executors(rounds: int) -> dict[str, Any]:
+    """The piston with either executor."""
+    scenario = load("piston", spindle_encoder__revolutions=REVOLUTIONS["piston"][64])
+
+    def side(executor: str) -> float:
+        with container(LATHE_BENCH_EXECUTOR=executor):
+            return run(scenario, partial(split, name="piston", arrangement="processes")).real_time_factor
+
+    found = sides.alternate({each: partial(side, each) for each in ("events", "single")}, rounds)
+    return {
+        "events_real_time_factor": sides.spread(found["events"]),
+        "single_threaded_real_time_factor": sides.spread(found["single"]),
+        "events_over_single_threaded_ratio": sides.ratio(found["events"], found["single"]),
+    }
+
+
+def naive(pace: str, samples: int) -> dict[str, float]:
+    """A run of the cell with a message a sample: what the recorder says."""
+    nodes = ("recorder", "tool", "drive", "controller", "spindle")
+    with contextlib.ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-bench-"))
+        paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = os.environ | {
+            "PYTHONPATH": paths,
+            "ROS_DOMAIN_ID": str(stack.enter_context(harness.free_domain())),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        }
+        children = {}
+        for name in nodes:
+            command = [sys.executable, "-m", "benchmarks.naive.piston", name, str(samples), pace, folder]
+            children[name] = stack.enter_context(
+                subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+            )
+            stack.callback(children[name].kill)
+        for child in children.values():
+            assert child.stdout, "it was opened"
+            assert child.stdout.readline() == "ready\n", "a naive node did not start"
+        spindle = children["spindle"].stdin
+        assert spindle, "it was opened"
+        spindle.write("go\n")
+        spindle.flush()
+        told = children["recorder"].communicate(timeout=_PATIENCE)[0]
+    return dict(json.loads(told))
+
+
+def _naive(ours: Callable[[], float], *, quick: bool) -> dict[str, Any]:
+    """The piston with a message a sample, beside one process a node of ours (``ours``: its real-time factor)."""
+    lost: dict[str, list[float]] = {}
+
+    def side(pace: str) -> float:
+        samples = _NAIVE[pace][quick]
+        told = naive(pace, samples)
+        lost.setdefault(pace, []).append(100 * (1 - told["tool"] / samples))
+        return told["tool"] / told["wall_s"]
+
+    paces = ["timer"] if quick else list(_NAIVE)
+    found = sides.alternate({"ours": ours} | {each: partial(side, each) for each in paces}, 1 if quick else _ROUNDS)
+    return {
+        pace: {
+            "samples_per_s": sides.spread(found[pace]),
+            "real_time_factor": sides.spread([rate / _RATE for rate in found[pace]]),
+            "samples_lost_percent": sides.spread(lost[pace]),
+            "lathe_rc_over_naive_ratio": sides.ratio(found["ours"], [rate / _RATE for rate in found[pace]]),
+        }
+        for pace in paces
+    }
+
+
+def measure(*, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
+    """All of it, 12 minutes; quick: the piston once with short and with long blocks."""
+    found: dict[str, Any] = {}
+    if quick:
+        # Short, and not the 1024 of five processes: most of the time goes into starting them.
+        found["piston_5_nodes"] = _cells("piston", [64], ["processes", "composed"], 1, say, _QUICK_SHARE)
+        found["piston_5_nodes"] |= _cells("piston", [1024], ["composed"], 1, say, _QUICK_SHARE)
+        ours = found["piston_5_nodes"]["block_64"]["processes"]["real_time_factor"]["median"]
+        say("  a message a sample")
+        return {**found, "naive": _naive(lambda: float(ours), quick=True)}
+    arrangements = ["processes", "grouped", "composed"]
+    for name, sizes in REVOLUTIONS.items():
+        count = len(harness.with_recorder(load(name), Path("bag"), keep=True).nodes)
+        found[f"{name}_{count}_nodes"] = _cells(name, list(sizes), arrangements, _ROUNDS, say)
+    say("  one block in flight")
+    found["latency_per_hop_us"] = _latency(_ROUNDS)
+    say("  executors")
+    found["executor"] = _executors(_ROUNDS)
+    say("  a message a sample")
+    scenario = load("piston", spindle_encoder__revolutions=REVOLUTIONS["piston"][64])
+    alone = partial(split, name="piston", arrangement="processes")
+    return {**found, "naive": _naive(lambda: run(scenario, alone).real_time_factor, quick=False)}
