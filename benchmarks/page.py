@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/performance.md, made from a stored result; ``./lathe bench --page`` writes it.
+"""docs/performance.md, made from a stored result; ``./lathe bench --page COMMIT`` writes it.
 
 What the parts tell of themselves comes from their docstrings, what a reader should know beyond figures from
 performance_notes.md beside this file.
@@ -26,7 +26,7 @@ _TITLES = {
     "growth": "Growth",
     "peers": "Drive and loop",
 }
-# What issue 6 asks for at least, by the dotted name of a figure; parts may also say it beside it, as target_NAME.
+# What is aimed at, by the dotted name of a figure; parts may also say it beside it, as target_NAME.
 _TARGETS = {"engine.c_ratio": 0.9, "engine.lanes_c_ratio": 3.0, "engine.real_time_factor": 150.0}
 _TARGET = "target_"
 _MOST_COLUMNS = 7  # of a table; what has more is laid on its side
@@ -283,7 +283,8 @@ def page(result: Mapping[str, Any]) -> str:
     lines = [
         "# Performance",
         "",
-        "Generated from the benchmarks of this repository; `./lathe bench --page` measures anew and writes this page.",
+        "Generated from the benchmarks of this repository: `./lathe bench` measures,",
+        "`./lathe bench --page COMMIT` writes this page.",
         "",
         f"- **Machine**: {where}; {machine.get('system', '')}, Python {machine.get('python', '?')}.",
         f"- **Commit**: `{result.get('commit', '?')}`{' (quick: rough figures)' if result.get('quick') else ''}.",

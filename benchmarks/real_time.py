@@ -6,8 +6,8 @@ Blocks of 64 samples, so one is due each millisecond. Composed for ten minutes, 
 - ``lateness_..._us``: from the moment at which a block was due to that at which the spindle let it go; its jitter
   is the standard deviation;
 - ``latency_..._us``: from there until every member has completed it, as they tell, which is every few blocks;
-- ``missed_deadlines``: blocks that went out later than a block lasts; the schedule slips when half a window was lost, so
-- ``real_time_factor`` below 1 says how much;
+- ``missed_deadlines``: blocks that went out later than a block lasts;
+- ``real_time_factor``: below 1 by what the schedule has slipped, which it does when half a window is lost;
 - ``cpu_percent``: of one core, all processes together; ``idle_...``: while the nodes wait for a member that does not
   come, and when all are ready but blocks are ten seconds apart.
 

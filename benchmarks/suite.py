@@ -53,11 +53,11 @@ def run(parts: Iterable[str], *, quick: bool, say: Say) -> dict[str, Any]:
     return result
 
 
-def store(result: Mapping[str, Any], folder: Path = STORE) -> Path:
+def store(result: Mapping[str, Any]) -> Path:
     """Keep a result under its commit; parts measured before at the same commit stay."""
-    path = folder / f"{result['commit']}{'-quick' if result['quick'] else ''}.json"
+    path = STORE / f"{result['commit']}{'-quick' if result['quick'] else ''}.json"
     before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    folder.mkdir(parents=True, exist_ok=True)
+    STORE.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({**before, **result}, indent=1) + "\n", encoding="utf-8")
     return path
 

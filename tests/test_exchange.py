@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the nodes of one process hand over to each other."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ rclpy = pytest.importorskip("rclpy")
 from lathe_rc_msgs.msg import Progress  # noqa: E402 - only where there is ROS 2
 
 from lathe_rc.harness import free_domain  # noqa: E402
+from lathe_rc.nodes import spindle_node  # noqa: E402
 from lathe_rc.nodes.exchange import Exchange  # noqa: E402
 from lathe_rc.nodes.report import Reporter  # noqa: E402
 from lathe_rc.nodes.spindle_node import SpindleNode  # noqa: E402
@@ -74,3 +77,31 @@ def test_a_sample_that_is_not_finite_is_refused_where_it_is_made(spindle, monkey
     monkeypatch.setattr(spindle.stage, "process", spoil)
     with pytest.raises(LatheError, match="/encoder: /spindle_encoder sends speed = nan at sample 5; allowed: finite"):
         spindle._begin()
+
+
+def test_a_transition_that_breaks_fails_the_node(spindle, monkeypatch):
+    """rclpy swallows what a transition raises; the others would wait for a node that never comes."""
+
+    def breaks():
+        raise StopIteration("no types")
+
+    monkeypatch.setattr(spindle, "activate_part", breaks)
+    spindle.trigger_activate()
+    assert str(spindle.failure) == "spindle_encoder: StopIteration: no types"
+
+
+def test_the_schedule_makes_up_half_a_window_and_slips_by_more(spindle, monkeypatch):
+    now = 100.0
+    monkeypatch.setattr(spindle_node, "time", SimpleNamespace(monotonic=lambda: now))
+    spindle.trigger_activate()
+    spindle._pace = SimpleNamespace(speed_factor=1.0)
+    spindle._begin()
+    block = 64 * spindle.table.step
+    half = spindle.table.window // 2  # of 3: one block
+    now += (1.0 + 0.9 * half) * block
+    spindle.release()
+    assert (spindle.blocks, spindle.slipped) == (1, 0.0)
+    now = 100.0 + (2.0 + 1.1 * half) * block
+    spindle.release()
+    assert spindle.blocks == 2
+    assert spindle.slipped == pytest.approx(1.1 * half * block)

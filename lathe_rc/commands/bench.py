@@ -25,15 +25,26 @@ def _suite() -> ModuleType:
     return importlib.import_module("benchmarks.suite")
 
 
-def _stored(suite: ModuleType, name: str) -> dict[str, Any]:
+def _stored(suite: ModuleType, option: str, name: str) -> dict[str, Any]:
     path = next((path for path in (Path(name), suite.STORE / f"{name}.json") if path.is_file()), None)
     if path is None:
         known = ", ".join(sorted(path.stem for path in suite.STORE.glob("*.json"))) or "none yet"
-        raise InputError(f"--against {name}: no such file or stored commit; stored: {known}")
+        raise InputError(f"{option} {name}: no such file or stored commit; stored: {known}")
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except ValueError as error:
-        raise InputError(f"--against {path}: not a result of lathe bench ({error})") from None
+        raise InputError(f"{option} {path}: not a result of lathe bench ({error})") from None
+
+
+def _write_page(suite: ModuleType, result: dict[str, Any]) -> Path:
+    """The page of a result, with its plot."""
+    docs = Path(suite.ROOT) / "docs"
+    page, growth = (importlib.import_module(f"benchmarks.{name}") for name in ("page", "growth"))
+    if "growth" in result:
+        growth.plot(result["growth"], docs / page.GROWTH_IMAGE)
+    path = docs / "performance.md"
+    path.write_text(page.page(result), encoding="utf-8")
+    return path
 
 
 def _table(suite: ModuleType, result: dict[str, Any], other: dict[str, Any] | None) -> Table:
@@ -56,8 +67,9 @@ def _table(suite: ModuleType, result: dict[str, Any], other: dict[str, Any] | No
 @click.argument("parts", nargs=-1)
 @click.option("--quick", is_flag=True, help="under a minute; rough figures")
 @click.option("--against", metavar="COMMIT|FILE", help="show the figures of a stored result beside these")
+@click.option("--page", metavar="COMMIT|FILE", help="measure nothing: make docs/performance.md of a stored result")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
-def bench(parts: tuple[str, ...], against: str | None, *, quick: bool, as_json: bool) -> None:
+def bench(parts: tuple[str, ...], against: str | None, page: str | None, *, quick: bool, as_json: bool) -> None:
     """Measure how fast lathe_rc is here, as ratios side by side; PARTS chooses some, default all.
 
     The result is kept under .lathe/bench by commit. docs/performance.md says what each figure means.
@@ -66,7 +78,10 @@ def bench(parts: tuple[str, ...], against: str | None, *, quick: bool, as_json: 
     for part in parts:
         if part not in suite.PARTS:
             raise InputError(f"lathe bench {part}; allowed: {', '.join(suite.PARTS)}")
-    other = _stored(suite, against) if against else None
+    if page:
+        click.echo(_write_page(suite, _stored(suite, "--page", page)))
+        return
+    other = _stored(suite, "--against", against) if against else None
     said = Console(stderr=True)
     chosen = parts or (suite.QUICK if quick else suite.PARTS)
     result = suite.run(chosen, quick=quick, say=lambda line: said.print(line, highlight=False))

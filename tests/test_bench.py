@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""lathe bench: the frame around the benchmarks. What they measure is nothing that a test could hold."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from lathe_rc import cli
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks import page, sides, suite
+
+RESULT = {
+    "commit": "abc",
+    "quick": False,
+    "machine": {"processor": "a processor", "cores": 2, "system": "Linux", "python": "3.11"},
+    "engine": {
+        "c_ratio": {"median": 0.95, "low": 0.9, "high": 1.0, "runs": 3},
+        "target_c_ratio": 0.9,
+        "real_time_factor": {"median": 140.0, "low": 120.0, "high": 160.0, "runs": 3},
+        "target_real_time_factor": 150.0,
+        "took_s": 1.0,
+    },
+}
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli.main, ["bench", *arguments])
+
+
+def test_sides_take_turns_and_their_rounds_belong_together():
+    order = []
+    counts = {"a": iter([1.0, 2.0, 4.0]), "b": iter([2.0, 2.0, 2.0])}
+
+    def side(name):
+        def ask():
+            order.append(name)
+            return next(counts[name])
+
+        return ask
+
+    found = sides.alternate({name: side(name) for name in counts}, 3)
+    assert order == ["a", "b"] * 3
+    assert sides.ratio(found["a"], found["b"]) == {"median": 1.0, "low": 0.5, "high": 2.0, "runs": 3}
+
+
+def test_results_are_kept_by_commit_and_parts_are_added(tmp_path, monkeypatch):
+    monkeypatch.setattr(suite, "STORE", tmp_path)
+    path = suite.store(RESULT)
+    suite.store({"commit": "abc", "quick": False, "start": {"offline_s": 2.0}})
+    kept = json.loads(path.read_text())
+    assert path.name == "abc.json"
+    assert set(kept) >= {"engine", "start"}
+    assert suite.figures(kept)["engine.c_ratio"] == 0.95
+
+
+def test_a_stored_result_is_shown_beside(tmp_path, monkeypatch):
+    monkeypatch.setattr(suite, "run", lambda *_, **__: {**RESULT, "commit": "def"})
+    monkeypatch.setattr(suite, "STORE", tmp_path)
+    old = tmp_path / "old.json"
+    old.write_text(json.dumps({**RESULT, "engine": {"c_ratio": 0.5}}))
+    shown = run("engine", "--against", str(old))
+    assert shown.exit_code == 0, shown.output
+    assert "1.9" in next(line for line in shown.output.splitlines() if "engine.c_ratio" in line)
+    assert json.loads(run("engine", "--json").output)["engine"]["c_ratio"]["median"] == 0.95
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["engin"], "lathe bench engin; allowed: engine, ros"),
+        (["--against", "no-such-commit"], "--against no-such-commit: no such file or stored commit"),
+        (["--page", "no-such-commit"], "--page no-such-commit: no such file or stored commit"),
+    ],
+)
+def test_what_is_not_there_is_one_line(arguments, words):
+    told = run(*arguments)
+    assert told.exit_code == 2
+    assert words in told.output
+
+
+def test_the_page_says_what_is_met_and_what_is_not():
+    text = page.page(RESULT)
+    assert "a processor" in text
+    assert "0.95 (0.9 … 1)" in text
+    assert "≥ 0.9: met" in text
+    assert "≥ 150: **not met**" in text
+
+
+def test_every_part_is_there():
+    for part in suite.PARTS:
+        assert (suite.ROOT / "benchmarks" / f"{part}.py").is_file()
