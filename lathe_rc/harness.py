@@ -378,7 +378,10 @@ class Processes:
             try:
                 event = self._events.get(timeout=silence)
             except queue.Empty:
-                raise LatheError(f"no node has reported anything for {silence:.0f} s{self._tails()}") from None
+                running = ", ".join(name for name in self._children if name not in self._ended)
+                raise LatheError(
+                    f"no node has reported anything for {silence:.0f} s; still running: {running}{self._tails()}"
+                ) from None
             self._newest[event["event"]] = event
             if event["event"] == "exit":
                 self._ended.add(event["node"])

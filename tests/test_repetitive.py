@@ -193,3 +193,12 @@ def test_jump_of_the_angle_is_named():
         list(
             controller.block(0, angle=angle, speed=np.ones(5), past_angle=late, error=np.zeros(5), command=np.empty(5))
         )
+
+
+@pytest.mark.parametrize("delay", [1, 60, 700])
+def test_a_block_longer_than_the_delay_is_taken_in_pieces_of_it(delay):
+    """Else the memory would be written over before it is read."""
+    _, whole, _ = learn(np.sin, 6.0, make(delay=delay), delay=delay)
+    lengths = [delay] * (whole.size // delay) + [whole.size % delay]
+    _, pieces, _ = learn(np.sin, 6.0, make(delay=delay), delay=delay, lengths=lengths)
+    assert whole.tobytes() == pieces.tobytes()

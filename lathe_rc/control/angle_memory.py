@@ -333,15 +333,16 @@ def step(
 ) -> tuple[int, int]:
     """Step from sample ``start`` of a block, whose first one is sample ``first`` of the run, until it needs help.
 
-    Returns the sample that is reached and why: `DONE` at the end of the block, `CYCLE_ENDED` after the sample in
-    which one ended, `SMOOTH` where the next chunk of the smoothed cycle is wanted, and the errors. The block
-    ``begins`` in the first call for it.
+    Returns the sample that is reached and why: `CYCLE_ENDED` after the sample in which one ended, `SMOOTH` where the
+    next chunk of the smoothed cycle is wanted, the errors, and `DONE` at the end of the block or after ``delay``
+    samples: learning further ahead of what is read would write over it. The block ``begins`` in the first call for it.
     """
     angles, errors = windows[0, : angle.size + 3], windows[1, : angle.size + 3]
     if begins:
         _take(first, delay, grid / _TURN, angle, past_angle, error, whole, real, angles, errors)
+    stop = min(angle.size, start + max(delay, 1))
     reached, reason = _learn(
-        start, delay - first, grid, cycle, looks_ahead, learning, gain, ramp, ratio, reach, angle, lead, angles,
+        start, delay - first, grid, cycle, looks_ahead, learning, gain, ramp, ratio, reach, angle[:stop], lead, angles,
         errors, sample, work, chunk, scratch, memory, whole, real,
     )  # fmt: skip
     _send(start, reached, law, grid, cycle, settings, memory, real, angle, lead, rate, bend, work, told)

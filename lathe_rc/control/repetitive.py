@@ -21,6 +21,7 @@ from lathe_rc.control.angle_memory import (
     CYCLE_ENDED,
     CYCLE_LARGEST,
     CYCLE_SQUARES,
+    DONE,
     FROM,
     INTEGERS,
     JUMPED,
@@ -185,7 +186,7 @@ class RepetitiveController:
         if self._windows.shape[1] < angle.size + 3:
             self._windows = np.empty((2, angle.size + 3))
         reached, reason, begins = 0, SMOOTH, True
-        while reason in (CYCLE_ENDED, SMOOTH):
+        while reason in (CYCLE_ENDED, SMOOTH) or (reason == DONE and reached < angle.size):
             reached, reason = step(
                 first, reached, begins, self._delay, self._grid, self._cycle, self._correction.looks_ahead,
                 self.learning and self.joined, self._gain, self._ramp, self._q.ratio, self._q.reach,
