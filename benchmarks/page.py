@@ -253,7 +253,8 @@ def _ros(found: Mapping[str, Any]) -> list[str]:
         rates = {key: {what: value for what, value in run.items() if _is_figure(value)} for key, run in runs.items()}
         nodes = {key: run["cpu_us_per_block"] for key, run in runs.items() if "cpu_us_per_block" in run}
         lines += [f"### {_named(name)}", "", *_together(f"ros.{name}", rates)]
-        lines += ["Processor time of each process [µs/block]:", "", *_together(f"ros.{name}.cpu", nodes)]
+        if nodes:
+            lines += ["Processor time of each process [µs/block]:", "", *_together(f"ros.{name}.cpu", nodes)]
     return lines + _part("ros", {name: value for name, value in found.items() if name not in cells})
 
 
@@ -291,6 +292,7 @@ def page(result: Mapping[str, Any]) -> str:
         "- **Figures** are medians on this machine, the lowest and the highest run in brackets. What is compared was",
         "  measured in turn (A B A B …), and a **ratio** is the median of the quotients, one a round: it holds while",
         "  the speed of the machine wanders. Absolute figures are worth less.",
+        *([f"- **Note**: {result['note']}"] if "note" in result else []),
         "",
         "`./lathe bench --against COMMIT` compares with a stored result; no test asserts a timing.",
         "",

@@ -54,7 +54,10 @@ def run(parts: Iterable[str], *, quick: bool, say: Say) -> dict[str, Any]:
 
 
 def store(result: Mapping[str, Any]) -> Path:
-    """Keep a result under its commit; parts measured before at the same commit stay."""
+    """Keep a result under its commit; parts measured before at the same commit stay.
+
+    A ``note`` that is written into the file by hand stays too, and stands on the page.
+    """
     path = STORE / f"{result['commit']}{'-quick' if result['quick'] else ''}.json"
     before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     STORE.mkdir(parents=True, exist_ok=True)
