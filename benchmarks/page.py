@@ -26,8 +26,6 @@ _TITLES = {
     "growth": "Growth",
     "peers": "Drive and loop",
 }
-# What is aimed at, by the dotted name of a figure; parts may also say it beside it, as target_NAME.
-_TARGETS = {"engine.c_ratio": 0.9, "engine.lanes_c_ratio": 3.0, "engine.real_time_factor": 150.0}
 _TARGET = "target_"
 _MOST_COLUMNS = 7  # of a table; what has more is laid on its side
 _UNITS = (
@@ -107,9 +105,9 @@ def _named(key: str) -> str:
     return f"{words} [{unit}]" if words and unit else words or unit
 
 
-def _goal(name: str, group: Mapping[str, Any], key: str) -> str:
+def _goal(group: Mapping[str, Any], key: str) -> str:
     """The target of a figure in a group, and whether it is met."""
-    target, found = group.get(f"{_TARGET}{key}", _TARGETS.get(f"{name}.{key}")), group.get(key)
+    target, found = group.get(f"{_TARGET}{key}"), group.get(key)
     value = found["median"] if isinstance(found, Mapping) and _is_spread(found) else found
     if target is None or not isinstance(value, int | float):
         return ""
@@ -147,7 +145,7 @@ def _part(name: str, found: Mapping[str, Any], level: int = 3) -> list[str]:
     flat = {key: group for key, group in flat.items() if any(names[column] > 1 for column in group)}
     lines: list[str] = []
     if single:
-        rows = [(_named(key), figure(found[key]), _goal(name, found, key)) for key in single]
+        rows = [(_named(key), figure(found[key]), _goal(found, key)) for key in single]
         lines += _table(("figure", "found", "target"), rows)
     if flat:
         lines += _together(name, flat)
@@ -164,8 +162,7 @@ def _together(name: str, groups: Mapping[str, Mapping[str, Any]]) -> list[str]:
         key: [figure(group[column]) if column in group else "" for column in columns] for key, group in groups.items()
     }
     goals = {
-        key: "; ".join(goal for column in columns if (goal := _goal(f"{name}.{key}", group, column)))
-        for key, group in groups.items()
+        key: "; ".join(goal for column in columns if (goal := _goal(group, column))) for key, group in groups.items()
     }
     if len(columns) <= _MOST_COLUMNS:
         rows = [[_named(key), *row, goals[key]] for key, row in cells.items()]
@@ -264,7 +261,7 @@ def _targets(result: Mapping[str, Any]) -> list[str]:
 
     def look(name: str, group: Mapping[str, Any]) -> None:
         for key, value in group.items():
-            if goal := _goal(name, group, key):
+            if goal := _goal(group, key):
                 found.append((f"`{name}.{key}`", figure(value), goal))
             elif isinstance(value, Mapping):
                 look(f"{name}.{key}", value)

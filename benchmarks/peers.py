@@ -86,7 +86,7 @@ class _Drive:
         """`ElectrodynamicDrive`, some samples at a time."""
         outputs = np.empty((3, self.command.size))
         for first in range(0, self.command.size, length):
-            self._machine.block(first, self.command[first : first + length], *outputs[:, first : first + length])
+            self._machine.block(self.command[first : first + length], *outputs[:, first : first + length])
         return np.asarray(outputs[0])
 
     def lfilter(self) -> Array:

@@ -24,7 +24,7 @@ def identify(command, *, natural_frequency=1038.0, damping=0.804, delay=0.36e-3,
         force_constant=1.0, step=STEP, method="foh",
     )  # fmt: skip
     position = np.empty(command.size)
-    drive.block(0, command, position, np.empty(command.size), np.empty(command.size))
+    drive.block(command, position, np.empty(command.size), np.empty(command.size))
     identifier = DriveIdentifier(
         model_delay=delay if model_delay is None else model_delay,
         feedback_delay=DELAY,

@@ -97,6 +97,7 @@ def test_each_lane_has_the_bits_of_its_cell_alone(lanes):
         ("two_channel", ["piezo_actuator.hysteresis=bouc_wen", "electrodynamic_actuator.noise_rms=1e-8"]),
         ("two_channel", ["learning_controller.events=['revolution 3: freeze']"]),
         ("direct_compensation", []),
+        ("vibration", []),
     ],
 )
 def test_what_has_no_kernel_for_lanes_runs_lane_by_lane(name, overrides):

@@ -42,7 +42,7 @@ def drive(command, lengths=None, **options):
     """Position, velocity and current of a drive."""
     motion = np.empty((3, command.size))
     machine = make_drive(**options)
-    in_blocks(lengths or [command.size], machine.block, command, *motion)
+    in_blocks(lengths or [command.size], lambda _, *parts: machine.block(*parts), command, *motion)
     return motion
 
 
@@ -128,7 +128,7 @@ def test_end_stop_holds_the_carriage_until_it_is_driven_back():
     command = np.where(np.arange(6400) < 3200, 3e-3, -0.5e-3)
     machine = make_drive(stroke=1e-3)
     position, velocity, current = np.empty((3, 6400))
-    machine.block(0, command, position, velocity, current)
+    machine.block(command, position, velocity, current)
     at_stop = position == 1e-3
     assert position.max() == 1e-3
     assert at_stop.sum() == machine.stopped

@@ -298,7 +298,7 @@ def simulated(command, natural_frequency, damping, delay, method="foh"):
         force_constant=1.0, step=STEP, method=method,
     )  # fmt: skip
     position, velocity, current = np.empty((3, command.size))
-    drive.block(0, command, position, velocity, current)
+    drive.block(command, position, velocity, current)
     return position
 
 

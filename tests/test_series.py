@@ -171,7 +171,7 @@ def test_without_mass_the_carriage_is_the_coarse_drive():
         force_constant=30.0,
         step=STEP,
         method="foh",
-    ).block(0, command, *alone)
+    ).block(command, *alone)
     assert_allclose(drive(make_drive(ratio=0.0), command, set_point)[:3], alone, rtol=1e-9, atol=1e-12)
 
 

@@ -107,7 +107,7 @@ class _Record:
             step=self._step,
             method=self._method,
         )
-        drive.block(0, self.command, *self._room)
+        drive.block(self.command, *self._room)
         error: Array = self.position[skip:] - self._room[0, skip:]
         transition = drive.plant.transition
         slowest = float(np.abs(np.linalg.eigvals(transition)).max())

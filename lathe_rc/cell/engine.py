@@ -36,12 +36,10 @@ class Engine:
             raise InputError(f"{cell.master.name}.revolutions = 0; an offline run needs an end: allowed above 0")
         self.samples: int = cell.master.samples
         self._cell = cell
-        block = cell.master.shared.block_size
-        self._chunk = max(block, min(cell.shortest_feedback or MAX_BLOCK, MAX_BLOCK) // block * block)
+        self._chunk = chunk_size(cell, MAX_BLOCK)
         tracks = {}
         for topic, source in cell.dense.items():
-            delays = dict.fromkeys(sample_fields(source.type), 0) | longest_delays(cell.inputs(topic))
-            tracks[topic] = Track(source.type, delays, self._chunk)
+            tracks[topic] = Track(source.type, delays(cell, topic, source.type), self._chunk)
         self._stages = [
             (stage, Ports(stage, tracks), {topic: remapped(stage.shared, topic) for topic in stage.sparse_topics})
             for stage in cell.stages.values()
@@ -61,6 +59,17 @@ class Engine:
                     sparse.setdefault(topics[message.topic], []).append(message)
             for sink in receivers:
                 sink.chunk(first, samples, dense, sparse)
+
+
+def chunk_size(cell: Cell, most: int) -> int:
+    """Samples to compute at a time: whole blocks, as many as the feedback allows and ``most`` holds, at least one."""
+    block = cell.master.shared.block_size
+    return max(block, min(cell.shortest_feedback or most, most) // block * block)
+
+
+def delays(cell: Cell, topic: str, msgtype: str) -> dict[str, int]:
+    """Longest delay [sample] at which each field of a topic is read; 0 where it is not."""
+    return dict.fromkeys(sample_fields(msgtype), 0) | longest_delays(cell.inputs(topic))
 
 
 class Ports:

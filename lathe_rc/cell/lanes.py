@@ -7,10 +7,10 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.cell.engine import Ports
+from lathe_rc.cell.engine import Ports, chunk_size, delays
 from lathe_rc.cell.messages import MAX_BLOCK, Signals, sample_fields
 from lathe_rc.cell.stages.lanes import LaneStage, lane_stage, same
-from lathe_rc.cell.track import Track, longest_delays
+from lathe_rc.cell.track import Track
 from lathe_rc.cell.wiring import Cell, remapped
 from lathe_rc.errors import InputError
 
@@ -50,9 +50,7 @@ class Lanes:
         self.samples: int = first.master.samples
         for lane, cell in enumerate(cells):
             _check(lane, first, cell)
-        block = first.master.shared.block_size
-        room = max(_SAMPLES // len(cells), block)
-        self._chunk = max(block, min(first.shortest_feedback or MAX_BLOCK, MAX_BLOCK, room) // block * block)
+        self._chunk = chunk_size(first, min(MAX_BLOCK, _SAMPLES // len(cells)))
         self._stages: dict[str, LaneStage[Any]] = {}
         tracks: dict[str, Track] = {}
         shared: set[str] = set()
@@ -61,8 +59,8 @@ class Lanes:
             lanes = lane_stage([cell.stages[name] for cell in cells], shared=shared.issuperset(topics))
             for port in stage.outputs:
                 topic, fields = remapped(stage.shared, port.topic), sample_fields(port.type)
-                delays = dict.fromkeys(fields, 0) | longest_delays(first.inputs(topic))
-                tracks[topic] = Track(port.type, delays, self._chunk, len(cells), lanes.shared)
+                kept = delays(first, topic, port.type)
+                tracks[topic] = Track(port.type, kept, self._chunk, len(cells), lanes.shared)
                 if set(fields) <= set(lanes.shared):
                     shared.add(topic)
             self._stages[name] = lanes

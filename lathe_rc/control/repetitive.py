@@ -40,7 +40,6 @@ from lathe_rc.control.q_filter import QFilter
 from lathe_rc.errors import LatheError
 
 Array = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 _TURN = 2.0 * np.pi
 LEARNING_DELAY = 3  #: samples from a measured error to its place in the memory: cubic interpolation looks ahead

@@ -102,8 +102,8 @@ class ElectrodynamicDrive:
         self._state = np.zeros(2)
         self._line = np.zeros(self.plant.delay + 2)
 
-    def block(self, first: int, command: Array, position: Array, velocity: Array, current: Array) -> None:
-        """Step from sample ``first`` on; arrays of shape (n,) [m, m, m/s, A]. At rest at 0 before sample 0."""
+    def block(self, command: Array, position: Array, velocity: Array, current: Array) -> None:
+        """Step through a block; arrays of shape (n,) [m, m, m/s, A]. At rest at 0 before the first."""
         plant = self.plant
         self.stopped += _advance(
             plant.transition, plant.weights, plant.fraction, self._spring, self._damper,

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The drives of the tool for many cells at once: arrays have a last axis more, one place a lane.
+"""The tool and its drives for many cells at once: arrays have a last axis more, one place a lane.
 
-Each lane gets the bits that `electrodynamic` and `piezo` would give it alone.
+Each lane gets the bits that `electrodynamic`, `piezo` and `tool` would give it alone.
 """
 
 import numpy as np
@@ -177,3 +177,22 @@ def _resonate(
             x[lane] = position[k, lane]
         for lane in range(x.size):
             v[lane] = velocity[k, lane]
+
+
+@kernel
+def add_drive(
+    begins: bool,  # noqa: FBT001 - kernels take their arguments by position
+    reference: Array,
+    expected: Array,
+    position: Array,
+    measured: Array,
+    displacement: Array,
+    known: Array,
+    error: Array,
+) -> None:
+    """`tool.add_drive`; what is not a drive's own, the reference and what is expected, is of shape (n,)."""
+    for k in range(reference.size):
+        for lane in range(position.shape[1]):
+            displacement[k, lane] = position[k, lane] if begins else displacement[k, lane] + position[k, lane]
+            known[k, lane] = (expected[k] if begins else known[k, lane]) - measured[k, lane]
+            error[k, lane] = reference[k] - displacement[k, lane]

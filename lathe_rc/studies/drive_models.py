@@ -211,7 +211,7 @@ def _simulated(drive: SecondOrder) -> StepResponse:
         method="foh",
     )
     position, velocity, current = np.empty((3, _SAMPLES))
-    machine.block(0, np.ones(_SAMPLES), position, velocity, current)
+    machine.block(np.ones(_SAMPLES), position, velocity, current)
     # The command rises linearly from sample -1 to sample 0: half a step before, on the average.
     return StepResponse((np.arange(_SAMPLES) + 0.5) * step, position)
 

@@ -75,6 +75,6 @@ class ElectrodynamicActuator(Drive):
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         (command,), (state,) = inputs, outputs
-        self.drive.block(first, command["position"], state["position"], state["velocity"], state["effort"])
+        self.drive.block(command["position"], state["position"], state["velocity"], state["effort"])
         self._sensor.measure(state["position"], state["measured_position"])
         return []

@@ -24,7 +24,6 @@ from lathe_rc.control import angle_memory, angle_memory_lanes
 from lathe_rc.control.correction import CorrectionLaw
 from lathe_rc.control.repetitive import memory_size
 from lathe_rc.errors import LatheError
-from lathe_rc.jit import kernel
 from lathe_rc.plants import lanes as plants
 from lathe_rc.plants.hysteresis import PLAYS
 from lathe_rc.signals.noise import Sensor
@@ -156,7 +155,7 @@ class LearningLanes(LaneStage[LearningController]):
         lead = angle_memory_lanes.largest_lead(self._lead_time, self._constant, speed)
         errors = np.concatenate((self._errors, tool["measured_error"]))
         for finer in others:
-            errors[3:] += finer["measured_position"]
+            errors[3:] += _spread(finer["measured_position"], len(self.stages))
         angles = np.concatenate((self._angles, past["angle"]))
         arrives = min(max(self._delay - first, 0), angle.size)
         self._arrive(arrives, angles, errors)
@@ -182,7 +181,7 @@ class LearningLanes(LaneStage[LearningController]):
             )
 
     def _arrive(self, arrives: int, angles: Array, errors: Array) -> None:
-        """Take care of the first errors of the run, and keep the newest three; see `angle_memory.take`."""
+        """Take care of the first errors of the run, and keep the newest three; see `angle_memory.step`."""
         if arrives < angles.size - 3 and self._whole[angle_memory.SEEN] == 0:
             self._whole[angle_memory.SEEN] = 1
             angles[: arrives + 3], errors[: arrives + 3] = angles[arrives + 3], errors[arrives + 3]
@@ -282,27 +281,13 @@ class PiezoLanes(LaneStage[PiezoActuator]):
         _measure(self._sensors, state["position"], state["measured_position"])
 
 
+def _spread(array: Array, lanes: int) -> Array:
+    """An array (n, lanes), also of a signal that is equal in all lanes."""
+    return array if array.ndim == 2 else np.repeat(array[:, None], lanes, axis=1)
+
+
 def _columns(signals: Signals) -> Signals:
     return {name: array[:, None] if array.ndim == 1 else array for name, array in signals.items()}
-
-
-@kernel
-def _add(
-    begin: bool,  # noqa: FBT001 - kernels take their arguments by position
-    reference: Array,
-    expected: Array,
-    position: Array,
-    measured: Array,
-    displacement: Array,
-    known: Array,
-    error: Array,
-) -> None:
-    """Add a drive's motion to the displacement of the tool and take it off what is known of the error."""
-    for k in range(reference.size):
-        for lane in range(position.shape[1]):
-            displacement[k, lane] = position[k, lane] if begin else displacement[k, lane] + position[k, lane]
-            known[k, lane] = (expected[k] if begin else known[k, lane]) - measured[k, lane]
-            error[k, lane] = reference[k] - displacement[k, lane]
 
 
 class ToolLanes(LaneStage[Tool]):
@@ -319,14 +304,15 @@ class ToolLanes(LaneStage[Tool]):
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> None:
         """See `LaneStage`."""
-        (tool,), form = outputs, self.stages[0].form
+        (tool,), form, lanes = outputs, self.stages[0].form, len(self.stages)
         assert form is not None
         expected = np.empty_like(tool["reference"])
         form.block(inputs, tool["reference"], expected, tool["height"])
         for place, state in enumerate(inputs[len(form.inputs) :]):
-            _add(
-                place == 0, tool["reference"], expected, state["position"], state["measured_position"],
-                tool["displacement"], tool["measured_error"], tool["error"],
+            position, measured = (_spread(state[name], lanes) for name in ("position", "measured_position"))
+            plants.add_drive(
+                place == 0, tool["reference"], expected, position, measured, tool["displacement"],
+                tool["measured_error"], tool["error"],
             )  # fmt: skip
 
 
