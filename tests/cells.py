@@ -6,6 +6,7 @@ import itertools
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from lathe_rc.cell.scenario import TABLES, Scenario
 
 Values = Mapping[str, Any]
 
+SCENARIOS = sorted((Path(__file__).parents[1] / "config").glob("*.yaml"))  #: that come with lathe_rc
 NODES = ("spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool")
 
 

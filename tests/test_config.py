@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every scenario that comes with lathe_rc runs, and gives the same bits in one process of nodes as offline."""
 
-from pathlib import Path
-
 import pytest
+from cells import SCENARIOS
 
 from lathe_rc import harness
 from lathe_rc.cell import scenario
-
-SCENARIOS = sorted((Path(__file__).parents[1] / "config").glob("*.yaml"))
 
 
 @pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)

@@ -6,7 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
-from cells import scenario
+from cells import SCENARIOS, scenario
 from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
@@ -16,6 +16,7 @@ from lathe_rc.bag import reader, story
 from lathe_rc.bag.resim import resimulate
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.stream import feed
+from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
 from lathe_rc.part import ErrorsByRevolution
@@ -50,6 +51,15 @@ def test_an_unchanged_process_run_comes_out_to_the_bit(processes):
     assert (told["equal"], told["changed"], told["different"]) == (True, False, [])
     assert told["digest"] == result.digest
     assert np.array_equal(told["rms_um"], result.errors.rms * 1e6)
+
+
+@pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
+def test_every_scenario_comes_out_to_the_bit(path, tmp_path):
+    """Whatever its stages announce on the way, like a channel that joins."""
+    loaded = scenarios.load(path, ["spindle_encoder.revolutions=25", "spindle_encoder.speed_factor=0"])
+    harness.run(loaded, bag=tmp_path / "bag")
+    found = resimulate(tmp_path / "bag")
+    assert (found.changed, found.different, found.missing) == (False, [], [])
 
 
 def test_what_it_writes_is_the_bag_again(processes, tmp_path):

@@ -177,7 +177,8 @@ def resimulate(
         cell, compared, events = wire(chosen, original, recorded, source)
         for name, stage in cell.stages.items():
             for index, action in events.get(name, []):
-                stage.schedule(action, index)
+                if action not in stage.announces:
+                    stage.schedule(action, index)
         digests = _Digests(cell)
         errors = ErrorsByRevolution({f"/{name}": said.type for name, said in cell.dense.items()})
         samples = cell.master.samples

@@ -94,6 +94,7 @@ class Stage(ABC):
     kind: ClassVar[str]
     Parameters: ClassVar[type[NodeParameters]]
     actions: ClassVar[tuple[str, ...]] = ()  #: events that it knows
+    announces: ClassVar[tuple[str, ...]] = ()  #: events that come about by themselves
 
     inputs: tuple[Input, ...] = ()
     outputs: tuple[Output, ...] = ()

@@ -34,6 +34,7 @@ class LearningController(Stage):
     kind = "learning_controller"
     Parameters = LearningControllerParameters
     actions = ("freeze", "learn", "clear", *_FILE_ACTIONS)
+    announces = ("joined",)
 
     def __init__(self, name: str, parameters: LearningControllerParameters) -> None:
         self.parameters = parameters
