@@ -8,7 +8,6 @@ blocks one append, and the rest of the work is done once a chunk.
 
 import os
 import struct
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 import zstandard
+from isal.isal_zlib import crc32
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -274,7 +274,7 @@ class McapFile:
             data=self._compressor.compress(whole) if self._compressor else whole,
             message_start_time=first,
             message_end_time=last,
-            uncompressed_crc=zlib.crc32(whole),
+            uncompressed_crc=crc32(whole),
             uncompressed_size=len(whole),
         )
         record = _encoded(chunk)
@@ -351,6 +351,6 @@ class McapFile:
             offsets.append(SummaryOffset(group_opcode=opcode, group_start=place, group_length=len(data)))
             place += len(data)
         summary = b"".join(groups.values()) + _encoded(*offsets)
-        crc = zlib.crc32(_FOOTER.pack(Opcode.FOOTER, 20, start, place), zlib.crc32(summary))
+        crc = crc32(_FOOTER.pack(Opcode.FOOTER, 20, start, place), crc32(summary))
         footer = Footer(summary_start=start, summary_offset_start=place, summary_crc=crc)
         return summary + _encoded(footer) + MCAP0_MAGIC

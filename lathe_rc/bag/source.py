@@ -5,10 +5,9 @@ Nothing in a bag is trusted: what it says of sizes is checked before anything of
 """
 
 import struct
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -16,6 +15,7 @@ from typing import Any, BinaryIO
 import lz4.frame
 import numpy as np
 import zstandard
+from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 from rosbags.interfaces import Qos
@@ -25,12 +25,15 @@ from lathe_rc.bag.walk import walk
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import InputError, LatheError
 
+Message = tuple[str, int, bytes]  #: topic, log time [ns] and bytes
+
 MOST_BYTES = 2**28  #: longest chunk or record that is read into memory [B]
 MOST_TOPICS = 4096  #: topics of a bag
 MOST_TEXT = 2**20  #: longest text in its metadata [B]
 MOST_UNPACKED = 2**36  #: of a file that is compressed as a whole [B]
 
 _PIECE = 2**20  # of a file that is unpacked [B]
+_NEVER = 2**63  # log time after all others [ns]
 _CHANNELS = 2**16  # numbers that a channel may have
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
@@ -63,7 +66,7 @@ class Topic:
     count: int
 
 
-def unpack(compression: str, data: bytes, size: int) -> bytes:
+def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
     """The records of a chunk; never more than it says.
 
     Raises:
@@ -78,7 +81,7 @@ def unpack(compression: str, data: bytes, size: int) -> bytes:
         elif compression == "lz4":
             whole = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
         elif compression == "":
-            whole = data
+            whole = bytes(data)
         else:
             raise ValueError(f"compression {compression[:64]!r} is not known; allowed: zstd, lz4, none")
     except (zstandard.ZstdError, RuntimeError) as error:
@@ -147,10 +150,11 @@ def read_chunk(content: bytes, place: int) -> bytes:
     try:
         _, _, size, crc, name = _CHUNK.unpack_from(content)
         start = _CHUNK.size + name
-        whole = unpack(content[_CHUNK.size : start].decode("utf-8", "replace"), content[start + 8 :], size)
+        name_of = content[_CHUNK.size : start].decode("utf-8", "replace")
+        whole = unpack(name_of, memoryview(content)[start + 8 :], size)
     except (ValueError, struct.error) as error:
         raise ValueError(f"chunk at byte {place}: {_line(error)}") from None
-    if crc and zlib.crc32(whole) != crc:
+    if crc and crc32(whole) != crc:
         raise ValueError(f"chunk at byte {place}: its checksum is wrong")
     return whole
 
@@ -272,7 +276,7 @@ class Source:
             # rosbags would unpack each message to whatever size it says.
             whole.metadata = whole.metadata._replace(compression_mode=None)
 
-    def _chunks(self, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, bytes]]:
+    def _chunks(self, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[list[Message]]:
         """Messages of the wanted connections, chunk by chunk."""
         with Path(str(self._storage.path)).open("rb") as stream:
             for chunk in self._storage.chunks:
@@ -283,9 +287,9 @@ class Source:
                 stream.seek(chunk.chunk_start_offset)
                 record = read_record(stream, chunk.chunk_start_offset + chunk.chunk_length)
                 found = _messages(read_chunk(record[1] if record else b"", chunk.chunk_start_offset), topics)
-                for topic, log_ns, data in found:
-                    if start_ns <= log_ns < stop_ns:
-                        yield topic, log_ns, data
+                if start_ns or stop_ns < _NEVER:
+                    found = [message for message in found if start_ns <= message[1] < stop_ns]
+                yield found
 
     def blocks(self, topic: str, *, start_ns: int | None = None) -> Iterator[Block]:
         """The blocks of a dense topic, from a log time [ns] on.
@@ -312,8 +316,14 @@ class Source:
 
     def messages(
         self, topics: set[str] | None = None, *, start_ns: int | None = None, stop_ns: int | None = None
-    ) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, log time [ns] and bytes of each message, in the order of log times.
+    ) -> Iterator[Message]:
+        """Topic, log time [ns] and bytes of each message, in the order of log times; see `batches`."""
+        return chain.from_iterable(self.batches(topics, start_ns=start_ns, stop_ns=stop_ns))
+
+    def batches(
+        self, topics: set[str] | None = None, *, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[list[Message]]:
+        """Topic, log time [ns] and bytes of each message, in the order of log times, as many at a time as come handy.
 
         Args:
             topics: those wanted; None: all.
@@ -330,11 +340,11 @@ class Source:
             if self._in_order:
                 names = {c.topic for c in wanted}
                 channels = {c.id: c.topic for c in self._storage.connections if c.topic in names}
-                yield from self._chunks(channels, start_ns or 0, stop_ns or 2**63)
+                yield from self._chunks(channels, start_ns or 0, stop_ns or _NEVER)
                 return
             for connection, log_ns, data in self._reader.messages(wanted, start=start_ns, stop=stop_ns):
                 whole = unpack("zstd", data, unpacked_size(data[:18])) if self._packed else bytes(data)
-                yield connection.topic, log_ns, whole
+                yield [(connection.topic, log_ns, whole)]
         except _BROKEN as error:
             raise InputError(f"{self.path}: broken ({_line(error)}); lathe bag check says more") from None
 

@@ -65,6 +65,15 @@ class _Dense:
         self.read()
         return True
 
+    def add_all(self, data: Iterable[bytes]) -> None:
+        """Take messages and read them.
+
+        Raises:
+            LatheError: see `read`.
+        """
+        self._messages += data
+        self.read()
+
     def read(self) -> None:
         """Read the messages that have been taken.
 
@@ -207,7 +216,7 @@ class Tape:
     def __init__(self, path: Path, topic: str) -> None:
         self._source = Source(path)
         self._dense = _Dense(topic, self._source.topics[topic].type)
-        self._messages = self._source.messages({topic})
+        self._batches = self._source.batches({topic})
 
     def take(self, samples: int) -> Signals:
         """The next samples, arrays of shape (samples,).
@@ -216,12 +225,10 @@ class Tape:
             LatheError: there are not so many, or some are missing.
         """
         while self._dense.end - self._dense.first < samples:
-            end = self._dense.end
-            while (found := next(self._messages, None)) and not self._dense.add(found[2]):
-                pass
-            self._dense.read()
-            if self._dense.end == end:
-                raise LatheError(f"{self._dense.topic} ends at sample {end}")
+            found = next(self._batches, None)
+            if found is None:
+                raise LatheError(f"{self._dense.topic} ends at sample {self._dense.end}")
+            self._dense.add_all(data for _, _, data in found)
         return self._dense.take(samples)
 
 
