@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -35,13 +36,20 @@ class DiscretePlant:
     def response(self, frequency: npt.ArrayLike) -> npt.NDArray[np.complex128]:
         """Response of the position to the command at ``frequency`` [rad/s], of the difference equation itself."""
         z = np.exp(1j * np.asarray(frequency, dtype=np.float64) * self.step)
-        order = self.transition.shape[0]
-        # x[n] = Φ·x[n-1] + w·u[n] is z·(z·I - Φ)⁻¹·w; ss2tf gives the rational function after the z.
-        terms = []
-        for lag in range(3):
-            top, bottom = ss2tf(self.transition, self.weights[:, lag : lag + 1], np.eye(1, order), np.zeros((1, 1)))
-            terms.append(np.polyval(top[0], z) / np.polyval(bottom, z) * z ** (1.0 - lag - self.delay))
+        terms = [
+            np.polyval(top[0], z) / np.polyval(bottom, z) * z ** (1.0 - lag - self.delay)
+            for lag, (top, bottom) in enumerate(self._rational)
+        ]
         return np.asarray(sum(terms))
+
+    @cached_property
+    def _rational(self) -> list[tuple[Array, Array]]:
+        """Numerator and denominator of each weight's way to the position.
+
+        x[n] = Φ·x[n-1] + w·u[n] is z·(z·I - Φ)⁻¹·w; ss2tf gives the rational function after the z.
+        """
+        out = np.eye(1, self.transition.shape[0]), np.zeros((1, 1))
+        return [ss2tf(self.transition, self.weights[:, lag : lag + 1], *out) for lag in range(3)]
 
 
 def _foh(a: Array, b: Array, step: float) -> tuple[Array, Array, Array]:

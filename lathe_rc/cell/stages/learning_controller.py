@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from lathe_rc.control.repetitive import Cycle, RepetitiveController, largest_fee
 from lathe_rc.errors import InputError
 from lathe_rc.plants.linear import discretise, second_order
 
+_MOST = 1024  # entries of a table of margins
 _FILE_ACTIONS = ("save", "load")
 
 
@@ -236,6 +238,7 @@ class _Margins:
         # Three digits of a model are more than its margin is good for, and a steady one is computed once.
         key = _three_digits(model.natural_frequency, model.damping)
         if key not in self._responses:
+            _make_room(self._responses)
             parameters = self._stage.parameters
             a, b = second_order(model.natural_frequency, model.damping)
             self._responses[key] = discretise(a, b, parameters.model_delay, parameters.step, "foh").response
@@ -246,6 +249,7 @@ class _Margins:
         models = (model.natural_frequency, model.damping, inverted.natural_frequency, inverted.damping)
         key = (speed, _three_digits(*models))
         if key not in self._suprema:
+            _make_room(self._suprema)
             self._suprema[key] = self._stage.loop(self._response(model)).supremum(speed)
         return self._suprema[key]
 
@@ -257,6 +261,12 @@ class _Margins:
         below, above = self._speeds[after - 1], self._speeds[after]
         lower, upper = self._supremum(below, model), self._supremum(above, model)
         return 1.0 - ((upper - lower) / (above - below) * (speed - below) + lower)
+
+
+def _make_room(table: dict[Any, Any]) -> None:
+    """Let the oldest entry go from a full table: a model that wanders would fill it for ever."""
+    if len(table) >= _MOST:
+        del table[next(iter(table))]
 
 
 @lru_cache
