@@ -116,7 +116,7 @@ def test_file_without_shared_parameters_takes_them_from_the_command_line(cell):
         ("=5", "--set '=5':  is not shared; allowed: sample_rate, block_size"),
         ("feed=1e-3", "--set 'feed=1e-3': feed is not shared; allowed: sample_rate, block_size"),
         ("fork.feed=1", "--set 'fork.feed=1': no node 'fork' in the scenario; allowed: spindle_encoder, learning"),
-        ("tool.fed=1", "tool.fed: unknown parameter; allowed: autostart, block_size"),
+        ("tool.fed=1", "tool.fed: unknown parameter; allowed: allow_faults, autostart"),
         ("tool.=1", "tool.: unknown parameter"),
         ("tool.feed=fast", "tool.feed = 'fast'; allowed: a finite number from 0 [m/rev]"),
         ("tool.feed=.nan", "tool.feed = nan; allowed: a finite number from 0 [m/rev]"),

@@ -14,10 +14,9 @@ from lathe_rc.analysis.drive_fit import DriveFit
 from lathe_rc.analysis.metrology import evenly
 from lathe_rc.bag.recorded import Recorded
 from lathe_rc.cell import messages
-from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters
-from lathe_rc.cell.wiring import remapped
 from lathe_rc.errors import InputError
 from lathe_rc.files import replacing
 

@@ -10,11 +10,12 @@ from lathe_rc.bag.source import Source
 from lathe_rc.bag.stream import Tape
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.tool import Tool
-from lathe_rc.cell.wiring import Cell, remapped
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 
 
@@ -41,6 +42,9 @@ class _PlayedSpindle(SpindleEncoder):
             signals["angle_true"] -= self._said.turns
         return []
 
+    def act(self, action: str, index: int) -> None:
+        """What was wrong with it is in the recording."""
+
 
 Events = dict[str, list[tuple[int, str]]]  #: sample and action of the events of each node
 
@@ -66,7 +70,7 @@ def wire(
     """
     nodes = dict(chosen.nodes)
     if original is not None:
-        nodes = {name: table.model_copy(update={"events": []}) for name, table in nodes.items()}
+        nodes = {name: table.model_copy(update={"events": [], "faults": []}) for name, table in nodes.items()}
     cell = Cell(nodes)
     master = cell.master
     recorded.check_names([*cell.dense])

@@ -5,9 +5,10 @@ from collections.abc import Iterable, Mapping
 from typing import Protocol
 
 from lathe_rc.cell.messages import MAX_BLOCK, Signals, sample_fields
+from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import Sparse, Stage, compile_kernels
 from lathe_rc.cell.track import Track, longest_delays
-from lathe_rc.cell.wiring import Cell, remapped
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 
 

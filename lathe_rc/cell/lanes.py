@@ -9,9 +9,10 @@ import numpy.typing as npt
 
 from lathe_rc.cell.engine import Ports, chunk_size, delays
 from lathe_rc.cell.messages import MAX_BLOCK, Signals, sample_fields
+from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stages.lanes import LaneStage, lane_stage, same
 from lathe_rc.cell.track import Track
-from lathe_rc.cell.wiring import Cell, remapped
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 
 Array = npt.NDArray[np.float64]

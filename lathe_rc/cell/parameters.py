@@ -115,6 +115,7 @@ class SharedParameters(Table):
     block_size: Annotated[int, Ge(1), Le(MAX_BLOCK)] = parameter(64, "samples in a block", "sample")
     nominal_rpm: Annotated[float, Gt(0), Le(60_000)] = parameter(1000.0, "nominal spindle speed", "1/min")
     seed: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(0, "seed of everything random in the cell")
+    allow_faults: bool = parameter(default=False, doc="let the nodes take faults; otherwise they are refused")
     joint_state_period: Annotated[int, Ge(1)] = parameter(1280, "a JointState message every so many samples", "sample")
     window: Annotated[int, Ge(0), Le(4096)] = parameter(
         64, "blocks in flight, counted from the slowest member; 0: free-running, may lose blocks", "block"
@@ -157,8 +158,27 @@ class NodeParameters(SharedParameters):
     events: list[str] = parameter(
         [], "scheduled events, as 'revolution 60: freeze', 'second 3.5: freeze' or 'sample 7000: clear'"
     )
+    faults: list[str] = parameter(
+        [],
+        "what breaks and when, as 'revolution 20 to 25: coarse/state.measured_position stuck'; without 'to' it stays",
+    )
     volatile_inputs: list[str] = parameter(
         [],
         "input topics whose publisher keeps no messages for those who come late (a device with default QoS)",
     )
     autostart: bool = parameter(default=True, doc="configure and activate by itself")
+
+
+def remapped(table: NodeParameters, topic: str) -> str:
+    """The relative name of a topic after the node's ``remap`` rules.
+
+    Raises:
+        InputError: a rule is not of the form old:=new.
+    """
+    for rule in table.remap:
+        old, arrow, new = rule.partition(":=")
+        if not arrow or not old or not new:
+            raise InputError(f"remap = {rule!r}; allowed: old:=new")
+        if old == topic:
+            return new
+    return topic

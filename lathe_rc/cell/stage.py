@@ -16,8 +16,11 @@ import numpy as np
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
-from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.errors import InputError
+from lathe_rc.safety import faults
+from lathe_rc.safety.faults import Fault
+from lathe_rc.safety.injection import Injection, Port
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,8 @@ class Trigger:
 
 _NOTHING = np.empty(0)
 
-_EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)\s*:\s*(\S.*?)\s*")
+_EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)(?:\s+to\s+([0-9.eE+-]+))?\s*:\s*(\S.*?)\s*")
+_FAULT, _REPAIR = "fault", "repair"  # verbs of the events that all stages know: fault FAULT, repair TARGET
 
 
 class Stage(ABC):
@@ -89,12 +93,14 @@ class Stage(ABC):
     Attributes:
         inputs, outputs: the ports; the arrays handed to `advance` stand in their order.
         sparse_topics: relative name and type of every topic that carries `Sparse` messages.
+        own_inputs: number of inputs that `process` gets; one more may tell the spindle angle to the events.
     """
 
     kind: ClassVar[str]
     Parameters: ClassVar[type[NodeParameters]]
     actions: ClassVar[tuple[str, ...]] = ()  #: events that it knows
     announces: ClassVar[tuple[str, ...]] = ()  #: events that come about by themselves
+    devices: ClassVar[tuple[str, ...]] = ()  #: what can break beside its ports; see `lathe_rc.safety.faults.Kind`
 
     inputs: tuple[Input, ...] = ()
     outputs: tuple[Output, ...] = ()
@@ -103,37 +109,74 @@ class Stage(ABC):
         self.name = name
         self.shared = parameters
         self.sparse_topics: dict[str, str] = {}
-        self._triggers = [self._trigger(text) for text in parameters.events]
+        self._triggers = [self._trigger("events", text) for text in parameters.events]
+        self._triggers += [trigger for text in parameters.faults for trigger in self._break_down(text)]
+        self._injection: Injection | None = None
+        self.own_inputs = 0
         self._scheduled: list[tuple[int, str]] = []
 
     def declare(self, *, inputs: Sequence[Input] = (), outputs: Sequence[Output] = ()) -> None:
-        """Set the ports; to be called once, at the end of the constructor."""
-        self.inputs, self.outputs = tuple(inputs), tuple(outputs)
+        """Set the ports; to be called once, at the end of the constructor.
+
+        Raises:
+            InputError: an event or fault that cannot be.
+        """
+        self.inputs, self.outputs, self.own_inputs = tuple(inputs), tuple(outputs), len(inputs)
+        if inputs and self._angle() is None and any(trigger.kind == "revolution" for trigger in self._triggers):
+            self.inputs += (Input("encoder", messages.ENCODER, ("angle",)),)
         self._joints = [(place, output.joint) for place, output in enumerate(self.outputs) if output.joint]
         if self._joints:
             self.sparse_topics[f"{self.name}/joint_states"] = messages.JOINTS
-        if self.actions:
+        if self.takes_events:
             self.sparse_topics[f"{self.name}/events"] = messages.EVENT
+        if self.shared.allow_faults:
+            self._injection = Injection(
+                self.name,
+                [Port(remapped(self.shared, p.topic), p.type, p.fields, p.delay, out=False) for p in inputs],
+                [
+                    Port(remapped(self.shared, p.topic), p.type, tuple(messages.sample_fields(p.type)), 0, out=True)
+                    for p in outputs
+                ],
+                seed=self.shared.seed,
+                step=self.shared.step,
+            )
         for trigger in self._triggers:
-            if trigger.kind == "revolution" and self._angle() is None:
-                raise InputError(
-                    f"{self.name}.events: {self.kind} does not see the spindle, so revolution {trigger.value:g} "
-                    "means nothing to it; give second or sample"
-                )
+            self.check_action(trigger.action)
 
-    def _trigger(self, text: str) -> Trigger:
+    @property
+    def takes_events(self) -> bool:
+        """Whether there are events for it."""
+        return bool(self.actions) or self.shared.allow_faults
+
+    def _trigger(self, what: str, text: str) -> Trigger:
         match = _EVENT.fullmatch(text)
         try:
-            trigger = Trigger(match[1], float(match[2]), match[3]) if match else None
+            trigger = Trigger(match[1], float(match[2]), match[4]) if match and not match[3] else None
         except ValueError:
             trigger = None
         if trigger is None or not 0 <= trigger.value < math.inf:
             raise InputError(
-                f"{self.name}.events = {text!r}; allowed: 'revolution R: ACTION', 'second T: ACTION' or "
+                f"{self.name}.{what} = {text!r}; allowed: 'revolution R: ACTION', 'second T: ACTION' or "
                 "'sample N: ACTION'"
             )
-        self.check_action(trigger.action)
         return trigger
+
+    def _break_down(self, text: str) -> list[Trigger]:
+        """Begin and, if it has one, end of a fault."""
+        match = _EVENT.fullmatch(text)
+        if match is None:
+            raise InputError(
+                f"{self.name}.faults = {text!r}; allowed: 'revolution R to S: FAULT', 'second ...', 'sample ...'; "
+                "without 'to' it stays"
+            )
+        begin = self._trigger("faults", f"{match[1]} {match[2]}: {_FAULT} {match[4]}")
+        if not match[3]:
+            return [begin]
+        target = faults.parse(match[4], f"{self.name}.faults").target
+        end = self._trigger("faults", f"{match[1]} {match[3]}: {_REPAIR} {target}")
+        if end.value <= begin.value:
+            raise InputError(f"{self.name}.faults = {text!r} ends before it begins; allowed: an end after {match[2]}")
+        return [begin, end]
 
     def check_action(self, action: str) -> None:
         """Refuse an event that cannot be carried out.
@@ -141,9 +184,29 @@ class Stage(ABC):
         Raises:
             InputError: the stage does not know it, or lacks what it needs.
         """
+        verb, _, rest = action.partition(" ")
+        if verb == _FAULT:
+            self._check_fault(faults.parse(rest, self.name))
+            return
+        if verb == _REPAIR:
+            self._check_allowed(action)
+            return
         if action not in self.actions:
             known = ", ".join(self.actions) or f"none ({self.kind} has no events)"
             raise InputError(f"{self.name}: event {action!r}; allowed: {known}")
+
+    def _check_allowed(self, what: str) -> None:
+        if not self.shared.allow_faults:
+            raise InputError(f"{self.name}: {what!r} is refused; set allow_faults = true under /** to let things break")
+
+    def _check_fault(self, fault: Fault) -> None:
+        self._check_allowed(f"fault {fault.text}")
+        assert self._injection is not None, "there is one if faults are allowed"
+        what = faults.KINDS[fault.kind].what
+        if what not in self.devices:
+            self._injection.check(fault)
+        elif fault.target != what:
+            raise InputError(f"{self.name}: fault {fault.text!r}: no such target for it; allowed: {what}")
 
     def schedule(self, action: str, index: int) -> None:
         """Let an event take effect at sample ``index``, which the host has not issued yet.
@@ -199,10 +262,10 @@ class Stage(ABC):
         Returns:
             The sparse messages of the block, by sample index.
         """
-        if self._triggers or self._scheduled:
+        if self._triggers or self._scheduled or self._injection:
             sparse = self._advance_with_events(first, inputs, outputs)
         else:
-            sparse = self.process(first, inputs, outputs)
+            sparse = self.process(first, inputs[: self.own_inputs], outputs)
         for place, joint in self._joints:
             sparse = sparse + self._joint_states(first, joint, outputs[place])
         if len(sparse) > 1:
@@ -217,7 +280,7 @@ class Stage(ABC):
         for index, action in self._due(first, samples, inputs):
             sparse += self._compute(first, start, index - first, inputs, outputs)
             start = index - first
-            self.perform(action)
+            self.act(action, index)
             sparse.append(Sparse(f"{self.name}/events", messages.EVENT, index, {"action": action}))
         return sparse + self._compute(first, start, samples, inputs, outputs)
 
@@ -226,7 +289,38 @@ class Stage(ABC):
     ) -> list[Sparse]:
         if start == stop:
             return []
-        return self.process(first + start, _cut(inputs, start, stop), _cut(outputs, start, stop))
+        first, read, written = first + start, _cut(inputs[: self.own_inputs], start, stop), _cut(outputs, start, stop)
+        if self._injection is None:
+            return self.process(first, read, written)
+        sparse = self.process(first, self._injection.inputs(first, read), written)
+        self._injection.outputs(first, written)
+        return sparse
+
+    def act(self, action: str, index: int) -> None:
+        """Carry out an event at sample ``index``, the next one."""
+        verb, _, rest = action.partition(" ")
+        if verb == _FAULT:
+            fault = faults.parse(rest, self.name)
+            if faults.KINDS[fault.kind].what in self.devices:
+                self.damage(fault)
+            else:
+                assert self._injection is not None, "the fault has been checked"
+                self._injection.begin(fault, index)
+        elif verb == _REPAIR:
+            assert self._injection is not None, "the event has been checked"
+            self._injection.end(rest, index)
+            if rest in self.devices:
+                self.mend()
+        else:
+            self.perform(action)
+
+    def damage(self, fault: Fault) -> None:
+        """Suffer a fault of one of its ``devices``."""
+        raise NotImplementedError(fault.text)
+
+    def mend(self) -> None:
+        """Be as before all of them."""
+        raise NotImplementedError
 
     def _joint_states(self, first: int, joint: Joint, signals: Signals) -> list[Sparse]:
         period = self.shared.joint_state_period
@@ -269,6 +363,7 @@ def _cut(signals: Sequence[Signals], start: int, stop: int) -> list[Signals]:
 def compile_kernels(stage: Stage) -> None:
     """Compile what the stage runs, by an empty block: the first real block then takes no longer than the next."""
     inputs = [
-        {name: np.empty(0, messages.sample_fields(port.type)[name]) for name in port.fields} for port in stage.inputs
+        {name: np.empty(0, messages.sample_fields(port.type)[name]) for name in port.fields}
+        for port in stage.inputs[: stage.own_inputs]
     ]
     stage.process(0, inputs, [messages.allocate(port.type, 0) for port in stage.outputs])

@@ -9,7 +9,7 @@ from graphlib import CycleError, TopologicalSorter
 import numpy as np
 
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stage import Input, Stage
 from lathe_rc.cell.stages import STAGES
@@ -19,21 +19,6 @@ from lathe_rc.cell.stages.profile import ProfileStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError
-
-
-def remapped(table: NodeParameters, topic: str) -> str:
-    """The relative name of a topic after the node's ``remap`` rules.
-
-    Raises:
-        InputError: a rule is not of the form old:=new.
-    """
-    for rule in table.remap:
-        old, arrow, new = rule.partition(":=")
-        if not arrow or not old or not new:
-            raise InputError(f"remap = {rule!r}; allowed: old:=new")
-        if old == topic:
-            return new
-    return topic
 
 
 @dataclass(frozen=True)

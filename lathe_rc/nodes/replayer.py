@@ -22,10 +22,11 @@ from std_srvs.srv import Trigger
 
 from lathe_rc.bag import story
 from lathe_rc.bag.source import Source
+from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.replayer import KIND, ReplayerParameters
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
-from lathe_rc.cell.wiring import Cell, remapped
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import alone
 from lathe_rc.nodes.ports import latched_qos, message_class

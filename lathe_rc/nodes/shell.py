@@ -17,9 +17,8 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
-from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.cell.wiring import remapped
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import declare
 from lathe_rc.nodes.exchange import Exchange

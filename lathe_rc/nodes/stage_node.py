@@ -72,7 +72,7 @@ class StageNode(CellNode):
         self._outside, self._outside_due = set(self.outlets), 0.0
         # Computed in this process for readers to share, and nothing of their past is wanted: no need to copy.
         self._shared = [q for topic, q in self._queues.items() if q.inside and not self._tracks[topic].delay]
-        if self.stage.actions:
+        if self.stage.takes_events:
             self.create_service(Schedule, "~/schedule", self._on_schedule)
 
     def tick(self, now: float) -> None:

@@ -134,6 +134,11 @@ class HardSpot:
         if not 0.0 <= self.factor < np.inf:
             raise InputError(f"hard spot: factor {self.factor:g}; allowed: 0 or more")
 
+    @property
+    def row(self) -> tuple[float, ...]:
+        """As the kernel has it."""
+        return self.start, self.width, self.bottom, self.top, self.factor
+
 
 def _check_window(what: str, start: float, width: float) -> None:
     if not (np.isfinite(start) and 0.0 < width < _TURN):
@@ -394,7 +399,6 @@ class CuttingProcess:
         heights, compliances = part.heights, part.compliances
         if heights is None or compliances is None:
             heights, compliances = np.zeros(1), np.array([elasticity.compliance])
-        spots = [(spot.start, spot.width, spot.bottom, spot.top, spot.factor) for spot in part.hard_spots]
         self._process = Process(
             step=step,
             depth=depth,
@@ -411,16 +415,24 @@ class CuttingProcess:
             mode=mode,
             mode_now=_instant(mode),
             gaps=np.array(part.gaps, dtype=np.float64).reshape(-1, 2),
-            spots=np.array(spots, dtype=np.float64).reshape(-1, 5),
+            spots=np.array([spot.row for spot in part.hard_spots], dtype=np.float64).reshape(-1, 5),
             heights=np.ascontiguousarray(heights, dtype=np.float64),
             compliances=np.ascontiguousarray(compliances, dtype=np.float64),
             grid=grid,
         )
+        self._whole = self._process
         self._lag_state, self._mode_state = rest(following), rest(mode)
         self._state = np.array([wear.initial, np.nan, 0.0, 0.0])
         # A power of two, so that a mask wraps the index; a sample may be up to a revolution long.
         self._surface = np.zeros(1 << (2 * grid + 2).bit_length())
         self._counts = np.zeros(2, dtype=np.int64)
+
+    def damage(self, *, shorter: float = 0.0, spots: Sequence[HardSpot] = ()) -> None:
+        """Let the edge be shorter [m] than it was made, and the part further hard spots; nothing given: neither."""
+        further = np.array([spot.row for spot in spots], dtype=np.float64).reshape(-1, 5)
+        self._process = self._whole._replace(
+            depth=self._whole.depth - shorter, spots=np.concatenate((self._whole.spots, further))
+        )
 
     @property
     def apart(self) -> int:

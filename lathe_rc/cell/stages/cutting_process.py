@@ -15,6 +15,7 @@ from lathe_rc.cell.stage import Input, Output, Sparse, Stage
 from lathe_rc.errors import InputError
 from lathe_rc.plants.cutting import PAPER, REALISTIC, RIGID, CuttingProcess, Elasticity, HardSpot, Part, Wear
 from lathe_rc.plants.cutting_force import SpecificForce
+from lathe_rc.safety.faults import Fault
 from lathe_rc.signals.allowance import Allowance, mean_reverting, unbounded
 from lathe_rc.signals.noise import Sensor
 
@@ -160,6 +161,7 @@ class CuttingProcessStage(Stage):
 
     kind = "cutting_process"
     Parameters = CuttingProcessParameters
+    devices = ("cut",)
 
     def __init__(self, name: str, parameters: CuttingProcessParameters) -> None:
         super().__init__(name, parameters)
@@ -180,10 +182,26 @@ class CuttingProcessStage(Stage):
             step=parameters.step,
         )
         self._movers = moved
+        self._shorter, self._spots = 0.0, list[HardSpot]()
         self.declare(
             inputs=[Input("encoder", messages.ENCODER, ("angle_true", "speed_true")), *(_READ[name] for name in moved)],
             outputs=[Output("cut", messages.CUT)],
         )
+
+    def damage(self, fault: Fault) -> None:
+        """See `Stage`."""
+        values = fault.values
+        if fault.kind == "tool_broken":
+            self._shorter += values["length"]
+        else:
+            everywhere = values["start"], values["width"], -np.inf, np.inf
+            self._spots.append(HardSpot(*everywhere, values["factor"]))
+        self.cut.damage(shorter=self._shorter, spots=self._spots)
+
+    def mend(self) -> None:
+        """See `Stage`: a new tool in even material."""
+        self._shorter, self._spots = 0.0, []
+        self.cut.damage()
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`; the cross feed is positive into the part."""

@@ -140,7 +140,6 @@ class LearningLanes(LaneStage[LearningController]):
             and table.q_filter == "exponential"
             and table.make_q().chunk == first.make_q().chunk
             and not table.identify
-            and not table.events
             and table.cycle_points == first.cycle_points
             and table.points_per_revolution == first.points_per_revolution
             for table, stage in zip(tables, stages, strict=True)
@@ -333,7 +332,8 @@ def lane_stage(stages: Sequence[Stage], *, shared: bool) -> LaneStage[Any]:
     """What steps some stages of one kind at once; ``shared`` if all that they read is the same in all lanes."""
     if shared and all(same(stages[0].shared, stage.shared) for stage in stages):
         return Shared(stages)
+    eventful = any(stage.shared.events or stage.shared.faults for stage in stages)
     for kind, lanes, fits in _LANES:
-        if isinstance(stages[0], kind) and fits(stages):
+        if isinstance(stages[0], kind) and not eventful and fits(stages):
             return cast("LaneStage[Any]", lanes(stages))
     return Separate(stages)

@@ -10,7 +10,7 @@ from annotated_types import Ge, Le
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import Joint, Output, Sparse, Stage
+from lathe_rc.cell.stage import Joint, Output, Sparse, Stage, Trigger
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.signals.encoder import Encoder
 
@@ -57,8 +57,16 @@ class SpindleEncoder(Stage):
             if parameters.revolutions
             else None
         )
+        self._triggers = [self._by_sample(trigger) for trigger in self._triggers]
         self._encoder = Encoder(self.law, parameters.step, parameters.counts_per_revolution, parameters.speed_window)
         self.declare(outputs=[Output("encoder", messages.ENCODER, Joint("angle", "speed"))])
+
+    def _by_sample(self, trigger: Trigger) -> Trigger:
+        """The same trigger; who makes the angle knows when it comes."""
+        if trigger.kind != "revolution":
+            return trigger
+        sample = self.law.samples_until(2.0 * np.pi * trigger.value, self.parameters.step)
+        return Trigger("sample", float(sample), trigger.action)
 
     def speed_range(self) -> tuple[float, float]:
         """Lowest and highest spindle speed in the run [rad/s]."""

@@ -1,0 +1,328 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Faults by name: what a broken device or a bad line makes of a signal.
+
+A fault is written ``TARGET KIND NAME=VALUE ...``, like ``coarse/state.measured_position wrong scale=1.1``. The target
+is ``TOPIC.FIELD`` of a port, ``TOPIC`` where the fault concerns several fields, or what is broken itself.
+
+Each acts sample by sample from its first sample on and depends on nothing but the samples since then and the seed: the
+cutting into blocks leaves no trace. Times are in s, all else is in the unit of the signal.
+"""
+
+import math
+import re
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import lfilter
+
+from lathe_rc.cell.messages import Signals
+from lathe_rc.errors import InputError
+
+Array = npt.NDArray[np.float64]
+
+_TURN = 2.0 * np.pi
+_LONGEST = 200  # characters of a fault: an event holds it
+_VALUE = re.compile(r"(\w+)=(\S+)")
+
+
+@dataclass(frozen=True)
+class Value:
+    """A number that a kind of fault takes.
+
+    Attributes:
+        doc: what it is.
+        unit: of it; "" for that of the signal.
+        default: None: it has to be given.
+        low: smallest that is allowed.
+        above: whether ``low`` itself is not.
+        below: all that is allowed is.
+    """
+
+    doc: str
+    unit: str = ""
+    default: float | None = None
+    low: float = -math.inf
+    above: bool = False
+    below: float = math.inf
+
+    def takes(self, value: float) -> bool:
+        """Whether it is allowed."""
+        return math.isfinite(value) and (value > self.low if self.above else value >= self.low) and value < self.below
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of fault.
+
+    Attributes:
+        doc: what happens to the signal.
+        values: numbers that it takes, by name.
+        what: it concerns: ``field``: any field of a port; ``encoder``: angle, speed and index pulse together;
+            ``cut``: the cutting process itself.
+        whole: fields of whole numbers can have it too.
+    """
+
+    doc: str
+    values: Mapping[str, Value]
+    what: str = "field"
+    whole: bool = False
+
+
+_TIME = Value("how long", "s", low=0.0, above=True)
+KINDS: Mapping[str, Kind] = {
+    "off": Kind("0, as from a device without power", {}, whole=True),
+    "stuck": Kind("the first sample stays", {}, whole=True),
+    "garbage": Kind(
+        "random numbers, uniform up to the amplitude to both sides", {"amplitude": Value("largest", low=0.0)}
+    ),
+    "wrong": Kind(
+        "scale · signal + offset",
+        {"scale": Value("factor", "1", 1.0), "offset": Value("added", "", 0.0)},
+    ),
+    "slow": Kind("behind a first-order lag", {"time": Value("its time constant", "s", low=0.0, above=True)}),
+    "delayed": Kind("late; the first sample stays until then", {"time": _TIME}),
+    "intermittent": Kind(
+        "0 now and then, at random times, as from a loose contact; good at first",
+        {
+            "good": Value("mean time of a good spell", "s", low=0.0, above=True),
+            "off": Value("mean time of a spell without signal", "s", low=0.0, above=True),
+        },
+    ),
+    "noisy": Kind("with white noise added", {"rms": Value("its root mean square", low=0.0)}),
+    "missed_index": Kind("no index pulse", {}, what="encoder"),
+    "lost_counts": Kind(
+        "at once, and after every whole revolution since then, the measured angle falls back by some counts",
+        {"angle": Value("how much of a turn is lost each time", "rad", low=0.0, above=True)},
+        what="encoder",
+    ),
+    "reversed": Kind("the measured angle runs backwards, as with tracks A and B exchanged", {}, what="encoder"),
+    "tool_broken": Kind("the edge is shorter", {"length": Value("what has broken off", "m", low=0.0)}, what="cut"),
+    "hard_spot": Kind(
+        "harder material in a part of each revolution",
+        {
+            "factor": Value("of the specific force", "1", low=0.0),
+            "start": Value("where it begins", "rad", 0.0),
+            "width": Value("of it", "rad", math.pi, low=0.0, above=True, below=_TURN),
+        },
+        what="cut",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault as it is asked for.
+
+    Attributes:
+        target: what is broken.
+        kind: how, a key of `KINDS`.
+        values: numbers that belong to it, by name; complete.
+    """
+
+    target: str
+    kind: str
+    values: Mapping[str, float]
+
+    @property
+    def text(self) -> str:
+        """How it is written."""
+        given = [f"{name}={value!r}" for name, value in self.values.items()]
+        return " ".join([self.target, self.kind, *given])
+
+
+def parse(text: str, whose: str) -> Fault:
+    """Read a fault; ``whose`` names the node in messages.
+
+    Raises:
+        InputError: no such kind or value, one that is missing, twice there or out of its range.
+    """
+    if len(text) > _LONGEST:
+        raise InputError(f"{whose}: a fault of {len(text)} characters; allowed: up to {_LONGEST}")
+    target, _, rest = text.strip().partition(" ")
+    name, _, rest = rest.strip().partition(" ")
+    kind = KINDS.get(name)
+    if kind is None:
+        known = ", ".join(KINDS)
+        raise InputError(f"{whose}: fault {text!r}; allowed: TARGET KIND NAME=VALUE ..., KIND one of {known}")
+    given: dict[str, float] = {}
+    for part in rest.split():
+        match = _VALUE.fullmatch(part)
+        key = match[1] if match else part
+        try:
+            number = float(match[2]) if match else math.nan
+        except ValueError:
+            number = math.nan
+        if key not in kind.values or key in given or not kind.values[key].takes(number):
+            raise InputError(f"{whose}: fault {text!r}: {part}; allowed: {_allowed(kind)}")
+        given[key] = number
+    missing = [key for key, value in kind.values.items() if value.default is None and key not in given]
+    if missing:
+        raise InputError(f"{whose}: fault {text!r}: no {missing[0]}; allowed: {_allowed(kind)}")
+    # In the order of the table, so that equal faults read equal.
+    values = {key: given.get(key, value.default or 0.0) for key, value in kind.values.items()}
+    return Fault(target, name, values)
+
+
+def _allowed(kind: Kind) -> str:
+    """The values of a kind in words."""
+    words = []
+    for name, value in kind.values.items():
+        limit = "" if value.low == -math.inf else f" {'above' if value.above else 'from'} {value.low:g}"
+        limit += "" if value.below == math.inf else f" below {value.below:.4g}"
+        words.append(f"{name}= a finite number{limit}{f' [{value.unit}]' if value.unit not in ('', '1') else ''}")
+    return "each once: " + ", ".join(words) if words else "no values"
+
+
+# ---- what they do to samples --------------------------------------------------------------------------------
+
+
+class Disturbance:
+    """What a fault of a port makes of the samples while it lasts, and what it leaves.
+
+    Args:
+        fault: see `Fault`.
+        seed: of the cell.
+        step: sampling step [s].
+        whose: makes the random numbers its own.
+    """
+
+    def __init__(self, fault: Fault, *, seed: int, step: float, whose: str) -> None:
+        self._field, self._step = fault.target.rpartition(".")[2], step
+        self._values = dict(fault.values)
+        entropy = [seed, zlib.crc32(f"{whose} {fault.text}".encode())]
+        self._random = np.random.default_rng(np.random.SeedSequence(entropy))
+
+    def during(self, signals: Signals) -> None:
+        """Change the samples in place; called in order, arrays of shape (n,), n above 0."""
+        self.change(signals[self._field])
+
+    def change(self, signal: Array) -> None:
+        """Change those of the field that the fault is of."""
+        raise NotImplementedError
+
+    def after(self, signals: Signals) -> None:
+        """Change those that come when the fault is over."""
+
+
+class _Off(Disturbance):
+    def change(self, signal: Array) -> None:
+        signal[:] = 0
+
+
+class _Stuck(Disturbance):
+    _kept: float | None = None
+
+    def change(self, signal: Array) -> None:
+        if self._kept is None:
+            self._kept = signal[0]
+        signal[:] = self._kept
+
+
+class _Garbage(Disturbance):
+    def change(self, signal: Array) -> None:
+        amplitude = self._values["amplitude"]
+        signal[:] = self._random.uniform(-amplitude, amplitude, signal.size)
+
+
+class _Wrong(Disturbance):
+    def change(self, signal: Array) -> None:
+        signal *= self._values["scale"]
+        signal += self._values["offset"]
+
+
+class _Slow(Disturbance):
+    _state: Array | None = None
+
+    def change(self, signal: Array) -> None:
+        pole = math.exp(-self._step / self._values["time"])
+        if self._state is None:
+            self._state = np.array([pole * signal[0]])
+        signal[:], self._state = lfilter([1.0 - pole], [1.0, -pole], signal, zi=self._state)
+
+
+class _Delayed(Disturbance):
+    _line: Array | None = None
+
+    def change(self, signal: Array) -> None:
+        if self._line is None:
+            self._line = np.full(max(1, round(self._values["time"] / self._step)), signal[0])
+        whole = np.concatenate((self._line, signal))
+        signal[:], self._line = whole[: signal.size], whole[signal.size :]
+
+
+class _Intermittent(Disturbance):
+    _dead, _left = True, 0  # the state of the contact, and for how many samples more
+
+    def change(self, signal: Array) -> None:
+        place = 0
+        while place < signal.size:
+            if not self._left:
+                self._dead = not self._dead
+                mean = self._values["off" if self._dead else "good"] / self._step
+                self._left = math.ceil(self._random.exponential(mean))
+            stop = min(place + self._left, signal.size)
+            if self._dead:
+                signal[place:stop] = 0
+            self._left -= stop - place
+            place = stop
+
+
+class _Noisy(Disturbance):
+    def change(self, signal: Array) -> None:
+        signal += self._values["rms"] * self._random.standard_normal(signal.size)
+
+
+class _MissedIndex(Disturbance):
+    def during(self, signals: Signals) -> None:
+        signals["index_pulse"][:] = 0
+
+
+class _LostCounts(Disturbance):
+    _start: float | None = None
+    _lost = 0.0
+
+    def during(self, signals: Signals) -> None:
+        angle = signals["angle"]
+        if self._start is None:
+            self._start = float(angle[0])
+        lost = self._values["angle"] * (np.floor((angle - self._start) / _TURN) + 1.0)
+        self._lost = float(lost[-1])
+        angle -= lost
+
+    def after(self, signals: Signals) -> None:
+        signals["angle"] -= self._lost
+
+
+class _Reversed(Disturbance):
+    _start: float | None = None
+    _turned = 0.0
+
+    def during(self, signals: Signals) -> None:
+        angle = signals["angle"]
+        if self._start is None:
+            self._start = float(angle[0])
+        self._turned = float(angle[-1]) - self._start
+        angle[:] = 2.0 * self._start - angle
+        signals["speed"] *= -1.0
+
+    def after(self, signals: Signals) -> None:
+        signals["angle"] -= 2.0 * self._turned
+
+
+#: of the faults of ports, by kind; those of the cut are the cutting process' own
+DISTURBANCES: Mapping[str, type[Disturbance]] = {
+    "off": _Off,
+    "stuck": _Stuck,
+    "garbage": _Garbage,
+    "wrong": _Wrong,
+    "slow": _Slow,
+    "delayed": _Delayed,
+    "intermittent": _Intermittent,
+    "noisy": _Noisy,
+    "missed_index": _MissedIndex,
+    "lost_counts": _LostCounts,
+    "reversed": _Reversed,
+}
