@@ -14,7 +14,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _PACKAGE = Path(__file__).parent
-_KERNELS = ("*.py", "signals/*.py", "plants/*.py", "control/*.py", "analysis/*.py", "bag/walk.py")
+_KERNELS = ("*.py", "signals/*.py", "plants/*.py", "control/*.py", "analysis/*.py", "bag/walk.py", "safety/*.py")
 
 
 def _source_hash() -> str:

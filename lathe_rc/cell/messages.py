@@ -23,6 +23,8 @@ CUT = f"{PACKAGE}/msg/CutBlock"
 PERIODIC = f"{PACKAGE}/msg/PeriodicStatus"
 LEARNING = f"{PACKAGE}/msg/LearningStatus"
 EVENT = f"{PACKAGE}/msg/Event"
+SAFETY = f"{PACKAGE}/msg/SafetyBlock"
+SAFETY_STATUS = f"{PACKAGE}/msg/SafetyStatus"
 MEMBER = f"{PACKAGE}/msg/Member"
 JOINTS = "sensor_msgs/msg/JointState"
 

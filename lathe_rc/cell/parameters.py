@@ -169,6 +169,14 @@ class NodeParameters(SharedParameters):
     autostart: bool = parameter(default=True, doc="configure and activate by itself")
 
 
+class ObedientParameters(NodeParameters):
+    """Of a node that obeys the supervisor."""
+
+    reaction_delay: Annotated[int, Ge(0), Le(2**24)] = parameter(
+        0, "samples until a reaction of the supervisor is obeyed; at least a block; 0: nobody is listened to", "sample"
+    )
+
+
 def remapped(table: NodeParameters, topic: str) -> str:
     """The relative name of a topic after the node's ``remap`` rules.
 

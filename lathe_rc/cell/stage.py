@@ -289,7 +289,7 @@ class Stage(ABC):
     ) -> list[Sparse]:
         if start == stop:
             return []
-        first, read, written = first + start, _cut(inputs[: self.own_inputs], start, stop), _cut(outputs, start, stop)
+        first, read, written = first + start, cut(inputs[: self.own_inputs], start, stop), cut(outputs, start, stop)
         if self._injection is None:
             return self.process(first, read, written)
         sparse = self.process(first, self._injection.inputs(first, read), written)
@@ -356,7 +356,8 @@ class Stage(ABC):
         """Compute samples ``first`` on; see `advance`."""
 
 
-def _cut(signals: Sequence[Signals], start: int, stop: int) -> list[Signals]:
+def cut(signals: Sequence[Signals], start: int, stop: int) -> list[Signals]:
+    """Samples from ``start`` on and before ``stop`` of a block, as views."""
     return [{name: samples[start:stop] for name, samples in part.items()} for part in signals]
 
 

@@ -57,6 +57,18 @@ class Cycle:
     learning: bool
 
 
+class AngleLostError(LatheError):
+    """The memory cannot be read at the angle that was measured.
+
+    Attributes:
+        reached: samples of the block that were computed before.
+    """
+
+    def __init__(self, message: str, reached: int) -> None:
+        super().__init__(message)
+        self.reached = reached
+
+
 class RepetitiveController:
     """Self-learning controller of one channel.
 
@@ -177,7 +189,7 @@ class RepetitiveController:
             The cycles that end in this block; the block goes on after each.
 
         Raises:
-            LatheError: the spindle turned so fast that the memory would have been read where nothing is
+            AngleLostError: the spindle turned so fast that the memory would have been read where nothing is
                 learned yet, or its angle jumped.
         """
         rates = self._correction.law is not CorrectionLaw.NONE
@@ -198,12 +210,15 @@ class RepetitiveController:
             elif reason == CYCLE_ENDED:
                 yield self._end_cycle(first + reached - 1)
         if reason == AHEAD:
-            raise LatheError(
+            raise AngleLostError(
                 f"sample {first + reached}: the memory is read at {angle[reached]:.6g} rad before it is learned; "
-                f"the spindle turns at {speed[reached]:.5g} rad/s: reduce its speed, the lead or the feedback delay"
+                f"the spindle turns at {speed[reached]:.5g} rad/s: reduce its speed, the lead or the feedback delay",
+                reached,
             )
         if reason == JUMPED:
-            raise LatheError(f"sample {first + reached}: the spindle angle jumps to {past_angle[reached]:.6g} rad")
+            raise AngleLostError(
+                f"sample {first + reached}: the spindle angle jumps to {past_angle[reached]:.6g} rad", reached
+            )
 
     def _smooth(self) -> None:
         """Apply Q to the cycle before, for the chunk of grid points that learning has come to."""

@@ -13,6 +13,7 @@ from lathe_rc.cell.stages.position_controller import PositionController
 from lathe_rc.cell.stages.profile import ProfileStage
 from lathe_rc.cell.stages.series_drive import SeriesDriveStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.stages.supervisor import Supervisor
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.stages.vibration import Vibration
 
@@ -32,5 +33,6 @@ STAGES: dict[str, type[Stage]] = {
         PositionController,
         ForceController,
         DecouplerStage,
+        Supervisor,
     )
 }

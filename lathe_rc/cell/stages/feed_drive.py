@@ -9,10 +9,11 @@ from annotated_types import Ge, Gt, Le
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import ObedientParameters, parameter
 from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
 from lathe_rc.plants import feed
 from lathe_rc.plants.feed import Feedback, FeedDrive
+from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.example_002 import fill_disturbance
 from lathe_rc.signals.noise import Sensor
 from lathe_rc.transfer import TransferFunction
@@ -20,7 +21,7 @@ from lathe_rc.transfer import TransferFunction
 Axis = Literal["cross", "longitudinal"]
 
 
-class FeedDriveParameters(NodeParameters):
+class FeedDriveParameters(ObedientParameters):
     """Model from command to position, limits, backlash, and the position sensor."""
 
     axis: Axis = parameter("cross", "which slide; the first word of its topics")
@@ -94,21 +95,25 @@ class FeedDriveStage(Stage):
         )
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         self._motor, self._seen, self._load = (np.empty(messages.MAX_BLOCK) for _ in range(3))
-        axis = parameters.axis
+        axis, delay = parameters.axis, parameters.reaction_delay
         self.declare(
-            inputs=[Input(f"{axis}/command", messages.SERVO, ("command",))],
+            inputs=[
+                Input(f"{axis}/command", messages.SERVO, ("command",)),
+                *([Input("safety", messages.SAFETY, ("reaction",), delay)] if delay else []),
+            ],
             outputs=[Output(f"{axis}/state", messages.STATE, Joint("position", "velocity", "effort"))],
         )
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
-        (command,), (state,) = inputs, outputs
-        size = command["command"].size
+        (servo, *safety), (state,) = inputs, outputs
+        command = servo["command"]
+        if safety:
+            command = np.where(safety[0]["reaction"] >= Reaction.HOLD, 0.0, command)
+        size = command.size
         motor, seen = self._motor[:size], self._seen[:size]
         load = self._load[: size if self.parameters.disturbance else 0]
         fill_disturbance(first, self.parameters.step, self.parameters.disturbance, load)
-        self.drive.block(
-            first, command["command"], state["position"], state["velocity"], state["effort"], motor, seen, load
-        )
+        self.drive.block(first, command, state["position"], state["velocity"], state["effort"], motor, seen, load)
         self._sensor.measure(seen, state["measured_position"])
         return []

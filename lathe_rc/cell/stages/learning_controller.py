@@ -12,13 +12,14 @@ import numpy as np
 
 from lathe_rc.analysis.learning import LearningLoop, Response
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import MAX_BLOCK, Signals
-from lathe_rc.cell.stage import Input, Output, Sparse, Stage
+from lathe_rc.cell.messages import MAX_BLOCK, Samples, Signals
+from lathe_rc.cell.stage import Input, Output, Sparse, Stage, cut
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
+from lathe_rc.cell.stages.obedience import Obedience
 from lathe_rc.control import memory_file
 from lathe_rc.control.correction import Correction
 from lathe_rc.control.identification import DriveIdentifier, Identified
-from lathe_rc.control.repetitive import Cycle, RepetitiveController, largest_feedback_delay
+from lathe_rc.control.repetitive import AngleLostError, Cycle, RepetitiveController, largest_feedback_delay
 from lathe_rc.errors import InputError
 from lathe_rc.plants.linear import discretise, second_order
 
@@ -36,7 +37,7 @@ class LearningController(Stage):
     kind = "learning_controller"
     Parameters = LearningControllerParameters
     actions = ("freeze", "learn", "clear", *_FILE_ACTIONS)
-    announces = ("joined",)
+    announces = ("joined", "lost")
 
     def __init__(self, name: str, parameters: LearningControllerParameters) -> None:
         self.parameters = parameters
@@ -69,6 +70,9 @@ class LearningController(Stage):
         inputs += [Input(f"{drive}/state", messages.STATE, ("measured_position",), delay) for drive in parameters.finer]
         if parameters.identify:
             inputs.append(Input("coarse/state", messages.STATE, ("measured_position",), delay))
+        self._obedience = Obedience(self._controller, parameters) if parameters.reaction_delay else None
+        if self._obedience:
+            inputs.append(Input("safety", messages.SAFETY, ("reaction",), parameters.reaction_delay))
         self._identifier = DriveIdentifier(
             model_delay=parameters.model_delay,
             feedback_delay=delay,
@@ -164,6 +168,8 @@ class LearningController(Stage):
             memory_file.save(Path(self.parameters.memory_file), controller.memory(), grid)
         elif action == "load":
             controller.remember(self._read_memory())
+        elif self._obedience:
+            self._obedience.learn(wanted=action == "learn")
         else:
             controller.learning = action == "learn"
 
@@ -171,19 +177,45 @@ class LearningController(Stage):
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
-        (encoder, past, tool, *others), (command,) = inputs, outputs
+        (command,) = outputs
+        if self._obedience is None:
+            return self._control(first, inputs, command["position"])
+        *inputs, safety = inputs
+        sparse: list[Sparse] = []
+        for start, stop in self._obedience.pieces(safety["reaction"]):
+            read, written = cut(inputs, start, stop), command["position"][start:stop]
+            sparse += self._control_until_lost(first + start, read, written)
+            self._obedience.apply(written)
+        return sparse
+
+    def _control_until_lost(self, first: int, inputs: Sequence[Signals], command: Samples) -> list[Sparse]:
+        """The same, but without an angle that it can use the controller gives up, and the command stays."""
+        assert self._obedience is not None, "without one there is nobody to take over"
+        if self._obedience.lost:
+            command[:] = self._obedience.newest
+            return []
+        try:
+            return self._control(first, inputs, command)
+        except AngleLostError as error:
+            self._obedience.lost = True
+            command[error.reached :] = command[error.reached - 1] if error.reached else self._obedience.newest
+            return [Sparse(f"{self.name}/events", messages.EVENT, first + error.reached, {"action": "lost"})]
+
+    def _control(self, first: int, inputs: Sequence[Signals], command: Samples) -> list[Sparse]:
+        encoder, past, tool, *others = inputs
         parameters = self.parameters
         angle, speed, past_angle, error = encoder["angle"], encoder["speed"], past["angle"], tool["measured_error"]
         if parameters.law == "time_periodic":
             angle = parameters.nominal_speed * (parameters.step * np.arange(first, first + angle.size))
             past_angle = angle - parameters.nominal_speed * (parameters.step * parameters.feedback_delay)
+        if parameters.law == "time_periodic" or (self._obedience and self._obedience.constant_lead):
             speed = np.full(angle.size, parameters.nominal_speed)
         for finer in others[: len(parameters.finer)]:
             error = error + finer["measured_position"]
         position = others[-1]["measured_position"] if parameters.identify else None
         identified, sparse = 0, []
         for cycle in self._controller.block(
-            first, angle=angle, speed=speed, past_angle=past_angle, error=error, command=command["position"]
+            first, angle=angle, speed=speed, past_angle=past_angle, error=error, command=command
         ):
             if position is not None:
                 reached = cycle.sample_index + 1 - first
@@ -192,7 +224,7 @@ class LearningController(Stage):
             sparse += self._end_cycle(cycle)
         if position is not None:
             self._identifier.block(first, identified, position.size, position)
-            self._identifier.commanded(first, command["position"])
+            self._identifier.commanded(first, command)
         return sparse
 
     def _end_cycle(self, cycle: Cycle) -> list[Sparse]:

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Prints the tables of safety.md: kinds of faults, states, reactions, and what is done about every fault."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from lathe_rc import harness
+from lathe_rc.cell import messages, scenario
+from lathe_rc.safety.faults import KINDS
+from lathe_rc.safety.state_machine import MEANING, Reaction, State, table
+
+CONFIG = Path(__file__).parents[1] / "config"
+#: scenario, revolution of the fault, and the faults by node
+CASES = {
+    "supervised": (
+        60,
+        {
+            "spindle_encoder": [
+                "encoder.angle off",
+                "encoder.angle stuck",
+                "encoder.angle garbage amplitude=100",
+                "encoder.angle wrong scale=1.001",
+                "encoder.speed wrong scale=1.2",
+                "encoder.angle slow time=0.01",
+                "encoder.angle delayed time=0.005",
+                "encoder.speed intermittent good=0.01 off=0.001",
+                "encoder.angle noisy rms=1e-4",
+                "encoder missed_index",
+                "encoder lost_counts angle=0.01",
+                "encoder reversed",
+            ],
+            "learning_controller": [
+                "tool.measured_error off",
+                "tool.measured_error stuck",
+                "tool.measured_error garbage amplitude=1e-4",
+                "tool.measured_error wrong scale=-1",
+                "tool.measured_error delayed time=0.01",
+                "tool.measured_error noisy rms=2e-6",
+            ],
+            "electrodynamic_actuator": [
+                "coarse/command.position off",
+                "coarse/command.position stuck",
+                "coarse/command.position delayed time=0.002",
+                "coarse/state.position stuck",
+                "coarse/state.measured_position off",
+                "coarse/state.measured_position stuck",
+                "coarse/state.measured_position garbage amplitude=1e-4",
+                "coarse/state.measured_position wrong scale=0.9 offset=1e-5",
+                "coarse/state.measured_position slow time=0.001",
+                "coarse/state.measured_position intermittent good=0.01 off=0.001",
+                "coarse/state.measured_position noisy rms=1e-5",
+            ],
+        },
+    ),
+    "supervised_turning": (
+        200,
+        {
+            "cutting_process": [
+                "cut tool_broken length=1e-3",
+                "cut hard_spot factor=2",
+                "cut.measured_force off",
+                "cut.measured_force stuck",
+                "cut.measured_force wrong scale=0.8",
+                "cut.measured_force noisy rms=10",
+            ],
+            "longitudinal": ["longitudinal/command.command stuck", "longitudinal/state.velocity off"],
+        },
+    ),
+}
+
+
+def kinds() -> list[str]:
+    """The table of the kinds of faults."""
+    lines = ["| kind | of | what the signal becomes | values |", "| --- | --- | --- | --- |"]
+    for name, kind in KINDS.items():
+        values = []
+        for key, value in kind.values.items():
+            unit = {"": "unit of the signal", "1": ""}.get(value.unit, value.unit)
+            default = "" if value.default is None else f" ({value.default:.4g})"
+            values.append(f"`{key}`{default}: {value.doc}{f' [{unit}]' if unit else ''}")
+        of = {"field": "any field", "encoder": "the encoder", "cut": "the cut"}[kind.what]
+        lines.append(f"| `{name}` | {of} | {kind.doc} | {'; '.join(values)} |")
+    return lines
+
+
+def states() -> list[str]:
+    """The table of the states and what leads from one to another."""
+    lines = [f"| cause | {' | '.join(f'from {state.name.lower()}' for state in State)} |", "| --- |" + " --- |" * 4]
+    lines += [f"| {' | '.join(row)} |" for row in table()]
+    lines += ["", "| reaction | what is done |", "| --- | --- |"]
+    return lines + [f"| {reaction.name.lower()} | {said} |" for reaction, said in MEANING.items()]
+
+
+def noticed(name: str, node: str, fault: str, revolution: int) -> str:
+    """A row of the table of faults: one run."""
+    overrides = [f"{node}.faults=['revolution {revolution}: {fault}']"]
+    recording = harness.run(scenario.load(CONFIG / f"{name}.yaml", overrides)).recording
+    begin = recording.sparse[f"/{node}/events"].values["sample_index"][0]
+    status = recording.sparse["/safety/status"].values
+    found = list(zip(status["sample_index"], status["state"], strict=True)) if status else []
+    safe = next((index for index, state in found if state == State.SAFE), None)
+    # The error is positive where the tool is too deep in the part.
+    tools = [signals["error"] for topic, signals in recording.dense.items() if recording.types[topic] == messages.TOOL]
+    depth = [f"{error[begin:safe].max() * 1e6:.3g}" for error in tools] or [""]
+    row = [name, f"`{fault}` at {node}"]
+    if not status:
+        return f"| {' | '.join([*row, 'not noticed', '', '', *depth])} |"
+    angle = recording.of_type(messages.ENCODER)["angle_true"]
+    first, step = found[0][0], 1.0 / 64000
+    by = (
+        f"{status['monitor'][0]}, {(first - begin) * step * 1e3:.3g}, {(angle[first] - angle[begin]) / (2 * np.pi):.3g}"
+    )
+    end = State(status["state"][-1]).name.lower()
+    after = end if safe is None else f"{end} after {(safe - begin) * step * 1e3:.3g} ms"
+    return f"| {' | '.join([*row, by, Reaction(max(status['reaction'])).name.lower(), after, *depth])} |"
+
+
+def main() -> None:
+    """All tables, or with ``--static`` those that need no run."""
+    print("\n".join([*kinds(), "", *states()]))
+    if "--static" in sys.argv:
+        return
+    print("\n| scenario | fault | noticed by, after [ms, rev] | reaction | state at the end | too deep by [µm] |")
+    print("| --- | --- | --- | --- | --- | ---: |")
+    for name, (revolution, faults) in CASES.items():
+        for node, texts in faults.items():
+            for fault in texts:
+                print(noticed(name, node, fault, revolution))
+
+
+main()

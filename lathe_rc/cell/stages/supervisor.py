@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Watches the cell and says what is to be done; who listens reads it as feedback with a declared delay."""
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Le
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.stage import Input, Output, Sparse, Stage
+from lathe_rc.errors import InputError
+from lathe_rc.safety import state_machine
+from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Monitor, Rate, Threshold
+from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
+
+Asked = Literal["warn", "freeze", "fall_back", "hold", "retract", "stop"]
+
+_SENSOR, _COMMAND = ("measured_position", "effort"), ("position",)
+
+
+class SupervisorParameters(NodeParameters):
+    """Thresholds, each 0 for a monitor that is off, and what is asked for beyond them."""
+
+    drives: list[str] = parameter(["coarse"], "drives of the tool that are watched, by the names of their topics")
+    slides: list[Literal["cross", "longitudinal"]] = parameter([], "slides that are watched")
+
+    speed_limit: Annotated[float, Ge(0)] = parameter(
+        0.0, "encoder: measured speed, deviation from the nominal", "rad/s"
+    )
+    speed_reaction: Asked = parameter("stop", "what is asked for then")
+    acceleration_limit: Annotated[float, Ge(0)] = parameter(0.0, "encoder: change of the measured speed", "rad/s^2")
+    acceleration_window: Annotated[int, Ge(1), Le(65536)] = parameter(640, "over so many samples", "sample")
+    acceleration_reaction: Asked = parameter("stop", "what is asked for then")
+    index_limit: Annotated[float, Ge(0), Le(3)] = parameter(
+        0.0, "encoder: measured angle from index pulse to index pulse, deviation from a revolution", "rad"
+    )
+    index_reaction: Asked = parameter("retract", "what is asked for then")
+    following_limit: list[Annotated[float, Ge(0)]] = parameter(
+        [], "drives: command - measured position, the drive's own lag included; one for each, or none", "m"
+    )
+    following_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
+    following_reaction: Asked = parameter("retract", "what is asked for then")
+    stroke_limit: list[Annotated[float, Ge(0)]] = parameter(
+        [], "drives: measured position to each side; one for each, or none", "m"
+    )
+    stroke_reaction: Asked = parameter("retract", "what is asked for then")
+    effort_limit: list[Annotated[float, Ge(0)]] = parameter(
+        [], "drives: current or voltage at which one is taken to be saturated; one for each, or none", "A or V"
+    )
+    effort_time: Annotated[float, Ge(0)] = parameter(5e-3, "for so long", "s")
+    effort_reaction: Asked = parameter("freeze", "what is asked for then")
+    error_limit: Annotated[float, Ge(0)] = parameter(0.0, "tool: measured error", "m")
+    error_after: Annotated[float, Ge(0)] = parameter(
+        10.0, "after so many from the start or a reset: they are there to learn", "rev"
+    )
+    error_reaction: Asked = parameter("retract", "what is asked for then")
+    growth_limit: Annotated[float, Ge(0)] = parameter(
+        0.0, "tool: RMS error of a revolution over that of the one before"
+    )
+    growth_cycles: Annotated[int, Ge(1), Le(1000)] = parameter(3, "so many times in a row", "rev")
+    growth_floor: Annotated[float, Ge(0)] = parameter(1e-6, "RMS error that does not count", "m")
+    growth_reaction: Asked = parameter("freeze", "what is asked for then")
+    force_limit: Annotated[float, Ge(0)] = parameter(0.0, "cut: measured force", "N")
+    force_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
+    force_low: Annotated[float, Ge(0)] = parameter(0.0, "cut: measured force below this is lost", "N")
+    force_after: Annotated[float, Ge(0)] = parameter(10.0, "after so many from the start or a reset", "rev")
+    force_reaction: Asked = parameter("retract", "what is asked for beyond either")
+    slide_limit: list[Annotated[float, Ge(0)]] = parameter(
+        [], "slides: measured position to each side; one for each, or none", "m"
+    )
+    slide_reaction: Asked = parameter("hold", "what is asked for then")
+
+    clear_position: float = parameter(
+        0.25e-3, "the tool is out of the part where the first drive's measured position is beyond this", "m"
+    )
+    clear_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
+
+
+class Supervisor(Stage):
+    """See `lathe_rc.safety`.
+
+    Attributes:
+        parameters: its table.
+        monitors: those that are on.
+        state: of the cell.
+        reaction: in force.
+    """
+
+    kind = "supervisor"
+    Parameters = SupervisorParameters
+    actions = (RESET,)
+
+    def __init__(self, name: str, parameters: SupervisorParameters) -> None:
+        super().__init__(name, parameters)
+        self.parameters = parameters
+        self._inputs = [Input("encoder", messages.ENCODER, ("angle", "speed", "index_pulse"))]
+        self.monitors: list[Monitor] = []
+        self.state, self.reaction = State.NOMINAL, Reaction.NONE
+        self._was_reset = False
+        self._out = self._reads(f"{parameters.drives[0]}/state", messages.STATE, _SENSOR) if parameters.drives else None
+        self._clearance = Clearance(parameters.clear_position, self._samples(parameters.clear_time))
+        self._watch_spindle()
+        self._watch_error()
+        self._watch_drives()
+        self._watch_cut()
+        self.declare(inputs=self._inputs, outputs=[Output("safety", messages.SAFETY)])
+        self.sparse_topics["safety/status"] = messages.SAFETY_STATUS
+
+    # ---- monitors -----------------------------------------------------------------------------------
+
+    def _reads(self, topic: str, msgtype: str, fields: tuple[str, ...]) -> int:
+        """Place of an input, added if it is not there."""
+        for place, port in enumerate(self._inputs):
+            if port.topic == topic:
+                return place
+        self._inputs.append(Input(topic, msgtype, fields))
+        return len(self._inputs) - 1
+
+    def _samples(self, seconds: float) -> int:
+        return max(1, round(seconds * self.shared.sample_rate))
+
+    def _each(self, name: str, of: Sequence[str]) -> list[tuple[str, float]]:
+        """What is watched with its limit, for a list of limits that are on."""
+        limits: list[float] = getattr(self.parameters, name)
+        if limits and len(limits) != len(of):
+            raise InputError(f"{self.name}.{name} = {limits}; allowed: one for each of {', '.join(of) or 'none'}")
+        return [(subject, limit) for subject, limit in zip(of, limits or [0.0] * len(of), strict=True) if limit]
+
+    def _reaction(self, name: str) -> Reaction:
+        asked = Reaction[getattr(self.parameters, name).upper()]
+        if asked >= Reaction.RETRACT and not self.parameters.drives:
+            raise InputError(
+                f"{self.name}.{name} = {asked.name.lower()}, but no drive is named that takes the tool out; allowed: "
+                "warn, freeze, fall_back or hold, or name the drives"
+            )
+        return asked
+
+    def _watch_spindle(self) -> None:
+        table, add = self.parameters, self.monitors.append
+        if table.speed_limit:
+            reaction = self._reaction("speed_reaction")
+            speed = table.nominal_speed
+            add(Threshold("speed", "encoder", table.speed_limit, reaction, signal=(0, "speed"), offset=speed))
+        if table.acceleration_limit:
+            add(
+                Rate(
+                    "acceleration",
+                    "encoder",
+                    table.acceleration_limit,
+                    self._reaction("acceleration_reaction"),
+                    signal=(0, "speed"),
+                    window=table.acceleration_window,
+                    step=table.step,
+                    before=table.nominal_speed,
+                )
+            )
+        if table.index_limit:
+            add(IndexPulses(table.index_limit, self._reaction("index_reaction"), encoder=0))
+
+    def _watch_error(self) -> None:
+        table, add = self.parameters, self.monitors.append
+        tool = self._reads("tool", messages.TOOL, ("measured_error",)) if table.error_limit or table.growth_limit else 0
+        if table.error_limit:
+            reaction = self._reaction("error_reaction")
+            add(
+                Threshold(
+                    "error",
+                    "tool",
+                    table.error_limit,
+                    reaction,
+                    signal=(tool, "measured_error"),
+                    after=table.error_after,
+                )
+            )
+        if table.growth_limit:
+            reaction = self._reaction("growth_reaction")
+            add(
+                Growth(
+                    table.growth_limit,
+                    reaction,
+                    encoder=0,
+                    tool=tool,
+                    cycles=table.growth_cycles,
+                    floor=table.growth_floor,
+                )
+            )
+
+    def _watch_drives(self) -> None:
+        table, add = self.parameters, self.monitors.append
+        for drive, limit in self._each("following_limit", table.drives):
+            state = self._reads(f"{drive}/state", messages.STATE, _SENSOR)
+            command = self._reads(f"{drive}/command", messages.COMMAND, _COMMAND)
+            add(
+                Threshold(
+                    "following",
+                    drive,
+                    limit,
+                    self._reaction("following_reaction"),
+                    signal=(command, "position"),
+                    other=(state, "measured_position"),
+                    samples=self._samples(table.following_time),
+                )
+            )
+        for what, of, name, field, seconds in (
+            ("stroke", table.drives, "stroke_limit", "measured_position", 0.0),
+            ("effort", table.drives, "effort_limit", "effort", table.effort_time),
+            ("slide", table.slides, "slide_limit", "measured_position", 0.0),
+        ):
+            for subject, limit in self._each(name, of):
+                state = self._reads(f"{subject}/state", messages.STATE, _SENSOR)
+                reaction, samples = self._reaction(f"{what}_reaction"), self._samples(seconds)
+                add(Threshold(what, subject, limit, reaction, signal=(state, field), samples=samples))
+
+    def _watch_cut(self) -> None:
+        table = self.parameters
+        if not (table.force_limit or table.force_low):
+            return
+        place, reaction = self._reads("cut", messages.CUT, ("measured_force",)), self._reaction("force_reaction")
+        signal, samples = (place, "measured_force"), self._samples(table.force_time)
+        if table.force_limit:
+            self.monitors.append(Threshold("force", "cut", table.force_limit, reaction, signal=signal, samples=samples))
+        if table.force_low:
+            self.monitors.append(
+                Below(
+                    "force_low",
+                    "cut",
+                    table.force_low,
+                    reaction,
+                    signal=signal,
+                    samples=samples,
+                    after=table.force_after,
+                )
+            )
+
+    # ---- samples ------------------------------------------------------------------------------------
+
+    def perform(self, action: str) -> None:
+        """See `Stage`: a reset; what is still wrong raises its alarm again."""
+        to = state_machine.after(self.state, action)
+        if to is not None and self.reaction is not Reaction.STOP:
+            self.state, self.reaction, self._was_reset = to, Reaction.NONE, True
+            for monitor in self.monitors:
+                monitor.reset()
+
+    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+        """See `Stage`."""
+        (safety,) = outputs
+        samples = safety["state"].size
+        found = [(alarm.place, monitor, alarm.value) for monitor in self.monitors if (alarm := monitor.look(inputs))]
+        sparse: list[Sparse] = []
+        if self._was_reset:
+            sparse.append(self._status(first, RESET, "", 0.0, 0.0))
+            self._was_reset = False
+        reached = 0
+        for place, monitor, value in sorted(found, key=lambda alarm: alarm[0]):
+            self._fill(safety, inputs, first, reached, place, sparse)
+            reached = place
+            to = state_machine.after(self.state, monitor.reaction)
+            assert to is not None, "every reaction is known in every state"
+            if to is State.RETRACTING and self.state is not to:
+                self._clearance.begin()
+            self.state, self.reaction = to, max(self.reaction, monitor.reaction)
+            sparse.append(self._status(first + place, monitor.name, monitor.subject, value, monitor.limit))
+        self._fill(safety, inputs, first, reached, samples, sparse)
+        return sparse
+
+    def _fill(
+        self, safety: Signals, inputs: Sequence[Signals], first: int, start: int, stop: int, sparse: list[Sparse]
+    ) -> None:
+        """State and reaction of some samples without an alarm; the tool may be out at one of them."""
+        if self.state is State.RETRACTING and self._out is not None:
+            place = self._clearance.first(inputs[self._out]["measured_position"][start:stop])
+            if place is not None:
+                safety["state"][start : start + place] = self.state
+                safety["reaction"][start : start + place] = self.reaction
+                start += place
+                self.state = State.SAFE
+                sparse.append(self._status(first + start, RETRACTED, self.parameters.drives[0], 0.0, 0.0))
+        safety["state"][start:stop] = self.state
+        safety["reaction"][start:stop] = self.reaction
+
+    def _status(self, index: int, monitor: str, subject: str, value: float, limit: float) -> Sparse:
+        values = {
+            "state": int(self.state),
+            "reaction": int(self.reaction),
+            "monitor": monitor,
+            "subject": subject,
+            "value": value,
+            "limit": limit,
+        }
+        return Sparse("safety/status", messages.SAFETY_STATUS, index, values)

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motions that keep within velocity, acceleration and jerk, and a command that is taken over and given back by them."""
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import BPoly
+
+Array = npt.NDArray[np.float64]
+
+_LONGER = 1.05  # factor from one try of a duration to the next
+_LOOKS = 129  # points at which a motion is looked at
+_WITHIN = 1.0 + 1e-9
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What a motion keeps within; what it begins with may be beyond.
+
+    Attributes:
+        velocity: [m/s].
+        acceleration: [m/s²].
+        jerk: [m/s³].
+    """
+
+    velocity: float
+    acceleration: float
+    jerk: float
+
+
+def motion(start: float, velocity: float, end: float | None, bounds: Bounds, step: float) -> Array:
+    """A motion to rest: a polynomial of fifth degree, as short as the bounds allow to 5 %.
+
+    Args:
+        start: where it begins [m], without acceleration.
+        velocity: with which it begins [m/s].
+        end: where it ends [m]; None: where it comes to rest the soonest.
+        bounds: that it keeps within; a larger velocity at the start is not exceeded.
+        step: sampling step [s].
+
+    Returns:
+        Positions one step after the start and on, up to the end [m], shape (n,), n at least 1.
+    """
+    highest = max(bounds.velocity, abs(velocity))
+    length = abs(velocity) * step if end is None else abs(end - start)
+    # The shortest that the peaks of a motion from rest to rest could allow; nothing shorter need be tried.
+    duration = max(step, 1.875 * length / highest, (60.0 * length / bounds.jerk) ** (1 / 3) / 2.0)
+    while True:
+        goal = start + velocity * duration / 2.0 if end is None else end
+        path = BPoly.from_derivatives([0.0, duration], [[start, velocity, 0.0], [goal, 0.0, 0.0]])
+        times = np.linspace(0.0, duration, _LOOKS)
+        peaks = [float(np.abs(path(times, order)).max()) for order in (1, 2, 3)]
+        limits = (highest, bounds.acceleration, bounds.jerk)
+        if all(peak <= limit * _WITHIN for peak, limit in zip(peaks, limits, strict=True)):
+            break
+        duration *= _LONGER
+    samples = int(np.ceil(duration / step))
+    positions: Array = path(np.minimum(np.arange(1, samples + 1) * step, duration))
+    positions[-1] = goal
+    return positions
+
+
+class Mode(Enum):
+    """Who commands."""
+
+    FOLLOW = "the controller"
+    HOLD = "nobody: the command comes to rest"
+    RETRACT = "the command goes to its place out of the part"
+
+
+class Takeover:
+    """A command that is held or retracted, and given back to its controller, without a jump of position or velocity.
+
+    Args:
+        bounds: of what it does itself.
+        retracted: where the command is when retracted [m].
+        step: sampling step [s].
+    """
+
+    def __init__(self, bounds: Bounds, retracted: float, step: float) -> None:
+        self._bounds, self._goal, self._step = bounds, retracted, step
+        self._mode = Mode.FOLLOW
+        self._path, self._place = np.zeros(1), 1  # positions to come; of what is added to the command when it follows
+        self._given, self._wanted = np.zeros(2), np.zeros(2)  # the last two samples, after and before
+
+    @property
+    def newest(self) -> float:
+        """What was given last [m]."""
+        return float(self._given[1])
+
+    @property
+    def remaining(self) -> int:
+        """Samples until the motion that is under way ends."""
+        return self._path.size - self._place
+
+    def change(self, mode: Mode) -> None:
+        """Take over, or give back, from the next sample on."""
+        if mode is self._mode:
+            return
+        velocity = (self._given[1] - self._given[0]) / self._step
+        if mode is Mode.FOLLOW:
+            rest = velocity - (self._wanted[1] - self._wanted[0]) / self._step
+            self._path = motion(self._given[1] - self._wanted[1], rest, 0.0, self._bounds, self._step)
+        else:
+            goal = self._goal if mode is Mode.RETRACT else None
+            self._path = motion(self._given[1], velocity, goal, self._bounds, self._step)
+        self._mode, self._place = mode, 0
+
+    def apply(self, command: Array) -> None:
+        """Make of what the controller wants what the drive gets; in place, shape (n,) [m]."""
+        wanted = np.concatenate((self._wanted, command))[-2:]
+        if self._mode is not Mode.FOLLOW or self._place < self._path.size:
+            ahead = self._path[self._place : self._place + command.size]
+            self._place += ahead.size
+            if self._mode is Mode.FOLLOW:
+                command[: ahead.size] += ahead
+            else:
+                command[: ahead.size], command[ahead.size :] = ahead, self._path[-1]
+        self._given, self._wanted = np.concatenate((self._given, command))[-2:], wanted

@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Monitors, the state machine, what the controllers do about it: bounded, the same everywhere, nothing without a cause."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from cells import SCENARIOS, command, cuts, spans
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from lathe_rc import harness
+from lathe_rc.bag.resim import resimulate
+from lathe_rc.cell import messages
+from lathe_rc.cell import scenario as scenarios
+from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion
+from lathe_rc.errors import InputError
+from lathe_rc.safety import state_machine
+from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Rate, Threshold
+from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
+
+STEP = 1.0 / 64000
+CONFIG = SCENARIOS[0].parent
+
+
+# ---- bounded motions
+
+bounds = st.builds(Bounds, st.floats(0.01, 1.0), st.floats(1.0, 200.0), st.floats(1e3, 1e6))
+places = st.floats(-1e-3, 1e-3)
+
+
+def derivatives(positions, start, velocity):
+    """Velocity, acceleration, jerk of a motion, from its samples and the two before it."""
+    whole = np.concatenate(([start - velocity * STEP, start], positions))
+    return [np.diff(whole, order) / STEP**order for order in (1, 2, 3)]
+
+
+@given(bounds=bounds, start=places, end=places, velocity=st.floats(-0.05, 0.05))
+def test_a_motion_keeps_within_its_bounds_and_ends_where_it_shall(bounds, start, end, velocity):
+    positions = motion(start, velocity, end, bounds, 1e-5)
+    assert positions[-1] == end
+    whole = np.concatenate(([start], positions))
+    moving, accelerating = np.diff(whole) / 1e-5, np.diff(whole, 2) / 1e-10
+    # The last step is cut short by up to a sample.
+    assert np.abs(moving[:-1]).max(initial=0.0) <= max(bounds.velocity, abs(velocity)) * (1 + 1e-6)
+    assert np.abs(accelerating[:-1]).max(initial=0.0) <= bounds.acceleration * 1.001 + 1e-3
+
+
+@given(bounds=bounds, start=places, velocity=st.floats(-0.5, 0.5))
+def test_a_brake_comes_to_rest_in_the_direction_of_travel(bounds, start, velocity):
+    positions = motion(start, velocity, None, bounds, 1e-5)
+    travelled = (positions[-1] - start) * np.sign(velocity)
+    assert travelled >= 0.0
+    assert np.all(np.diff(positions) * np.sign(velocity) >= -1e-15)
+
+
+def taken_over(lengths, changes, wave):
+    takeover = Takeover(Bounds(0.1, 50.0, 1e5), 0.3e-3, STEP)
+    out = wave.copy()
+    for first, stop in spans(lengths):
+        marks = sorted({first, stop, *(index for index in changes if first < index < stop)})
+        for begin, end in itertools.pairwise(marks):
+            if begin in changes:
+                takeover.change(changes[begin])
+            takeover.apply(out[begin:end])
+    return out
+
+
+WAVE = 100e-6 * np.sin(np.arange(20_000) * STEP * 2 * np.pi * 33.0)
+
+
+def test_a_command_that_is_retracted_and_given_back_never_jumps():
+    changes = {1000: Mode.HOLD, 5000: Mode.RETRACT, 9000: Mode.FOLLOW}
+    out = taken_over([20_000], changes, WAVE)
+    assert_array_equal(out[:1000], WAVE[:1000])
+    assert np.ptp(out[3000:5000]) == 0.0
+    assert_allclose(out[8000:9000], 0.3e-3, rtol=1e-12)
+    assert_array_equal(out[-1000:], WAVE[-1000:])
+    assert np.abs(np.diff(out)).max() <= (0.1 + np.abs(np.diff(WAVE)).max() / STEP) * STEP * 1.001
+    natural = np.abs(np.diff(WAVE, 2)).max() / STEP**2
+    assert np.abs(np.diff(out, 2)).max() / STEP**2 <= 50.0 + 2.0 * natural
+
+
+@given(lengths=cuts)
+def test_the_cutting_of_a_takeover_into_blocks_leaves_no_trace(lengths):
+    size = sum(lengths)
+    changes = {size // 5: Mode.HOLD, size // 3: Mode.RETRACT, size // 2: Mode.FOLLOW}
+    changes = {index: mode for index, mode in changes.items() if index > 0}
+    assert_array_equal(taken_over([size], changes, WAVE[:size]), taken_over(lengths, changes, WAVE[:size]))
+
+
+# ---- the state machine
+
+
+@given(st.lists(st.sampled_from([*Reaction, RETRACTED, RESET])))
+def test_safe_comes_after_retracting_alone_and_nominal_by_reset_alone(causes):
+    state = State.NOMINAL
+    for cause in causes:
+        to = state_machine.after(state, cause)
+        if to is None:
+            continue
+        if to is State.SAFE and state is not State.SAFE:
+            assert (state, cause) == (State.RETRACTING, RETRACTED)
+        if to is State.NOMINAL and state is not State.NOMINAL:
+            assert cause == RESET
+            assert state is not State.RETRACTING
+        if cause in (Reaction.RETRACT, Reaction.STOP):
+            assert to in (State.RETRACTING, State.SAFE)
+        state = to
+
+
+# ---- monitors
+
+ENCODER, TOOL = 0, 1
+SPEED = 100.0
+
+
+def signals(size=20_000, speed=None, error=None):
+    speed = np.full(size, SPEED) if speed is None else speed
+    angle = np.cumsum(speed) * STEP - speed[0] * STEP
+    pulse = np.diff(np.floor(angle / (2 * np.pi)), prepend=-1.0) > 0
+    tool = np.zeros(size) if error is None else error
+    return [{"angle": angle, "speed": speed, "index_pulse": pulse.astype(np.uint8)}, {"measured_error": tool}]
+
+
+def alarms(monitor, inputs, lengths=None):
+    """Sample and value of each alarm."""
+    size, found = inputs[ENCODER]["angle"].size, []
+    for first, stop in spans(lengths or [size]):
+        alarm = monitor.look([{name: array[first:stop] for name, array in part.items()} for part in inputs])
+        if alarm:
+            found.append((first + alarm.place, alarm.value))
+    return found
+
+
+def jumped(at=12_000, by=0.01):
+    inputs = signals()
+    inputs[ENCODER]["angle"][at:] += by
+    return inputs
+
+
+def risen(at=12_345):
+    speed = np.full(20_000, SPEED)
+    speed[at:] = 1.2 * SPEED
+    return signals(speed=speed)
+
+
+def growing(factor):
+    turns = np.floor(signals()[ENCODER]["angle"] / (2 * np.pi))
+    return signals(error=1e-5 * factor**turns)
+
+
+CASES = {
+    "speed": (lambda: Threshold("s", "e", 15.0, Reaction.STOP, signal=(0, "speed"), offset=SPEED), risen),
+    "lasting": (
+        lambda: Threshold("s", "e", 15.0, Reaction.STOP, signal=(0, "speed"), offset=SPEED, samples=500), risen
+    ),
+    "late": (
+        lambda: Threshold("e", "t", 1e-5, Reaction.STOP, signal=(1, "measured_error"), after=2.5), lambda: growing(1.5)
+    ),
+    "rate": (
+        lambda: Rate("a", "e", 100.0, Reaction.STOP, signal=(0, "speed"), window=64, step=STEP, before=SPEED), risen
+    ),
+    "index": (lambda: IndexPulses(1e-2 / 2, Reaction.STOP, encoder=0), jumped),
+    "growth": (lambda: Growth(1.2, Reaction.FREEZE, encoder=0, tool=1, cycles=2, floor=1e-6), lambda: growing(1.5)),
+    "below": (
+        lambda: Below("b", "e", SPEED * 1.1, Reaction.HOLD, signal=(0, "speed"), samples=10, after=1.5), risen
+    ),
+}  # fmt: skip
+
+
+def test_each_alarm_comes_at_its_sample():
+    revolution = 2 * math.pi / SPEED / STEP
+    expected = {
+        "speed": (12_345, 20.0),
+        "lasting": (12_345 + 499, 20.0),
+        "late": (math.ceil(2.5 * revolution), 1e-5 * 1.5**2),
+        "rate": (12_345, 20.0 / (64 * STEP)),
+        "index": (12_062, 0.005),  # late by what is allowed
+        "growth": (math.ceil(3 * revolution), 1.5),
+        "below": (math.ceil(1.5 * revolution) + 9, SPEED),
+    }
+    for name, (make, inputs) in CASES.items():
+        ((sample, value),) = alarms(make(), inputs())
+        assert sample == expected[name][0], name
+        assert_allclose(value, expected[name][1], atol=2e-3 if name == "index" else 0.0, rtol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_nothing_is_said_without_a_cause(name):
+    make, _ = CASES[name]
+    quiet = signals() if name != "below" else signals(speed=np.full(20_000, 1.2 * SPEED))
+    assert alarms(make(), quiet) == []
+
+
+@pytest.mark.parametrize("name", CASES)
+@given(lengths=st.lists(st.integers(1, 9000), min_size=1, max_size=8))
+def test_the_cutting_of_what_is_watched_leaves_no_trace(name, lengths):
+    make, inputs = CASES[name]
+    given_lengths = [*lengths, max(1, 20_000 - sum(lengths))]
+    whole = [
+        {key: np.resize(array, sum(given_lengths))[: sum(given_lengths)] for key, array in part.items()}
+        for part in inputs()
+    ]
+    assert alarms(make(), whole, given_lengths) == alarms(make(), whole)
+
+
+def test_an_alarm_comes_again_after_a_reset_alone():
+    make, inputs = CASES["speed"]
+    monitor, given_inputs = make(), inputs()
+    assert len(alarms(monitor, given_inputs, [13_000, 3000, 4000])) == 1
+    monitor.reset()
+    assert len(alarms(monitor, given_inputs, [13_000, 3000, 4000])) == 1
+
+
+def test_what_is_not_a_number_is_beyond_every_limit():
+    inputs = signals()
+    inputs[ENCODER]["speed"][777] = np.nan
+    ((sample, _),) = alarms(CASES["speed"][0](), inputs)
+    assert sample == 777
+
+
+def test_the_tool_is_out_when_it_has_been_for_long_enough():
+    clearance = Clearance(1.0, 3)
+    assert clearance.first(np.array([0.0, 1.0, 2.0])) is None
+    assert clearance.first(np.array([1.0, 0.0])) == 0
+    clearance.begin()
+    assert clearance.first(np.array([1.0, 0.0, 1.0, 1.0, 1.0])) == 4
+
+
+# ---- in the cell
+
+
+def supervised(*overrides, name="supervised"):
+    return scenarios.load(CONFIG / f"{name}.yaml", ["spindle_encoder.revolutions=30", *overrides])
+
+
+def status(result):
+    found = result.recording.sparse["/safety/status"].values
+    return list(zip(found["monitor"], found["state"], found["reaction"], found["sample_index"], strict=True))
+
+
+STUCK = "electrodynamic_actuator.faults=['revolution 20: coarse/state.measured_position slow time=1e-3']"
+
+
+def test_a_supervisor_that_sees_nothing_changes_nothing():
+    watched, alone = supervised(), scenarios.load(CONFIG / "piston.yaml", ["spindle_encoder.revolutions=30"])
+    with_it, without = harness.run(watched).digest, harness.run(alone).digest
+    assert {topic: with_it[topic] for topic in without} == without
+    assert set(with_it) - set(without) == {
+        "/safety", "/safety/status", "/supervisor/events", "/tool/events", "/spindle_encoder/events",
+        "/electrodynamic_actuator/events",
+    }  # fmt: skip
+
+
+def test_a_fault_is_noticed_and_the_tool_leaves_the_part_along_a_bounded_profile():
+    result = harness.run(supervised(STUCK))
+    (first, *_, last) = status(result)
+    assert first[:3] == ("error", State.RETRACTING, Reaction.RETRACT)
+    assert last[:2] == (RETRACTED, State.SAFE)
+    wanted = command(result)
+    obeyed = first[3] + 3200
+    assert_array_equal(np.flatnonzero(np.diff(wanted[last[3] + 6400 :])), [])
+    assert wanted[-1] == 0.3e-3
+    out = wanted[obeyed:]
+    assert np.abs(np.diff(out)).max() <= 0.05 * STEP * 1.001
+    assert np.abs(np.diff(out, 2)).max() <= 50.0 * STEP**2 * 1.001
+    assert result.recording.of_type(messages.TOOL)["displacement"][-1] > 0.28e-3
+
+
+@pytest.mark.parametrize("mode", ["composed", "processes"])
+def test_reactions_are_the_same_in_every_host(mode):
+    loaded = supervised(STUCK)
+    assert harness.run(loaded, mode=mode).digest == harness.run(loaded).digest
+
+
+def test_a_reset_gives_the_command_back_and_learning_goes_on():
+    passing = STUCK.replace("revolution 20", "revolution 10 to 11")
+    result = harness.run(supervised(passing, "supervisor.events=['revolution 15: reset']"))
+    assert [told[:2] for told in status(result)][-2:] == [(RETRACTED, State.SAFE), (RESET, State.NOMINAL)]
+    wanted = command(result)
+    assert np.abs(np.diff(wanted[20_000:])).max() <= 0.2 * STEP
+    # Once all is over the form error is what it was before.
+    assert result.errors.rms[-1] < 2.0 * result.errors.rms[8]
+    assert result.recording.of_type(messages.SAFETY)["state"][-1] == State.NOMINAL
+
+
+def test_a_stop_is_not_reset():
+    stop = "spindle_encoder.faults=['revolution 10 to 10.1: encoder.speed wrong scale=1.5']"
+    result = harness.run(supervised(stop, "supervisor.events=['revolution 15: reset']"))
+    assert result.recording.of_type(messages.SAFETY)["reaction"][-1] == Reaction.STOP
+
+
+def test_an_angle_that_no_controller_can_use_ends_in_the_safe_state_not_in_an_error():
+    lost = "spindle_encoder.faults=['revolution 20: encoder.angle garbage amplitude=100']"
+    result = harness.run(supervised(lost))
+    assert "lost" in result.recording.sparse["/learning_controller/events"].values["action"]
+    assert (RETRACTED, State.SAFE) in [told[:2] for told in status(result)]
+
+
+def test_a_broken_tool_stops_the_feed():
+    broken = "cutting_process.faults=['revolution 200: cut tool_broken length=1e-3']"
+    result = harness.run(scenarios.load(CONFIG / "supervised_turning.yaml", [broken]))
+    ((monitor, state, reaction, index),) = status(result)
+    assert (monitor, state, reaction) == ("force_low", State.DEGRADED, Reaction.HOLD)
+    velocity = result.recording.of_type(messages.STATE)["velocity"]
+    assert velocity[index] > 1e-3
+    assert abs(velocity[-1]) < 1e-9
+
+
+def test_a_re_simulation_reacts_in_the_same_way(tmp_path):
+    harness.run(supervised(STUCK, "supervisor.events=['revolution 26: reset']"), bag=tmp_path / "bag")
+    found = resimulate(tmp_path / "bag")
+    assert (found.changed, found.different, found.missing) == (False, [], [])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["supervisor.following_limit=[1e-4, 2e-4]"], "allowed: one for each of coarse"),
+        (["supervisor.slide_limit=[1e-4]"], "allowed: one for each of none"),
+        (["learning_controller.reaction_delay=32"], "feedback of safety is delayed by 32 samples, block_size = 64"),
+        (["supervisor.speed_limit=-1"], "allowed: a finite number from 0"),
+    ],
+)
+def test_what_cannot_be_is_refused(overrides, said):
+    with pytest.raises(InputError) as caught:
+        harness.run(supervised(*overrides))
+    assert said in str(caught.value)
+
+
+def test_who_can_take_no_tool_out_cannot_retract():
+    with pytest.raises(InputError, match="no drive is named that takes the tool out"):
+        harness.run(scenarios.load(CONFIG / "supervised_turning.yaml", ["supervisor.force_reaction=retract"]))
