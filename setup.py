@@ -22,6 +22,7 @@ NODES = [
     "position_controller",
     "force_controller",
     "decoupler",
+    "supervisor",
     "recorder",
 ]
 

@@ -262,7 +262,7 @@ class Stage(ABC):
         Returns:
             The sparse messages of the block, by sample index.
         """
-        if self._triggers or self._scheduled or self._injection:
+        if self._triggers or self._scheduled or (self._injection and self._injection.any):
             sparse = self._advance_with_events(first, inputs, outputs)
         else:
             sparse = self.process(first, inputs[: self.own_inputs], outputs)

@@ -62,6 +62,10 @@ def motion(start: float, velocity: float, end: float | None, bounds: Bounds, ste
     return positions
 
 
+def _last_two(before: Array, samples: Array) -> Array:
+    return samples[-2:].copy() if samples.size > 1 else np.concatenate((before, samples))[-2:]
+
+
 class Mode(Enum):
     """Who commands."""
 
@@ -110,7 +114,7 @@ class Takeover:
 
     def apply(self, command: Array) -> None:
         """Make of what the controller wants what the drive gets; in place, shape (n,) [m]."""
-        wanted = np.concatenate((self._wanted, command))[-2:]
+        wanted = _last_two(self._wanted, command)
         if self._mode is not Mode.FOLLOW or self._place < self._path.size:
             ahead = self._path[self._place : self._place + command.size]
             self._place += ahead.size
@@ -118,4 +122,4 @@ class Takeover:
                 command[: ahead.size] += ahead
             else:
                 command[: ahead.size], command[ahead.size :] = ahead, self._path[-1]
-        self._given, self._wanted = np.concatenate((self._given, command))[-2:], wanted
+        self._given, self._wanted = _last_two(self._given, command), wanted

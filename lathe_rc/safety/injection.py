@@ -106,9 +106,10 @@ class Injection:
             if injected.fault.target == target and injected.end > index:
                 injected.end = index
 
-    def targets(self) -> set[str]:
-        """Those with a fault that has not ended."""
-        return {injected.fault.target for injected in self._injected if injected.end == math.inf}
+    @property
+    def any(self) -> bool:
+        """Whether there is a fault, or has been: some leave something."""
+        return bool(self._injected)
 
     def inputs(self, first: int, inputs: Sequence[Signals]) -> list[Signals]:
         """What the stage gets; what others read as well stays as it is."""
