@@ -25,7 +25,20 @@ from lathe_rc.errors import InputError, LatheError
 _REFRESH = 0.1  # [s] between updates of the progress line
 _LOG_PERIOD = 2.0  # [s] between lines where there is no terminal
 # in lathe_rc.commands, imported when they are wanted
-_ELSEWHERE = ("bag", "bench", "export", "fit", "measure", "record", "replay", "report", "resim", "study", "view")
+_ELSEWHERE = (
+    "bag",
+    "bench",
+    "export",
+    "fit",
+    "measure",
+    "policy",
+    "record",
+    "replay",
+    "report",
+    "resim",
+    "study",
+    "view",
+)
 _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
 
 
@@ -214,7 +227,8 @@ def run(
         console.print(_table(result))
     for fact in _facts(result):
         console.print(fact, highlight=False)
-    for name, path in (("bag", result.bag), ("profile", profile)):
+    snapshots = [("snapshot", path) for path in result.snapshots]
+    for name, path in (("bag", result.bag), *snapshots, ("profile", profile)):
         if path:
             console.print(f"{name}: {path}", highlight=False, soft_wrap=True)
 

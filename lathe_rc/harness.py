@@ -30,15 +30,12 @@ from lathe_rc import part
 from lathe_rc.analysis.metrology import FormErrors, Measurement, form_errors
 from lathe_rc.bag import reader, recover
 from lathe_rc.bag.check import write_digests
-from lathe_rc.bag.record import OfflineRecorder, begin
+from lathe_rc.bag.record import OfflineRecorder, begin, begin_snapshots, recorder_of
 from lathe_rc.bag.writer import refuse_existing
 from lathe_rc.cell import messages
 from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.messages import Signals
-from lathe_rc.cell.parameters import SharedParameters
-from lathe_rc.cell.recorder import KIND as RECORDER
-from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
@@ -63,7 +60,8 @@ class Result:
         mode: the host.
         samples: length of the run.
         wall_s: from block 0 to the last block computed and recorded by every member [s].
-        bag: where it is recorded; None if it was not to be kept.
+        bag: where it is recorded; None if it was not to be kept, or in snapshots alone.
+        snapshots: bags of parts of the run, see `lathe_rc.bag.snapshot`.
         recording: all signals.
     """
 
@@ -72,6 +70,7 @@ class Result:
     samples: int
     wall_s: float
     bag: Path | None
+    snapshots: tuple[Path, ...]
     recording: Recording = field(repr=False)
 
     @property
@@ -136,6 +135,7 @@ class Result:
                 "per_revolution_ront": (self.part.roundness.peak_to_valley * 1e6).tolist() if errors.rms.size else [],
             },
             "bag": str(self.bag) if self.bag else None,
+            "snapshots": [str(path) for path in self.snapshots],
             "digest": self.digest,
         }
 
@@ -160,7 +160,8 @@ def run(
         mode: ``offline``: a loop in this process; ``composed``: all nodes in one process; ``processes``: each node
             a process.
         groups: nodes that share a process, for ``processes``, the others have their own; None: as the scenario says.
-        bag: folder to record to; None: nothing is kept.
+        bag: folder to record to; None: nothing is kept. Where the recorder's ``mode`` is ``snapshot``, their folder
+            is named after it, and the whole run is kept until its end alone.
         watch: called with every event, from the thread that called `run`. The first is ``checked``, with the
             run's samples and step [s]: from then on nothing is refused.
         domain: ROS domain; None: a free one.
@@ -177,8 +178,8 @@ def run(
     if bag is not None:
         refuse_existing(bag)
     result = _run(scenario, cell, mode, groups, bag, watch, domain)
-    if bag is not None:
-        write_digests(bag, result.digest)
+    if result.bag is not None:
+        write_digests(result.bag, result.digest)
     return result
 
 
@@ -196,27 +197,40 @@ def _run(
     if mode == "offline":
         return _offline(scenario, cell, bag, watch)
     with contextlib.ExitStack() as stack:
-        place = bag
+        table = recorder_of(scenario)[1]
+        folder = table.snapshots_of(bag) if bag is not None and table.mode != "continuous" else None
+        place = kept = _whole(scenario, bag)
         if place is None:
             place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-"))) / "bag"
-        complete = with_recorder(scenario, place, keep=bag is not None)
+        complete = with_recorder(scenario, place, keep=bag is not None, snapshots=folder)
         split = [list(complete.nodes)] if mode == "composed" else complete.processes(groups)
         processes = stack.enter_context(Processes(complete, split, domain=domain))
         try:
             events = processes.wait_for_end(watch)
         except BaseException:
             processes.stop()
-            if bag is not None:
-                recover.mend(bag)
+            for path in ([kept] if kept else []) + _bags_in(folder):
+                recover.mend(path)
             raise
         return Result(
             scenario=scenario,
             mode="grouped" if mode == "processes" and len(split) < len(complete.nodes) else mode,
             samples=cell.master.samples,
             wall_s=(events["complete"]["monotonic_ns"] - events["block0"]["monotonic_ns"]) * 1e-9,
-            bag=bag,
+            bag=kept,
+            snapshots=tuple(_bags_in(folder)),
             recording=reader.read(place),
         )
+
+
+def _whole(scenario: Scenario, bag: Path | None) -> Path | None:
+    """The bag that keeps the whole run, if one does."""
+    return None if recorder_of(scenario)[1].mode == "snapshot" else bag
+
+
+def _bags_in(folder: Path | None) -> list[Path]:
+    """The snapshots in a folder, in the order of their triggers."""
+    return sorted(folder.iterdir()) if folder is not None and folder.is_dir() else []
 
 
 class _Watcher:
@@ -240,31 +254,36 @@ def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[
     engine = Engine(cell)
     collector = Collector(cell, engine.samples)
     sinks: list[Sink] = [collector, _Watcher(watch)]
-    writer = None
+    recorder = snapshots = None
     if bag is not None:
-        writer = begin(bag, scenario)
-        sinks.append(OfflineRecorder(cell, engine.samples, writer))
+        snapshots = begin_snapshots(bag, scenario, cell)
+        recorder = OfflineRecorder(cell, engine.samples, begin(bag, scenario, snapshots), snapshots)
+        sinks.append(recorder)
     start = time.monotonic()
     try:
         watch({"event": "block0", "node": cell.master.name})
         engine.run(sinks)
     finally:
-        if writer:
-            writer.close()
+        if recorder:
+            recorder.close()
     wall = time.monotonic() - start
-    return Result(scenario, "offline", engine.samples, wall, bag, collector.recording())
+    kept = _whole(scenario, bag)
+    found = tuple(_bags_in(snapshots.folder)) if snapshots else ()
+    return Result(scenario, "offline", engine.samples, wall, kept, found, collector.recording())
 
 
-def with_recorder(scenario: Scenario, bag: Path, *, keep: bool) -> Scenario:
-    """The scenario as its processes run it: with a recorder on ``bag``, and a spindle that waits for all members."""
+def with_recorder(scenario: Scenario, bag: Path, *, keep: bool, snapshots: Path | None = None) -> Scenario:
+    """The scenario as its processes run it: with a recorder on ``bag``, and a spindle that waits for all members.
+
+    With ``snapshots`` it makes those too, in that folder; what is not to be kept has none.
+    """
     nodes = dict(scenario.nodes)
-    recorders = scenario.of_kind(RECORDER)
-    shared = {name: getattr(scenario.shared, name) for name in SharedParameters.model_fields}
-    name = recorders[0] if recorders else RECORDER
-    table = nodes.get(name) or RecorderParameters(**shared)
+    name, table = recorder_of(scenario)
     changes: dict[str, object] = {"bag": str(bag.resolve())}
     if not keep:
-        changes["compression"] = "none"
+        changes |= {"compression": "none", "mode": "continuous"}
+    elif snapshots is not None:
+        changes |= {"mode": "both", "snapshots": str(snapshots.resolve())}
     nodes[name] = table.model_copy(update=changes)
     for master in scenario.of_kind(SpindleEncoder.kind):
         others = [node for node in nodes if node != master]
@@ -343,7 +362,10 @@ class Processes:
         name = "+".join(group)
         with (self._folder / f"{group[0]}.log").open("wb") as log:
             child = subprocess.Popen(
-                [sys.executable, "-m", "lathe_rc.nodes.container", *members, "--ros-args", "--params-file", str(file)],
+                [
+                    *(sys.executable, "-m", "lathe_rc.nodes.container", *members),
+                    *("--ros-args", "--params-file", str(file), "--enclave", f"/{group[0]}"),
+                ],
                 env=environment,
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,

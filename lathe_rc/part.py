@@ -34,7 +34,7 @@ def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
     angle, error = (
         recording.of_type(kind)[field] for kind, field in ((messages.ENCODER, "angle_true"), (messages.TOOL, "error"))
     )
-    found = measure(angle, error, roundness_cutoff=cutoff, roughness_cutoff=cutoff)
+    found = measure(angle - _turned(angle), error, roundness_cutoff=cutoff, roughness_cutoff=cutoff)
     if not found.form.rms.size:
         raise InputError("nothing to measure: the recording has no complete revolution; let it run longer")
     return found
@@ -59,6 +59,11 @@ def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
         "largest_upr": {"upr": largest, "amplitude": float(waves[largest]) * 1e6},
         "ra": um(found.roughness.ra),
     }
+
+
+def _turned(angle: np.ndarray) -> float:
+    """Angle of the first complete revolution of a snapshot [rad]; 0 of a run, which begins in its first turn."""
+    return 2.0 * np.pi * float(np.ceil(angle[0] / (2.0 * np.pi))) if angle.size and angle[0] >= 2.0 * np.pi else 0.0
 
 
 def _encoder_and_tool(types: Mapping[str, str]) -> list[str | None]:
@@ -86,6 +91,8 @@ class ErrorsByRevolution:
         if encoder is None or tool is None:
             return
         named = {full(topic): signals for topic, signals in dense.items()}
+        if not self._angle.size:
+            self._done = round(_turned(named[encoder]["angle_true"]) / (2.0 * np.pi))
         self._angle = np.concatenate([self._angle, named[encoder]["angle_true"]])
         self._error = np.concatenate([self._error, named[tool]["error"]])
         if self._angle[-1] - self._angle[0] > _TOGETHER * 2.0 * np.pi:
@@ -115,12 +122,16 @@ class FirstAndLast:
         assert tool is not None, "its caller has looked"
         self._encoder, self._tool = encoder, tool
         self._head = self._tail = np.empty((2, 0))  # angle and error
+        self._start = 0.0  # angle of the first revolution [rad]
         self._before = 0  # revolutions before the tail
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
         named = {full(topic): signals for topic, signals in dense.items()}
         piece = np.stack([named[self._encoder]["angle_true"], named[self._tool]["error"]])
+        if not self._tail.size:
+            self._start = _turned(piece[0])
+            self._before = round(self._start / (2.0 * np.pi))
         if self._head.size == 0 or np.ptp(self._head[0]) < _TOGETHER * 2.0 * np.pi:
             self._head = np.concatenate([self._head, piece], axis=1)
         self._tail = np.concatenate([self._tail, piece], axis=1)
@@ -131,14 +142,14 @@ class FirstAndLast:
 
     def numbers(self) -> dict[str, Any] | None:
         """Revolutions, and what is told of the first and the last; None if there is no complete one."""
-        head = measure(*self._head, roundness_cutoff=_CUTOFF)
+        head = measure(self._head[0] - self._start, self._head[1], roundness_cutoff=_CUTOFF)
         if not head.form.rms.size:
             return None
         tail = measure(self._tail[0] - self._before * 2.0 * np.pi, self._tail[1], roundness_cutoff=_CUTOFF)
         revolutions = self._before + int(tail.form.rms.size)
         return {
             "revolutions": revolutions,
-            "first": numbers(head, 0),
+            "first": numbers(head, 0) | {"revolution": round(self._start / (2.0 * np.pi)) + 1},
             "last": numbers(tail, -1) | {"revolution": revolutions},
         }
 

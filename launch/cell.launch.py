@@ -63,6 +63,7 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             executable="container",
             arguments=[f"{name}:{complete.kind(name)}" for name in group],
             parameters=[file.name],
+            ros_arguments=["--enclave", f"/{group[0]}"],
             output="screen",
             on_exit=end_with,
         )

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors, the state machine, what the controllers do about it: bounded, the same everywhere, nothing without a cause."""
+"""Monitors, the state machine, what controllers do about it: bounded, the same everywhere, nothing without a cause."""
 
 import itertools
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -109,6 +111,14 @@ def test_safe_comes_after_retracting_alone_and_nominal_by_reset_alone(causes):
         if cause in (Reaction.RETRACT, Reaction.STOP):
             assert to in (State.RETRACTING, State.SAFE)
         state = to
+
+
+def test_the_page_has_the_tables_of_the_code():
+    script = CONFIG.parent / "docs" / "safety.py"
+    printed = subprocess.run([sys.executable, script, "--static"], capture_output=True, text=True, check=True).stdout
+    page = script.with_suffix(".md").read_text(encoding="utf-8")
+    for table in printed.strip().split("\n\n"):
+        assert table in page, "run: python docs/safety.py"
 
 
 # ---- monitors

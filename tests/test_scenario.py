@@ -296,3 +296,10 @@ def test_a_recorder_that_is_added_takes_only_what_all_nodes_share(tmp_path):
     recorder = harness.with_recorder(made, tmp_path / "bag", keep=True).nodes["recorder"]
     assert (recorder.block_size, recorder.run_id) == (32, "test")
     assert (recorder.stage, recorder.autostart) == ("", True)
+
+
+@pytest.mark.parametrize("path", ["x" * 5000, "/proc/self/mem", "/proc/kmsg", "/dev/zero"])
+def test_the_identity_of_a_run_waits_for_no_file(path, cell):
+    """Neither a traceback nor a wait, though it looks at files before anybody needs them."""
+    loaded = load(cell, [f"learning_controller.memory_file={path}"])
+    assert loaded.shared.run_id

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from lathe_rc.bag.snapshot import SNAPSHOT, first_sample
 from lathe_rc.bag.source import Source
+from lathe_rc.bag.trust import shown
 from lathe_rc.cell import messages
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.wire import Block, Decoder
@@ -31,6 +33,7 @@ class Findings:
         compared: topics whose digest was recorded and is the same.
         messages: all of them.
         samples: of the dense topics that are all of one length.
+        first: where a snapshot begins; 0 of a whole run.
     """
 
     wrong: list[str] = field(default_factory=list)
@@ -39,6 +42,7 @@ class Findings:
     compared: int = 0
     messages: int = 0
     samples: int = 0
+    first: int = 0
 
     @property
     def exit_code(self) -> int:
@@ -55,7 +59,7 @@ class _Dense:
         self._told = 0
         self._step_ns: int | None = None
         self._run_id = ""
-        self.end = 0
+        self.end = findings.first
         self.ended = False
 
     def _tell(self, where: list[str], what: str) -> None:
@@ -69,7 +73,7 @@ class _Dense:
         try:
             block = self._decoder.decode(data)
         except ValueError as error:
-            self._tell(self._findings.wrong, str(error))
+            self._tell(self._findings.wrong, shown(error))
             return
         if self._step_ns is None:
             self._step_ns, self._run_id = block.step_ns, block.run_id
@@ -108,6 +112,7 @@ def check(path: Path) -> Findings:
     sparse: dict[str, SparseTopic] = {}
     with Source(path) as source:
         types = {topic: said.type for topic, said in source.topics.items()}
+        findings.first = first_sample(source.about)
         dense = {t: _Dense(t, k, findings, digester) for t, k in types.items() if k in messages.block_types()}
         sparse = {topic: SparseTopic() for topic, kind in types.items() if kind in messages.sparse_types()}
         counts = dict.fromkeys(types, 0)
@@ -121,7 +126,7 @@ def check(path: Path) -> Findings:
             if said.count != counts[topic]:
                 findings.wrong.append(f"{topic}: {counts[topic]} messages, {said.count} by the metadata")
         findings.messages = sum(counts.values())
-    _ends(dense, findings)
+    _ends(dense, findings, part=SNAPSHOT in source.about)
     if dense and not findings.lost and not findings.wrong:
         findings.digests = digester.result(sparse)
         _compare(path, findings)
@@ -132,18 +137,18 @@ def _add(part: SparseTopic, topic: str, msgtype: str, log_ns: int, data: bytes, 
     try:
         part.append(log_ns, messages.values_of(msgtype, data))
     except ValueError as error:
-        findings.wrong.append(f"{topic}: at {log_ns} ns: {error}")
+        findings.wrong.append(f"{topic}: at {log_ns} ns: {shown(error)}")
 
 
-def _ends(dense: Mapping[str, _Dense], findings: Findings) -> None:
-    """Every dense topic of a complete run ends with the same sample, in a block that says so."""
-    end = max((part.end for part in dense.values()), default=0)
-    for topic, part in dense.items():
-        if part.end < end:
-            findings.lost.append(f"{topic}: ends at sample {part.end}, others at {end}")
-        elif not part.ended:
+def _ends(dense: Mapping[str, _Dense], findings: Findings, *, part: bool) -> None:
+    """Every dense topic ends with the same sample, and unless the bag has but a part of the run says that it does."""
+    end = max((looked.end for looked in dense.values()), default=findings.first)
+    for topic, looked in dense.items():
+        if looked.end < end:
+            findings.lost.append(f"{topic}: ends at sample {looked.end}, others at {end}")
+        elif not looked.ended and not part:
             findings.lost.append(f"{topic}: no last block; the run went on")
-    findings.samples = end
+    findings.samples = end - findings.first
 
 
 def recorded(path: Path) -> dict[str, str]:

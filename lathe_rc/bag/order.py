@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from lathe_rc.bag.rows import Dense, Plan, Sheet
-from lathe_rc.bag.writer import BagWriter
+from lathe_rc.bag.writer import Output
 from lathe_rc.cell.messages import START_NS, Samples, Signals
 from lathe_rc.cell.wire import Block
 from lathe_rc.errors import LatheError
@@ -29,7 +29,7 @@ class Merger:
     block counts: then nothing with an earlier time can still come.
 
     Args:
-        writer: the bag; its topics must have been added.
+        writer: the bag, or what makes bags; its topics must have been added.
         dense: message type and source by fully qualified dense topic.
         sparse: source by fully qualified sparse topic.
         run_id: identity of the run.
@@ -45,7 +45,7 @@ class Merger:
 
     def __init__(
         self,
-        writer: BagWriter,
+        writer: Output,
         dense: Mapping[str, tuple[str, str]],
         sparse: Mapping[str, str],
         *,

@@ -22,6 +22,7 @@ from lathe_rc.bag.identify import Identified
 from lathe_rc.bag.played import asked_for, wire
 from lathe_rc.bag.record import OfflineRecorder, begin
 from lathe_rc.bag.recorded import Recorded
+from lathe_rc.bag.snapshot import first_sample
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.stream import feed
 from lathe_rc.bag.writer import refuse_existing
@@ -128,6 +129,16 @@ def with_controller(scenario: Scenario, file: Path) -> Scenario:
     return Scenario(scenario.name, nodes)
 
 
+def _refuse_snapshot(source: Source) -> None:
+    first = first_sample(source.about)
+    if first:
+        raise InputError(
+            f"{source.path} is a snapshot from sample {first} on: the start of the run, from which controllers and "
+            "drives have their state, is missing; allowed: a bag from sample 0 on (recorder.mode = both records the "
+            "whole run beside the snapshots)"
+        )
+
+
 def resimulate(
     path: Path,
     overrides: Sequence[str] = (),
@@ -159,6 +170,7 @@ def resimulate(
     if output is not None:
         refuse_existing(output)
     with Source(path) as source, tempfile.TemporaryDirectory(prefix="lathe-resim-") as folder:
+        _refuse_snapshot(source)
         recorded = Recorded(source, topics or {})
         original = None if scenario is not None else _of_bag(recorded, source, Path(folder))
         if scenario is not None:

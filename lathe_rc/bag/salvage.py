@@ -13,19 +13,21 @@ from typing import BinaryIO
 
 import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
-from lathe_rc.bag.source import MOST_BYTES, MOST_TOPICS, read_chunk, read_record, unpack, unpack_file, unpacked_size
-from lathe_rc.errors import InputError
+from lathe_rc.bag import trust
+from lathe_rc.bag.source import read_chunk, unpack, unpack_file, unpacked_size
+from lathe_rc.bag.trust import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record, shown
+from lathe_rc.errors import InputError, LatheError
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message that is compressed by itself; CDR begins with a zero
-_UNREADABLE = (McapError, ValueError, KeyError, IndexError, EOFError, struct.error, TypeError)
+_MOST_DESCRIBED = 16 * MOST_TEXT  # texts and definitions that are kept [characters]
+_MOST_DAMAGE = 1000  # places that are told
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,8 @@ class Salvage:
     about: dict[str, str] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     lost_bytes: int = 0
+    _qos: trust.Qos = field(default_factory=trust.Qos, repr=False)
+    _described: int = 0  # characters of texts and definitions
 
     def __post_init__(self) -> None:
         kinds = (".mcap", ".db3", ".zstd")
@@ -97,7 +101,7 @@ class Salvage:
             except ValueError as error:
                 raise InputError(f"{file}: {error}") from None
             except zstandard.ZstdError as error:
-                self.damage.append(f"{file.name}: {error}")
+                self.damage.append(f"{file.name}: {shown(error)}")
 
     # ---- MCAP ---------------------------------------------------------------------------------------
 
@@ -112,7 +116,8 @@ class Salvage:
             yield from self._records(file, stream, size, schemas, channels)
 
     def _lose(self, file: Path, place: int, end: int, why: str) -> None:
-        self.damage.append(f"{file.name}: {why}")
+        if len(self.damage) < _MOST_DAMAGE:
+            self.damage.append(f"{file.name}: {shown(why)}")
         self.lost_bytes += end - place
 
     def _records(
@@ -140,6 +145,9 @@ class Salvage:
             if opcode == Opcode.FOOTER:
                 return
             if opcode == Opcode.CHUNK:
+                if inside is not None:
+                    self._lose(file, 0, len(content), f"chunk in the chunk at byte {inside}")
+                    continue
                 try:
                     whole = read_chunk(content, place)
                 except ValueError as error:
@@ -160,49 +168,70 @@ class Salvage:
             data = ReadDataStream(BytesIO(content))
             if opcode == Opcode.SCHEMA:
                 schema = Schema.read(data)
+                self._describe(len(schema.data))
                 schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
                 self._channel(Channel.read(data), schemas, channels)
             elif opcode == Opcode.METADATA:
                 metadata = Metadata.read(data)
                 if metadata.name == "lathe_rc":
+                    self._describe(sum(map(len, [*metadata.metadata, *metadata.metadata.values()])))
                     self.about |= metadata.metadata
-        except _UNREADABLE as error:
-            self._lose(file, 0, len(content), f"record of kind {opcode}: {error}")
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001 - mcap and rosbags raise whatever broken bytes lead to
+            self._lose(file, 0, len(content), f"record of kind {opcode}: {shown(error)}")
         return None
 
+    def _describe(self, length: int) -> None:
+        """Count what is kept beside the messages."""
+        if self._described + length > _MOST_DESCRIBED:
+            raise ValueError(f"more than {_MOST_DESCRIBED} characters of texts and definitions")
+        self._described += length
+
     def _channel(self, channel: Channel, schemas: dict[int, Schema], channels: dict[int, str]) -> None:
-        if len(self.topics) >= MOST_TOPICS:
-            raise ValueError(f"more than {MOST_TOPICS} topics")
         schema = schemas[channel.schema_id]
+        trust.check_name(channel.topic)
+        trust.check_name(schema.name)
+        self._qos.add(channel)
         qos = tuple(parse_qos(channel.metadata.get("offered_qos_profiles", "") or "[]"))
-        channels[channel.id] = channel.topic
         digest = channel.metadata.get("topic_type_hash", "")
         self.topics[channel.topic] = Announced(schema.name, schema.data.decode(), digest, qos)
+        channels[channel.id] = channel.topic
 
     # ---- SQLite -------------------------------------------------------------------------------------
 
     def _sqlite(self, file: Path) -> Iterator[tuple[str, int, bytes]]:
         try:
             with closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as base:
+                trust.check_tables(base)
                 names = self._sqlite_topics(base)
                 rows = base.execute(
                     "SELECT topic_id, timestamp, data FROM messages WHERE length(data) <= ? ORDER BY id", (MOST_BYTES,)
                 )
                 for number, log_ns, data in rows:
-                    if number in names and isinstance(data, bytes):
-                        yield names[number], int(log_ns), data
-        except sqlite3.Error as error:
-            self._lose(file, 0, 0, str(error))
+                    if number in names and isinstance(log_ns, int) and log_ns >= 0 and isinstance(data, bytes):
+                        yield names[number], log_ns, data
+        except (LatheError, MemoryError):
+            raise
+        except Exception as error:  # noqa: BLE001 - SQLite and rosbags raise whatever broken bytes lead to
+            self._lose(file, 0, 0, shown(error))
 
     def _sqlite_topics(self, base: sqlite3.Connection) -> dict[int, str]:
         names: dict[int, str] = {}
         try:
-            defined = dict(base.execute("SELECT topic_type, encoded_message_definition FROM message_definitions"))
+            rows = base.execute("SELECT topic_type, encoded_message_definition FROM message_definitions")
+            defined = {kind: text for kind, text in rows.fetchmany(MOST_TOPICS) if isinstance(text, str)}
         except sqlite3.Error:
             defined = {}  # bags of older ROS have none
-        for number, name, kind, qos in base.execute("SELECT id, name, type, offered_qos_profiles FROM topics"):
+        listed = base.execute("SELECT id, name, type, offered_qos_profiles FROM topics").fetchmany(MOST_TOPICS)
+        for number, name, kind, qos in listed:
+            trust.check_name(name)
+            trust.check_name(kind)
+            text = qos if isinstance(qos, str) else ""
+            trust.check_yaml(text, "offered_qos_profiles")
+            definition = defined.get(kind, "")
+            self._describe(len(definition) + len(text))
             names[number] = name
-            profiles = tuple(parse_qos(qos)) if isinstance(qos, str) and qos else ()
-            self.topics[name] = Announced(str(kind), str(defined.get(kind, "")), "", profiles)
+            self.topics[name] = Announced(kind, definition, "", tuple(parse_qos(text)))
         return names

@@ -4,51 +4,45 @@
 Nothing in a bag is trusted: what it says of sizes is checked before anything of that size is made.
 """
 
+import heapq
 import struct
+import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from io import BytesIO
 from itertools import chain, pairwise
+from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Any
 
 import lz4.frame
 import numpy as np
 import zstandard
 from isal.isal_zlib import crc32
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
+from mcap.records import Channel
 from mcap.writer import MCAP0_MAGIC
 from rosbags.interfaces import Qos
-from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2 import Reader
 
+from lathe_rc.bag import trust
+from lathe_rc.bag.trust import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record, shown
 from lathe_rc.bag.walk import walk
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import InputError, LatheError
 
 Message = tuple[str, int, bytes]  #: topic, log time [ns] and bytes
 
-MOST_BYTES = 2**28  #: longest chunk or record that is read into memory [B]
-MOST_TOPICS = 4096  #: topics of a bag
-MOST_TEXT = 2**20  #: longest text in its metadata [B]
 MOST_UNPACKED = 2**36  #: of a file that is compressed as a whole [B]
 
 _PIECE = 2**20  # of a file that is unpacked [B]
-_NEVER = 2**63  # log time after all others [ns]
+_NEVER = 2**64  # log time after all others [ns]
 _CHANNELS = 2**16  # numbers that a channel may have
-_RECORD = struct.Struct("<BQ")  # opcode, length
+_AT_ONCE = 2**14  # messages of a batch
 _CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
-_BROKEN = (
-    ReaderError,
-    OSError,
-    ValueError,
-    KeyError,
-    IndexError,
-    TypeError,
-    AttributeError,
-    struct.error,
-    EOFError,
-    zstandard.ZstdError,
-)
+_SQLITE = b"SQLite format 3\0"
 
 
 @dataclass(frozen=True)
@@ -85,7 +79,7 @@ def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
         else:
             raise ValueError(f"compression {compression[:64]!r} is not known; allowed: zstd, lz4, none")
     except (zstandard.ZstdError, RuntimeError) as error:
-        raise ValueError(_line(error)) from None
+        raise ValueError(shown(error)) from None
     if len(whole) != size:
         raise ValueError(f"it does not unpack to the {size} B that it says")
     return whole
@@ -116,31 +110,6 @@ def unpack_file(path: Path) -> Iterator[bytes]:
             yield piece
 
 
-def read_record(stream: BinaryIO, limit: int) -> tuple[int, bytes] | None:
-    """Opcode and content of the next record of an MCAP file.
-
-    Args:
-        stream: at a record.
-        limit: where the file or the chunk ends.
-
-    Returns:
-        None at the end.
-
-    Raises:
-        ValueError: it is cut off, or longer than allowed.
-    """
-    place = stream.tell()
-    if place == limit:
-        return None
-    head = stream.read(_RECORD.size)
-    opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, limit)
-    if place + _RECORD.size + length > limit:
-        raise ValueError(f"cut off at byte {place}")
-    if length > MOST_BYTES:
-        raise ValueError(f"record of {length} B at byte {place}; allowed: up to {MOST_BYTES}")
-    return opcode, stream.read(length)
-
-
 def read_chunk(content: bytes, place: int) -> bytes:
     """The records of a chunk that stands at byte ``place``.
 
@@ -153,7 +122,7 @@ def read_chunk(content: bytes, place: int) -> bytes:
         name_of = content[_CHUNK.size : start].decode("utf-8", "replace")
         whole = unpack(name_of, memoryview(content)[start + 8 :], size)
     except (ValueError, struct.error) as error:
-        raise ValueError(f"chunk at byte {place}: {_line(error)}") from None
+        raise ValueError(f"chunk at byte {place}: {shown(error)}") from None
     if crc and crc32(whole) != crc:
         raise ValueError(f"chunk at byte {place}: its checksum is wrong")
     return whole
@@ -162,29 +131,69 @@ def read_chunk(content: bytes, place: int) -> bytes:
 def _damage(path: Path) -> str:
     """What is longer than it says or than is allowed in an MCAP file, and where; empty if nothing is."""
     limit = path.stat().st_size - len(MCAP0_MAGIC)
+    qos = trust.Qos()
     with path.open("rb") as stream:
-        if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            return f"{path.name}: not an MCAP file"
+        head = stream.read(len(MCAP0_MAGIC))
+        if head != MCAP0_MAGIC:
+            return "" if trust.is_packed(head) else f"{path.name}: not an MCAP file"
         place = stream.tell()
         try:
-            while record := read_record(stream, limit):
+            while (record := read_record(stream, limit)) and record[0] != Opcode.FOOTER:
                 if record[0] == Opcode.CHUNK:
-                    read_chunk(record[1], place)
+                    whole = read_chunk(record[1], place)
+                    inside = BytesIO(whole)
+                    while inner := read_record(inside, len(whole)):
+                        _add_qos(qos, *inner)
+                _add_qos(qos, *record)
                 place = stream.tell()
-        except ValueError as error:
-            return f"{path.name}: {error}; lathe bag recover saves the rest"
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001 - mcap raises whatever broken bytes lead to
+            return f"{path.name}: {shown(error)}; lathe bag recover saves the rest"
     return ""
 
 
-def _messages(whole: bytes, topics: Mapping[int, str]) -> list[tuple[str, int, bytes]]:
+def _add_qos(qos: trust.Qos, opcode: int, content: bytes) -> None:
+    if opcode == Opcode.CHANNEL:
+        qos.add(Channel.read(ReadDataStream(BytesIO(content))))
+
+
+def _check_storage(path: Path) -> None:
+    """Refuse a file that a library could not read in bounded memory and time; others than those of bags pass.
+
+    Raises:
+        ValueError: says why; mcap and SQLite raise others.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(len(_SQLITE))
+    if trust.is_packed(head):
+        with tempfile.TemporaryDirectory(prefix="lathe-unpacked-") as folder:
+            plain = Path(folder) / path.stem
+            with plain.open("wb") as out:
+                out.writelines(unpack_file(path))
+            with plain.open("rb") as stream:
+                if trust.is_packed(stream.read(len(_SQLITE))):
+                    raise ValueError(f"{path.name} is compressed twice")
+            _check_storage(plain)
+    elif head == _SQLITE:
+        trust.check_database(path)
+    elif head.startswith(MCAP0_MAGIC) and not trust.summary_of(path) and (why := _damage(path)):
+        raise ValueError(why)
+
+
+def _messages(whole: bytes, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[list[Message]]:
     """Topic, log time and bytes of the wanted messages among the records of a chunk, by log time."""
     found = walk(whole)
     wanted = np.zeros(_CHANNELS, dtype=bool)
     wanted[list(topics)] = True
     found = found[wanted[found[:, 0]]]
+    if start_ns or stop_ns < _NEVER:
+        found = found[(found[:, 1] >= start_ns) & (found[:, 1] < stop_ns)]
     if np.any(found[1:, 1] < found[:-1, 1]):
         found = found[np.argsort(found[:, 1], kind="stable")]
-    return [(topics[channel], log_ns, whole[begin:end]) for channel, log_ns, begin, end in found.tolist()]
+    for first in range(0, len(found), _AT_ONCE):
+        rows = found[first : first + _AT_ONCE].tolist()
+        yield [(topics[channel], log_ns, whole[begin:end]) for channel, log_ns, begin, end in rows]
 
 
 class Source:
@@ -205,52 +214,66 @@ class Source:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        files = [path] if path.is_file() else sorted(path.glob("*.mcap"))
         try:
-            self._check_metadata()
-            for file in path.glob("*.zstd"):
-                for _ in unpack_file(file):  # rosbags would write it out, however long it is
-                    pass
+            self._check_files()
             self._reader = Reader(path)
             self._reader.open()
-        except _BROKEN as error:
-            why = _line(error)
-            for file in files:
+        except (LatheError, MemoryError):
+            raise
+        except Exception as error:  # noqa: BLE001 - the libraries raise whatever broken bytes lead to
+            why = shown(error)
+            for file in filter(Path.is_file, [path] if path.is_file() else sorted(path.glob("*.mcap"))):
                 why = _damage(file) or why
             raise InputError(f"{path}: not a readable bag ({why})") from None
-        self._find_chunks()
-        # Chunks in order are checked as they are read, the others by rosbags, which trusts what they say of sizes.
-        why = next((text for file in files if (text := _damage(file))), "") if not self._in_order else ""
-        if why:
-            self._reader.close()
-            raise InputError(f"{path}: not a readable bag ({why})")
         try:
             self._read_head()
-        except _BROKEN as error:
+        except (LatheError, MemoryError):
             self._reader.close()
-            raise InputError(f"{path}: not a readable bag ({_line(error)})") from None
+            raise
+        except Exception as error:  # noqa: BLE001 - see above
+            self._reader.close()
+            raise InputError(f"{path}: not a readable bag ({shown(error)})") from None
 
-    def _check_metadata(self) -> None:
-        metadata = self.path / "metadata.yaml"
-        if metadata.exists() and metadata.stat().st_size > MOST_TEXT * 16:
-            raise InputError(f"{metadata}: {metadata.stat().st_size} B; allowed: up to {MOST_TEXT * 16}")
+    def _check_files(self) -> None:
+        """Look at what the libraries would believe.
+
+        Raises:
+            InputError: metadata that is too long.
+            ValueError: see `_check_storage`.
+        """
+        if self.path.is_dir():
+            metadata = self.path / "metadata.yaml"
+            if metadata.exists():
+                if metadata.stat().st_size > MOST_TEXT * 16:
+                    raise InputError(f"{metadata}: {metadata.stat().st_size} B; allowed: up to {MOST_TEXT * 16}")
+                trust.check_yaml(metadata.read_text(encoding="utf-8"), metadata.name)
+        for file in sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]:
+            if file.is_file():
+                _check_storage(file)
+            elif file.exists() and not file.is_dir():
+                raise ValueError(f"{file.name} is no file")  # opening a pipe would wait for its writer
 
     def _read_head(self) -> None:
+        whole: Any = self._reader.storage
+        self._storages: list[Any] = getattr(whole, "storages", [whole])
+        self._packed = self._reader.compression_mode == "message"
         connections = self._reader.connections
         if len(connections) > MOST_TOPICS:
             raise InputError(f"{self.path}: {len(connections)} topics; allowed: up to {MOST_TOPICS}")
         self.topics: dict[str, Topic] = {}
         for connection in connections:
+            trust.check_name(connection.topic)
+            trust.check_name(connection.msgtype)
             ext: Any = connection.ext
             known = self.topics.get(connection.topic)
-            count = connection.msgcount + (known.count if known else 0)
+            count = trust.number(connection.msgcount) + (known.count if known else 0)
             self.topics[connection.topic] = Topic(connection.msgtype, tuple(ext.offered_qos_profiles), count)
-        custom: Any = getattr(self._reader.storage.metadata, "custom", None) or {}
+        custom: Any = getattr(whole.metadata, "custom", None) or {}
         texts = {key: text for key, text in custom.items() if isinstance(key, str) and isinstance(text, str)}
         self.about: Mapping[str, str] = {key[:256]: text[:MOST_TEXT] for key, text in texts.items()}
         empty = not self._reader.message_count
-        self.first_ns = 0 if empty else self._reader.start_time
-        self.last_ns = 0 if empty else self._reader.end_time - 1
+        self.first_ns = 0 if empty else trust.number(self._reader.start_time)
+        self.last_ns = 0 if empty else trust.number(self._reader.end_time) - 1
 
     def __enter__(self) -> "Source":
         """Itself."""
@@ -262,34 +285,34 @@ class Source:
         """Close it."""
         self._reader.close()
 
-    def _find_chunks(self) -> None:
-        """See whether the file is chunks one after the other, which are read faster than messages one by one."""
-        whole: Any = self._reader.storage
-        storages = getattr(whole, "storages", [whole])
-        self._storage: Any = storages[0]
-        chunks = getattr(self._storage, "chunks", [])
-        followed = all(a.message_end_time <= b.message_start_time for a, b in pairwise(chunks))
-        mode = self._reader.compression_mode
-        self._in_order = len(storages) == 1 and bool(chunks) and followed and not mode
-        self._packed = mode == "message"
-        if self._packed:
-            # rosbags would unpack each message to whatever size it says.
-            whole.metadata = whole.metadata._replace(compression_mode=None)
+    def _chunks(self, storage: Any, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[list[Message]]:
+        """Messages of the wanted connections of an MCAP file, by its index."""
+        chunks = [
+            chunk
+            for chunk in storage.chunks
+            if chunk.message_end_time >= start_ns
+            and chunk.message_start_time < stop_ns
+            and (not chunk.message_index_offsets or topics.keys() & chunk.message_index_offsets.keys())
+        ]
+        with Path(str(storage.path)).open("rb") as stream:
 
-    def _chunks(self, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[list[Message]]:
-        """Messages of the wanted connections, chunk by chunk."""
-        with Path(str(self._storage.path)).open("rb") as stream:
-            for chunk in self._storage.chunks:
-                if chunk.message_end_time < start_ns or chunk.message_start_time >= stop_ns:
-                    continue
-                if not topics.keys() & chunk.message_index_offsets.keys():
-                    continue
+            def read(chunk: Any) -> Iterator[list[Message]]:
                 stream.seek(chunk.chunk_start_offset)
                 record = read_record(stream, chunk.chunk_start_offset + chunk.chunk_length)
-                found = _messages(read_chunk(record[1] if record else b"", chunk.chunk_start_offset), topics)
-                if start_ns or stop_ns < _NEVER:
-                    found = [message for message in found if start_ns <= message[1] < stop_ns]
-                yield found
+                whole = read_chunk(record[1] if record else b"", chunk.chunk_start_offset)
+                return _messages(whole, topics, start_ns, stop_ns)
+
+            def late(chunk: Any) -> Iterator[Message]:
+                yield "", chunk.message_start_time, b""  # a chunk is not read before its time
+                yield from chain.from_iterable(read(chunk))
+
+            if all(a.message_end_time <= b.message_start_time for a, b in pairwise(chunks)):
+                for chunk in chunks:
+                    yield from read(chunk)
+                return
+            for message in heapq.merge(*map(late, chunks), key=itemgetter(1)):
+                if message[0]:
+                    yield [message]
 
     def blocks(self, topic: str, *, start_ns: int | None = None) -> Iterator[Block]:
         """The blocks of a dense topic, from a log time [ns] on.
@@ -303,7 +326,7 @@ class Source:
             try:
                 yield decoder.decode(data)
             except ValueError as error:
-                raise LatheError(f"{self.path}: {topic}: {error}") from None
+                raise LatheError(f"{self.path}: {topic}: {shown(error)}") from None
 
     def step_ns(self, topic: str) -> int:
         """Sampling step of a dense topic [ns], as its first block says; 0 if it has none.
@@ -333,22 +356,24 @@ class Source:
         Raises:
             InputError: the bag is broken where the next message should be.
         """
-        wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
-        if not wanted:
-            return
+        names = set(self.topics) if topics is None else topics & set(self.topics)
         try:
-            if self._in_order:
-                names = {c.topic for c in wanted}
-                channels = {c.id: c.topic for c in self._storage.connections if c.topic in names}
-                yield from self._chunks(channels, start_ns or 0, stop_ns or _NEVER)
-                return
-            for connection, log_ns, data in self._reader.messages(wanted, start=start_ns, stop=stop_ns):
-                whole = unpack("zstd", data, unpacked_size(data[:18])) if self._packed else bytes(data)
-                yield [(connection.topic, log_ns, whole)]
-        except _BROKEN as error:
-            raise InputError(f"{self.path}: broken ({_line(error)}); lathe bag check says more") from None
+            for storage in self._storages:
+                wanted = [c for c in storage.connections if c.topic in names]
+                if not wanted:
+                    continue
+                if getattr(storage, "chunks", None):
+                    channels = {c.id: c.topic for c in wanted}
+                    found = self._chunks(storage, channels, start_ns or 0, _NEVER if stop_ns is None else stop_ns)
+                else:
+                    single = storage.messages(wanted, start=start_ns, stop=stop_ns)
+                    found = ([(connection.topic, log_ns, data)] for connection, log_ns, data in single)
+                yield from map(self._unpacked, found) if self._packed else found
+        except (LatheError, MemoryError):
+            raise
+        except Exception as error:  # noqa: BLE001 - the libraries raise whatever broken bytes lead to
+            raise InputError(f"{self.path}: broken ({shown(error)}); lathe bag check says more") from None
 
-
-def _line(error: BaseException) -> str:
-    """The first line of what a library says, and not much of it."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+    def _unpacked(self, batch: list[Message]) -> list[Message]:
+        """Messages that are compressed one by one; rosbags would unpack each to whatever size it says."""
+        return [(topic, log_ns, unpack("zstd", data, unpacked_size(data[:18]))) for topic, log_ns, data in batch]

@@ -4,6 +4,8 @@
 import base64
 import json
 import platform
+import re
+import shutil
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,6 +22,8 @@ RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"
 FILE = "lathe_rc.file."  #: and NODE.PARAM: what was in the file that the parameter names
 RECOVERED = "lathe_rc.recovered"  #: that the bag was completed, and what that cost
 _MOST_FILE = 2**19  # longest such file that is kept [B]
+_MOST_COPIED = 2**26  # longest that is copied from elsewhere; no reader takes a longer one [B]
+_LONGEST_NAME = 80  # characters of a file
 _PACKAGES = ("numpy", "scipy", "numba", "mcap", "rosbags")
 
 
@@ -61,7 +65,10 @@ def _versions() -> dict[str, str]:
 
 
 def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str] = ()) -> Scenario:
-    """The scenario that a bag was made with; its files are written to ``folder``, which must last as long as it.
+    """The scenario that a bag was made with.
+
+    Its files are written to ``folder``, which must last as long as it. Files that it names and the bag does not hold
+    are copied there: a run of what somebody else recorded writes to none that it names.
 
     Raises:
         InputError: the bag has none, or one that this version does not accept.
@@ -69,14 +76,39 @@ def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str]
     if SCENARIO not in about:
         raise InputError("the bag holds no scenario; it was not made by lathe_rc, or its recorder never saw the cell")
     file = folder / "scenario.yaml"
-    file.write_text(about[SCENARIO], encoding="utf-8")
+    file.write_bytes(about[SCENARIO].encode(errors="surrogatepass"))
     sets: list[str] = []
     for key, text in about.items():
         node, dot, name = key.removeprefix(FILE).rpartition(".")
         if not key.startswith(FILE) or not dot:
             continue
         place = folder / f"file{len(sets)}"
-        place.write_bytes(base64.b64decode(text))
+        try:
+            place.write_bytes(base64.b64decode(text))
+        except ValueError:
+            raise InputError(
+                f"{key[:80]!r} of the bag is not base64; recover the bag, or set {node[:80]!r} anew"
+            ) from None
         sets.append(f"{node}.{name}={place}")
+    sets += _copied(scenarios.load(file, sets), folder)
     loaded = scenarios.load(file, [*sets, *overrides])
     return Scenario(about.get(NAME, "") or loaded.name, loaded.nodes)
+
+
+def _copied(scenario: Scenario, folder: Path) -> list[str]:
+    """Copy files from elsewhere that a scenario names to ``folder``; what to set so that it names these."""
+    sets: list[str] = []
+    for node, table in scenario.nodes.items():
+        for row in type(table).rows().values():
+            named = Path(str(getattr(table, row.name))) if row.is_path else Path()
+            if not named.name or named.is_relative_to(folder.resolve()):
+                continue
+            place = folder / f"named{len(sets)}" / re.sub(r"[^\w.-]", "_", named.name)[-_LONGEST_NAME:]
+            place.parent.mkdir(exist_ok=True)
+            try:
+                if named.is_file() and named.stat().st_size <= _MOST_COPIED:
+                    shutil.copyfile(named, place)
+            except OSError as error:
+                raise InputError(f"{node}.{row.name} = {str(named)[:200]!r}: {error.strerror}; set another") from None
+            sets.append(f"{node}.{row.name}={place}")
+    return sets

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lathe_rc.bag.snapshot import first_sample
 from lathe_rc.bag.source import Source
+from lathe_rc.bag.trust import shown
 from lathe_rc.cell import messages
 from lathe_rc.cell.engine import Sink
 from lathe_rc.cell.messages import START_NS, Signals
@@ -17,6 +19,7 @@ from lathe_rc.errors import LatheError
 
 _TOGETHER, _TOGETHER_BYTES = 64, 2**18  # messages of a topic that are read at once, and their size
 _AHEAD = 64  # pieces that one topic may be ahead of another
+_MOST_WAITING = 2**18  # messages of a sparse topic ahead of the blocks
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class BagHeader:
 
     Attributes:
         types: message type by fully qualified signal topic.
-        samples: of every dense topic.
+        samples: index after the last of every dense topic: their number, but in a snapshot.
         left: samples that some topics have beyond that: the recording was interrupted; 0 if it was not.
         step_ns: sampling step [ns]; 0 if the bag has no dense topic.
         run_id: identity of the run.
@@ -41,12 +44,12 @@ class BagHeader:
 
 
 class _Dense:
-    """Blocks of a topic that have not been handed on."""
+    """Blocks of a topic that have not been handed on, from sample ``first`` on."""
 
-    def __init__(self, topic: str, msgtype: str) -> None:
+    def __init__(self, topic: str, msgtype: str, first: int = 0) -> None:
         self.topic, self.type = topic, msgtype
         self.blocks: deque[Block] = deque()
-        self.first = self.end = 0
+        self.first = self.end = first
         self.newest: Block | None = None
         self._messages: list[bytes] = []
         self._bytes = 0
@@ -85,7 +88,7 @@ class _Dense:
             for block in self._decoder.decode_all(messages):
                 self._append(block)
         except ValueError as error:
-            raise LatheError(f"{self.topic}: {error}") from None
+            raise LatheError(f"{self.topic}: {shown(error)}") from None
 
     def _append(self, block: Block) -> None:
         if block.first_index != self.end:
@@ -120,20 +123,21 @@ class Feeder:
         types: message type by fully qualified topic; others than signal topics are left out.
         sinks: get the pieces.
         piece: samples in a piece.
+        first: where all begin.
 
     Attributes:
         types: of the signal topics.
-        first: samples handed on so far.
+        first: the first sample that has not been handed on.
     """
 
-    def __init__(self, types: Mapping[str, str], sinks: Iterable[Sink], piece: int) -> None:
+    def __init__(self, types: Mapping[str, str], sinks: Iterable[Sink], piece: int, first: int = 0) -> None:
         self.types = {topic: msgtype for topic, msgtype in types.items() if msgtype in messages.signal_types()}
-        self._dense = {t: _Dense(t, kind) for t, kind in self.types.items() if kind in messages.block_types()}
+        self._dense = {t: _Dense(t, kind, first) for t, kind in self.types.items() if kind in messages.block_types()}
         self._sparse: dict[str, list[tuple[int, Mapping[str, Any]]]] = {
             topic: [] for topic in self.types if topic not in self._dense
         }
         self._sinks, self._piece = list(sinks), piece
-        self.first = 0
+        self.first = first
 
     @property
     def step_ns(self) -> int:
@@ -153,10 +157,14 @@ class Feeder:
         """
         dense = self._dense.get(topic)
         if dense is None:
+            if not self._dense:
+                return  # nothing that they could be handed on with
+            if len(self._sparse[topic]) >= _MOST_WAITING:
+                raise LatheError(f"{topic}: more than {_MOST_WAITING} messages without the blocks of their time")
             try:
                 self._sparse[topic].append((log_ns, messages.values_of(self.types[topic], data)))
             except ValueError as error:
-                raise LatheError(f"{topic}: at {log_ns} ns: {error}") from None
+                raise LatheError(f"{topic}: at {log_ns} ns: {shown(error)}") from None
             return
         if dense.add(data) and dense.end - self.first >= self._piece:
             self._hand_on(self._piece)
@@ -245,7 +253,8 @@ def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536) -> BagHeader:
         LatheError: samples are missing or repeated.
     """
     with Source(path) as source:
-        feeder = Feeder({topic: kind.type for topic, kind in source.topics.items()}, sinks, piece)
+        types = {topic: kind.type for topic, kind in source.topics.items()}
+        feeder = Feeder(types, sinks, piece, first_sample(source.about))
         try:
             for topic, log_ns, data in source.messages(set(feeder.types)):
                 feeder.add(topic, log_ns, data)

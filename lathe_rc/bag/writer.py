@@ -2,14 +2,17 @@
 """Writing rosbag2 directories.
 
 rosbags writes the directory, its metadata and the schemas. Its own MCAP storage has neither a chunk size nor a
-flush, which are what a crash promise needs; `lathe_rc.bag.mcap_file` has.
+flush, which are what a crash promise needs; `lathe_rc.bag.mcap_file` has. Its YAML takes 0.2 s for a bag, during which
+a cell that is being recorded would wait; libyaml takes some ms.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, Literal, Protocol, TextIO, cast
 
+import rosbags.rosbag2.writer
+import yaml
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
@@ -20,9 +23,9 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import CompressionMode, StoragePlugin, WriterError
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lathe_rc.bag.mcap_file import McapFile, RowPlan
 from lathe_rc.cell import messages
@@ -33,6 +36,63 @@ Durability = Literal["volatile", "transient_local"]
 
 FLUSH_PERIOD = 0.5  #: [s] of wall time after which a recorder writes messages out even if they fill no chunk
 _FOREVER = QosTime(9223372036, 854775807)
+
+
+class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]  # absent without libyaml
+    """Writes texts in quotes: no reader, of whatever version of YAML, takes one for a number."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        """Write equal parts out each time, as rosbags does."""
+        return True
+
+
+_Dumper.add_representer(str, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"'))
+
+
+class _Yaml:
+    """What rosbags' writer uses of ruamel.yaml."""
+
+    def __init__(self, typ: str) -> None:
+        self.default_flow_style = False
+
+    def dump(self, tree: Any, stream: TextIO) -> None:
+        """Write plain data."""
+        yaml.dump(tree, stream, _Dumper, default_flow_style=self.default_flow_style, allow_unicode=True)
+
+
+rosbags.rosbag2.writer.YAML = _Yaml  # type: ignore[attr-defined,assignment]  # see the top: it has no option for it
+
+
+class Output(Protocol):
+    """What takes the messages of a run: a bag, or what makes bags of them."""
+
+    def tell(self, about: Mapping[str, str]) -> None:
+        """Store texts; see `BagWriter`."""
+
+    def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
+        """Announce a topic; see `BagWriter`."""
+
+    def channel(self, topic: str) -> int:
+        """The number of a topic in the file."""
+
+    def write(self, topic: str, log_ns: int, data: bytes) -> None:
+        """Append a message; see `BagWriter`."""
+
+    def write_rows(self, plan: RowPlan, first_ns: int, data: bytes) -> None:
+        """Append rows of blocks; see `BagWriter`."""
+
+    def flush(self) -> None:
+        """Hand what has been written so far to the operating system; see `BagWriter`."""
+
+    def close(self) -> None:
+        """Finish; see `BagWriter`."""
+
+
+@cache
+def _definition(msgtype: str) -> tuple[str, str]:
+    """Text and hash of a message type that this package knows."""
+    store = messages.store()
+    return store.generate_msgdef(msgtype, ros_version=2)[0], store.hash_rihs01(msgtype)
 
 
 def offered_qos(depth: int, durability: Durability) -> Qos:
@@ -138,16 +198,25 @@ class BagWriter:
         self.tell(about)
 
     def tell(self, about: Mapping[str, str]) -> None:
-        """Store texts: in the file at once, where they survive a crash, and in metadata.yaml at the end."""
+        """Store texts: in the file at once, where they survive a crash, and in metadata.yaml at the end.
+
+        Raises:
+            LatheError: the disk does not take it.
+        """
         for key, text in about.items():
             self._writer.set_custom_data(key, text)
-        if about:
+        if not about:
+            return
+        try:
             self._file.add_metadata("lathe_rc", about)
+        except OSError as error:
+            raise self._full(error) from None
 
     def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
         """Announce a fully qualified topic of a type that this package knows."""
+        text, digest = _definition(msgtype)
         self._added(
-            topic, self._writer.add_connection(topic, msgtype, typestore=messages.store(), offered_qos_profiles=[qos])
+            topic, self._writer.add_connection(topic, msgtype, msgdef=text, rihs01=digest, offered_qos_profiles=[qos])
         )
 
     def copy_topic(self, topic: str, msgtype: str, qos: Sequence[Qos], *, definition: str, digest: str) -> bool:
@@ -175,7 +244,9 @@ class BagWriter:
                 )
             else:
                 made = self._writer.add_connection(topic, msgtype, typestore=store, offered_qos_profiles=qos)
-        except (TypesysError, WriterError, KeyError):
+        except (OSError, MemoryError):
+            raise
+        except Exception:  # noqa: BLE001 - rosbags makes code of a definition, which raises whatever that leads to
             return False
         self._added(topic, made)
         return True

@@ -103,7 +103,8 @@ class Table(BaseModel):
             if first["type"] == "extra_forbidden":
                 known = ", ".join(sorted(cls.model_fields))
                 raise InputError(f"{node}.{name}: unknown parameter; allowed: {known}") from None
-            raise InputError(f"{node}.{name} = {values[name]!r}; allowed: {cls.rows()[name].allowed()}") from None
+            given = f"{values[name]!r:.200}"
+            raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
 
 
 class SharedParameters(Table):

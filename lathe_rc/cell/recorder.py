@@ -1,20 +1,48 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the recorder, which is no stage: it computes nothing and delays nobody's samples."""
 
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Le
 
 from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.errors import InputError
 
 KIND = "recorder"
 
 
 class RecorderParameters(NodeParameters):
-    """Where and how to record."""
+    """Where, when and how to record."""
 
     bag: str = parameter("", "folder of the bag; must not exist; empty: bag_ and the run id", path=True)
     compression: Literal["zstd", "none"] = parameter("zstd", "compression of the bag's chunks")
     chunk_size: Annotated[int, Ge(4096), Le(2**28)] = parameter(
         2**18, "size of the bag's chunks: what a crash may lose", "B"
     )
+    mode: Literal["continuous", "snapshot", "both"] = parameter(
+        "continuous", "what is recorded: the whole run in one bag, snapshots around triggers, or both"
+    )
+    snapshots: str = parameter(
+        "", "folder of the snapshots, each a bag; must not exist; empty: that of the bag and _snapshots", path=True
+    )
+    pre: Annotated[float, Ge(0), Le(3600)] = parameter(5.0, "simulated time that a snapshot has before a trigger", "s")
+    post: Annotated[float, Ge(0), Le(3600)] = parameter(1.0, "simulated time that a snapshot has after a trigger", "s")
+    triggers: list[str] = parameter(
+        [],
+        "events that trigger a snapshot, as patterns of NODE: ACTION, like '*: fault *' or 'fine_controller: joined'",
+    )
+    memory: Annotated[int, Ge(2**16), Le(2**38)] = parameter(
+        2**29, "memory that the time before a trigger may take", "B"
+    )
+
+    def model_post_init(self, context: Any, /) -> None:
+        """Refuse a trigger that no event could ever match."""
+        super().model_post_init(context)
+        for pattern in self.triggers:
+            if ": " not in pattern and "*" not in pattern:
+                raise InputError(f"triggers = {pattern!r}; allowed: a pattern of NODE: ACTION, like '*: {pattern}'")
+
+    def snapshots_of(self, bag: Path) -> Path:
+        """The folder of the snapshots, with the bag in ``bag``."""
+        return Path(self.snapshots) if self.snapshots else bag.with_name(f"{bag.name}_snapshots")

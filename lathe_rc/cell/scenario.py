@@ -3,6 +3,8 @@
 
 import hashlib
 import json
+import os
+import stat
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +22,7 @@ TABLES: dict[str, type[NodeParameters]] = {kind: stage.Parameters for kind, stag
 TABLES[RECORDER] = RecorderParameters
 
 _EVERYONE = "/**"
+_MOST_FILE = 2**26  # [B]
 # What changes neither a sample nor a message of a run, and so not its identity.
 _HOST_PARAMETERS = {"run_id", "speed_factor", "window", "members", "processes", "autostart"}
 
@@ -141,6 +144,19 @@ def _absolute(kind: str, name: str, value: Value, folder: Path) -> Value:
     return str((folder / value).resolve())
 
 
+def _content(path: Path) -> str:
+    """A hash of a file's content; its name if it is none, longer than any reader takes, or cannot be read."""
+    try:
+        # Some files of the system would have a reader wait for ever, or never end.
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as stream:
+            status = os.fstat(stream.fileno())
+            if stat.S_ISREG(status.st_mode) and status.st_size <= _MOST_FILE:
+                return hashlib.sha256(stream.read(_MOST_FILE) or b"").hexdigest()
+            return path.name
+    except OSError:
+        return path.name  # who needs the file says why it cannot be read
+
+
 def _identity(nodes: Mapping[str, NodeParameters]) -> str:
     """A run id that names the scenario's content: two runs of it give the same messages."""
     content = {}
@@ -150,8 +166,7 @@ def _identity(nodes: Mapping[str, NodeParameters]) -> str:
         values = table.model_dump(exclude=_HOST_PARAMETERS)
         for row in type(table).rows().values():
             if row.is_path and values[row.name]:
-                path = Path(values[row.name])
-                values[row.name] = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else path.name
+                values[row.name] = _content(Path(values[row.name]))
         content[name] = values
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 

@@ -78,7 +78,8 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
     if told["error_um"]:
         first, last = told["error_um"]["first"], told["error_um"]["last"]
         console.print(
-            f"form error: {first['rms']:.4g} µm RMS in revolution 1, {last['rms']:.4g} in {last['revolution']}"
+            f"form error: {first['rms']:.4g} µm RMS in revolution {first['revolution']}, "
+            f"{last['rms']:.4g} in {last['revolution']}"
         )
     for key, text in told["about"].items():
         if key == story.SCENARIO:

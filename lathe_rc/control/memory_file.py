@@ -3,6 +3,7 @@
 
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +14,8 @@ from lathe_rc.files import replacing
 Array = npt.NDArray[np.float64]
 
 _FORMAT = 1
-_HEADERS = 4096  # [B] of an array's own header, at most
-_LARGEST = 1 << 16  # [B] for the numbers beside the memory
+_NAMES = {"format.npy", "grid.npy", "points.npy"}
+_ROOM = 1 << 16  # [B] beside the memory itself: headers, the other numbers, the archive's own
 
 
 def save(path: Path, points: Array, grid: int) -> None:
@@ -47,24 +48,68 @@ def load(path: Path, cycle: int, grid: int) -> Array:
         InputError: there is no such file, it is something else, or it is of another grid or cycle.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
-        if set(sizes) != {"format.npy", "grid.npy", "points.npy"}:
-            raise InputError(f"{path} is not a saved memory; name a file that `save` wrote")
-        points_size = sizes.pop("points.npy")
-        if max(sizes.values()) > _LARGEST or points_size > 8 * cycle + _HEADERS:
-            raise InputError(f"{path} holds another cycle; allowed: {cycle} points with {grid} per revolution")
-        with np.load(path, allow_pickle=False) as archive:
-            version, own_grid, points = archive["format"], archive["grid"], archive["points"]
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
+        version, own_grid, points = _read(path, cycle, grid)
+    except LatheError:
+        raise
+    except Exception as error:  # noqa: BLE001 - zipfile and NumPy raise whatever broken bytes lead to
         reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a saved memory"
         raise InputError(f"{path}: the memory cannot be loaded ({reason}); name a file that `save` wrote") from None
-    if version.size != 1 or int(version) != _FORMAT:
+    if version != _FORMAT:
         raise InputError(f"{path}: its format is {version}; allowed: {_FORMAT}")
-    if points.shape != (cycle,) or own_grid.size != 1 or int(own_grid) != grid:
+    if points.shape != (cycle,) or own_grid != grid:
         raise InputError(
             f"{path} holds {points.size} points with {own_grid} per revolution; allowed: {cycle} with {grid}"
         )
     if points.dtype != np.float64 or not np.isfinite(points).all():
         raise InputError(f"{path}: a value in the memory is not a finite number; save it again")
     return np.asarray(points)
+
+
+def _read(path: Path, cycle: int, grid: int) -> tuple[int, int, npt.NDArray[Any]]:
+    """Format, points per revolution and points in a file that is not larger than it may be.
+
+    Raises:
+        InputError: it is larger, or no file or archive of the kind.
+        ValueError: an array in it is none; zipfile and NumPy raise others.
+    """
+    largest = 8 * cycle + _ROOM
+    # Opening a pipe would wait for its writer, for ever.
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: the memory cannot be loaded (not a file); name a file that `save` wrote")
+    size = path.stat().st_size
+    if size > largest:
+        raise InputError(f"{path}: {size} B; allowed: up to {largest} for {cycle} points with {grid} per revolution")
+    with zipfile.ZipFile(path) as archive:
+        sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+        if set(sizes) != _NAMES:
+            raise InputError(f"{path} is not a saved memory; name a file that `save` wrote")
+        if max(sizes.values()) > largest:
+            raise InputError(f"{path} holds another cycle; allowed: {cycle} points with {grid} per revolution")
+        version, own_grid = (_number(_array(archive, name)) for name in ("format.npy", "grid.npy"))
+        return version, own_grid, _array(archive, "points.npy")
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
+    """An array of an archive; what its header says of its size is compared with what there is of it.
+
+    Raises:
+        ValueError: it is none; zipfile and NumPy raise others.
+    """
+    with archive.open(name) as stream:
+        if np.lib.format.read_magic(stream) != (1, 0):
+            raise ValueError("another format of arrays than `save` writes")
+        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+        data = stream.read()
+    found: npt.NDArray[Any] = np.frombuffer(data, dtype).reshape(shape).copy()
+    return found
+
+
+def _number(array: npt.NDArray[Any]) -> int:
+    """The one whole number of an array.
+
+    Raises:
+        ValueError: it holds something else.
+    """
+    if array.size != 1 or array.dtype.kind not in "iu":
+        raise ValueError("not a whole number")
+    return int(array.item())

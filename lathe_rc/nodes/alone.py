@@ -2,10 +2,8 @@
 """Nodes that are members of no cell: start, parameters, signals, exit code."""
 
 import contextlib
-import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import TypeVar
 
 import rclpy
@@ -15,7 +13,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from lathe_rc.cell.parameters import Table
 from lathe_rc.errors import LatheError
-from lathe_rc.nodes import declare
+from lathe_rc.nodes import dds, declare
 
 T = TypeVar("T", bound=Table)
 
@@ -43,6 +41,7 @@ def member_of_none(
     Raises:
         InputError: a parameter that is refused.
     """
+    dds.settle()
     rclpy.init(args=None if args is None else ["lathe", *args], signal_handler_options=signals)
     try:
         node = Node(
@@ -77,7 +76,6 @@ def run(
     Returns:
         The exit code.
     """
-    os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("fastdds.xml")))
     try:
         # What the replayed system told on /rosout must not be mixed with what this node tells.
         with member_of_none(kind, table, values, args, rosout=False) as (node, parameters):

@@ -9,7 +9,6 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from types import FrameType
 
 import rclpy
@@ -21,6 +20,7 @@ from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.nodes import dds
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.recorder_node import RecorderNode
 from lathe_rc.nodes.report import THROUGHPUT, Reporter
@@ -36,7 +36,15 @@ def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellN
     if kind not in TABLES:
         raise InputError(f"{name}: no stage {kind!r}; allowed: {', '.join(TABLES)}")
     classes: dict[str, type[CellNode]] = {RECORDER: RecorderNode, SpindleEncoder.kind: SpindleNode}
-    return classes.get(kind, StageNode)(name, kind, reporter, exchange)
+    try:
+        return classes.get(kind, StageNode)(name, kind, reporter, exchange)
+    except RuntimeError as error:
+        raise LatheError(f"{name}: {_words(error)}") from None
+
+
+def _words(error: RuntimeError) -> str:
+    """What rcl says, without the file and line of its source."""
+    return str(error).splitlines()[0].partition(", at /")[0]
 
 
 class _Stop:
@@ -129,13 +137,11 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
     faulthandler.enable()  # a crash of a library leaves where it happened in the log
     _tune()
     reporter = Reporter()
-    os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("fastdds.xml")))
+    dds.settle()
     try:
         rclpy.init(args=None if args is None else ["lathe", *args], signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
-        # rcl's own words, without the file and line of its source
-        why = str(error).splitlines()[0].partition(", at /")[0]
-        print(f"lathe: --ros-args: {why}", file=sys.stderr)
+        print(f"lathe: --ros-args: {_words(error)}", file=sys.stderr)
         return InputError.exit_code
     stop = _Stop()
     nodes: list[CellNode] = []

@@ -8,11 +8,13 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from lathe_rc_msgs.msg import CellState
 from rclpy.qos import QoSProfile
+from std_srvs.srv import Trigger
 
 from lathe_rc.bag import story
 from lathe_rc.bag.order import Merger
-from lathe_rc.bag.record import signal_depth
-from lathe_rc.bag.writer import FLUSH_PERIOD, BagWriter, offered_qos
+from lathe_rc.bag.record import bag_of, signal_depth
+from lathe_rc.bag.snapshot import Snapshot, Snapshots
+from lathe_rc.bag.writer import FLUSH_PERIOD, Output, offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
@@ -45,12 +47,13 @@ class RecorderNode(CellNode):
         assert isinstance(self.table, RecorderParameters)
         name = self.table.bag or f"bag_{self.table.run_id or 'cell'}"
         self._path = Path(name)
-        self._writer: BagWriter | None = BagWriter(
-            self._path,
-            compression=self.table.compression,
-            chunk_size=self.table.chunk_size,
-            about={},
-        )
+        self._snapshots: Snapshots | None = None
+        if self.table.mode != "continuous":
+            place, namespace = self.table.snapshots_of(self._path), self.get_namespace().rstrip("/") + "/"
+            self._snapshots = Snapshots(
+                place, self.table, name=self.get_name(), namespace=namespace, told=self._tell_snapshot
+            )
+        self._writer: Output | None = bag_of(self._path, self.table, self._snapshots)
         self._depth = signal_depth(self.table)
         self._queues: dict[str, BlockQueue] = {}
         self._sparse: dict[str, str] = {}  # topic -> source
@@ -63,6 +66,7 @@ class RecorderNode(CellNode):
 
     def activate_part(self) -> None:
         """Subscribe to the host topics; the signals follow when the members have announced them."""
+        self.create_service(Trigger, "~/snapshot", self._on_snapshot)
         for topic, (kind, qos) in _HOST_TOPICS.items():
             full = self.topic(topic)
             self._open.add_topic(full, self._type_name(kind), offered_qos(qos.depth, "volatile"))
@@ -73,7 +77,7 @@ class RecorderNode(CellNode):
         return f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
 
     @property
-    def _open(self) -> BagWriter:
+    def _open(self) -> Output:
         assert self._writer is not None, "the bag is closed"
         return self._writer
 
@@ -94,7 +98,10 @@ class RecorderNode(CellNode):
 
     def statistics(self) -> dict[str, object]:
         """See `CellNode`."""
-        return {"blocks": self._blocks, "lost blocks": self._lost, "bag": str(self._path)}
+        told: dict[str, object] = {"blocks": self._blocks, "lost blocks": self._lost, "bag": str(self._path)}
+        if self._snapshots is not None:
+            told |= {"snapshots": self._snapshots.bags, "memory for snapshots [B]": self._snapshots.held}
+        return told
 
     @property
     def _lost(self) -> int:
@@ -113,16 +120,24 @@ class RecorderNode(CellNode):
                 if topic not in self._queues and topic not in self._sparse:
                     self._subscribe(topic, msgtype, name, sparse=sparse, in_cell=not alone)
         self._explain()
+        dense = {topic: (queue.type, queue.source) for topic, queue in self._queues.items()}
+        if self._snapshots is not None and dense:
+            self._prepare(self._snapshots, dense)
         if not alone and self.table.window:
             self._merger = Merger(
                 self._open,
-                {topic: (queue.type, queue.source) for topic, queue in self._queues.items()},
+                dense,
                 self._sparse,
                 run_id=self.table.run_id,
                 step_ns=self.table.step_ns,
                 samples=self.table.block_size,
             )
         self.announce()
+
+    def _prepare(self, snapshots: Snapshots, dense: dict[str, tuple[str, str]]) -> None:
+        names = [name.removeprefix(self.get_namespace().rstrip("/") + "/") for name in self.members]
+        needed = snapshots.prepare(dense, names)
+        self.get_logger().info(f"snapshots: up to {needed} B of memory, bags in {snapshots.folder}")
 
     def _explain(self) -> None:
         """Let the bag say what was run, with the parameters that the members really have."""
@@ -142,6 +157,45 @@ class RecorderNode(CellNode):
         if in_cell:
             queue.expect(source)
         self.listen(topic, msgtype, partial(self._on_message, queue), partial(self._on_block, queue))
+
+    # ---- snapshots ----------------------------------------------------------------------------------
+
+    def _tell_snapshot(self, snapshot: Snapshot) -> None:
+        """Say that one has been begun or closed."""
+        sample, cause = snapshot.triggers[0]
+        span = f"samples {snapshot.first} to {snapshot.first + snapshot.samples - 1}"
+        if not snapshot.samples:
+            text = f"snapshot {snapshot.path} begun: {cause} at sample {sample}"
+        elif snapshot.whole:
+            text = f"snapshot {snapshot.path} closed: {span}"
+        else:
+            text = f"snapshot {snapshot.path} closed: {span}; wanted up to {snapshot.wanted}, the run ended before"
+        self.get_logger().info(text)
+        self.reporter(
+            "snapshot",
+            self.get_name(),
+            bag=str(snapshot.path),
+            sample=sample,
+            first=snapshot.first,
+            samples=snapshot.samples,
+            whole=snapshot.whole,
+        )
+
+    def _on_snapshot(self, request: Any, response: Any) -> Any:
+        if self._snapshots is None:
+            response.message = f"{self.get_name()}.mode = 'continuous'; allowed for snapshots: snapshot or both"
+        elif self._writer is None or self.failure or not self._queues:
+            response.message = "nothing is being recorded: the cell has not started, or it has ended"
+        else:
+            sample = self._snapshots.next_sample
+            try:
+                found = self._snapshots.trigger(f"{self.get_name()}: service", sample)
+            except LatheError as error:
+                self.fail(error)
+                response.message = str(error)
+                return response
+            response.success, response.message = True, f"sample {sample}: {found.path}"
+        return response
 
     # ---- data ---------------------------------------------------------------------------------------
 
@@ -223,6 +277,9 @@ class RecorderNode(CellNode):
         if getattr(self, "_writer", None) is None:
             return
         complete = bool(self._queues) and (self._merger.complete if self._merger else self._ended == set(self._queues))
+        if self._snapshots is not None and not complete:
+            cause = f"{self.get_name()}: {self.failure or 'interrupted'}"
+            self.attempt(partial(self._snapshots.interrupt, cause))
         if self._merger is not None:
             self.attempt(self._merger.write_rest)
         try:

@@ -66,6 +66,9 @@ class Form:
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
         if not self.refused:
+            if first and not self._angle.size and not self._done:
+                # A snapshot begins in the midst of a revolution.
+                self._done = int(np.ceil(dense[self._encoder]["angle_true"][0] / _TURN))
             self._angle = np.concatenate([self._angle, dense[self._encoder]["angle_true"]])
             self._error = np.concatenate([self._error, dense[self.tool]["error"]])
             self._measure(_MARGIN)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lathe_rc.bag.snapshot import first_sample
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.stream import Feeder
 from lathe_rc.cell import messages
@@ -156,7 +157,7 @@ def gather(path: Path) -> Gathered:
         forms = [Form(encoders[0], tool) for tool in of_type(types, messages.TOOL)] if encoders else []
         curves = Curves(types)
         told = Gathered(source.about, {topic: Tally(kind) for topic, kind in sorted(types.items())}, forms, curves)
-        feeder = Feeder(types, [*forms, curves], _PIECE)
+        feeder = Feeder(types, [*forms, curves], _PIECE, first_sample(source.about))
         try:
             _read(source, feeder, told)
         except LatheError as error:

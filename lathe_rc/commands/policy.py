@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``lathe policy``: what SROS2 is to allow the nodes of a scenario."""
+
+from pathlib import Path
+
+import click
+
+from lathe_rc import security
+from lathe_rc.cli import _load
+from lathe_rc.errors import InputError
+from lathe_rc.files import replacing
+
+
+@click.command()
+@click.argument("scenario")
+@click.option(
+    "--group",
+    "groups",
+    multiple=True,
+    metavar="NODE+NODE",
+    help="nodes that share a process, instead of those that the scenario names; repeatable; none: one each",
+)
+@click.option("--namespace", default="/", show_default=True, help="of the cell")
+@click.option("--with", "beside", multiple=True, type=click.Choice(security.BESIDE), help="let in as well; repeatable")
+@click.option("--set", "overrides", multiple=True, metavar="NODE.PARAM=VALUE", help="also PARAM=VALUE if shared")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="file to write; default: the standard output")
+def policy(
+    scenario: str,
+    groups: tuple[str, ...],
+    namespace: str,
+    beside: tuple[str, ...],
+    overrides: tuple[str, ...],
+    output: Path | None,
+) -> None:
+    """Make the SROS2 policy of a SCENARIO: an enclave for each process, the least that its nodes need."""
+    loaded = _load(scenario, overrides)
+    split = [group.split("+") for group in groups if group != "none"]
+    loaded.processes(split, "--group")
+    made = security.policy(loaded, groups=split if groups else None, namespace=namespace, beside=beside)
+    text = security.to_xml(made, f"the scenario {loaded.name}")
+    if output is None:
+        click.echo(text, nl=False)
+        return
+    try:
+        with replacing(output) as file:
+            file.write(text.encode())
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written ({error.strerror})") from None
+    click.echo(f"{output}: enclaves {' '.join(made)}")

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SROS2 policies: what each node of a cell may publish, read, serve and call. Made from the wiring, without ROS.
+
+DDS security knows processes, not nodes: an enclave is what one process may do, the union of its nodes' profiles.
+Nothing is denied by name, since what no profile of an enclave allows is denied.
+"""
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lathe_rc import harness
+from lathe_rc.cell.recorder import KIND as RECORDER
+from lathe_rc.cell.replayer import KIND as REPLAYER
+from lathe_rc.cell.rerun_bridge import KIND as RERUN_BRIDGE
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.topic_recorder import KIND as TOPIC_RECORDER
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError
+from lathe_rc.reference import HOST_TOPICS
+from lathe_rc.view.rerun_signals import drawn
+
+OPERATOR = "operator"  #: people with the tools of ROS: they read everything and call every service
+
+_NAMESPACE = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+")
+_LOG, _PARAMETER_EVENTS, _CLOCK = "/rosout", "/parameter_events", "/clock"
+_PARAMETERS = (
+    "describe_parameters",
+    "get_parameter_types",
+    "get_parameters",
+    "get_type_description",
+    "list_parameters",
+    "set_parameters",
+    "set_parameters_atomically",
+)
+_LIFECYCLE = (
+    "change_state",
+    "get_available_states",
+    "get_available_transitions",
+    "get_state",
+    "get_transition_graph",
+)
+_SERVICES = {RECORDER: ("snapshot",), REPLAYER: ("pause", "resume", "toggle_paused")}  # of one kind of node alone
+_RECORDED = ("/diagnostics", "cell_state")  # host topics that a bag holds
+_COMMAND_LINE = "/_ros2cli_*/get_type_description"  # that the nodes of ros2 topic, ros2 service and so on serve
+
+
+@dataclass(frozen=True, kw_only=True)
+class Profile:
+    """What one node may do. Names are relative to its namespace, or absolute where the whole domain shares them.
+
+    Attributes:
+        namespace: of the node; ``/`` or ``/a/b``.
+        node: its name.
+        publish, subscribe: topics.
+        reply, request: services.
+    """
+
+    namespace: str
+    node: str
+    publish: frozenset[str]
+    subscribe: frozenset[str]
+    reply: frozenset[str]
+    request: frozenset[str] = frozenset()
+
+
+Policy = dict[str, list[Profile]]  #: profiles of each enclave, by its path
+
+
+def absolute(namespace: str, name: str) -> str:
+    """A name after its namespace has been put before it."""
+    return name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"
+
+
+class _Maker:
+    """Profiles of the nodes of a cell and of those beside it.
+
+    Args:
+        scenario: with a recorder.
+        namespace: of the cell.
+    """
+
+    def __init__(self, scenario: Scenario, namespace: str) -> None:
+        self._scenario, self._namespace = scenario, namespace
+        self._cell = Cell(scenario.nodes)
+        self._signals = {**self._cell.dense, **self._cell.sparse}
+        self.members: list[Profile] = []
+
+    def member(self, name: str, group: Sequence[str]) -> Profile:
+        """A node of the cell that shares its process with ``group``; what is published there it reads in memory."""
+        kind, stage = self._scenario.kind(name), self._cell.stages.get(name)
+        own = {topic for topic, source in self._signals.items() if source.node == name}
+        reads = {topic for topic in self._signals if stage is None or stage in self._cell.readers(topic)}
+        inside = {topic for topic, source in self._signals.items() if source.node in group}
+        services = [*_LIFECYCLE, *_SERVICES.get(kind, ())]
+        if stage and f"{name}/events" in stage.sparse_topics:
+            services.append("schedule")
+        told = {topic.name for topic in HOST_TOPICS if kind in topic.publishers}
+        heard = {topic.name for topic in HOST_TOPICS if kind in topic.subscribers}
+        profile = self._node(
+            name,
+            publish=own | told | {f"{name}/transition_event"},
+            subscribe=reads - inside | heard,
+            services=services,
+        )
+        self.members.append(profile)
+        return profile
+
+    def _node(
+        self,
+        name: str,
+        *,
+        publish: Iterable[str] = (),
+        subscribe: Iterable[str] = (),
+        services: Iterable[str] = (),
+        logs: bool = True,
+    ) -> Profile:
+        """A node with what every node of rclpy has; ``services`` are its own."""
+        return Profile(
+            namespace=self._namespace,
+            node=name,
+            publish=frozenset([*publish, _PARAMETER_EVENTS, *([_LOG] if logs else [])]),
+            subscribe=frozenset(subscribe),
+            reply=frozenset(f"{name}/{service}" for service in [*_PARAMETERS, *services]),
+        )
+
+    def rerun_bridge(self) -> Profile:
+        """It reads the signals that a scene shows."""
+        return self._node(RERUN_BRIDGE, subscribe=[t for t, source in self._signals.items() if drawn(source.type)])
+
+    def replayer(self) -> Profile:
+        """It takes the place of the cell: it publishes what a bag of it holds, not as members but by itself."""
+        topics = [*self._signals, *_RECORDED, _CLOCK]
+        return self._node(REPLAYER, publish=topics, services=_SERVICES[REPLAYER], logs=False)
+
+    def topic_recorder(self) -> Profile:
+        """It reads every topic of the cell."""
+        return self._node(TOPIC_RECORDER, subscribe=self._published() - {_LOG, _PARAMETER_EVENTS}, logs=False)
+
+    def operator(self) -> Profile:
+        """A person with the tools of ROS, which give their nodes names of their own."""
+        return Profile(
+            namespace=self._namespace,
+            node=OPERATOR,
+            publish=frozenset([_LOG, _PARAMETER_EVENTS]),
+            subscribe=self._published(),
+            reply=frozenset([_COMMAND_LINE]),
+            request=frozenset(service for profile in self.members for service in profile.reply),
+        )
+
+    def _published(self) -> frozenset[str]:
+        return frozenset(topic for profile in self.members for topic in profile.publish)
+
+
+_BESIDE: Mapping[str, Callable[[_Maker], Profile]] = {
+    OPERATOR: _Maker.operator,
+    REPLAYER: _Maker.replayer,
+    RERUN_BRIDGE: _Maker.rerun_bridge,
+    TOPIC_RECORDER: _Maker.topic_recorder,
+}
+BESIDE = tuple(_BESIDE)  #: who may be let in beside the members of a cell
+
+
+def policy(
+    scenario: Scenario,
+    *,
+    groups: Sequence[Sequence[str]] | None = None,
+    namespace: str = "/",
+    beside: Iterable[str] = (),
+) -> Policy:
+    """What the processes of a scenario may do.
+
+    Args:
+        scenario: the cell; it gets a recorder if it has none.
+        groups: names of nodes that share a process, the others have their own; None: as the scenario says.
+        namespace: of the cell, ``/`` or ``/a/b``.
+        beside: others that are let in, of `BESIDE`.
+
+    Returns:
+        The profiles of each enclave. Its path is the fully qualified name of its process's first node.
+
+    Raises:
+        InputError: the scenario cannot be wired, a node in ``groups`` that there is not, or no ROS namespace.
+    """
+    if not _NAMESPACE.fullmatch(namespace):
+        raise InputError(f"namespace {namespace!r}; allowed: / or /NAME or /NAME/NAME, of letters, digits and _")
+    # The bag's folder is no matter of policy.
+    complete = harness.with_recorder(scenario, Path(RECORDER), keep=True)
+    maker = _Maker(complete, namespace)
+    made = {
+        absolute(namespace, group[0]): [maker.member(name, group) for name in group]
+        for group in complete.processes(groups)
+    }
+    return made | {absolute(namespace, kind): [_BESIDE[kind](maker)] for kind in dict.fromkeys(beside)}
+
+
+def to_xml(made: Policy, title: str) -> str:
+    """The policy as SROS2 reads it, version 0.2.0; ``title`` says whose it is."""
+    root = ET.Element("policy", version="0.2.0")
+    enclaves = ET.SubElement(root, "enclaves")
+    for path, profiles in made.items():
+        inner = ET.SubElement(ET.SubElement(enclaves, "enclave", path=path), "profiles")
+        for profile in profiles:
+            _append(ET.SubElement(inner, "profile", ns=profile.namespace, node=profile.node), profile)
+    ET.indent(root)
+    return f"""<?xml version="1.0" encoding="UTF-8"?>
+<!-- SPDX-License-Identifier: Apache-2.0
+     SROS2 policy of {title}, made by `lathe policy` (docs/security.md).
+     An enclave is a process; what is not allowed here is denied. -->
+{ET.tostring(root, encoding="unicode")}
+"""
+
+
+def _append(element: ET.Element, profile: Profile) -> None:
+    for kind, rules in (
+        ("service", {"reply": profile.reply, "request": profile.request}),
+        ("topic", {"publish": profile.publish, "subscribe": profile.subscribe}),
+    ):
+        for rule, names in rules.items():
+            if names:
+                allowed = ET.SubElement(element, f"{kind}s", {rule: "ALLOW"})
+                for text in sorted(_expression(profile, name) for name in names):
+                    ET.SubElement(allowed, kind).text = text
+
+
+def _expression(profile: Profile, name: str) -> str:
+    """A name as policies have it: ~ stands for the node's own."""
+    own = f"{profile.node}/"
+    return f"~/{name.removeprefix(own)}" if name.startswith(own) else name

@@ -1,0 +1,392 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hostile files: damage to valid ones, the same every time, and what longer runs of benchmarks/fuzz.py have found."""
+
+import contextlib
+import os
+import re
+import sqlite3
+import struct
+import zipfile
+
+import fuzz_targets as fuzz
+import numpy as np
+import pytest
+import zstandard
+from fuzz_targets import CUT, TARGETS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import MCAP0_MAGIC
+
+from lathe_rc.bag import story, trust
+from lathe_rc.bag.check import check
+from lathe_rc.bag.salvage import Salvage
+from lathe_rc.bag.source import MOST_BYTES, Source, unpack
+from lathe_rc.bag.stream import Feeder
+from lathe_rc.bag.writer import BagWriter, offered_qos
+from lathe_rc.cell import messages
+from lathe_rc.control import memory_file
+from lathe_rc.errors import InputError, LatheError
+
+FAST = [name for name, target in TARGETS.items() if not target.slow]
+SLOW = [name for name, target in TARGETS.items() if target.slow]
+
+
+@contextlib.contextmanager
+def refused(said):
+    """A refusal that says so, in one line."""
+    with pytest.raises(InputError, match=said) as found:
+        yield
+    assert len(str(found.value).splitlines()) == 1
+
+
+BOMB = zstandard.compress(bytes(MOST_BYTES + 1))
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_what_is_valid_is_read(name):
+    for data in TARGETS[name].seeds():
+        TARGETS[name].read(data)
+
+
+@pytest.mark.parametrize("name", FAST)
+@settings(max_examples=30)
+@given(st.randoms(use_true_random=False))
+def test_damage_is_refused_in_a_line(name, random):
+    TARGETS[name].read(TARGETS[name].damaged(random))
+
+
+@pytest.mark.parametrize("name", SLOW)
+@settings(max_examples=3)
+@given(st.randoms(use_true_random=False))
+def test_damage_is_refused_by_what_takes_longer(name, random):
+    TARGETS[name].read(TARGETS[name].damaged(random))
+
+
+# ---- memories
+
+
+def archive(path, **members):
+    with zipfile.ZipFile(path, "w") as out:
+        for name, content in {**dict.fromkeys(("format", "grid", "points"), b""), **members}.items():
+            out.writestr(f"{name}.npy", content)
+    return path
+
+
+def array(header, data=b""):
+    text = header.encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\0" + struct.pack("<H", len(text)) + text + data
+
+
+@pytest.mark.parametrize(
+    "members",
+    [
+        {"format": b"not an array"},
+        {"format": array("{'descr': '<i8', 'fortran_order': False, 'shape': (")},
+        {"format": array("{'descr': '<i8', 'fortran_order': False, 'shape': (1099511627776,)}")},
+        {"format": array("{'descr': '|O', 'fortran_order': False, 'shape': ()}", b"cposix\nsystem\n")},
+        {"format": array("{'descr': '<U4000', 'fortran_order': False, 'shape': ()}", b"\n\0\0\0" * 4000)},
+        {"format": b"\x93NUMPY\x02\0" + bytes(4)},
+    ],
+)
+def test_archive_that_is_no_memory_is_refused(tmp_path, members):
+    with pytest.raises(InputError, match="not a saved memory"):
+        memory_file.load(archive(tmp_path / "memory.npz", **members), 64, 32)
+
+
+@pytest.mark.parametrize("change", [lambda d: d[:6] + b"\1" + d[7:], lambda d: d[:8] + b"\x08" + d[9:]])
+def test_archive_with_a_flag_or_method_that_it_does_not_have_is_refused(change):
+    fuzz.TARGETS["memory"].read(change(TARGETS["memory"].seeds()[0]))
+
+
+def test_memory_that_is_a_pipe_or_far_too_long_is_refused_unread(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="not a file"):
+        memory_file.load(tmp_path / "pipe", 64, 32)
+    with (tmp_path / "long").open("wb") as file:
+        file.truncate(2**40)
+    with pytest.raises(InputError, match="allowed: up to"):
+        memory_file.load(tmp_path / "long", 64, 32)
+
+
+# ---- bags
+
+
+def record(opcode, content):
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def text(value):
+    return struct.pack("<I", len(value)) + value
+
+
+def channel(qos, number=1):
+    pairs = text(b"offered_qos_profiles") + text(qos)
+    return record(4, struct.pack("<HH", number, 1) + text(b"/t") + text(b"cdr") + text(pairs))
+
+
+SCHEMA = record(3, struct.pack("<H", 1) + text(b"std_msgs/msg/String") + text(b"ros2msg") + text(b"string data\n"))
+STATISTICS = record(11, bytes(42) + text(b""))
+HEADER = record(1, text(b"ros2") + text(b""))
+ENDLESS = b"a: &a [{x: 1}]\n" + b"".join(b"%c: &%c {<<: [*%c, *%c]}\n" % (n, n, n - 1, n - 1) for n in range(98, 122))
+
+
+def chunk(data=b"", *, compression=b"zstd", size=None, packed=None):
+    packed = zstandard.compress(data) if packed is None else packed
+    head = struct.pack("<QQQI", 0, 1, len(data) if size is None else size, 0) + text(compression)
+    return record(6, head + struct.pack("<Q", len(packed)) + packed)
+
+
+def chunk_index(start, length, *, size=1000, packed=9):
+    return record(
+        8, struct.pack("<QQQQIQ", 0, 1, start, length, 0, 0) + text(b"zstd") + struct.pack("<QQ", packed, size)
+    )
+
+
+def mcap(path, data=b"", summary=b""):
+    head = MCAP0_MAGIC + HEADER + data
+    start = len(head) if summary else 0
+    path.write_bytes(head + summary + record(2, struct.pack("<QQI", start, 0, 0)) + MCAP0_MAGIC)
+    return path
+
+
+FIRST = len(MCAP0_MAGIC + HEADER)
+
+
+@pytest.mark.parametrize(
+    ("data", "summary", "said"),
+    [
+        (chunk(size=MOST_BYTES, packed=BOMB), b"", "does not unpack to the"),
+        (chunk(packed=b"x" * 20), b"", "chunk at byte"),
+        (b"", SCHEMA + STATISTICS + struct.pack("<BQ", 13, 2**63), "cut off at byte"),
+        (b"", SCHEMA + STATISTICS + struct.pack("<BQ", 13, 2**32), "cut off at byte"),
+        (b"", SCHEMA + STATISTICS + channel(ENDLESS), "YAML aliases"),
+        (SCHEMA + channel(ENDLESS), b"", "YAML aliases"),
+        (chunk(SCHEMA + channel(ENDLESS)), b"", "YAML aliases"),
+        (b"", SCHEMA + STATISTICS + channel(b"[" * 100_000), "nested deeper"),
+        (b"", SCHEMA + STATISTICS + channel(b"a: b: c"), "not YAML"),
+        (b"", SCHEMA + STATISTICS + channel(b"x" * 2000) * 600, "characters of quality of service"),
+        (b"", SCHEMA + STATISTICS + channel(b"") * 5000, "more than 4096 topics"),
+        (b"", SCHEMA + STATISTICS + chunk_index(2**63, 100), "not where one can be"),
+        (chunk(), SCHEMA + STATISTICS + 2 * chunk_index(FIRST, len(chunk())), "not where one can be"),
+        (chunk(), SCHEMA + STATISTICS + chunk_index(FIRST, len(chunk()), size=2**40), "not where one can be"),
+        (chunk(), SCHEMA + STATISTICS + chunk_index(FIRST, len(chunk()), packed=2**62), "not where one can be|B in it"),
+        (
+            3 * chunk(),
+            SCHEMA
+            + STATISTICS
+            + b"".join(chunk_index(FIRST + k * len(chunk()), len(chunk()), size=2**28) for k in range(3)),
+            "chunks of the same time",
+        ),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_index_that_would_cost_memory_or_time_is_refused(tmp_path, data, summary, said):
+    with refused(said):
+        check(mcap(tmp_path / "bad.mcap", data, summary))
+
+
+def test_times_of_an_index_are_not_added_up_in_memory(tmp_path):
+    """A chunk of 8 million messages comes in batches."""
+    message = record(5, struct.pack("<HIQQ", 1, 0, 5, 5))
+    path = mcap(tmp_path / "many.mcap", chunk((SCHEMA + channel(b"")) + message * 100_000))
+    with Source(path) as source:
+        assert sum(1 for _ in source.messages()) == 100_000
+    indexed = tmp_path / "indexed"
+    writer = BagWriter(indexed, compression="zstd", chunk_size=2**23, about={})
+    writer.add_topic("/joints", messages.JOINTS, offered_qos(10, "volatile"))
+    for number in range(100_000):
+        writer.write("/joints", number, b"\0\1\0\0")
+    writer.close()
+    with Source(indexed) as source:
+        lengths = [len(batch) for batch in source.batches()]
+    assert sum(lengths) == 100_000
+    assert max(lengths) <= 2**14
+
+
+def test_messages_that_never_meet_their_blocks_are_not_kept_for_ever():
+    data = messages.encode("std_msgs/msg/Header", messages.header(0, 1))
+    alone = Feeder({"/events": messages.EVENT}, [], 64)
+    for _ in range(10):
+        alone.add("/events", 0, data)
+    assert not alone._sparse["/events"]
+    waiting = Feeder({"/events": messages.EVENT, "/tool": messages.TOOL}, [], 64)
+    waiting._sparse["/events"] = [(0, {})] * 2**18
+    with pytest.raises(LatheError, match="without the blocks of their time"):
+        waiting.add("/events", 0, data)
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (chunk(chunk(SCHEMA)), "chunk in the chunk"),
+        (SCHEMA + channel(ENDLESS), "YAML aliases"),
+        (SCHEMA + channel(b"a: b: c"), "not YAML"),
+        (record(3, struct.pack("<H", 1) + text(b"a\nb") + text(b"") + text(b"")) + channel(b""), "name 'a.nb'"),
+        (record(12, text(b"lathe_rc") + text(text(b"k") + text(b"x" * 2**24))), "characters of texts and definitions"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_would_cost_memory_is_not_saved_either(tmp_path, data, said):
+    salvage = Salvage(mcap(tmp_path / "bad.mcap", data))
+    assert list(salvage) == []
+    assert said in "".join(salvage.damage).replace("\\n", ".n")
+
+
+def test_damage_is_counted_beyond_what_is_told(tmp_path):
+    salvage = Salvage(mcap(tmp_path / "bad.mcap", 3000 * record(5, b"")))
+    assert list(salvage) == []
+    assert len(salvage.damage) == 1000
+
+
+def test_topic_whose_definition_is_no_text_is_lost_with_its_messages(tmp_path):
+    """It was announced by then: recovery asked for what was not there."""
+    broken = record(3, struct.pack("<H", 1) + text(b"std_msgs/msg/String") + text(b"ros2msg") + text(b"\xff"))
+    salvage = Salvage(mcap(tmp_path / "bad.mcap", broken + channel(b"") + record(5, struct.pack("<HIQQ", 1, 0, 5, 5))))
+    assert [topic for topic, _, _ in salvage if topic not in salvage.topics] == []
+
+
+# ---- the folder around a bag
+
+
+def folder(path, *, change=lambda metadata: metadata, seed=0):
+    metadata, *rest = TARGETS["folder"].seeds()[seed].split(CUT, 2)
+    fuzz.write_folder(path, CUT.join([change(metadata), *rest]))
+    return path
+
+
+def named(metadata, name):
+    return re.sub(rb'"?/where"?', lambda _: name, metadata)
+
+
+LAUGHS = b"a: &a [x, x]\n" + b"".join(b"%c: &%c [*%c, *%c]\n" % (n, n, n - 1, n - 1) for n in range(98, 123))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda m: LAUGHS + m, "YAML aliases"),
+        (lambda m: m + b"\nx: " + b"[" * 200_000, "nested deeper"),
+        (lambda m: named(m, b"5"), "name '5'"),
+        (lambda m: named(m, b'"/wh\\nere"'), "allowed: up to 1024 characters that print"),
+        (lambda m: named(m, b'""'), "name ''"),
+        (lambda m: m.replace(b"20", b"many"), "'many' where a whole number belongs"),
+        (lambda m: b"\xff" + m, "codec can't decode"),
+        (lambda m: b"\x01" + m, "not YAML"),
+    ],
+)
+def test_metadata_that_nobody_can_use_are_refused(tmp_path, change, said):
+    with refused(said):
+        check(folder(tmp_path / "bag", change=change))
+
+
+def test_pipe_in_a_folder_is_refused_unread(tmp_path):
+    os.mkfifo(folder(tmp_path / "bag") / "more.mcap")
+    with pytest.raises(InputError, match="no file"):
+        check(tmp_path / "bag")
+
+
+def database(path, *statements):
+    bag = folder(path, seed=next(k for k, seed in enumerate(TARGETS["folder"].seeds()) if b"SQLite format" in seed))
+    with sqlite3.connect(bag / "bag.db3") as base:
+        for statement in statements:
+            base.execute(statement)
+    base.close()
+    return bag
+
+
+COUNTING = """CREATE VIEW message_definitions AS
+    WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i FROM n"""
+
+
+@pytest.mark.parametrize(
+    ("statements", "said"),
+    [
+        (
+            ("DROP TABLE message_definitions", COUNTING),
+            "view 'message_definitions'",
+        ),
+        (("ALTER TABLE topics ADD COLUMN x GENERATED ALWAYS AS (zeroblob(1000000000))",), "table 'topics'"),
+        (("CREATE VIRTUAL TABLE x USING fts5(y)",), "table 'x'"),
+        (("UPDATE messages SET data = zeroblob(268435457) WHERE id = 1",), "a message of 268435457 B"),
+    ],
+)
+def test_database_that_answers_more_than_it_holds_is_refused(tmp_path, statements, said):
+    bag = database(tmp_path / "bag", *statements)
+    with pytest.raises(InputError, match=said):
+        check(bag)
+    salvage = Salvage(bag)
+    assert list(salvage) == []
+    assert said in salvage.damage[0]
+
+
+def test_file_that_is_packed_twice_or_behind_what_zstd_skips_is_looked_at(tmp_path):
+    skipped = b"\x50\x2a\x4d\x18" + struct.pack("<I", 4) + b"skip"
+    inside = mcap(tmp_path / "bad.mcap", b"", SCHEMA + STATISTICS + channel(ENDLESS)).read_bytes()
+    for content, said in ((skipped + zstandard.compress(inside), "YAML aliases"), (zstandard.compress(BOMB), "twice")):
+        (tmp_path / "x.mcap").write_bytes(content)
+        with pytest.raises(InputError, match=said):
+            Source(tmp_path / "x.mcap")
+
+
+def test_names_and_numbers_of_a_bag_are_what_they_should_be():
+    for name in ("", "a\nb", "\x1b[2J", "x" * 1025, 5, None, "\ud800"):
+        with pytest.raises(ValueError, match="characters that print"):
+            trust.check_name(name)
+    with pytest.raises(ValueError, match="does not unpack"):
+        unpack("zstd", BOMB, 1000)
+    assert trust.shown("\x1b[2Ja\nb") == "\ufffd[2Ja"
+
+
+# ---- what a bag says of itself
+
+
+def test_run_of_a_bag_writes_to_no_file_that_the_bag_names(tmp_path):
+    """A bag could name any file of the reader's as the memory to be saved."""
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    (tmp_path / "files").mkdir()
+    scenario = f"learning_controller: {{ros__parameters: {{memory_file: {precious}, run_id: r}}}}"
+    found = story.scenario_of({story.SCENARIO: scenario}, tmp_path / "files")
+    named = found.nodes["learning_controller"].memory_file
+    memory_file.save(type(precious)(named), np.zeros(4), 4)
+    assert precious.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("about", "said"),
+    [
+        ({f"{story.FILE}tool.profile_file": "a"}, "is not base64"),
+        ({f"{story.FILE}tool.profile_file": "\u00e9"}, "is not base64"),
+        ({f"{story.FILE}a=b.c": ""}, "a is not shared"),
+        ({story.SCENARIO: "\ud800"}, "not a text file"),
+    ],
+)
+def test_texts_that_are_no_scenario_are_refused(tmp_path, about, said):
+    with pytest.raises(InputError, match=said):
+        story.scenario_of({story.SCENARIO: "tool: {ros__parameters: {seed: 1}}", **about}, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "definition",
+    [
+        "float64 X=1e999\n",
+        "uint8 class\nuint8 class_\n",
+        'int32 A=\'"""); import os; os.abort()\'\n',
+        "string X=\"'''+__import__('os').abort()+'''\"\n",
+        "uint8[" + "9" * 5000 + "] x\n",
+        "MSG: a/b\n" + "=" * 80 + "\nMSG: 1/2\nuint8 x\n",
+        "a/b/c/D[] d\n" * 50,
+        "\0",
+    ],
+)
+def test_definitions_make_no_code_run(definition):
+    for kind in ("my_msgs/msg/Mine", "1", "", "a b/msg/C\nuint8 x", "x" * 2000):
+        TARGETS["definitions"].read(f"{kind}\n\n{definition}".encode())
+
+
+@pytest.mark.parametrize(
+    "hostile",
+    ["<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "' onload='x", "</pre><b>", "{{ 7 * 7 }}{% x %}"],
+)
+def test_page_has_the_same_elements_whatever_the_bag_says(hostile):
+    assert fuzz.elements_of_page("x" + hostile) == fuzz._plain_elements()

@@ -1,0 +1,433 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Snapshots: what a recording of the whole run has around a trigger, in every host, in memory that does not grow."""
+
+import errno
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from cells import scenario
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from lathe_rc import harness
+from lathe_rc.bag.order import Merger
+from lathe_rc.bag.snapshot import SNAPSHOT, Snapshots, first_sample
+from lathe_rc.bag.writer import offered_qos
+from lathe_rc.cell import messages
+from lathe_rc.cell.framing import Framer
+from lathe_rc.cell.messages import START_NS
+from lathe_rc.cell.recorder import RecorderParameters
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wire import Encoder
+from lathe_rc.errors import InputError, LatheError
+
+STEP_NS, BLOCK, PRE, POST = 15_625, 64, 3200, 1280
+TIMES = {"pre": PRE / 64_000, "post": POST / 64_000, "triggers": ["*: freeze", "learning_controller: clear"]}
+EVENTS = ["sample 9000: freeze", "sample 13000: learn", "sample 20000: clear"]
+
+
+def cell(events=EVENTS, revolutions=8.0, speed_factor=0.0, **recorder):
+    spindle = {"revolutions": revolutions, "speed_factor": speed_factor}
+    learning = {"events": list(events)}
+    return scenario(spindle_encoder=spindle, learning_controller=learning, recorder={**TIMES, **recorder})
+
+
+def read(path):
+    """Topic, log time and bytes of every signal message, as they stand in the file."""
+    with AnyReader([path]) as bags:
+        found = [
+            (connection.topic, connection.msgtype, stamp, bytes(data)) for connection, stamp, data in bags.messages()
+        ]
+    return [(topic, stamp, data) for topic, kind, stamp, data in found if kind in messages.signal_types()]
+
+
+def about(path):
+    metadata = yaml.safe_load((path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    return metadata["custom_data"]
+
+
+def told(path):
+    return json.loads(about(path)[SNAPSHOT])
+
+
+def span(whole, first, last):
+    """The messages of a recording of the whole run from the sample ``first`` to ``last``."""
+    return [each for each in whole if START_NS + first * STEP_NS <= each[1] <= START_NS + last * STEP_NS]
+
+
+def rows(first, last):
+    """First sample and last of the blocks that hold the samples from ``first`` to ``last``."""
+    return first // BLOCK * BLOCK, last // BLOCK * BLOCK + BLOCK - 1
+
+
+@pytest.fixture(scope="module", params=["offline", "processes"])
+def recorded(request, tmp_path_factory):
+    bag = tmp_path_factory.mktemp(request.param) / "bag"
+    return harness.run(cell(mode="both"), mode=request.param, groups=[], bag=bag)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The same run in a bag of its own, without snapshots."""
+    return read(harness.run(cell(), bag=tmp_path_factory.mktemp("whole") / "bag").bag)
+
+
+# --- content
+
+
+def test_each_trigger_has_a_bag_named_by_its_sample(recorded):
+    assert [path.name for path in recorded.snapshots] == ["sample_0000009000", "sample_0000020000"]
+    assert {path.parent for path in recorded.snapshots} == {recorded.bag.with_name("bag_snapshots")}
+
+
+def test_snapshots_are_the_same_span_of_the_whole_bag(recorded, whole):
+    for path, at in zip(recorded.snapshots, (9000, 20000), strict=True):
+        assert read(path) == span(whole, *rows(at - PRE, at + POST))
+    assert read(recorded.bag) == whole
+
+
+def test_snapshot_says_what_it_is_of_what_and_why(recorded):
+    for path, at, action in zip(recorded.snapshots, (9000, 20000), ("freeze", "clear"), strict=True):
+        first, last = rows(at - PRE, at + POST)
+        triggers = [[at, f"learning_controller: {action}"]]
+        assert told(path) == {"first_sample": first, "samples": last - first + 1, "whole": True, "triggers": triggers}
+        assert first_sample(about(path)) == first
+        whole = about(recorded.bag)
+        assert {key: text for key, text in about(path).items() if key != SNAPSHOT} == whole
+        assert {"lathe_rc.scenario", "lathe_rc.versions", "lathe_rc.run_id"} <= whole.keys()
+
+
+def test_state_of_the_cell_is_in_each_snapshot(recorded):
+    """It is published once at the start: long before a snapshot begins."""
+    if recorded.mode == "offline":
+        return
+    for path in recorded.snapshots:
+        with AnyReader([path]) as bags:
+            states = [each for each in bags.messages() if each[0].topic == "/cell_state"]
+            assert bags.deserialize(states[0][2], states[0][0].msgtype).state == 1  # RUNNING
+        assert states[0][1] >= START_NS + told(path)["first_sample"] * STEP_NS
+
+
+def test_mcap_reads_snapshots(recorded):
+    for path in recorded.snapshots:
+        with (path / f"{path.name}.mcap").open("rb") as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            found = [(channel.topic, message.log_time, message.data) for _, channel, message in reader.iter_messages()]
+            assert reader.get_summary().statistics.message_count == len(found)
+        signals = read(path)
+        assert [each for each in found if each[0] in {topic for topic, *_ in signals}] == signals
+
+
+@settings(max_examples=20)
+@given(
+    st.lists(st.integers(0, 7500), min_size=1, max_size=5, unique=True),
+    st.integers(0, 2000),
+    st.integers(0, 1000),
+    st.sampled_from([16, 64, 320]),
+)
+def test_no_sample_is_missing_or_written_twice(tmp_path_factory, samples, pre, post, block):
+    """Spans that overlap or touch are one snapshot, and so are those whose blocks do."""
+    path = tmp_path_factory.mktemp("spans") / "bag"
+    times = {"mode": "both", "pre": pre / 64_000, "post": post / 64_000, "triggers": ["*"], "chunk_size": 4096}
+    events = {"events": [f"sample {at}: clear" for at in samples]}
+    spindle = {"revolutions": 2.0}
+    result = harness.run(
+        scenario({"block_size": block}, spindle_encoder=spindle, learning_controller=events, recorder=times), bag=path
+    )
+    expected = []
+    for at in sorted(samples):
+        if at >= result.samples:
+            continue
+        first, last = max(at - pre, 0) // block * block, ((at + post) // block + 1) * block - 1
+        if expected and first <= expected[-1][1] + 1:
+            expected[-1] = expected[-1][0], last
+        else:
+            expected.append((first, last))
+    everything = read(result.bag)
+    assert [read(snapshot) for snapshot in result.snapshots] == [span(everything, *each) for each in expected]
+
+
+def test_run_that_ends_before_its_time_is_up_ends_the_snapshot(tmp_path, whole):
+    result = harness.run(cell(["sample 30000: clear"], mode="snapshot"), bag=tmp_path / "bag")
+    (path,) = result.snapshots
+    assert result.samples < 30000 + POST
+    assert told(path)["whole"] is False
+    assert told(path)["samples"] == result.samples - told(path)["first_sample"]
+    assert result.bag is None
+    assert [each.name for each in tmp_path.iterdir()] == ["bag_snapshots"]
+    last = {topic: data for topic, _, data in read(path)}
+    assert messages.decode(messages.TOOL, last["/tool"]).block.last
+
+
+def test_no_trigger_leaves_nothing(tmp_path):
+    assert harness.run(cell([], mode="snapshot"), bag=tmp_path / "bag").snapshots == ()
+    assert not list(tmp_path.iterdir())
+
+
+# --- processes
+
+
+ASK = """
+import sys, rclpy
+from std_srvs.srv import Trigger
+rclpy.init()
+node = rclpy.create_node("asker")
+client = node.create_client(Trigger, "/recorder/snapshot")
+assert client.wait_for_service(timeout_sec=20.0)
+for line in sys.stdin:
+    future = client.call_async(Trigger.Request())
+    rclpy.spin_until_future_complete(node, future, timeout_sec=20.0)
+    answer = future.result()
+    print(answer.success, answer.message, flush=True)
+node.destroy_node()
+rclpy.shutdown()
+"""
+
+
+class Asker:
+    """Calls the recorder's service from another process."""
+
+    def __init__(self):
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", ASK], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def ask(self):
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+        success, _, message = self._process.stdout.readline().strip().partition(" ")
+        return success == "True", message
+
+    def close(self):
+        self._process.stdin.close()
+        self._process.wait()
+        self._process.stdout.close()
+
+
+def test_service_makes_a_snapshot_and_an_interrupted_run_leaves_one(domain, tmp_path):
+    running = cell([], 100.0, 1.0, mode="snapshot")
+    expected = read(harness.run(cell([], 100.0), bag=tmp_path / "whole").bag)
+    complete = harness.with_recorder(running, tmp_path / "bag", keep=True)
+    asker = Asker()
+    try:
+        with harness.Processes(complete, [[name] for name in complete.nodes], domain=domain) as processes:
+            processes.wait_for("cycle")
+            success, answer = asker.ask()
+            assert success
+            word, at, path = answer.replace(":", "").split()
+            first, last = rows(int(at) - PRE, int(at) + POST)
+            assert (word, Path(path)) == ("sample", tmp_path / "bag_snapshots" / f"sample_{int(at):010}")
+            assert processes.wait_for("snapshot")["samples"] == 0
+            closed = processes.wait_for("snapshot")
+            assert closed["bag"] == path
+            assert (closed["first"], closed["samples"], closed["whole"]) == (first, last - first + 1, True)
+            assert read(Path(path)) == span(expected, first, last)
+            # Whatever is closed is complete while the run goes on; what follows it is the next snapshot's.
+            processes.wait_for("cycle", cycle=40.0)
+    finally:
+        asker.close()
+    assert not (tmp_path / "bag").exists()
+    _, interrupted = sorted((tmp_path / "bag_snapshots").iterdir())
+    found = told(interrupted)
+    assert found["triggers"][0][1] == "recorder: interrupted"
+    assert found["whole"] is False
+    # The nodes are stopped one by one: some blocks of the last rows are missing.
+    left = read(interrupted)
+    dense = {topic: stamp for topic, stamp, _ in left if not topic.endswith(("joint_states", "learning", "events"))}
+    last = (min(dense.values()) - START_NS) // STEP_NS
+    assert last >= found["first_sample"] + PRE - 1
+    assert span(left, 0, last) == span(expected, found["first_sample"], last)
+
+
+def test_service_says_why_there_is_no_snapshot(domain, tmp_path):
+    complete = harness.with_recorder(cell([], 0.0, 1.0), tmp_path / "bag", keep=True)
+    asker = Asker()
+    try:
+        with harness.Processes(complete, [list(complete.nodes)], domain=domain) as processes:
+            processes.wait_for("cycle")
+            assert asker.ask() == (False, "recorder.mode = 'continuous'; allowed for snapshots: snapshot or both")
+    finally:
+        asker.close()
+
+
+@pytest.mark.parametrize("node", ["tool", "recorder"])
+def test_a_killed_node_leaves_the_last_seconds(node, tmp_path, whole):
+    """Those of a node's death, or, of the recorder's, what had come to the disk of the snapshot under way."""
+    pids = {}
+
+    def kill(event):
+        if event["event"] == "active":
+            pids[event["node"]] = event["pid"]
+        if event["event"] == ("snapshot" if node == "recorder" else "cycle") and node in pids:
+            os.kill(pids.pop(node), signal.SIGKILL)
+
+    events = ["sample 9000: freeze"] if node == "recorder" else []
+    running = cell(events, 2000.0, mode="snapshot", chunk_size=4096)
+    with pytest.raises(LatheError, match=f"^{node} was killed by SIGKILL"):
+        harness.run(running, mode="processes", groups=[], bag=tmp_path / "bag", watch=kill)
+    (path,) = (tmp_path / "bag_snapshots").iterdir()
+    found = told(path)
+    assert found["whole"] is False
+    cause = "learning_controller: freeze" if node == "recorder" else "recorder: interrupted"
+    assert found["triggers"][0][1] == cause
+    read(path)
+
+
+# --- memory, refusals, a full disk
+
+
+class Feed:
+    """A cell of one topic that never ends, straight into `Snapshots`."""
+
+    def __init__(self, tmp_path, **recorder):
+        self.table = RecorderParameters(**{"run_id": "run", **TIMES, "mode": "snapshot", "triggers": ["*"], **recorder})
+        self.snapshots = Snapshots(tmp_path / "snapshots", self.table, name="recorder")
+        dense = {"/a": (messages.STATE, "/one")}
+        self.needed = self.snapshots.prepare(dense, ["one"])
+        self.snapshots.add_topic("/a", messages.STATE, offered_qos(1, "volatile"))
+        self._merger = Merger(self.snapshots, dense, {}, run_id="run", step_ns=STEP_NS, samples=self.table.block_size)
+        self._encoder = Encoder(messages.STATE, "run", "/one", STEP_NS)
+        self._signals = messages.allocate(messages.STATE, self.table.block_size)
+        self.rows = 0
+
+    def row(self):
+        first = self.rows * self.table.block_size
+        self._merger.add_block("/a", self._encoder.block(first, self._signals, None, last=False, companions=0))
+        self._merger.release()
+        self.rows += 1
+
+    @property
+    def kept(self):
+        """Messages and rows in memory."""
+        return len(self.snapshots._kept) + len(self.snapshots._waiting)
+
+
+def test_memory_does_not_grow_with_the_run_nor_with_triggers(tmp_path):
+    feed, most = Feed(tmp_path), PRE // BLOCK + 8
+    full = set()
+    for row in range(4000):
+        feed.row()
+        assert feed.kept <= most
+        assert feed.snapshots.held <= feed.needed
+        if row > most:
+            full.add(feed.kept)
+        if row % 97 == 96 or 2000 < row < 2500:
+            feed.snapshots.trigger("test")
+    feed.snapshots.close()
+    assert min(full) >= PRE // BLOCK
+    assert feed.snapshots.bags > 10
+
+
+def test_snapshot_comes_to_the_disk_in_bounded_pieces(tmp_path):
+    """A trigger writes nothing by itself, and each block that comes a few: the cell is not held up."""
+    feed = Feed(tmp_path, chunk_size=4096, compression="none")
+    for _ in range(200):
+        feed.row()
+    snapshot = feed.snapshots.trigger("test")
+    file = snapshot.path / f"{snapshot.path.name}.mcap"
+    begun = size = file.stat().st_size
+    grown = []
+    for _ in range(PRE // BLOCK):
+        feed.row()
+        grown.append(file.stat().st_size - size)
+        size += grown[-1]
+    block = feed.needed / (PRE / BLOCK + 18)
+    assert max(grown) < 6 * block
+    assert size - begun > PRE / BLOCK * block
+
+
+def test_standing_cell_does_not_keep_the_snapshot_from_the_disk(tmp_path):
+    feed = Feed(tmp_path, chunk_size=2**20, compression="none")
+    for _ in range(200):
+        feed.row()
+    snapshot = feed.snapshots.trigger("test")
+    file = snapshot.path / f"{snapshot.path.name}.mcap"
+    feed.snapshots.flush()
+    feed.snapshots.flush()
+    assert file.stat().st_size > feed.needed * PRE / BLOCK / (PRE / BLOCK + 18)
+
+
+def test_flood_of_events_is_refused_by_name(tmp_path):
+    feed = Feed(tmp_path, memory=600_000, triggers=["one: never"])
+    feed.snapshots.add_topic("/one/events", messages.EVENT, offered_qos(1, "volatile"))
+
+    event = Framer("run", "/one", STEP_NS).sparse(Sparse("one/events", messages.EVENT, 0, {"action": "again"}))
+    data = messages.encode(messages.EVENT, event)
+
+    def flood():
+        for k in range(10_000):
+            feed.snapshots.write("/one/events", START_NS + k, data)
+
+    with pytest.raises(LatheError, match=r"recorder: \d+ B are kept for pre = 0.05 s; allowed: memory = 600000 B"):
+        flood()
+
+
+@pytest.mark.parametrize(
+    ("recorder", "why"),
+    [
+        (
+            {"pre": 60.0, "memory": 2**20},
+            r"recorder.pre = 60 s takes \d+ B of memory, \d+ B for 64 samples .* allows pre = 0\.\d+ s: shorten pre or",
+        ),
+        ({"triggers": ["tol: *"]}, r"recorder.triggers = 'tol: \*': no node 'tol' in the cell; allowed: spindle_enc"),
+        ({"triggers": ["freeze"]}, r"triggers = 'freeze'; allowed: a pattern of NODE: ACTION, like '\*: freeze'"),
+        ({"pre": -1.0}, r"recorder.pre = -1.0; allowed: a finite number from 0 up to 3600 \[s\]"),
+    ],
+)
+@pytest.mark.parametrize("mode", ["offline", "composed"])
+def test_what_cannot_work_is_refused(tmp_path, recorder, why, mode):
+    with pytest.raises(InputError, match=why):
+        harness.run(cell(mode="snapshot", **recorder), mode=mode, bag=tmp_path / "bag")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("mode", ["offline", "composed"])
+def test_existing_snapshots_are_never_overwritten(tmp_path, mode):
+    (tmp_path / "bag_snapshots").mkdir()
+    (tmp_path / "bag_snapshots" / "precious").write_text("data")
+    with pytest.raises(InputError, match="bag_snapshots exists; a bag is never overwritten"):
+        harness.run(cell(mode="snapshot"), mode=mode, bag=tmp_path / "bag")
+    assert [path.name for path in (tmp_path / "bag_snapshots").iterdir()] == ["precious"]
+
+
+def test_full_disk_fails_by_name(tmp_path):
+    """A file that may not grow any more is the same to the recorder."""
+    feed = Feed(tmp_path, chunk_size=4096, compression="none", pre=1.0)
+    for _ in range(1000):
+        feed.row()
+    snapshot = feed.snapshots.trigger("test")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    why = rf"{snapshot.path}: cannot write \({os.strerror(errno.EFBIG)}\); what was recorded before is readable"
+
+    def fill():
+        for _ in range(1000):
+            feed.row()
+
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2**19, before[1]))
+        with pytest.raises(LatheError, match=why):
+            fill()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    with pytest.raises(LatheError, match=why):
+        feed.snapshots.close()
+    assert read(snapshot.path)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"first_sample": -1}', '{"first_sample": 1.5}', '{"first_sample": true}']
+)
+def test_what_a_bag_says_of_its_first_sample_is_checked(text):
+    with pytest.raises(InputError, match="allowed: what a recorder writes, with first_sample"):
+        first_sample({SNAPSHOT: text})
