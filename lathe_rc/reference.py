@@ -25,6 +25,7 @@ _TYPES = {bool: "bool", int: "integer", float: "double", str: "string"}
 _WHEN = {
     messages.JOINTS: "every `joint_state_period` samples",
     messages.LEARNING: "once a cycle",
+    messages.SAFETY_STATUS: "with an alarm, and when the state changes",
     messages.EVENT: "at each event",
 }
 _SCHEDULE = f"{messages.PACKAGE}/srv/Schedule"
@@ -204,6 +205,8 @@ def _ports(stage: Stage) -> Iterator[str]:
     if stage.actions:
         known = ", ".join(f"`{action}`" for action in stage.actions)
         yield f"Events: {known}. Service: `~/schedule` (`{_SCHEDULE}`) schedules one of them."
+    else:
+        yield f"With `allow_faults`: service `~/schedule` (`{_SCHEDULE}`) schedules faults and repairs."
 
 
 def _edge(port: Input) -> str:

@@ -23,7 +23,9 @@ _SENSOR, _COMMAND = ("measured_position", "effort"), ("position",)
 class SupervisorParameters(NodeParameters):
     """Thresholds, each 0 for a monitor that is off, and what is asked for beyond them."""
 
-    drives: list[str] = parameter(["coarse"], "drives of the tool that are watched, by the names of their topics")
+    drives: list[str] = parameter(
+        [], "drives of the tool that are watched, by the names of their topics; the first takes the tool out"
+    )
     slides: list[Literal["cross", "longitudinal"]] = parameter([], "slides that are watched")
 
     speed_limit: Annotated[float, Ge(0)] = parameter(
