@@ -340,9 +340,15 @@ def udp_ports(pid):
     }
 
 
+def as_started_by_a_user(monkeypatch):
+    """What nodes in this process have settled holds for those that it starts, too."""
+    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
+        monkeypatch.delenv(name, raising=False)
+
+
 @pytest.mark.parametrize("wanted", [None, "SUBNET"])
 def test_processes_of_the_harness_hear_the_network_only_if_asked_to(wanted, tmp_path, monkeypatch):
-    monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
+    as_started_by_a_user(monkeypatch)
     if wanted:
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", wanted)
     cell = harness.with_recorder(scenario(), tmp_path / "bag", keep=True)
@@ -358,7 +364,7 @@ def dds_ports(domain):
 
 @pytest.mark.parametrize("wanted", [None, "SUBNET"])
 def test_a_node_alone_hears_the_network_only_if_asked_to(wanted, observer, domain, tmp_path, monkeypatch):
-    monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
+    as_started_by_a_user(monkeypatch)
     if wanted:
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", wanted)
     with subprocess.Popen([sys.executable, "-m", "lathe_rc.nodes.tool", "--ros-args"]) as process:

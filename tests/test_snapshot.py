@@ -13,13 +13,16 @@ from pathlib import Path
 import pytest
 import yaml
 from cells import scenario
+from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness
+from lathe_rc.bag.check import check
 from lathe_rc.bag.order import Merger
+from lathe_rc.bag.resim import resimulate
 from lathe_rc.bag.snapshot import SNAPSHOT, Snapshots, first_sample
 from lathe_rc.bag.writer import offered_qos
 from lathe_rc.cell import messages
@@ -28,6 +31,7 @@ from lathe_rc.cell.messages import START_NS
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Encoder
+from lathe_rc.cli import main
 from lathe_rc.errors import InputError, LatheError
 
 STEP_NS, BLOCK, PRE, POST = 15_625, 64, 3200, 1280
@@ -104,6 +108,21 @@ def test_snapshot_says_what_it_is_of_what_and_why(recorded):
         whole = about(recorded.bag)
         assert {key: text for key, text in about(path).items() if key != SNAPSHOT} == whole
         assert {"lathe_rc.scenario", "lathe_rc.versions", "lathe_rc.run_id"} <= whole.keys()
+
+
+def test_the_commands_read_a_snapshot_as_a_bag(recorded):
+    for path in recorded.snapshots:
+        found = check(path)
+        assert (found.exit_code, found.first, found.samples) == (0, told(path)["first_sample"], told(path)["samples"])
+        shown = CliRunner().invoke(main, ["bag", "info", str(path), "--json"])
+        assert shown.exit_code == 0
+        # Its first complete revolution has the number that it has in the run.
+        assert json.loads(shown.stdout)["error_um"]["first"]["revolution"] > 1
+
+
+def test_a_snapshot_cannot_be_simulated_again(recorded):
+    with pytest.raises(InputError, match="the start of the run, from which controllers and drives have their state"):
+        resimulate(recorded.snapshots[0])
 
 
 def test_state_of_the_cell_is_in_each_snapshot(recorded):

@@ -189,7 +189,7 @@ def resimulate(
         cell, compared, events = wire(chosen, original, recorded, source)
         for name, stage in cell.stages.items():
             for index, action in events.get(name, []):
-                if action not in stage.announces:
+                if action.partition(":")[0] not in stage.announces:
                     stage.schedule(action, index)
         digests = _Digests(cell)
         errors = ErrorsByRevolution({f"/{name}": said.type for name, said in cell.dense.items()})

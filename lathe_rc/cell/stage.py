@@ -93,13 +93,14 @@ class Stage(ABC):
     Attributes:
         inputs, outputs: the ports; the arrays handed to `advance` stand in their order.
         sparse_topics: relative name and type of every topic that carries `Sparse` messages.
+        tells: events come about by themselves that only `process` knows of.
         own_inputs: number of inputs that `process` gets; one more may tell the spindle angle to the events.
     """
 
     kind: ClassVar[str]
     Parameters: ClassVar[type[NodeParameters]]
     actions: ClassVar[tuple[str, ...]] = ()  #: events that it knows
-    announces: ClassVar[tuple[str, ...]] = ()  #: events that come about by themselves
+    announces: ClassVar[tuple[str, ...]] = ()  #: events that come about by themselves; up to a colon
     devices: ClassVar[tuple[str, ...]] = ()  #: what can break beside its ports; see `lathe_rc.safety.faults.Kind`
 
     inputs: tuple[Input, ...] = ()
@@ -112,11 +113,16 @@ class Stage(ABC):
         self._triggers = [self._trigger("events", text) for text in parameters.events]
         self._triggers += [trigger for text in parameters.faults for trigger in self._break_down(text)]
         self._injection: Injection | None = None
-        self.own_inputs = 0
+        self.own_inputs, self.tells = 0, False
         self._scheduled: list[tuple[int, str]] = []
 
-    def declare(self, *, inputs: Sequence[Input] = (), outputs: Sequence[Output] = ()) -> None:
+    def declare(self, *, inputs: Sequence[Input] = (), outputs: Sequence[Output] = (), tells: bool = False) -> None:
         """Set the ports; to be called once, at the end of the constructor.
+
+        Args:
+            inputs: in the order of `process`.
+            outputs: the same.
+            tells: events come about by themselves, even if none can be asked for.
 
         Raises:
             InputError: an event or fault that cannot be.
@@ -127,7 +133,8 @@ class Stage(ABC):
         self._joints = [(place, output.joint) for place, output in enumerate(self.outputs) if output.joint]
         if self._joints:
             self.sparse_topics[f"{self.name}/joint_states"] = messages.JOINTS
-        if self.takes_events:
+        self.tells = tells
+        if self.takes_events or tells:
             self.sparse_topics[f"{self.name}/events"] = messages.EVENT
         if self.shared.allow_faults:
             self._injection = Injection(

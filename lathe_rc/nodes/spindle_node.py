@@ -109,10 +109,9 @@ class SpindleNode(StageNode):
     def _begin(self) -> None:
         self._running = True
         self.get_logger().info(f"run {self.table.run_id or '(no id)'} begins with {len(self._member_names)} members")
-        self._heard = time.monotonic()
-        self._schedule = self._heard
         self._say(CellState.RUNNING, 0)
         self.reporter("block0", self.get_name())
+        self._schedule = self._heard = time.monotonic()
         self.release()
 
     # ---- run ----------------------------------------------------------------------------------------

@@ -9,15 +9,16 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc.analysis.learning import Response
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Input, Joint, Output, Sparse
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters
 from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
 from lathe_rc.plants.linear import Discretisation
 from lathe_rc.signals.noise import Sensor
 
 
-class ElectrodynamicActuatorParameters(NodeParameters):
+class ElectrodynamicActuatorParameters(LimitedParameters):
     """The drive closed by its own loops, e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), its limits and its sensor."""
 
     natural_frequency: Annotated[float, Gt(0)] = parameter(1038.0, "natural frequency ωn", "rad/s")
@@ -43,6 +44,7 @@ class ElectrodynamicActuator(Drive):
 
     kind = "electrodynamic_actuator"
     Parameters = ElectrodynamicActuatorParameters
+    announces = (LIMITED, FREE)
 
     def __init__(self, name: str, parameters: ElectrodynamicActuatorParameters) -> None:
         super().__init__(name, parameters)
@@ -57,10 +59,12 @@ class ElectrodynamicActuator(Drive):
             step=parameters.step,
             method=parameters.discretisation,
         )
+        self._limited = LimitedCommand(name, parameters)
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         self.declare(
             inputs=[Input("coarse/command", messages.COMMAND, ("position",))],
             outputs=[Output("coarse/state", messages.STATE, Joint("position", "velocity", "effort"))],
+            tells=self._limited.on,
         )
 
     def responses(self) -> Mapping[str, Response]:
@@ -75,6 +79,7 @@ class ElectrodynamicActuator(Drive):
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         (command,), (state,) = inputs, outputs
-        self.drive.block(command["position"], state["position"], state["velocity"], state["effort"])
+        given, told = self._limited.block(first, command["position"])
+        self.drive.block(given, state["position"], state["velocity"], state["effort"])
         self._sensor.measure(state["position"], state["measured_position"])
-        return []
+        return told

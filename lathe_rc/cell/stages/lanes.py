@@ -332,7 +332,7 @@ def lane_stage(stages: Sequence[Stage], *, shared: bool) -> LaneStage[Any]:
     """What steps some stages of one kind at once; ``shared`` if all that they read is the same in all lanes."""
     if shared and all(same(stages[0].shared, stage.shared) for stage in stages):
         return Shared(stages)
-    eventful = any(stage.shared.events or stage.shared.faults for stage in stages)
+    eventful = any(stage.shared.events or stage.shared.faults or stage.tells for stage in stages)
     for kind, lanes, fits in _LANES:
         if isinstance(stages[0], kind) and not eventful and fits(stages):
             return cast("LaneStage[Any]", lanes(stages))

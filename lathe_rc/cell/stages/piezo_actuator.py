@@ -12,6 +12,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Joint, Output, Sparse
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters
 from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.set_point import SetPoint, SetPointParameters
 from lathe_rc.errors import InputError
@@ -26,7 +27,7 @@ from lathe_rc.plants.piezo import PiezoDrive, Stack
 from lathe_rc.signals.noise import Sensor
 
 
-class PiezoActuatorParameters(SetPointParameters):
+class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
     """Set point, resonance 1/(1 + 2ζp/ωn + p²/ωn²), amplifier, hysteresis and its linearisation, creep, sensor."""
 
     natural_frequency: Annotated[float, Gt(0)] = parameter(14600.0, "natural frequency ωn", "rad/s")
@@ -129,6 +130,7 @@ class PiezoActuator(Drive):
 
     kind = "piezo_actuator"
     Parameters = PiezoActuatorParameters
+    announces = (LIMITED, FREE)
 
     def __init__(self, name: str, parameters: PiezoActuatorParameters) -> None:
         super().__init__(name, parameters)
@@ -142,10 +144,12 @@ class PiezoActuator(Drive):
             method=parameters.discretisation,
         )
         self.set_point = SetPoint(name, parameters)
+        self._limited = LimitedCommand(name, parameters)
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         self.declare(
             inputs=self.set_point.inputs,
             outputs=[Output("fine/state", messages.STATE, Joint("position", "velocity", "effort"))],
+            tells=self._limited.on,
         )
 
     def responses(self) -> Mapping[str, Response]:
@@ -157,6 +161,7 @@ class PiezoActuator(Drive):
         (state,) = outputs
         set_point = np.empty_like(state["position"])
         self.set_point.fill(inputs, set_point)
-        self.drive.block(set_point, state["position"], state["velocity"], state["effort"])
+        given, told = self._limited.block(first, set_point)
+        self.drive.block(given, state["position"], state["velocity"], state["effort"])
         self._sensor.measure(state["position"], state["measured_position"])
-        return []
+        return told

@@ -13,6 +13,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import Input, Joint, Output, Sparse
+from lathe_rc.cell.stages.command_limits import LimitedCommand
 from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters
@@ -111,6 +112,7 @@ class SeriesDriveStage(Drive):
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
         self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
+        self._limited = LimitedCommand(name, coarse, "coarse"), LimitedCommand(name, fine, "fine")
         self._set_point = SetPoint(name, fine, inside=(_COARSE,))
         # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
         self._coarse_noise = Sensor(coarse.noise_rms, 0.0, parameters.seed, f"{name}/coarse")
@@ -121,6 +123,7 @@ class SeriesDriveStage(Drive):
                 Output("coarse/state", messages.STATE, Joint("position", "velocity", "effort")),
                 Output("fine/state", messages.STATE),
             ],
+            tells=any(limited.on for limited in self._limited),
         )
 
     def responses(self) -> Mapping[str, Response]:
@@ -138,10 +141,12 @@ class SeriesDriveStage(Drive):
         set_point, noise = np.empty((2, coarse["position"].size))
         self._set_point.fill(others, set_point)
         self._coarse_noise.measure(np.zeros_like(noise), noise)
+        given, told = self._limited[0].block(first, command["position"])
+        wanted, told_fine = self._limited[1].block(first, set_point)
         self.drive.block(
-            first, command["position"], set_point, noise,
+            first, given, wanted, noise,
             coarse["position"], coarse["velocity"], coarse["effort"], coarse["measured_position"],
             fine["position"], fine["velocity"], fine["effort"],
         )  # fmt: skip
         self._fine_sensor.measure(fine["position"], fine["measured_position"])
-        return []
+        return sorted(told + told_fine, key=lambda message: message.index)

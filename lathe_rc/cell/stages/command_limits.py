@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Limits of what a drive of the tool is commanded, and what is said of samples that are clipped."""
+
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Ge
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Samples
+from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.control.limits import CommandLimiter, CommandLimits
+
+LIMITED, FREE = "limited", "free"  #: events: a sample is clipped; none has been for a while
+_QUIET = 10e-3  # [s] without a clipped sample until a command is free again
+
+
+class LimitedParameters(NodeParameters):
+    """What the command is kept within, on its way to the drive."""
+
+    command_stroke: Annotated[float, Ge(0)] = parameter(
+        0.0, "the command is kept within this to each side; 0: none", "m"
+    )
+    command_velocity: Annotated[float, Ge(0)] = parameter(0.0, "and within this velocity; 0: none", "m/s")
+    command_acceleration: Annotated[float, Ge(0)] = parameter(0.0, "and within this acceleration; 0: none", "m/s^2")
+    command_jerk: Annotated[float, Ge(0)] = parameter(0.0, "and within this jerk; 0: none", "m/s^3")
+
+    def command_limits(self) -> CommandLimits:
+        """The limits that are set."""
+        given = (self.command_stroke, self.command_velocity, self.command_acceleration, self.command_jerk)
+        return CommandLimits(*(limit or np.inf for limit in given))
+
+
+class LimitedCommand:
+    """Keeps a command within its limits, and says with which sample that begins and ends.
+
+    Args:
+        node: whose command it is.
+        parameters: its table.
+        which: of its commands; empty if it has one.
+
+    Attributes:
+        on: whether there is a limit.
+    """
+
+    def __init__(self, node: str, parameters: LimitedParameters, which: str = "") -> None:
+        limits = parameters.command_limits()
+        self.on = limits.any
+        self._topic, self._limiter = f"{node}/events", CommandLimiter(limits, parameters.step)
+        self._which = f" {which}" if which else ""
+        self._begins = f"{LIMITED}:{self._which}" if which else LIMITED
+        self._quiet = round(_QUIET * parameters.sample_rate)
+        self._before, self._left = 0, 0  # clipped samples when it was last free; samples until it is free again
+
+    def block(self, first: int, command: Samples) -> tuple[Samples, list[Sparse]]:
+        """What the drive gets [m], shape (n,), and the events of samples ``first`` on."""
+        if not self.on:
+            return command, []
+        given = np.empty_like(command)
+        count = self._limiter.clipped
+        clipped = self._limiter.block(command, given)
+        if not self._left and self._limiter.clipped == count:
+            return given, []
+        return given, self._told(first, clipped, count)
+
+    def _told(self, first: int, clipped: Samples, count: int) -> list[Sparse]:
+        """The events of a block; ``count`` samples were clipped before it."""
+        found, place, samples = [], 0, clipped.size
+        while place < samples:
+            ahead = np.flatnonzero(clipped[place : place + self._left] if self._left else clipped[place:])
+            if self._left and ahead.size:
+                # Still at it: the quiet begins anew after the last of them.
+                after = int(ahead[-1]) + 1
+                count += int(clipped[place : place + after].sum())
+                place, self._left = place + after, self._quiet
+            elif self._left > samples - place:
+                self._left -= samples - place
+                place = samples
+            elif self._left:
+                place, self._left = place + self._left, 0
+                action = f"{FREE}:{self._which} {count - self._before} samples were clipped"
+                found.append(Sparse(self._topic, messages.EVENT, first + place - 1, {"action": action}))
+                self._before = count
+            elif ahead.size:
+                place += int(ahead[0])
+                found.append(
+                    Sparse(
+                        self._topic,
+                        messages.EVENT,
+                        first + place,
+                        {"action": self._begins},
+                    )
+                )
+                place, count, self._left = place + 1, count + 1, self._quiet
+            else:
+                place = samples
+        return found

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Limits of a command: kept by every sample, nothing changed within them, everything clipped counted and told."""
+
+import numpy as np
+import pytest
+from cells import SCENARIOS, command, cuts, run, spans
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from lathe_rc import harness
+from lathe_rc.bag.resim import resimulate
+from lathe_rc.cell import messages
+from lathe_rc.cell import scenario as scenarios
+from lathe_rc.control.limits import CommandLimiter, CommandLimits
+from lathe_rc.errors import InputError
+
+CONFIG = SCENARIOS[0].parent
+STEP = 1.0 / 64000
+LIMITS = CommandLimits(0.5e-3, 0.1, 200.0, 1e5)
+TIME = np.arange(32_000) * STEP
+
+
+def limited(wanted, limits=LIMITS, lengths=None):
+    limiter, found, clipped = CommandLimiter(limits, STEP), np.empty_like(wanted), []
+    for first, stop in spans(lengths or [wanted.size]):
+        clipped.append(limiter.block(wanted[first:stop], found[first:stop]))
+    assert limiter.clipped == sum(int(part.sum()) for part in clipped)
+    return found, np.concatenate(clipped)
+
+
+def peaks(given_command):
+    """Largest position, velocity, acceleration and jerk, at rest at 0 before the first sample."""
+    whole = np.concatenate((np.zeros(3), given_command))
+    return [np.abs(np.diff(whole, order)).max() / STEP**order for order in range(4)]
+
+
+def test_what_keeps_within_the_limits_goes_through_to_the_bit():
+    wave = 200e-6 * np.sin(2 * np.pi * 5 * TIME) * np.minimum(TIME * 5, 1.0) ** 3
+    found, clipped = limited(wave)
+    assert_array_equal(found, wave)
+    assert not clipped.any()
+
+
+@pytest.mark.parametrize(
+    ("wave", "settles"),
+    [
+        (np.where(TIME > 0.1, 200e-6, 0.0), True),
+        (np.where(TIME > 0.1, -480e-6, 0.0), True),
+        (np.where(TIME < 0.2, 400e-6 * np.sin(2 * np.pi * 150 * TIME), 100e-6 * np.sin(2 * np.pi * 16 * TIME)), True),
+        (1e-3 * np.sin(2 * np.pi * 16 * TIME), False),
+        (100e-6 * np.random.default_rng(0).standard_normal(TIME.size), False),
+    ],
+    ids=["step", "step to the stroke", "fast, then slow", "beyond the stroke", "noise"],
+)
+def test_every_sample_keeps_within_the_limits(wave, settles):
+    found, clipped = limited(wave)
+    position, velocity, acceleration, jerk = peaks(found)
+    assert position <= 0.5e-3
+    assert velocity <= 0.1 * (1 + 1e-3)
+    assert acceleration <= 200.0 * (1 + 1e-3)
+    assert jerk <= 1e5 * (1 + 1e-3)
+    assert clipped.any()
+    if settles:
+        assert_array_equal(found[-1000:], wave[-1000:])
+        assert not clipped[-1000:].any()
+
+
+levels = st.lists(st.floats(-1e-3, 1e-3), min_size=1, max_size=6)
+
+
+@settings(max_examples=50)
+@given(levels)
+def test_steps_of_any_height_keep_within_the_limits_and_are_reached(heights):
+    wave = np.repeat([*heights, 0.0], 6000)
+    found, _ = limited(wave)
+    position, velocity, acceleration, jerk = peaks(found)
+    assert position <= 0.5e-3
+    assert velocity <= 0.1001
+    assert acceleration <= 200.1
+    assert jerk <= 1.001e5
+    assert_allclose(found[-1], 0.0, atol=1e-9)
+
+
+@given(lengths=cuts)
+def test_cutting_into_blocks_leaves_no_trace(lengths):
+    wave = np.where(np.arange(sum(lengths)) % 400 < 200, 200e-6, 0.0)
+    for whole, parts in zip(limited(wave), limited(wave, lengths=lengths), strict=True):
+        assert_array_equal(whole, parts)
+
+
+def test_limits_that_are_not_set_limit_nothing():
+    wave = np.random.default_rng(1).standard_normal(1000)
+    found, clipped = limited(wave, CommandLimits())
+    assert_array_equal(found, wave)
+    assert not clipped.any()
+
+
+# ---- in the cell
+
+TIGHT = {"command_velocity": 0.05, "command_acceleration": 100.0, "command_jerk": 1e6}
+
+
+def events(result):
+    found = result.recording.sparse["/electrodynamic_actuator/events"].values
+    return list(zip(found["action"], found["sample_index"], strict=True))
+
+
+def test_clipped_samples_are_counted_and_told():
+    result = run({"block_size": 50}, electrodynamic_actuator=TIGHT)
+    told = events(result)
+    assert [action.partition(":")[0] for action, _ in told[:2]] == ["limited", "free"]
+    wanted = command(result)
+    _, clipped = limited(wanted, CommandLimits(np.inf, *TIGHT.values()))
+    assert told[0][1] == np.flatnonzero(clipped)[0]
+    counts = [int(action.split()[1]) for action, _ in told if action.startswith("free")]
+    ended = [index for action, index in told if action.startswith("free")]
+    assert sum(counts) == clipped[: ended[-1] + 1].sum()
+    for index in ended:
+        assert not clipped[index - 639 : index + 1].any()
+        assert clipped[index - 640]
+
+
+@pytest.mark.parametrize("mode", ["composed"])
+def test_limits_are_the_same_in_every_host(mode):
+    loaded = scenarios.load(CONFIG / "two_channel.yaml", CHANGES)
+    assert harness.run(loaded, mode=mode).digest == harness.run(loaded).digest
+
+
+CHANGES = [
+    "spindle_encoder.revolutions=20", "electrodynamic_actuator.command_velocity=0.02",
+    "electrodynamic_actuator.command_jerk=1e6", "piezo_actuator.command_stroke=1e-6",
+]  # fmt: skip
+
+
+def test_a_re_simulation_clips_in_the_same_way(tmp_path):
+    result = harness.run(scenarios.load(CONFIG / "two_channel.yaml", CHANGES), bag=tmp_path / "bag")
+    assert "/piezo_actuator/events" in result.recording.sparse
+    found = resimulate(tmp_path / "bag")
+    assert (found.changed, found.different, found.missing) == (False, [], [])
+
+
+@pytest.mark.parametrize(
+    ("limit", "said"),
+    [("coarse_command_velocity=0.005", "limited: coarse"), ("fine_command_stroke=1e-7", "limited: fine")],
+)
+def test_both_commands_of_drives_in_series_have_limits(limit, said):
+    result = harness.run(
+        scenarios.load(CONFIG / "series.yaml", ["spindle_encoder.revolutions=40", f"series_drive.{limit}"])
+    )
+    assert said in result.recording.sparse["/series_drive/events"].values["action"]
+
+
+def test_without_limits_nothing_is_told():
+    assert "/electrodynamic_actuator/events" not in run().recording.sparse
+
+
+def test_a_negative_limit_is_refused():
+    with pytest.raises(InputError, match="command_velocity = -1"):
+        run(electrodynamic_actuator={"command_velocity": -1.0})
+
+
+def test_the_state_follows_what_was_given_not_what_was_wanted():
+    result = run(electrodynamic_actuator={"command_stroke": 50e-6})
+    assert np.abs(result.recording.of_type(messages.STATE)["position"]).max() < 80e-6
