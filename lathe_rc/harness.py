@@ -49,6 +49,7 @@ Event = Mapping[str, Any]
 
 _SILENCE_LIMIT = 120.0  # [s] without any event: the first start on a machine compiles kernels
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
+_LOOK = 0.05  # [s] between looks at what a process has written
 
 
 @dataclass(frozen=True)
@@ -400,7 +401,7 @@ class Processes:
             try:
                 event = self._events.get(timeout=silence)
             except queue.Empty:
-                running = ", ".join(name for name in self._children if name not in self._ended)
+                running = ", ".join(f"{name}{self._place(name)}" for name in self._children if name not in self._ended)
                 raise LatheError(
                     f"no node has reported anything for {silence:.0f} s; still running: {running}{self._tails()}"
                 ) from None
@@ -468,6 +469,19 @@ class Processes:
         lines = self._log(name)
         start = next((place for place, line in enumerate(lines) if line.startswith("Current thread")), len(lines))
         return f" in {lines[start + 1].strip()}" if start + 1 < len(lines) else ""
+
+    def _place(self, name: str) -> str:
+        """Where a process is that says nothing, by its innermost call."""
+        child, before = self._children[name], len(self._log(name))
+        with contextlib.suppress(ProcessLookupError):
+            child.send_signal(signal.SIGUSR1)
+        deadline = time.monotonic() + _GRACE
+        while time.monotonic() < deadline and child.poll() is None:
+            said = [line.strip() for line in self._log(name)[before:]]
+            if place := next((line for line in said if line.startswith("File ")), ""):
+                return f" in {place}"
+            time.sleep(_LOOK)
+        return ""
 
     def _tails(self) -> str:
         return "".join(f"; {name}{self._tail(name)}" for name in self._children)

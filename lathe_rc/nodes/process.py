@@ -135,6 +135,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
         The exit code: 0, or that of the first failure.
     """
     faulthandler.enable()  # a crash of a library leaves where it happened in the log
+    faulthandler.register(signal.SIGUSR1)  # and the harness can ask where a silent process is
     _tune()
     reporter = Reporter()
     dds.settle()
