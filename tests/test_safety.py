@@ -17,11 +17,13 @@ from lathe_rc import harness
 from lathe_rc.bag.resim import resimulate
 from lathe_rc.cell import messages
 from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.stage import Sparse
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion
 from lathe_rc.errors import InputError
 from lathe_rc.safety import state_machine
 from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Rate, Threshold
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
+from lathe_rc.view import happened
 
 STEP = 1.0 / 64000
 CONFIG = SCENARIOS[0].parent
@@ -119,6 +121,14 @@ def test_the_page_has_the_tables_of_the_code():
     page = script.with_suffix(".md").read_text(encoding="utf-8")
     for table in printed.strip().split("\n\n"):
         assert table in page, "run: python docs/safety.py"
+
+
+def test_an_alarm_is_told_in_words_whatever_a_bag_says():
+    values = {"state": 2, "reaction": 5, "monitor": "error", "subject": "tool", "value": 2.5e-5, "limit": 2e-5}
+    said = happened.text(Sparse("safety/status", messages.SAFETY_STATUS, 7, values))
+    assert said == "error tool 2.5e-05, limit 2e-05: retracting, retract"
+    strange = happened.text(Sparse("safety/status", messages.SAFETY_STATUS, 7, values | {"state": 200, "limit": 0.0}))
+    assert strange == "error tool: ?, retract"
 
 
 # ---- monitors

@@ -15,6 +15,8 @@ from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError
+from lathe_rc.view import happened
+from lathe_rc.view.happened import HAPPENED
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_host import TYPES as HOST_TYPES
 from lathe_rc.view.report_host import Host
@@ -92,10 +94,10 @@ class Curves:
         for (topic, name), envelope in self.cycles.items():
             envelope.add(np.array([message.values[name] for message in sparse.get(topic, [])], dtype=float))
         for topic, found in sparse.items():
-            if self._types[topic] == messages.EVENT:
+            if self._types[topic] in HAPPENED:
                 self.event_count += len(found)
                 room = max(0, _MOST_EVENTS - len(self.events))
-                self.events += [Event(topic, event.index, event.values["action"]) for event in found[:room]]
+                self.events += [Event(topic, event.index, happened.text(event)) for event in found[:room]]
 
 
 def of_type(types: Mapping[str, str], kind: str) -> list[str]:

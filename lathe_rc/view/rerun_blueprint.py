@@ -7,6 +7,7 @@ import rerun.blueprint as rrb
 
 from lathe_rc.cell import messages
 from lathe_rc.view import rerun_part as parts
+from lathe_rc.view.happened import HAPPENED
 from lathe_rc.view.rerun_signals import ERROR, PLOTS, POSITION, curve_path, curves
 
 _LATEST_S, _LATEST_REVOLUTIONS = 0.3, 5  # before the time cursor, in plots of fast signals
@@ -99,7 +100,7 @@ def blueprint(types: Mapping[str, str], *, live: bool = False) -> rrb.Blueprint:
     rows: list[rrb.View | rrb.Container] = [rrb.Horizontal(*top)] if top else []
     rows += first
     tabs: list[rrb.View] = list(plots.values())
-    if live or messages.EVENT in kinds:  # live, what had to be left out stands there
+    if live or kinds & {*HAPPENED}:  # live, what had to be left out stands there
         tabs.append(rrb.TextLogView(origin="/events", name="events"))
     if tabs:
         rows.append(rrb.Tabs(*tabs, active_tab=0))

@@ -16,7 +16,9 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals, full
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import LatheError
+from lathe_rc.view import happened
 from lathe_rc.view import rerun_part as parts
+from lathe_rc.view.happened import HAPPENED
 from lathe_rc.view.rerun_revolutions import ANGLES, HIGHEST, Revolution, Revolutions
 from lathe_rc.view.rerun_signals import CYCLES, curve_path, curves, envelope
 
@@ -189,8 +191,8 @@ class Scene:
             values = parts.log_um(np.array([message.values[cycle.error] for message in found], dtype=np.float64))
             number = np.array([message.values[cycle.counter] for message in found])
             self._send(f"learning{topic}", self._when(index, number), rr.Scalars.columns(scalars=values))
-        elif kind == messages.EVENT:
-            texts = [f"{topic.strip('/')}: {message.values['action']}" for message in found]
+        elif kind in HAPPENED:
+            texts = [f"{topic.strip('/')}: {happened.text(message)}" for message in found]
             self._send("events", self._when(index, None), rr.TextLog.columns(text=texts))
 
     def _part(self, first: int, angle: Samples, tool: Signals) -> None:

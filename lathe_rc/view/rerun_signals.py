@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, full
+from lathe_rc.view.happened import HAPPENED
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ def wanted(msgtype: str) -> set[str]:
 
 def drawn(msgtype: str) -> bool:
     """Whether a scene has any use for messages of a type."""
-    return bool(wanted(msgtype)) or msgtype in CYCLES or msgtype == messages.EVENT
+    return bool(wanted(msgtype)) or msgtype in CYCLES or msgtype in HAPPENED
 
 
 def curve_path(topic: str, field: str) -> str:
