@@ -16,10 +16,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from lathe_rc import __version__, harness, part, resources
-from lathe_rc.cell import scenario as scenarios
+from lathe_rc import __version__, harness, part
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.commands import scenario as options
 from lathe_rc.errors import InputError, LatheError
 
 _REFRESH = 0.1  # [s] between updates of the progress line
@@ -70,13 +70,6 @@ class _Group(click.Group):
 @click.version_option(__version__)
 def main() -> None:
     """Emulate the control cell of a lathe for non-circular turning."""
-
-
-def _load(name: str, overrides: Sequence[str]) -> Scenario:
-    path = Path(name)
-    if not path.exists() and path.suffix == "":
-        path = path.with_suffix(".yaml")
-    return scenarios.load(resources.find(path), overrides)
 
 
 class _Watch:
@@ -176,18 +169,12 @@ def _run(
 @main.command()
 @click.argument("scenario")
 @click.option("--mode", type=click.Choice(["offline", "composed", "processes"]), default="offline", show_default=True)
-@click.option(
-    "--group",
-    "groups",
-    multiple=True,
-    metavar="NODE+NODE",
-    help="nodes that share a process, instead of those that the scenario names; repeatable; none: one each",
-)
+@options.groups
 @click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of the run")
 @click.option("--speed-factor", type=click.FloatRange(min=0), help="pace against real time; 0: as fast as possible")
 @click.option("--bag", type=click.Path(path_type=Path), help="folder to record to; must not exist")
 @click.option("--profile", type=click.Path(path_type=Path), help="CSV file to write the last revolution's profile to")
-@click.option("--set", "overrides", multiple=True, metavar="NODE.PARAM=VALUE", help="also PARAM=VALUE if shared")
+@options.overrides
 @click.option("--domain", type=click.IntRange(0, 232), help="ROS domain, for others to listen; default: a free one")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def run(
@@ -204,19 +191,18 @@ def run(
     as_json: bool,
 ) -> None:
     """Run a SCENARIO, a ROS 2 parameter file, to its end."""
-    loaded = _load(scenario, overrides)
-    options = {"revolutions": revolutions, "speed_factor": speed_factor}
-    given = {name: value for name, value in options.items() if value is not None}
+    loaded = options.load(scenario, overrides)
+    asked = {"revolutions": revolutions, "speed_factor": speed_factor}
+    given = {name: value for name, value in asked.items() if value is not None}
     changes = [f"{node}.{n}={v!r}" for node in loaded.of_kind(SpindleEncoder.kind) for n, v in given.items()]
     if changes:
-        loaded = _load(scenario, [*overrides, *changes])
-    split = [group.split("+") for group in groups if group != "none"]
-    loaded.processes(split, "--group")
+        loaded = options.load(scenario, [*overrides, *changes])
+    split = options.split(loaded, groups)
     if groups and mode != "processes":
         raise InputError(f"--group with --mode {mode}; allowed: --mode processes")
     if domain is not None and mode == "offline":
         raise InputError(f"--domain {domain} with --mode offline; allowed: --mode processes or composed")
-    result = _run(loaded, mode=mode, groups=split if groups else None, bag=bag, domain=domain)
+    result = _run(loaded, mode=mode, groups=split, bag=bag, domain=domain)
     if profile:
         part.write_profile(profile, result.recording, result.part, [result.errors.rms.size - 1])
     if as_json:
@@ -259,7 +245,7 @@ def demo(name: str, revolutions: float, folder: Path) -> None:
         number += 1
     place = folder / f"demo-{number}"
     announcement, title = _DEMOS[name]
-    scenario = _load(name, [f"spindle_encoder.revolutions={revolutions!r}"])
+    scenario = options.load(name, [f"spindle_encoder.revolutions={revolutions!r}"])
     console = Console()
     console.print(announcement, highlight=False)
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,12 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are written whole or not at all."""
+"""Files that are read whole, if they are none too large, and written whole or not at all."""
 
 import contextlib
+import errno
 import os
+import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, cast
+
+MOST = 2**26  #: longest file that is read whole [B]
+_NO_FILE = "not a file"
+
+
+def contents(path: Path, most: int = MOST) -> bytes:
+    """What is in a file. Pipes and files of the system that would have a reader wait, perhaps for ever, are none.
+
+    Raises:
+        OSError: it cannot be read; EFBIG: it is longer than ``most`` bytes.
+    """
+    with open(path, "rb", opener=_open_file) as stream:
+        found = stream.read(most + 1)
+    if found is None:  # it would have had to wait
+        raise OSError(errno.EINVAL, _NO_FILE)
+    if len(found) > most:
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+    return found
+
+
+def _open_file(name: str, flags: int) -> int:
+    number = os.open(name, flags | os.O_NONBLOCK)
+    if not stat.S_ISREG(os.fstat(number).st_mode):
+        os.close(number)
+        raise OSError(errno.EINVAL, _NO_FILE)
+    return number
 
 
 @contextlib.contextmanager

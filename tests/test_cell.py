@@ -62,8 +62,8 @@ def test_a_stopped_process_changes_no_bit(offline, node, tmp_path):
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
         processes.wait_for("cycle")
         os.kill(processes.pids[node], signal.SIGSTOP)
-        # The spindle names the silent one; only then does it go on.
-        assert processes.wait_for("stall")["member"] == f"/{node}"
+        # The spindle names the silent one, whomever else a busy machine delays; only then does it go on.
+        processes.wait_for("stall", member=f"/{node}")
         os.kill(processes.pids[node], signal.SIGCONT)
         processes.wait_for_end()
     assert reader.read(tmp_path / "bag").digests() == offline

@@ -183,6 +183,11 @@ def test_times_that_cannot_be_are_refused(text, said):
     assert said in str(caught.value)
 
 
+def test_what_is_repaired_is_one_of_the_targets():
+    with pytest.raises(InputError, match=r"repair 'coarse/state.nothing': there is no such target; allowed: coarse"):
+        run(ALLOWED, electrodynamic_actuator={"events": ["second 0.01: repair coarse/state.nothing"]})
+
+
 def test_faults_are_refused_unless_they_are_allowed():
     fault = "electrodynamic_actuator.faults=['second 1: coarse/state.position off']"
     found = CliRunner().invoke(main, ["run", "one_channel", "--set", fault])

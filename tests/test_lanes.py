@@ -98,6 +98,7 @@ def test_each_lane_has_the_bits_of_its_cell_alone(lanes):
         ("two_channel", ["learning_controller.events=['revolution 3: freeze']"]),
         ("direct_compensation", []),
         ("vibration", []),
+        ("supervised", ["supervisor.error_limit=1e-6"]),
     ],
 )
 def test_what_has_no_kernel_for_lanes_runs_lane_by_lane(name, overrides):

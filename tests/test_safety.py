@@ -290,9 +290,12 @@ def test_a_fault_is_noticed_and_the_tool_leaves_the_part_along_a_bounded_profile
     assert result.recording.of_type(messages.TOOL)["displacement"][-1] > 0.28e-3
 
 
-@pytest.mark.parametrize("mode", ["composed", "processes"])
-def test_reactions_are_the_same_in_every_host(mode):
-    loaded = supervised(STUCK)
+LOST = "spindle_encoder.faults=['revolution 20: encoder.angle garbage amplitude=100']"
+
+
+@pytest.mark.parametrize(("fault", "mode"), [(STUCK, "composed"), (STUCK, "processes"), (LOST, "composed")])
+def test_reactions_are_the_same_in_every_host(fault, mode):
+    loaded = supervised(fault)
     assert harness.run(loaded, mode=mode).digest == harness.run(loaded).digest
 
 
@@ -314,8 +317,7 @@ def test_a_stop_is_not_reset():
 
 
 def test_an_angle_that_no_controller_can_use_ends_in_the_safe_state_not_in_an_error():
-    lost = "spindle_encoder.faults=['revolution 20: encoder.angle garbage amplitude=100']"
-    result = harness.run(supervised(lost))
+    result = harness.run(supervised(LOST))
     assert "lost" in result.recording.sparse["/learning_controller/events"].values["action"]
     assert (RETRACTED, State.SAFE) in [told[:2] for told in status(result)]
 

@@ -2,10 +2,10 @@
 """What a bag tells of its run, so that it explains itself for months: scenario, files, versions."""
 
 import base64
+import contextlib
 import json
 import platform
 import re
-import shutil
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,13 +16,13 @@ from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError
+from lathe_rc.files import contents
 
 SCENARIO, NAME, VERSIONS = "lathe_rc.scenario", "lathe_rc.name", "lathe_rc.versions"
 RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"
 FILE = "lathe_rc.file."  #: and NODE.PARAM: what was in the file that the parameter names
 RECOVERED = "lathe_rc.recovered"  #: that the bag was completed, and what that cost
 _MOST_FILE = 2**19  # longest such file that is kept [B]
-_MOST_COPIED = 2**26  # longest that is copied from elsewhere; no reader takes a longer one [B]
 _LONGEST_NAME = 80  # characters of a file
 _PACKAGES = ("numpy", "scipy", "numba", "mcap", "rosbags")
 
@@ -106,8 +106,9 @@ def _copied(scenario: Scenario, folder: Path) -> list[str]:
             place = folder / f"named{len(sets)}" / re.sub(r"[^\w.-]", "_", named.name)[-_LONGEST_NAME:]
             place.parent.mkdir(exist_ok=True)
             try:
-                if named.is_file() and named.stat().st_size <= _MOST_COPIED:
-                    shutil.copyfile(named, place)
+                # A memory is written, perhaps, before it is read.
+                with contextlib.suppress(FileNotFoundError):
+                    place.write_bytes(contents(named))
             except OSError as error:
                 raise InputError(f"{node}.{row.name} = {str(named)[:200]!r}: {error.strerror}; set another") from None
             sets.append(f"{node}.{row.name}={place}")

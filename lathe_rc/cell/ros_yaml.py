@@ -7,11 +7,13 @@ by the C library's own strtol and strtod, as rcl_yaml_param_parser does it.
 """
 
 import ctypes
+import errno
 import re
 from pathlib import Path
 
 import yaml
 
+from lathe_rc import files
 from lathe_rc.cell.parameters import Value
 from lathe_rc.errors import InputError
 
@@ -157,12 +159,10 @@ def read(path: Path) -> dict[str, dict[str, Value]]:
         InputError: the file is missing, larger than 1 MiB, or not a ROS 2 parameter file.
     """
     try:
-        if path.exists() and not path.is_file():
-            raise InputError(f"{path}: cannot be read (not a file)")
-        if path.stat().st_size > _MAX_BYTES:
-            raise InputError(f"{path}: larger than {_MAX_BYTES >> 20} MiB; not a parameter file")
-        text = path.read_text(encoding="utf-8")
+        text = files.contents(path, _MAX_BYTES).decode()
     except OSError as error:
+        if error.errno == errno.EFBIG:
+            raise InputError(f"{path}: larger than {_MAX_BYTES >> 20} MiB; not a parameter file") from None
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; allowed: YAML in UTF-8") from None

@@ -3,14 +3,13 @@
 
 import hashlib
 import json
-import os
-import stat
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
 
+from lathe_rc import files
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Value
 from lathe_rc.cell.recorder import KIND as RECORDER
@@ -22,7 +21,6 @@ TABLES: dict[str, type[NodeParameters]] = {kind: stage.Parameters for kind, stag
 TABLES[RECORDER] = RecorderParameters
 
 _EVERYONE = "/**"
-_MOST_FILE = 2**26  # [B]
 # What changes neither a sample nor a message of a run, and so not its identity.
 _HOST_PARAMETERS = {"run_id", "speed_factor", "window", "members", "processes", "autostart"}
 
@@ -147,12 +145,7 @@ def _absolute(kind: str, name: str, value: Value, folder: Path) -> Value:
 def _content(path: Path) -> str:
     """A hash of a file's content; its name if it is none, longer than any reader takes, or cannot be read."""
     try:
-        # Some files of the system would have a reader wait for ever, or never end.
-        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as stream:
-            status = os.fstat(stream.fileno())
-            if stat.S_ISREG(status.st_mode) and status.st_size <= _MOST_FILE:
-                return hashlib.sha256(stream.read(_MOST_FILE) or b"").hexdigest()
-            return path.name
+        return hashlib.sha256(files.contents(path)).hexdigest()
     except OSError:
         return path.name  # who needs the file says why it cannot be read
 

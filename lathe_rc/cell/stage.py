@@ -197,6 +197,9 @@ class Stage(ABC):
             return
         if verb == _REPAIR:
             self._check_allowed(action)
+            if rest not in self.devices:
+                assert self._injection is not None, "there is one if faults are allowed"
+                self._injection.check_target(rest)
             return
         if action not in self.actions:
             known = ", ".join(self.actions) or f"none ({self.kind} has no events)"

@@ -6,23 +6,17 @@ from pathlib import Path
 import click
 
 from lathe_rc import security
-from lathe_rc.cli import _load
+from lathe_rc.commands import scenario as options
 from lathe_rc.errors import InputError
 from lathe_rc.files import replacing
 
 
 @click.command()
 @click.argument("scenario")
-@click.option(
-    "--group",
-    "groups",
-    multiple=True,
-    metavar="NODE+NODE",
-    help="nodes that share a process, instead of those that the scenario names; repeatable; none: one each",
-)
+@options.groups
 @click.option("--namespace", default="/", show_default=True, help="of the cell")
 @click.option("--with", "beside", multiple=True, type=click.Choice(security.BESIDE), help="let in as well; repeatable")
-@click.option("--set", "overrides", multiple=True, metavar="NODE.PARAM=VALUE", help="also PARAM=VALUE if shared")
+@options.overrides
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="file to write; default: the standard output")
 def policy(
     scenario: str,
@@ -33,10 +27,9 @@ def policy(
     output: Path | None,
 ) -> None:
     """Make the SROS2 policy of a SCENARIO: an enclave for each process, the least that its nodes need."""
-    loaded = _load(scenario, overrides)
-    split = [group.split("+") for group in groups if group != "none"]
-    loaded.processes(split, "--group")
-    made = security.policy(loaded, groups=split if groups else None, namespace=namespace, beside=beside)
+    loaded = options.load(scenario, overrides)
+    split = options.split(loaded, groups)
+    made = security.policy(loaded, groups=split, namespace=namespace, beside=beside)
     text = security.to_xml(made, f"the scenario {loaded.name}")
     if output is None:
         click.echo(text, nl=False)

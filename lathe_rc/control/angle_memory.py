@@ -33,7 +33,10 @@ SQUARES, LARGEST, CYCLE_SQUARES, CYCLE_LARGEST, ANGLES, ERRORS, INVARIANT, PLACE
 REALS = 15
 NO_CHUNK = -(1 << 62)
 
-DONE, CYCLE_ENDED, AHEAD, JUMPED, SMOOTH = 0, 1, 2, 3, 4  #: why `step` stopped
+DONE, CYCLE_ENDED, AHEAD, JUMPED, SMOOTH, BEHIND = 0, 1, 2, 3, 4, 5  #: why `step` stopped
+
+_BACK = 8  # grid points by which an angle that trembles may be behind the cycle that is still being read
+ROOM = _BACK + 8  #: grid points that a memory keeps beside a cycle, for what is read around a place
 
 
 @inlined
@@ -122,6 +125,8 @@ def find(
             return k, count, SMOOTH, ended
         if np.floor((angle[k] + lead[k]) * per_radian - cycle) + looks_ahead >= point + count:
             return k, count, AHEAD, ended
+        if np.floor((angle[k] + lead[k]) * per_radian) + _BACK < point + count:
+            return k, count, BEHIND, ended
         if ended:
             return k + 1, count, CYCLE_ENDED, 0
     return angle.size, count, DONE, ended
@@ -214,9 +219,10 @@ def _learn(
     per_radian = grid / _TURN
     k = max(start, min(arrives, angle.size))
     reason = DONE
-    while reason == DONE and k < angle.size:
+    last = whole[NEXT] + memory.size - cycle - ROOM
+    while reason == DONE and k < angle.size and whole[NEXT] < last:
         point = whole[NEXT]
-        stop = point + PIECE
+        stop = min(point + PIECE, last)
         if learning:
             if not 0 <= point - whole[CHUNK] < chunk.size:
                 if ratio < 0.0:
@@ -334,13 +340,13 @@ def step(
     """Step from sample ``start`` of a block, whose first one is sample ``first`` of the run, until it needs help.
 
     Returns the sample that is reached and why: `CYCLE_ENDED` after the sample in which one ended, `SMOOTH` where the
-    next chunk of the smoothed cycle is wanted, the errors, and `DONE` at the end of the block or after ``delay``
-    samples: learning further ahead of what is read would write over it. The block ``begins`` in the first call for it.
+    next chunk of the smoothed cycle is wanted, the errors, and `DONE` at the end of the block or where learning further
+    ahead of what is read would write over it. The block ``begins`` in the first call for it.
     """
     angles, errors = windows[0, : angle.size + 3], windows[1, : angle.size + 3]
     if begins:
         _take(first, delay, grid / _TURN, angle, past_angle, error, whole, real, angles, errors)
-    stop = min(angle.size, start + max(delay, 1))
+    stop = min(angle.size, start + max(delay, 1) if start >= delay - first else delay - first)
     reached, reason = _learn(
         start, delay - first, grid, cycle, looks_ahead, learning, gain, ramp, ratio, reach, angle[:stop], lead, angles,
         errors, sample, work, chunk, scratch, memory, whole, real,

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a controller has learned, in a file that survives a crash."""
 
+import errno
+import io
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -9,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.files import replacing
+from lathe_rc.files import contents, replacing
 
 Array = npt.NDArray[np.float64]
 
@@ -73,13 +75,14 @@ def _read(path: Path, cycle: int, grid: int) -> tuple[int, int, npt.NDArray[Any]
         ValueError: an array in it is none; zipfile and NumPy raise others.
     """
     largest = 8 * cycle + _ROOM
-    # Opening a pipe would wait for its writer, for ever.
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path}: the memory cannot be loaded (not a file); name a file that `save` wrote")
-    size = path.stat().st_size
-    if size > largest:
-        raise InputError(f"{path}: {size} B; allowed: up to {largest} for {cycle} points with {grid} per revolution")
-    with zipfile.ZipFile(path) as archive:
+    try:
+        found = contents(path, largest)
+    except OSError as error:
+        if error.errno == errno.EFBIG:
+            size = f"allowed: up to {largest} B for {cycle} points with {grid} per revolution"
+            raise InputError(f"{path}: larger than any memory; {size}") from None
+        raise
+    with zipfile.ZipFile(io.BytesIO(found)) as archive:
         sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
         if set(sizes) != _NAMES:
             raise InputError(f"{path} is not a saved memory; name a file that `save` wrote")

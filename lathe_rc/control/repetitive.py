@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from lathe_rc.control.angle_memory import (
     AHEAD,
+    BEHIND,
     CHUNK,
     CYCLE_ENDED,
     CYCLE_LARGEST,
@@ -31,6 +32,7 @@ from lathe_rc.control.angle_memory import (
     PLACE,
     REALS,
     REPLACED,
+    ROOM,
     SMOOTH,
     step,
 )
@@ -190,7 +192,7 @@ class RepetitiveController:
 
         Raises:
             AngleLostError: the spindle turned so fast that the memory would have been read where nothing is
-                learned yet, or its angle jumped.
+                learned yet, or so far back that it is no longer kept, or its angle jumped.
         """
         rates = self._correction.law is not CorrectionLaw.NONE
         lead, rate, bend = self._preview.block(first, speed, rates=rates)
@@ -213,6 +215,12 @@ class RepetitiveController:
             raise AngleLostError(
                 f"sample {first + reached}: the memory is read at {angle[reached]:.6g} rad before it is learned; "
                 f"the spindle turns at {speed[reached]:.5g} rad/s: reduce its speed, the lead or the feedback delay",
+                reached,
+            )
+        if reason == BEHIND:
+            raise AngleLostError(
+                f"sample {first + reached}: at {angle[reached]:.6g} rad the memory is no longer kept; the spindle has "
+                "turned back, or its angle is wrong",
                 reached,
             )
         if reason == JUMPED:
@@ -243,7 +251,7 @@ class RepetitiveController:
 
 def memory_size(cycle: int, q: QFilter) -> int:
     """Grid points that the memory of a ``cycle`` holds: with what Q needs before it, a power of two for the index."""
-    return 1 << (cycle + q.chunk + q.reach + 8).bit_length()
+    return 1 << (cycle + q.chunk + q.reach + ROOM).bit_length()
 
 
 def largest_feedback_delay(

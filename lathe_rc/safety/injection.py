@@ -4,6 +4,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NoReturn
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
@@ -79,20 +80,33 @@ class Injection:
         self._seed, self._step = seed, step
         self._injected: list[_Injected] = []
 
+        ports = [*self._inputs, *self._outputs]
+        self._fields = {f"{port.topic}.{name}" for port in ports for name in port.fields if not name.endswith(_TRUE)}
+        self._encoders = {port.topic for port in self._outputs if port.type == messages.ENCODER}
+
     def check(self, fault: Fault) -> None:
         """Refuse a fault that no port can have.
 
         Raises:
             InputError: says which ports there are.
         """
-        ports = [*self._inputs, *self._outputs]
-        if not any(port.takes(fault) for port in ports):
-            known = {f"{port.topic}.{field}" for port in ports for field in port.fields if not field.endswith(_TRUE)}
-            encoders = {port.topic for port in self._outputs if port.type == messages.ENCODER}
-            raise InputError(
-                f"{self._node}: fault {fault.text!r}: no such target for it; allowed: {', '.join(sorted(known))}"
-                + (f"; {', '.join(encoders)} for faults of the encoder itself" if encoders else "")
-            )
+        if not any(port.takes(fault) for port in [*self._inputs, *self._outputs]):
+            self._refuse(f"fault {fault.text!r}: no such target for it")
+
+    def check_target(self, target: str) -> None:
+        """Refuse a target that no fault of a port can have.
+
+        Raises:
+            InputError: says which there are.
+        """
+        if target not in self._fields | self._encoders:
+            self._refuse(f"repair {target!r}: there is no such target")
+
+    def _refuse(self, why: str) -> NoReturn:
+        raise InputError(
+            f"{self._node}: {why}; allowed: {', '.join(sorted(self._fields))}"
+            + (f"; {', '.join(self._encoders)} for faults of the encoder itself" if self._encoders else "")
+        )
 
     def begin(self, fault: Fault, index: int) -> None:
         """Let a fault begin at sample ``index``."""

@@ -306,30 +306,8 @@ def _clear(position: Array, beyond: float, needed: int, run: int) -> tuple[int, 
     return -1, run
 
 
-class Below(Monitor):
-    """A signal below the limit for some samples in a row.
-
-    Args:
-        name, subject, limit, reaction: see `Monitor`.
-        signal: place of the input and field.
-        samples: how many.
-        after: revolutions of the encoder, the first input, until it watches.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        subject: str,
-        limit: float,
-        reaction: Reaction,
-        *,
-        signal: tuple[int, str],
-        samples: int,
-        after: float,
-    ) -> None:
-        super().__init__(name, subject, limit, reaction)
-        self._signal, self._samples, self._run = signal, samples, 0
-        self._patience = Patience(after)
+class Below(Threshold):
+    """A signal below the limit for some samples in a row; nothing is subtracted from it."""
 
     def watch(self, inputs: Sequence[Signals]) -> Alarm | None:
         """See `Monitor`."""
@@ -337,12 +315,6 @@ class Below(Monitor):
         signal = inputs[self._signal[0]][self._signal[1]][begin:]
         place, self._run = _clear(-signal, -self.limit, self._samples, self._run)
         return Alarm(begin + place, float(signal[place])) if place >= 0 else None
-
-    def reset(self) -> None:
-        """See `Monitor`."""
-        super().reset()
-        self._patience.renew()
-        self._run = 0
 
 
 class Clearance:

@@ -2,6 +2,7 @@
 """Tables of numbers in CSV files: one reader, so that every bad file is refused in the same way."""
 
 import csv
+import errno
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,22 +10,18 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc import files
 from lathe_rc.errors import InputError
 
 Array = npt.NDArray[np.float64]
 
-_MAX_FILE = 64 * 2**20
-
 
 def _text(path: Path, what: str) -> str:
     try:
-        # Reading a pipe would wait for its writer, for ever.
-        if path.exists() and not path.is_file():
-            raise InputError(f"{path}: cannot be read (not a file); check the path of the {what}")
-        if path.stat().st_size > _MAX_FILE:
-            raise InputError(f"{path}: larger than {_MAX_FILE // 2**20} MiB; thin the points out")
-        return path.read_text(encoding="utf-8-sig")
+        return files.contents(path).decode("utf-8-sig")
     except OSError as error:
+        if error.errno == errno.EFBIG:
+            raise InputError(f"{path}: larger than {files.MOST // 2**20} MiB; thin the points out") from None
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path of the {what}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; allowed: CSV in UTF-8") from None

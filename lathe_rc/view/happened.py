@@ -5,6 +5,8 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.safety.state_machine import Reaction, State
 
+_STATES, _REACTIONS = {int(s): s.name.lower() for s in State}, {int(r): r.name.lower() for r in Reaction}
+
 HAPPENED = (messages.EVENT, messages.SAFETY_STATUS)  #: types of messages that say so
 
 
@@ -13,7 +15,6 @@ def text(message: Sparse) -> str:
     values = message.values
     if message.type == messages.EVENT:
         return str(values["action"])
-    states, reactions = {int(s): s.name.lower() for s in State}, {int(r): r.name.lower() for r in Reaction}
-    state, reaction = states.get(values["state"], "?"), reactions.get(values["reaction"], "?")
+    state, reaction = _STATES.get(values["state"], "?"), _REACTIONS.get(values["reaction"], "?")
     found = f" {values['value']:.4g}, limit {values['limit']:.4g}" if values["limit"] else ""
     return f"{values['monitor']} {values['subject']}{found}: {state}, {reaction}"

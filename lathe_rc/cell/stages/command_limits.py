@@ -84,14 +84,7 @@ class LimitedCommand:
                 self._before = count
             elif ahead.size:
                 place += int(ahead[0])
-                found.append(
-                    Sparse(
-                        self._topic,
-                        messages.EVENT,
-                        first + place,
-                        {"action": self._begins},
-                    )
-                )
+                found.append(Sparse(self._topic, messages.EVENT, first + place, {"action": self._begins}))
                 place, count, self._left = place + 1, count + 1, self._quiet
             else:
                 place = samples

@@ -99,7 +99,7 @@ def _measure(sensors: Sequence[Sensor], true: Array, measured: Array) -> None:
 
 
 class LearningLanes(LaneStage[LearningController]):
-    """Self-learning controllers without a correction, with an exponential Q and without events or identification."""
+    """Self-learning controllers without correction, events, identification or supervisor, with an exponential Q."""
 
     def __init__(self, stages: Sequence[LearningController]) -> None:
         super().__init__(stages)
@@ -140,6 +140,7 @@ class LearningLanes(LaneStage[LearningController]):
             and table.q_filter == "exponential"
             and table.make_q().chunk == first.make_q().chunk
             and not table.identify
+            and not table.reaction_delay
             and table.cycle_points == first.cycle_points
             and table.points_per_revolution == first.points_per_revolution
             for table, stage in zip(tables, stages, strict=True)
@@ -175,8 +176,8 @@ class LearningLanes(LaneStage[LearningController]):
                 self._end_cycle()
         if reason != angle_memory.DONE:
             raise LatheError(
-                f"sample {first + reached}: the memory of {self.stages[0].name} is read before it is learned, or the "
-                "spindle angle jumps; run the cells one by one to see which"
+                f"sample {first + reached}: the memory of {self.stages[0].name} is read where nothing is learned "
+                "or kept, or the spindle angle jumps; run the cells one by one to see which"
             )
 
     def _arrive(self, arrives: int, angles: Array, errors: Array) -> None:

@@ -178,30 +178,34 @@ class LearningController(Stage):
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         (command,) = outputs
-        if self._obedience is None:
-            return self._control(first, inputs, command["position"])
-        *inputs, safety = inputs
         sparse: list[Sparse] = []
+        if self._obedience is None:
+            self._control(first, inputs, command["position"], sparse)
+            return sparse
+        *inputs, safety = inputs
         for start, stop in self._obedience.pieces(safety["reaction"]):
             read, written = cut(inputs, start, stop), command["position"][start:stop]
-            sparse += self._control_until_lost(first + start, read, written)
+            self._control_until_lost(first + start, read, written, sparse)
             self._obedience.apply(written)
         return sparse
 
-    def _control_until_lost(self, first: int, inputs: Sequence[Signals], command: Samples) -> list[Sparse]:
+    def _control_until_lost(
+        self, first: int, inputs: Sequence[Signals], command: Samples, sparse: list[Sparse]
+    ) -> None:
         """The same, but without an angle that it can use the controller gives up, and the command stays."""
         assert self._obedience is not None, "without one there is nobody to take over"
         if self._obedience.lost:
             command[:] = self._obedience.newest
-            return []
+            return
         try:
-            return self._control(first, inputs, command)
+            self._control(first, inputs, command, sparse)
         except AngleLostError as error:
             self._obedience.lost = True
             command[error.reached :] = command[error.reached - 1] if error.reached else self._obedience.newest
-            return [Sparse(f"{self.name}/events", messages.EVENT, first + error.reached, {"action": "lost"})]
+            sparse.append(Sparse(f"{self.name}/events", messages.EVENT, first + error.reached, {"action": "lost"}))
 
-    def _control(self, first: int, inputs: Sequence[Signals], command: Samples) -> list[Sparse]:
+    def _control(self, first: int, inputs: Sequence[Signals], command: Samples, sparse: list[Sparse]) -> None:
+        """Fill the command; what is said of cycles goes to ``sparse``, also where the angle is lost after them."""
         encoder, past, tool, *others = inputs
         parameters = self.parameters
         angle, speed, past_angle, error = encoder["angle"], encoder["speed"], past["angle"], tool["measured_error"]
@@ -213,7 +217,7 @@ class LearningController(Stage):
         for finer in others[: len(parameters.finer)]:
             error = error + finer["measured_position"]
         position = others[-1]["measured_position"] if parameters.identify else None
-        identified, sparse = 0, []
+        identified = 0
         for cycle in self._controller.block(
             first, angle=angle, speed=speed, past_angle=past_angle, error=error, command=command
         ):
@@ -225,7 +229,6 @@ class LearningController(Stage):
         if position is not None:
             self._identifier.block(first, identified, position.size, position)
             self._identifier.commanded(first, command)
-        return sparse
 
     def _end_cycle(self, cycle: Cycle) -> list[Sparse]:
         parameters = self.parameters
