@@ -12,7 +12,7 @@ from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.interpolation import cubic, cubic_response
 from lathe_rc.control.lead import LeadLaw, Preview
 from lathe_rc.control.q_filter import Exponential, Unity
-from lathe_rc.control.repetitive import LEARNING_DELAY, RepetitiveController, largest_feedback_delay
+from lathe_rc.control.repetitive import LEARNING_DELAY, AngleLostError, RepetitiveController, largest_feedback_delay
 from lathe_rc.errors import LatheError
 from lathe_rc.signals import speed
 
@@ -193,6 +193,53 @@ def test_jump_of_the_angle_is_named():
         list(
             controller.block(0, angle=angle, speed=np.ones(5), past_angle=late, error=np.zeros(5), command=np.empty(5))
         )
+
+
+def wrong(at, by, lengths, delay):
+    """What is commanded until the angle is lost, and where; from sample ``at`` on it is wrong by up to ``by``."""
+    controller, samples = make(delay=delay), sum(lengths)
+    angle = np.arange(samples) * (SPEED * STEP)
+    late = np.concatenate((np.zeros(delay), angle))[:samples]
+    measured = angle + np.where(np.arange(samples) >= at, by * np.sin(np.arange(samples)), 0.0)
+    command, speeds, error = np.empty(samples), np.full(samples, SPEED), np.sin(late)
+    for start, stop in spans(lengths):
+        part = slice(start, stop)
+        try:
+            list(
+                controller.block(
+                    start, angle=measured[part], speed=speeds[part], past_angle=late[part], error=error[part],
+                    command=command[part],
+                )
+            )  # fmt: skip
+        except AngleLostError as lost:
+            return command[: start + lost.reached].tobytes(), start + lost.reached
+    return command.tobytes(), samples
+
+
+@given(
+    at=st.integers(0, 24_000), by=st.sampled_from([0.01, 0.3, 5.0, 100.0]), delay=st.sampled_from([1, 100, 3000]),
+    lengths=st.lists(st.integers(1, 9000), max_size=8),
+)  # fmt: skip
+def test_a_wrong_angle_is_lost_at_the_same_sample_whatever_the_blocks(at, by, delay, lengths):
+    """What is no longer in the memory is not read, so it does not matter how far learning has come in a block."""
+    total = max(25_000, sum(lengths))
+    expected = wrong(at, by, [total], delay)
+    assert wrong(at, by, [*lengths, total - sum(lengths)], delay) == expected
+    assert expected[1] < total or by < 1.0
+
+
+def test_a_spindle_that_turns_back_is_named_before_the_memory_is_read_where_it_is_forgotten():
+    controller, angle = make(delay=1), np.concatenate((np.linspace(0.0, 20.0, 12_000), np.linspace(20.0, 0.0, 12_000)))
+    late = np.concatenate(([0.0], angle[:-1]))
+    with pytest.raises(
+        AngleLostError, match=r"at 19\.\d+ rad the memory is no longer kept"
+    ):
+        list(
+            controller.block(
+                0, angle=angle, speed=np.full(angle.size, SPEED), past_angle=late, error=np.sin(late),
+                command=np.empty(angle.size),
+            )
+        )  # fmt: skip
 
 
 @pytest.mark.parametrize("delay", [1, 60, 700])

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scenario of a command: its argument and options, and how they are read."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from lathe_rc import resources
+from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.scenario import Scenario
+
+overrides = click.option(
+    "--set", "overrides", multiple=True, metavar="NODE.PARAM=VALUE", help="also PARAM=VALUE if shared"
+)
+
+groups = click.option(
+    "--group",
+    "groups",
+    multiple=True,
+    metavar="NODE+NODE",
+    help="nodes that share a process, instead of those that the scenario names; repeatable; none: one each",
+)
+
+
+def load(name: str, overrides: Sequence[str]) -> Scenario:
+    """The scenario of a file, or of a name without ``.yaml`` that is looked up in ``config`` as well.
+
+    Raises:
+        InputError: there is none, or it cannot be.
+    """
+    path = Path(name)
+    if not path.exists() and path.suffix == "":
+        path = path.with_suffix(".yaml")
+    return scenarios.load(resources.find(path), overrides)
+
+
+def split(scenario: Scenario, groups: Sequence[str]) -> list[list[str]] | None:
+    """The nodes of each ``--group``; None if none is given: as the scenario says.
+
+    Raises:
+        InputError: a node that there is not, or twice.
+    """
+    named = [group.split("+") for group in groups if group != "none"]
+    scenario.processes(named, "--group")
+    return named if groups else None
