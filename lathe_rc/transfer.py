@@ -10,8 +10,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import signal
-from scipy.linalg import expm, matrix_balance
+import scipy
 
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
@@ -127,10 +126,10 @@ def discretise(transfer: TransferFunction, step_s: float, hold: Hold) -> System:
     if bottom.size == 1 or not top.size:  # a gain alone, for which tf2ss has an idle state or a warning
         through = float(top[0] / bottom[0]) if top.size else 0.0
         return System(np.empty((0, 0)), np.empty(0), np.empty(0), np.empty(0), through)
-    a, b, c, d = signal.tf2ss(top, bottom)
+    a, b, c, d = scipy.signal.tf2ss(top, bottom)
     order = a.shape[0]
     # Poles far apart make a companion matrix of coefficients that differ by many powers of ten.
-    a, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    a, (scale, _) = scipy.linalg.matrix_balance(a, permute=False, separate=True)
     b, c = b / scale[:, None], c * scale[None, :]
     column = b[:, 0]
     if hold == "tustin":
@@ -140,7 +139,7 @@ def discretise(transfer: TransferFunction, step_s: float, hold: Hold) -> System:
     else:
         whole = np.zeros((order + 2, order + 2))
         whole[:order, :order], whole[:order, order], whole[order, order + 1] = a, column, 1.0 / step_s
-        whole = expm(whole * step_s)
+        whole = scipy.linalg.expm(whole * step_s)
         transition, held, rising = whole[:order, :order], whole[:order, order], whole[:order, order + 1]
         before, now = (held, np.zeros(order)) if hold == "zoh" else (held - rising, rising)
     return System(

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
-from scipy.signal import lfilter
+import scipy
 
 from lathe_rc.control.identification import DriveIdentifier
 from lathe_rc.errors import InputError
@@ -115,7 +114,7 @@ class _Record:
         pulse = np.zeros((2, length))
         pulse[0, 0] = pulse[1, 1] = 1.0
         poles = [1.0, -np.trace(transition), np.linalg.det(transition)]
-        base, _ = np.linalg.qr(lfilter([1.0], poles, pulse).T)
+        base, _ = np.linalg.qr(scipy.signal.lfilter([1.0], poles, pulse).T)
         error[:length] -= base @ (base.T @ error[:length])
         return error
 
@@ -215,7 +214,7 @@ def _polished(record: _Record, starts: list[Array], step: float) -> DriveFit:
     def residual(x: Array) -> Array:
         return record.residual(values(x), skip) / spread
 
-    found = least_squares(
+    found = scipy.optimize.least_squares(
         residual,
         np.clip(place(linear), place(low), place(high)),
         bounds=(place(low), place(high)),

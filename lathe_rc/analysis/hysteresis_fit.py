@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import lsq_linear
+import scipy
 
 from lathe_rc.errors import InputError
 from lathe_rc.plants.hysteresis import THRESHOLDS, PrandtlIshlinskii, check_thresholds, plays
@@ -113,7 +113,7 @@ def identify(loop: Loop, stroke: float, thresholds: Array = THRESHOLDS) -> Ident
             "give fewer thresholds"
         )
     bounds = np.append(-np.inf, np.zeros(thresholds.size + 1))
-    fit = lsq_linear(columns, displacement, (bounds, np.inf), method="bvls")
+    fit = scipy.optimize.lsq_linear(columns, displacement, (bounds, np.inf), method="bvls")
     offset, proportional, weights = fit.x[0], fit.x[1], fit.x[2:]
     if proportional < _LEAST:
         raise InputError(

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
+import scipy
 
 from lathe_rc.errors import InputError
 
@@ -105,7 +105,7 @@ def evenly(angle: Array, values: Array, points: int = POINTS) -> Array:
     turns = angle / (2.0 * np.pi)
     whole = _starts(turns, np.array([turns[-1] - turns[-2]])).size - 1
     at = np.arange(whole * points) / points
-    spline = CubicSpline(turns, values)
+    spline = scipy.interpolate.CubicSpline(turns, values)
     return np.asarray(spline(np.clip(at, turns[0], turns[-1]))).reshape(whole, points)
 
 

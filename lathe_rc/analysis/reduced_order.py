@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import Bounds, least_squares, minimize
+import scipy
 
 from lathe_rc.control.decoupler import LAG, inverse
 from lathe_rc.errors import InputError
@@ -175,7 +175,9 @@ def fit(measured: ChannelStep, *, zeros: int, poles: int, integrator: bool = Fal
         # Coefficients of p² are times squared.
         square = np.array([2.0, 1.0] * pairs + [1.0] * (poles - 2 * pairs))
         found = [
-            least_squares(residual, start, bounds=(low * square, high * square), xtol=1e-10, ftol=1e-10, max_nfev=_MOST)
+            scipy.optimize.least_squares(
+                residual, start, bounds=(low * square, high * square), xtol=1e-10, ftol=1e-10, max_nfev=_MOST
+            )
             for start in _starts(poles, pairs, float(time[-1]))
         ]
         best = min(found, key=lambda one: float(one.cost)).x
@@ -223,10 +225,10 @@ def fit_inverse(model: TransferFunction, measured: ChannelStep, *, least_lag: fl
     def miss(x: Array) -> float:
         return float(np.mean((output(x) - wanted) ** 2))
 
-    bounds = Bounds(
+    bounds = scipy.optimize.Bounds(
         np.append(np.full(len(live), 0.05), np.zeros(missing)),
         np.append(np.full(len(live), 20.0), np.full(missing, np.log(_LARGEST_LAG))),
     )
     first = np.append(np.ones(len(live)), np.full(missing, np.log(2.0)))
-    best = minimize(miss, first, method="SLSQP", bounds=bounds, options={"maxiter": 200, "ftol": 1e-12})
+    best = scipy.optimize.minimize(miss, first, method="SLSQP", bounds=bounds, options={"maxiter": 200, "ftol": 1e-12})
     return Fit(build(best.x), measured.time, wanted, output(best.x))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import brentq, minimize_scalar
+import scipy
 
 from lathe_rc.errors import InputError
 from lathe_rc.transfer import TransferFunction
@@ -106,7 +106,7 @@ class Regeneration:
         if k == 0:
             return Limit(float(values[0]), 0.0, np.pi)
         bounds = grid[k - 1], grid[min(k + 1, grid.size - 1)]
-        found = minimize_scalar(
+        found = scipy.optimize.minimize_scalar(
             lambda w: float(self.critical(w)), bounds=bounds, method="bounded", options={"xatol": 0}
         )
         frequency = float(found.x) if found.fun < values[k] else float(grid[k])
@@ -131,7 +131,9 @@ class Regeneration:
         still = float(loop(0.0).real)
         best = Limit(1.0 / still, 0.0, 0.0) if still > 0.0 else Limit(np.inf, np.nan, np.nan)
         for k in crossings:
-            frequency = float(brentq(lambda w: float(loop(w).imag), grid[k], grid[k + 1], xtol=1e-14 * grid[k + 1]))
+            frequency = float(
+                scipy.optimize.brentq(lambda w: float(loop(w).imag), grid[k], grid[k + 1], xtol=1e-14 * grid[k + 1])
+            )
             inverse = float(loop(frequency).real)
             if inverse > 0.0 and 1.0 / inverse < best.stiffness:
                 best = Limit(1.0 / inverse, frequency, float(frequency * period % (2.0 * np.pi)))

@@ -9,8 +9,7 @@ from typing import Any, TypeAlias
 
 import control
 import numpy as np
-from scipy import signal
-from scipy.linalg import matrix_balance
+import scipy
 
 from lathe_rc.transfer import TransferFunction
 
@@ -28,8 +27,8 @@ def state_space(plant: Plant) -> Lti:
         return control.ss([], [], [], [[0.0]])
     if len(plant.denominator) == 1:  # tf2ss would give a gain an idle state
         return control.ss([], [], [], [[plant.numerator[-1] / plant.denominator[0]]])
-    a, b, c, d = signal.tf2ss(plant.numerator, plant.denominator)
-    balanced, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    a, b, c, d = scipy.signal.tf2ss(plant.numerator, plant.denominator)
+    balanced, (scale, _) = scipy.linalg.matrix_balance(a, permute=False, separate=True)
     return control.ss(balanced, b / scale[:, None], c * scale[None, :], d)
 
 

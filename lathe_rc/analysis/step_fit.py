@@ -16,7 +16,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
+import scipy
 
 from lathe_rc.analysis.responses import second_order
 from lathe_rc.errors import InputError
@@ -146,7 +146,7 @@ def _best(measured: StepResponse, build: Callable[[Array], M], low: Array, high:
         return measured.residual(build(x))
 
     found = [
-        least_squares(residual, np.clip(start, low, high), bounds=(low, high), xtol=1e-12, ftol=1e-12)
+        scipy.optimize.least_squares(residual, np.clip(start, low, high), bounds=(low, high), xtol=1e-12, ftol=1e-12)
         for start in starts
     ]
     return build(min(found, key=lambda fit: float(fit.cost)).x)

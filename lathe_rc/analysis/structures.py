@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import brentq, minimize_scalar
+import scipy
 
 from lathe_rc.analysis.responses import Array, Complex, Response, lead, lead_lag, second_order, smoothing
 from lathe_rc.errors import InputError
@@ -101,7 +101,7 @@ def supremum(response: Response, highest: float) -> Peak:
     magnitude = np.abs(response(grid))
     worst = int(np.argmax(magnitude))
     ends = float(grid[max(worst - 1, 0)]), float(grid[min(worst + 1, _GRID - 1)])
-    near = minimize_scalar(lambda w: -abs(response(np.array([w]))[0]), bounds=ends, method="bounded")
+    near = scipy.optimize.minimize_scalar(lambda w: -abs(response(np.array([w]))[0]), bounds=ends, method="bounded")
     if -near.fun > magnitude[worst]:
         return Peak(float(near.x), float(-near.fun))
     return Peak(float(grid[worst]), float(magnitude[worst]))
@@ -137,7 +137,7 @@ def lead_errors(q: Response, z: Response, highest: float, gain: float = 1.0) -> 
         step = sign * math.pi / 8.0 / highest
         for k in range(1, _GRID):
             if excess(k * step) >= 0.0:
-                return float(brentq(excess, (k - 1) * step, k * step, xtol=1e-12))
+                return float(scipy.optimize.brentq(excess, (k - 1) * step, k * step, xtol=1e-12))
         return sign * math.inf
 
     return limit(-1.0), limit(1.0)
@@ -166,7 +166,7 @@ def limit_frequency(compensator: Response, highest: float, level: float = 1.0) -
     if not above.size:
         return math.inf
     first = int(above[0])
-    return float(brentq(excess, grid[first - 1], grid[first])) if first else 0.0
+    return float(scipy.optimize.brentq(excess, grid[first - 1], grid[first])) if first else 0.0
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import NonlinearConstraint, minimize
+import scipy
 
 from lathe_rc.analysis.responses import Array
 from lathe_rc.analysis.structures import Channel, direct_compensation, iterative, supremum
@@ -186,12 +186,12 @@ def _minimax(start: Array, bounds: Sequence[tuple[float, float]], weights: Array
         return float(scaled[-1])
 
     first = np.append(start, np.abs(logs(start * _UNITS)).max())
-    found = minimize(
+    found = scipy.optimize.minimize(
         largest,
         first,
         method="SLSQP",
         bounds=[*bounds, (0.0, None)],
-        constraints=NonlinearConstraint(slack, 0.0, np.inf),
+        constraints=scipy.optimize.NonlinearConstraint(slack, 0.0, np.inf),
         options={"maxiter": 500, "ftol": 1e-10},
     )
     return float(found.fun) if found.success else np.inf, np.asarray(found.x[:-1])

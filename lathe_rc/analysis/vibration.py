@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
-from scipy.integrate import cumulative_trapezoid, quad
+import scipy
 
 from lathe_rc.analysis.responses import Array, Response
 from lathe_rc.analysis.structures import uncompensated
@@ -42,8 +42,8 @@ def reduction(compensator: Response, band: float, spectrum: Spectrum = flat) -> 
         at = np.array([frequency])
         return float((spectrum(at) * np.abs(uncompensated(compensator(at))) ** 2)[0])
 
-    before = quad(lambda frequency: float(spectrum(np.array([frequency]))[0]), 0.0, band, limit=500)[0]
-    after = quad(left, 0.0, band, limit=500)[0]
+    before = scipy.integrate.quad(lambda frequency: float(spectrum(np.array([frequency]))[0]), 0.0, band, limit=500)[0]
+    after = scipy.integrate.quad(left, 0.0, band, limit=500)[0]
     return math.sqrt(before / after) if after > 0.0 else math.inf
 
 
@@ -63,7 +63,7 @@ def widest_band(compensator: Response, wanted: float, highest: float, spectrum: 
     grid = np.linspace(0.0, highest, _GRID)
     power = spectrum(grid)
     too_much: Array = power * (np.abs(uncompensated(compensator(grid))) ** 2 - wanted**-2)
-    excess = cumulative_trapezoid(too_much, grid, initial=0)
+    excess = scipy.integrate.cumulative_trapezoid(too_much, grid, initial=0)
     reached = np.flatnonzero(excess[1:] > 0.0)  # below the vibration's lowest frequency it stays 0
     if not reached.size:
         return math.inf

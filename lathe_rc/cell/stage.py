@@ -378,3 +378,5 @@ def compile_kernels(stage: Stage) -> None:
         for port in stage.inputs[: stage.own_inputs]
     ]
     stage.process(0, inputs, [messages.allocate(port.type, 0) for port in stage.outputs])
+    if stage.shared.allow_faults:
+        faults.prepare()

@@ -6,7 +6,7 @@ from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import BPoly
+import scipy
 
 Array = npt.NDArray[np.float64]
 
@@ -49,7 +49,7 @@ def motion(start: float, velocity: float, end: float | None, bounds: Bounds, ste
     duration = max(step, 1.875 * length / highest, (60.0 * length / bounds.jerk) ** (1 / 3) / 2.0)
     while True:
         goal = start + velocity * duration / 2.0 if end is None else end
-        path = BPoly.from_derivatives([0.0, duration], [[start, velocity, 0.0], [goal, 0.0, 0.0]])
+        path = scipy.interpolate.BPoly.from_derivatives([0.0, duration], [[start, velocity, 0.0], [goal, 0.0, 0.0]])
         times = np.linspace(0.0, duration, _LOOKS)
         peaks = [float(np.abs(path(times, order)).max()) for order in (1, 2, 3)]
         limits = (highest, bounds.acceleration, bounds.jerk)
@@ -86,7 +86,9 @@ class Takeover:
     def __init__(self, bounds: Bounds, retracted: float, step: float) -> None:
         self._bounds, self._goal, self._step = bounds, retracted, step
         self._mode = Mode.FOLLOW
-        self._path, self._place = np.zeros(1), 1  # positions to come; of what is added to the command when it follows
+        # Positions to come; of what is added to the command when it follows. None yet, but the first of them must not
+        # wait for SciPy to load what makes them.
+        self._path, self._place = motion(0.0, 0.0, 0.0, bounds, step), 1
         self._given, self._wanted = np.zeros(2), np.zeros(2)  # the last two samples, after and before
 
     @property

@@ -19,7 +19,7 @@ from math import ceil
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft, signal
+import scipy
 
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
@@ -178,18 +178,18 @@ class Weights(QFilter):
     def __init__(self, weights: Array, cycle: int) -> None:
         super().__init__(weights.size - 1, cycle)
         weights = weights / (weights[0] + 2.0 * weights[1:].sum())
-        self._length = fft.next_fast_len(self.chunk + 2 * self.reach, real=True)
+        self._length = scipy.fft.next_fast_len(self.chunk + 2 * self.reach, real=True)
         circle = np.zeros(self._length)
         circle[: weights.size] = weights
         circle[self._length - self.reach :] = weights[:0:-1]
-        self._spectrum = fft.rfft(circle).real
+        self._spectrum = scipy.fft.rfft(circle).real
         self._weights = weights
 
     def smooth(self, points: Array, smoothed: Array) -> None:
         """See `QFilter`."""
-        spectrum = fft.rfft(points, self._length)
+        spectrum = scipy.fft.rfft(points, self._length)
         spectrum *= self._spectrum
-        smoothed[:] = fft.irfft(spectrum, self._length)[self.reach : self.reach + self.chunk]
+        smoothed[:] = scipy.fft.irfft(spectrum, self._length)[self.reach : self.reach + self.chunk]
 
     def response(self, radians: Array) -> Array:
         """See `QFilter`."""
@@ -231,12 +231,12 @@ class LowPass(Weights):
                 f"FIR Q filter: pass band to {passed:.4g}, stop band from {stopped:.4g} rad per grid point; allowed: "
                 f"0 < pass < stop <= {np.pi:.4g}"
             )
-        taps, beta = signal.kaiserord(-20.0 * np.log10(ripple / 2.0), (stopped - passed) / np.pi)
+        taps, beta = scipy.signal.kaiserord(-20.0 * np.log10(ripple / 2.0), (stopped - passed) / np.pi)
         bands = np.concatenate((np.linspace(0.0, passed, _EDGES), np.linspace(stopped, np.pi, _EDGES)))
         wanted = np.repeat([1.0, 0.0], _EDGES)
         taps = min(taps | 1, 2 * cycle + 1)  # odd, so that its middle is a point; far too long is refused below
         while True:
-            taper = signal.firwin(taps, (passed + stopped) / 2.0, window=("kaiser", beta), fs=2.0 * np.pi)
+            taper = scipy.signal.firwin(taps, (passed + stopped) / 2.0, window=("kaiser", beta), fs=2.0 * np.pi)
             super().__init__(np.asarray(taper[taps // 2 :]), cycle)
             if np.abs(self.response(bands) - wanted).max() <= ripple:
                 break

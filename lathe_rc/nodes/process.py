@@ -164,6 +164,10 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
     finally:
         for node in nodes:
             node.finish()
+        # Threads of DDS that end with their process, and not before it, may take a lock of the shared memory with them:
+        # who sends to the same reader then waits for ever.
+        for node in nodes:
+            node.destroy_node()
         rclpy.try_shutdown()
 
 

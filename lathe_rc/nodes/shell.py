@@ -78,6 +78,11 @@ class CellNode(LifecycleNode):
         self.outlets: dict[str, Publisher] = {}
         self.inlets: dict[str, Subscription] = {}
 
+    def destroy_node(self) -> None:
+        """Leave the graph; rclpy itself would keep the node, and with it the threads of DDS, for its state machine."""
+        self._state_machine.destroy_when_not_in_use()
+        super().destroy_node()
+
     # ---- lifecycle ----------------------------------------------------------------------------------
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:

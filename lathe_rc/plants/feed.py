@@ -23,7 +23,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
+import scipy
 
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
@@ -202,7 +202,7 @@ def _realise(model: TransferFunction) -> tuple[Array, Array]:
     a = np.diag(np.ones(order - 1), 1)
     a[-1] = -bottom[:0:-1] / bottom[0]
     impulse = np.eye(1, order + 1)[0]
-    markov = lfilter(np.concatenate((np.zeros(bottom.size - top.size), top)), bottom, impulse)
+    markov = scipy.signal.lfilter(np.concatenate((np.zeros(bottom.size - top.size), top)), bottom, impulse)
     return a, np.asarray(markov[1:])
 
 

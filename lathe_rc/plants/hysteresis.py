@@ -26,7 +26,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import brentq
+import scipy
 
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
@@ -334,7 +334,7 @@ class BoucWen(_Operator):
         shape = np.array([self.a, self.beta, self.gamma])
         # It stays below A/(β + γ), but for rounding.
         bound = 2.0 * self.a / (self.beta + self.gamma)
-        return float(brentq(lambda h: _move(-h, 2.0, shape) - h, 0.0, bound, xtol=1e-15))
+        return float(scipy.optimize.brentq(lambda h: _move(-h, 2.0, shape) - h, 0.0, bound, xtol=1e-15))
 
     @property
     def flattest(self) -> float:

@@ -8,8 +8,7 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
-from scipy.signal import ss2tf
+import scipy
 
 Array = npt.NDArray[np.float64]
 Discretisation = Literal["foh", "tustin"]
@@ -37,7 +36,7 @@ class DiscretePlant:
         """Response of the position to the command at ``frequency`` [rad/s], of the difference equation itself."""
         z = np.exp(1j * np.asarray(frequency, dtype=np.float64) * self.step)
         terms = [
-            np.polyval(top[0], z) / np.polyval(bottom, z) * z ** (1.0 - lag - self.delay)
+            np.polyval(top, z) / np.polyval(bottom, z) * z ** (1.0 - lag - self.delay)
             for lag, (top, bottom) in enumerate(self._rational)
         ]
         return np.asarray(sum(terms))
@@ -46,10 +45,13 @@ class DiscretePlant:
     def _rational(self) -> list[tuple[Array, Array]]:
         """Numerator and denominator of each weight's way to the position.
 
-        x[n] = Φ·x[n-1] + w·u[n] is z·(z·I - Φ)⁻¹·w; ss2tf gives the rational function after the z.
+        x[n] = Φ·x[n-1] + w·u[n] is z·(z·I - Φ)⁻¹·w; with c that takes the position from x, the rational function after
+        the z is (det(z·I - Φ + w·c) - det(z·I - Φ)) / det(z·I - Φ). That is `scipy.signal.ss2tf`, but a controller
+        asks for it in mid-run, and half a second to load that module is no time to stand still.
         """
-        out = np.eye(1, self.transition.shape[0]), np.zeros((1, 1))
-        return [ss2tf(self.transition, self.weights[:, lag : lag + 1], *out) for lag in range(3)]
+        position, bottom = np.eye(1, self.transition.shape[0]), np.asarray(np.poly(self.transition))
+        ways = [np.outer(self.weights[:, lag], position) for lag in range(3)]
+        return [(np.asarray(np.poly(self.transition - way)) - bottom, bottom) for way in ways]
 
 
 def _foh(a: Array, b: Array, step: float) -> tuple[Array, Array, Array]:
@@ -57,7 +59,7 @@ def _foh(a: Array, b: Array, step: float) -> tuple[Array, Array, Array]:
     order = a.shape[0]
     block = np.zeros((order + 2, order + 2))
     block[:order, :order], block[:order, order], block[order, order + 1] = a, b, 1.0 / step if step else 0.0
-    whole = expm(block * step)
+    whole = scipy.linalg.expm(block * step)
     end = whole[:order, order + 1]
     return whole[:order, :order], whole[:order, order] - end, end
 

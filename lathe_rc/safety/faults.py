@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
+import scipy
 
 from lathe_rc.cell.messages import Signals
 from lathe_rc.errors import InputError
@@ -233,6 +233,11 @@ class _Wrong(Disturbance):
         signal += self._values["offset"]
 
 
+def prepare() -> None:
+    """Load what faults need of SciPy, which is loaded when it is first used: else that would be in mid-run."""
+    scipy.signal.lfilter([1.0], [1.0], np.zeros(1))
+
+
 class _Slow(Disturbance):
     _state: Array | None = None
 
@@ -240,7 +245,7 @@ class _Slow(Disturbance):
         pole = math.exp(-self._step / self._values["time"])
         if self._state is None:
             self._state = np.array([pole * signal[0]])
-        signal[:], self._state = lfilter([1.0 - pole], [1.0, -pole], signal, zi=self._state)
+        signal[:], self._state = scipy.signal.lfilter([1.0 - pole], [1.0, -pole], signal, zi=self._state)
 
 
 class _Delayed(Disturbance):

@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
+import scipy
 
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
@@ -151,7 +151,7 @@ class Measured:
         """See `Profile`."""
         rows = [np.interp(height, self.heights, column) for column in self.radius.T]
         closed = np.append(rows, rows[0])
-        spline = CubicSpline(np.append(self.angle, self.angle[0] + _TURN), closed, bc_type="periodic")
+        spline = scipy.interpolate.CubicSpline(np.append(self.angle, self.angle[0] + _TURN), closed, bc_type="periodic")
         return np.asarray(spline(self.angle[0] + np.mod(angle - self.angle[0], _TURN)))
 
 
@@ -299,7 +299,7 @@ class ProfileTable:
         for row, height in zip(self.table, self.heights, strict=True):
             values = profile.deviation(angle, float(height))
             values[-1] = values[0]
-            spline = CubicSpline(np.arange(points + 1.0), values, bc_type="periodic")
+            spline = scipy.interpolate.CubicSpline(np.arange(points + 1.0), values, bc_type="periodic")
             row[:] = spline.c.T
 
     def demand(self, speed: float, acceleration: float, feed: float) -> Demand:

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
-from scipy.interpolate import CubicSpline
-from scipy.signal import lfilter
 
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.control.invariance import FirstOrderInvariance
@@ -194,8 +193,8 @@ def responses(law: SpeedLaw, time_constant: float, nominal: float, angles: Array
     plant = discretise(np.array([[-1.0 / time_constant]]), np.array([1.0 / time_constant]), 0.0, step, "foh")
     # The command jumps at sample 0, where the plant is still at rest.
     still = -plant.weights[0, 0] * commands[:, :1]
-    moved, _ = lfilter(plant.weights[0, :2], [1.0, -plant.transition[0, 0]], commands, zi=still)
-    return np.asarray(CubicSpline(angle, moved, axis=1)(angles))
+    moved, _ = scipy.signal.lfilter(plant.weights[0, :2], [1.0, -plant.transition[0, 0]], commands, zi=still)
+    return np.asarray(scipy.interpolate.CubicSpline(angle, moved, axis=1)(angles))
 
 
 def run(parameters: InvarianceParameters, track: Track = untracked) -> InvarianceResult:
