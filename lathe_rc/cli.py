@@ -107,6 +107,8 @@ class _Watch:
         """Take an event of the run."""
         kind, update = event["event"], self._bar.update
         now = time.monotonic()
+        if kind == "stuck":
+            self._bar.console.print(f"{event['node']} did not end{event['place']}; the run is complete, it was killed")
         if self._bar.disable:
             self._log(event, now)
             return

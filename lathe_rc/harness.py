@@ -48,6 +48,7 @@ Mode = Literal["offline", "composed", "processes"]
 Event = Mapping[str, Any]
 
 _SILENCE_LIMIT = 120.0  # [s] without any event: the first start on a machine compiles kernels
+_FAREWELL = 10.0  # [s] without any event once the run is complete and its bag closed
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
 _LOOK = 0.05  # [s] between looks at what a process has written
 
@@ -399,9 +400,12 @@ class Processes:
         """
         while True:
             try:
-                event = self._events.get(timeout=silence)
+                event = self._events.get(timeout=_FAREWELL if self._complete else silence)
             except queue.Empty:
-                running = ", ".join(f"{name}{self._place(name)}" for name in self._children if name not in self._ended)
+                if self._complete:
+                    self._end_the_silent()
+                    continue
+                running = ", ".join(f"{name}{self._place(name)}" for name in self._running)
                 raise LatheError(
                     f"no node has reported anything for {silence:.0f} s; still running: {running}{self._tails()}"
                 ) from None
@@ -409,6 +413,25 @@ class Processes:
             if event["event"] == "exit":
                 self._ended.add(event["node"])
             yield event
+
+    @property
+    def _running(self) -> list[str]:
+        return [name for name in self._children if name not in self._ended]
+
+    @property
+    def _complete(self) -> bool:
+        """Whether all samples are in a bag that is closed: nothing can be lost any more."""
+        return bool(self._newest.get("closed", {}).get("complete"))
+
+    def _end_the_silent(self) -> None:
+        """End processes that the run does not need any more, and that do not end by themselves; names them.
+
+        DDS may hold one up: a neighbour that left took a lock of the shared memory with it.
+        """
+        for name in self._running:
+            self._abandoned.add(name)
+            self._events.put({"event": "stuck", "node": name, "place": self._place(name)})
+            self._children[name].kill()
 
     def wait_for(self, kind: str, node: str | None = None, **values: object) -> Event:
         """Wait for an event of a kind, from a node, with certain values.

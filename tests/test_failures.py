@@ -3,8 +3,10 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness
+from lathe_rc.bag import reader
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import InputError, LatheError
 
@@ -55,6 +58,21 @@ def test_a_killed_node_is_named_and_the_bag_is_readable(node, tmp_path):
         assert sum(1 for _ in bags.messages()) > 100
     with next(bag.glob("*.mcap")).open("rb") as stream:
         assert sum(1 for _ in make_reader(stream).iter_messages()) > 100
+
+
+def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_is_lost(monkeypatch, tmp_path):
+    monkeypatch.setattr(harness, "_FAREWELL", 1.0)
+    bag, told = tmp_path / "bag", []
+    cell = harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=6.0"]), bag, keep=True)
+    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+        # It stands for a process that DDS holds up.
+        processes._children["held"] = subprocess.Popen(["/bin/sh", "-c", "trap '' USR1; exec sleep 1000"])
+        thread = threading.Thread(target=processes._listen, args=("held", socket.socket(), processes._children["held"]))
+        thread.start()
+        processes.wait_for_end(told.append)
+        thread.join()
+    assert [event["node"] for event in told if event["event"] == "stuck"] == ["held"]
+    assert reader.read(bag).digests() == harness.run(load(PISTON, ["spindle_encoder.revolutions=6.0"])).digest
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

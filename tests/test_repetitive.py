@@ -231,9 +231,7 @@ def test_a_wrong_angle_is_lost_at_the_same_sample_whatever_the_blocks(at, by, de
 def test_a_spindle_that_turns_back_is_named_before_the_memory_is_read_where_it_is_forgotten():
     controller, angle = make(delay=1), np.concatenate((np.linspace(0.0, 20.0, 12_000), np.linspace(20.0, 0.0, 12_000)))
     late = np.concatenate(([0.0], angle[:-1]))
-    with pytest.raises(
-        AngleLostError, match=r"at 19\.\d+ rad the memory is no longer kept"
-    ):
+    with pytest.raises(AngleLostError, match=r"at 19\.\d+ rad the memory is no longer kept"):
         list(
             controller.block(
                 0, angle=angle, speed=np.full(angle.size, SPEED), past_angle=late, error=np.sin(late),

@@ -19,6 +19,8 @@ LINTERS = {
     "ruff format": ["ruff", "format", "--check", "--quiet"],
     "mypy": ["mypy", "--no-error-summary"],
 }
+# Tests wait for processes more than they compute, so two files run at once; what a file's tests share is made once.
+AT_ONCE = ["--numprocesses=2", "--dist=loadfile"]
 LOCKED_NUMPY = re.compile(r"^numpy==(\S+) ; python_full_version >=", re.MULTILINE)
 
 
@@ -70,7 +72,7 @@ def main(arguments: list[str]) -> int:
     failed = [name for name, command in linters.items() if not lint(name, command)]
     verdicts += [f"{name} FAILED: see above" for name in failed]
     verdicts.append("not run: the tests that need system packages or privileges (./lathe test --system)")
-    code = pytest.main(["-m", "not system", *arguments], plugins=[Verdicts(verdicts)])
+    code = pytest.main(["-m", "not system", *AT_ONCE, *arguments], plugins=[Verdicts(verdicts)])
     return int(code) or int(bool(failed))
 
 

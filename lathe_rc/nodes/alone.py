@@ -43,7 +43,6 @@ def member_of_none(
     """
     dds.settle()
     rclpy.init(args=None if args is None else ["lathe", *args], signal_handler_options=signals)
-    node = None
     try:
         node = Node(
             kind,
@@ -55,8 +54,6 @@ def member_of_none(
         yield node, table.read(kind, {**given, **values})
     finally:
         with contextlib.suppress(Exception):
-            if node is not None:
-                node.destroy_node()
             rclpy.try_shutdown()
 
 

@@ -164,10 +164,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
     finally:
         for node in nodes:
             node.finish()
-        # Threads of DDS that end with their process, and not before it, may take a lock of the shared memory with them:
-        # who sends to the same reader then waits for ever.
-        for node in nodes:
-            node.destroy_node()
+        # The nodes are not destroyed: Fast DDS may wait for itself for ever while others are leaving, too.
         rclpy.try_shutdown()
 
 

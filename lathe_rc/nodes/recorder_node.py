@@ -207,7 +207,7 @@ class RecorderNode(CellNode):
             self.attempt(self._writer.flush)
 
     def _on_sparse(self, topic: str, data: bytes) -> None:
-        if self.done:
+        if self.over:
             return
         stamp = messages.stamp_of(data)
         if self._merger is None:
@@ -218,7 +218,7 @@ class RecorderNode(CellNode):
 
     def _on_message(self, queue: BlockQueue, data: bytes) -> None:
         """A block of a node in another process."""
-        if self.done:
+        if self.over:
             return
         block = queue.add(data)
         queue.blocks.clear()
@@ -229,7 +229,7 @@ class RecorderNode(CellNode):
 
     def _on_block(self, queue: BlockQueue, block: Block) -> None:
         """A block of a node in this process."""
-        if self.done:
+        if self.over:
             return
         queue.take(block)
         queue.blocks.clear()

@@ -41,7 +41,8 @@ class CellNode(LifecycleNode):
 
     Attributes:
         table: its parameters, once configured.
-        done: it has finished its part of the run.
+        over: it has finished its part of the run.
+        done: it may leave: in a cell, all have finished theirs.
         failure: why it gave up.
         due: messages have come since it last worked.
         handled: messages received so far.
@@ -61,7 +62,7 @@ class CellNode(LifecycleNode):
         self.table: NodeParameters = TABLES[self.kind]()
         self.reporter = reporter
         self.exchange = exchange
-        self.done = False
+        self.over = self.done = False
         self.failure: LatheError | None = None
         self.next_tick = time.monotonic()
         self.active = False
@@ -77,11 +78,6 @@ class CellNode(LifecycleNode):
         self._host: dict[str, Publisher] = {}
         self.outlets: dict[str, Publisher] = {}
         self.inlets: dict[str, Subscription] = {}
-
-    def destroy_node(self) -> None:
-        """Leave the graph; rclpy itself would keep the node, and with it the threads of DDS, for its state machine."""
-        self._state_machine.destroy_when_not_in_use()
-        super().destroy_node()
 
     # ---- lifecycle ----------------------------------------------------------------------------------
 
@@ -318,7 +314,11 @@ class CellNode(LifecycleNode):
         self._settle()
 
     def _on_cell_state(self, state: CellState) -> None:
-        if state.state == CellState.FAILED and state.run_id == self.table.run_id:
+        if state.run_id != self.table.run_id:
+            return
+        if state.state == CellState.ENDED and self.over and not self.done:
+            self._leave([])
+        if state.state == CellState.FAILED:
             self.fail(LatheError(f"the cell failed: {state.message}"), cause="abandoned")
 
     @property
@@ -368,10 +368,19 @@ class CellNode(LifecycleNode):
                 self._host["progress"].publish(progress)
 
     def end(self, acknowledged: list[Publisher]) -> None:
-        """The node's part is over; wait until everybody has its last messages."""
+        """The node's part is over. In a cell it stays until all have ended; else until others have its last messages.
+
+        A process that leaves while messages are under way may take a lock of the transport with it, and those who
+        send to the same reader wait for ever.
+        """
+        self.over = True
+        if self.master is None or self.master.name == self.full_name:
+            self._leave([*acknowledged, self._host["progress"]])
+
+    def _leave(self, acknowledged: list[Publisher]) -> None:
         from rclpy.duration import Duration
 
-        for publisher in [*acknowledged, self._host["progress"]]:
+        for publisher in acknowledged:
             if not publisher.wait_for_all_acked(Duration(seconds=2)):
                 self.get_logger().warning(f"{publisher.topic}: not everybody has acknowledged the last message")
         self.done = True

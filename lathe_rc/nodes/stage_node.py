@@ -183,7 +183,7 @@ class StageNode(CellNode):
     def advance(self) -> None:
         """Compute every block whose inputs are there."""
         shared = self._shared
-        while not self.done and not self.failure:
+        while not self.over and not self.failure:
             ready = self._next()
             if ready is None:
                 return
