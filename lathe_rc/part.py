@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.analysis import profile_csv
-from lathe_rc.analysis.metrology import Measurement, form_errors, measure
+from lathe_rc.analysis.metrology import FormErrors, Measurement, form_errors, measure
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals, full
 from lathe_rc.cell.recording import Recording
@@ -81,7 +81,8 @@ class ErrorsByRevolution:
 
     def __init__(self, types: Mapping[str, str]) -> None:
         self._topics = _encoder_and_tool(types)
-        self._angle, self._error = np.empty(0), np.empty(0)
+        self._angle: list[np.ndarray] = []  # pieces
+        self._error: list[np.ndarray] = []
         self._rms: list[np.ndarray] = []
         self._done = 0  # revolutions
 
@@ -91,22 +92,27 @@ class ErrorsByRevolution:
         if encoder is None or tool is None:
             return
         named = {full(topic): signals for topic, signals in dense.items()}
-        if not self._angle.size:
+        if not self._angle:
             self._done = round(_turned(named[encoder]["angle_true"]) / (2.0 * np.pi))
-        self._angle = np.concatenate([self._angle, named[encoder]["angle_true"]])
-        self._error = np.concatenate([self._error, named[tool]["error"]])
-        if self._angle[-1] - self._angle[0] > _TOGETHER * 2.0 * np.pi:
+        self._angle.append(named[encoder]["angle_true"].copy())
+        self._error.append(named[tool]["error"].copy())
+        if self._angle[-1][-1] - self._angle[0][0] > _TOGETHER * 2.0 * np.pi:
             # A start two samples from the end may still move: it stays for the next piece.
-            found = form_errors(self._angle, self._error, self._done)
-            whole = int(np.searchsorted(found.starts, self._angle.size - 2)) - 1
+            angle, error, found = self._together()
+            whole = int(np.searchsorted(found.starts, angle.size - 2)) - 1
             self._rms.append(found.rms[:whole])
             self._done += whole
             keep = int(found.starts[whole])
-            self._angle, self._error = self._angle[keep:], self._error[keep:]
+            self._angle, self._error = [angle[keep:]], [error[keep:]]
+
+    def _together(self) -> tuple[np.ndarray, np.ndarray, FormErrors]:
+        """Angle, error and form errors of the pieces."""
+        angle, error = (np.concatenate([np.empty(0), *pieces]) for pieces in (self._angle, self._error))
+        return angle, error, form_errors(angle, error, self._done)
 
     def rms(self) -> np.ndarray:
         """RMS form error of each complete revolution [m], shape (revolutions,); to be asked at the end."""
-        return np.concatenate([*self._rms, form_errors(self._angle, self._error, self._done).rms])
+        return np.concatenate([*self._rms, self._together()[2].rms])
 
 
 class FirstAndLast:

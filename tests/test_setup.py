@@ -448,7 +448,7 @@ def test_all_checkers_run_and_any_failure_counts(checkers, failing):
 def test_system_tests_run_only_when_asked_for(checkers, monkeypatch):
     monkeypatch.setattr(system, "provide", lambda: "")
     check.main(["-k", "cell"])
-    assert checkers.pytest == ["-m", "not system", "-k", "cell"]
+    assert checkers.pytest == ["-m", "not system", *check.AT_ONCE, "-k", "cell"]
     assert any("--system" in line for line in checkers.verdicts)
     checkers.ran.clear()
     assert check.main(["--system", "-k", "cell"]) == 0

@@ -33,8 +33,7 @@ class _PlayedSpindle(SpindleEncoder):
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         (signals,) = outputs
-        for name, array in self._tape.take(next(iter(signals.values())).size).items():
-            signals[name][:] = array
+        self._tape.take_into(signals)
         if self._said and not self._said.has_truth:
             signals["angle_true"][:], signals["speed_true"][:] = signals["angle"], signals["speed"]
         if self._said:

@@ -102,6 +102,11 @@ class _Dense:
     def take(self, samples: int) -> Signals:
         """The next samples, as arrays of their own."""
         signals = messages.allocate(self.type, samples)
+        self.take_into(signals, samples)
+        return signals
+
+    def take_into(self, signals: Signals, samples: int) -> None:
+        """Fill arrays with the next samples."""
         filled = 0
         while filled < samples:
             block = self.blocks[0]
@@ -113,7 +118,6 @@ class _Dense:
             self.first += count
             if skip + count == block.samples:
                 self.blocks.popleft()
-        return signals
 
 
 class Feeder:
@@ -227,17 +231,24 @@ class Tape:
         self._batches = self._source.batches({topic})
 
     def take(self, samples: int) -> Signals:
-        """The next samples, arrays of shape (samples,).
+        """The next samples, arrays of shape (samples,); see `take_into`."""
+        signals = messages.allocate(self._dense.type, samples)
+        self.take_into(signals)
+        return signals
+
+    def take_into(self, signals: Signals) -> None:
+        """Fill arrays of shape (samples,) with the next samples.
 
         Raises:
             LatheError: there are not so many, or some are missing.
         """
+        samples = next(iter(signals.values())).size
         while self._dense.end - self._dense.first < samples:
             found = next(self._batches, None)
             if found is None:
                 raise LatheError(f"{self._dense.topic} ends at sample {self._dense.end}")
             self._dense.add_all(data for _, _, data in found)
-        return self._dense.take(samples)
+        self._dense.take_into(signals, samples)
 
 
 def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536) -> BagHeader:

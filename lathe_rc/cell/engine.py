@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The offline host: all stages of a cell in one loop."""
 
-from collections.abc import Iterable, Mapping
+import gc
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Protocol
 
 from lathe_rc.cell.messages import MAX_BLOCK, Signals, sample_fields
@@ -50,7 +51,14 @@ class Engine:
 
     def run(self, sinks: Iterable[Sink]) -> None:
         """Run to the end."""
-        receivers = list(sinks)
+        # What is there now stays: the garbage collector need not walk through it again and again.
+        gc.freeze()
+        try:
+            self._run(list(sinks))
+        finally:
+            gc.unfreeze()
+
+    def _run(self, receivers: Sequence[Sink]) -> None:
         for first in range(0, self.samples, self._chunk):
             samples = min(self._chunk, self.samples - first)
             dense: dict[str, Signals] = {}

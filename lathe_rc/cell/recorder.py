@@ -18,7 +18,7 @@ class RecorderParameters(NodeParameters):
     bag: str = parameter("", "folder of the bag; must not exist; empty: bag_ and the run id", path=True)
     compression: Literal["zstd", "none"] = parameter("zstd", "compression of the bag's chunks")
     chunk_size: Annotated[int, Ge(4096), Le(2**28)] = parameter(
-        2**18, "size of the bag's chunks: what a crash may lose", "B"
+        2**20, "size of the bag's chunks: what a crash may lose", "B"
     )
     mode: Literal["continuous", "snapshot", "both"] = parameter(
         "continuous", "what is recorded: the whole run in one bag, snapshots around triggers, or both"

@@ -2,6 +2,7 @@
 """The signals of a whole run, from whatever host, and their digests."""
 
 import hashlib
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -67,7 +68,9 @@ class Digester:
 
     def dense(self, topic: str, signals: Signals) -> None:
         """Take the next samples of a dense topic, arrays of shape (n,) by field."""
-        fields = self._fields.setdefault(topic, {name: hashlib.sha256() for name in signals})
+        fields = self._fields.get(topic)
+        if fields is None:
+            fields = self._fields[topic] = {name: hashlib.sha256() for name in signals}
         for name, samples in signals.items():
             fields[name].update(_bytes(samples))
 
@@ -81,8 +84,9 @@ class Digester:
 
 
 def _bytes(samples: Samples) -> memoryview:
-    little = samples.astype(samples.dtype.newbyteorder("<"), copy=False)
-    return np.ascontiguousarray(little).data
+    if sys.byteorder == "big" or not samples.dtype.isnative:
+        samples = samples.astype(samples.dtype.newbyteorder("<"))
+    return np.ascontiguousarray(samples).data
 
 
 def _flat(values: Sequence[Any]) -> Samples:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from lathe_rc_msgs.msg import Member, Progress
+from lathe_rc_msgs.msg import CellState, Member, Progress
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -187,6 +187,8 @@ class Replayer:
             )
             announced.append(publisher)
         self._announced = announced
+        self._run_id = scenario.shared.run_id
+        self._state = self._node.create_publisher(CellState, "/cell_state", latched_qos(1))
         self._topics &= set(self._publishers)
         self._window = scenario.shared.window
         self._master = f"/{remapped(cell.master.shared, 'encoder')}"
@@ -214,6 +216,15 @@ class Replayer:
                 break
         for topic in self._publishers:
             self._acknowledged(topic)
+        if self._parameters.as_cell:
+            self._let_go()
+
+    def _let_go(self) -> None:
+        """Say that the cell has ended, once the recorder has all of it: then it leaves."""
+        self._until(lambda: self._recorded >= self._blocks)
+        self._state.publish(CellState(run_id=self._run_id, state=CellState.ENDED))
+        if not self._state.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED)):
+            raise LatheError(f"the recorder has taken nothing for {_ACKNOWLEDGED:.0f} s")
 
     def _chosen(self) -> Iterator[tuple[str, int, bytes]]:
         first = self._source.first_ns
@@ -276,8 +287,13 @@ class Replayer:
     def _hold(self) -> None:
         """Let no more blocks be under way than the recorder can queue; what DDS acknowledges may not have been read."""
         self._blocks += 1
+        if self._window:
+            self._until(lambda: self._blocks - self._recorded <= self._window)
+
+    def _until(self, enough: Callable[[], bool]) -> None:
+        """Wait until the recorder has told enough."""
         heard = time.monotonic()
-        while self._window and self._blocks - self._recorded > self._window:
+        while not enough():
             before = self._recorded
             self._look(_LOOK)
             if self._recorded != before:
