@@ -26,6 +26,7 @@ ROOT = Path(__file__).parents[1]
 HOME = ROOT / ".lathe" / "fuzz"
 MEMORY = 2**30  # [B] beyond what the process begins with
 LONGEST = 10.0  # [s] of CPU time for an input
+_LOOK = 0.5  # [s] between looks at what the process reads
 _WAITING = 600.0  # [s] without a new input, after which the process is ended
 _FOLLOWED = ("lathe_rc", "mcap", "rosbags", "ruamel", "yaml")
 
@@ -174,7 +175,7 @@ def _watch(process: subprocess.Popen[bytes], folder: Path) -> bool:
         if newest and (_used(process) - used > 3.0 * LONGEST or time.monotonic() - since > _WAITING):
             process.kill()
             return True
-        time.sleep(0.5)
+        time.sleep(_LOOK)
     return False
 
 

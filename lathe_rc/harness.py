@@ -357,7 +357,6 @@ class Processes:
             VARIABLE: str(theirs.fileno()),
             "ROS_DOMAIN_ID": str(self.domain),
             "ROS_LOG_DIR": str(self._folder),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
         }
         if all(getattr(table, "speed_factor", 0.0) == 0.0 for table in self._scenario.nodes.values()):
             environment[THROUGHPUT] = "1"
@@ -399,15 +398,16 @@ class Processes:
             LatheError: nothing was heard for ``silence`` seconds.
         """
         while True:
+            wait = _FAREWELL if self._complete else silence
             try:
-                event = self._events.get(timeout=_FAREWELL if self._complete else silence)
+                event = self._events.get(timeout=wait)
             except queue.Empty:
-                if self._complete:
+                if self._complete and self._running:
                     self._end_the_silent()
                     continue
                 running = ", ".join(f"{name}{self._place(name)}" for name in self._running)
                 raise LatheError(
-                    f"no node has reported anything for {silence:.0f} s; still running: {running}{self._tails()}"
+                    f"no node has reported anything for {wait:.0f} s; still running: {running}{self._tails()}"
                 ) from None
             self._newest[event["event"]] = event
             if event["event"] == "exit":

@@ -71,6 +71,9 @@ def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_i
         thread.start()
         processes.wait_for_end(told.append)
         thread.join()
+        # Nobody is left to wait for.
+        with pytest.raises(LatheError, match="no node has reported anything for 1 s"):
+            processes.wait_for("cycle")
     assert [event["node"] for event in told if event["event"] == "stuck"] == ["held"]
     assert reader.read(bag).digests() == harness.run(load(PISTON, ["spindle_encoder.revolutions=6.0"])).digest
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from cells import scenario
@@ -115,6 +116,18 @@ def test_the_commands_read_a_snapshot_as_a_bag(recorded):
         found = check(path)
         assert (found.exit_code, found.first, found.samples) == (0, told(path)["first_sample"], told(path)["samples"])
         assert CliRunner().invoke(main, ["bag", "info", str(path), "--json"]).exit_code == 0
+
+
+def test_the_first_complete_revolution_of_a_snapshot_has_the_number_that_it_has_in_the_run(tmp_path):
+    result = harness.run(cell(mode="both", pre=0.25), bag=tmp_path / "bag")
+    path = result.snapshots[-1]
+    angle = result.recording.of_type(messages.ENCODER)["angle_true"]
+    begun = int(np.ceil(angle[told(path)["first_sample"]] / (2 * np.pi)))
+    shown = CliRunner().invoke(main, ["bag", "info", str(path), "--json"])
+    assert shown.exit_code == 0
+    first = json.loads(shown.stdout)["error_um"]["first"]["revolution"]
+    assert first == begun + 1
+    assert first > 1
 
 
 def test_a_snapshot_cannot_be_simulated_again(recorded):

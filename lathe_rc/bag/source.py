@@ -70,11 +70,8 @@ def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
         raise ValueError(f"{size} B when unpacked; allowed: up to {MOST_BYTES}")
     try:
         if compression == "zstd":
-            unpacker = zstandard.ZstdDecompressor()
-            if unpacked_size(data[:18]) == size:
-                whole = unpacker.decompress(data, allow_extra_data=False)
-            else:
-                whole = unpacker.stream_reader(data, read_across_frames=True).read(size + 1)
+            unpacker = zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True)
+            whole = unpacker.read(size + 1)
         elif compression == "lz4":
             whole = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
         elif compression == "":
@@ -88,7 +85,7 @@ def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
     return whole
 
 
-def unpacked_size(data: bytes | memoryview) -> int:
+def unpacked_size(data: bytes) -> int:
     """Size that a zstd frame says it has [B], from its first 18 bytes; -1 if it says nothing or is none."""
     try:
         return int(zstandard.frame_content_size(data))

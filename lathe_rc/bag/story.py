@@ -41,9 +41,11 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
             continue
         nodes[name] = table
         for row in type(table).rows().values():
-            path = Path(str(getattr(table, row.name))) if row.is_path else Path()
-            if row.is_path and path.is_file() and path.stat().st_size <= _MOST_FILE:
-                files[f"{FILE}{name}.{row.name}"] = base64.b64encode(path.read_bytes()).decode()
+            # A file that there is not yet, or that is longer, is none of these.
+            with contextlib.suppress(OSError):
+                if row.is_path:
+                    kept = contents(Path(str(getattr(table, row.name))), _MOST_FILE)
+                    files[f"{FILE}{name}.{row.name}"] = base64.b64encode(kept).decode()
     return {
         RUN_ID: scenario.shared.run_id,
         NAME: scenario.name,

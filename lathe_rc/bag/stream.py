@@ -102,12 +102,12 @@ class _Dense:
     def take(self, samples: int) -> Signals:
         """The next samples, as arrays of their own."""
         signals = messages.allocate(self.type, samples)
-        self.take_into(signals, samples)
+        self.take_into(signals)
         return signals
 
-    def take_into(self, signals: Signals, samples: int) -> None:
-        """Fill arrays with the next samples."""
-        filled = 0
+    def take_into(self, signals: Signals) -> None:
+        """Fill arrays of shape (samples,) with the next samples."""
+        filled, samples = 0, next(iter(signals.values())).size
         while filled < samples:
             block = self.blocks[0]
             skip = self.first - block.first_index
@@ -248,7 +248,7 @@ class Tape:
             if found is None:
                 raise LatheError(f"{self._dense.topic} ends at sample {self._dense.end}")
             self._dense.add_all(data for _, _, data in found)
-        self._dense.take_into(signals, samples)
+        self._dense.take_into(signals)
 
 
 def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536) -> BagHeader:

@@ -2,7 +2,6 @@
 """The signals of a whole run, from whatever host, and their digests."""
 
 import hashlib
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -84,9 +83,7 @@ class Digester:
 
 
 def _bytes(samples: Samples) -> memoryview:
-    if sys.byteorder == "big" or not samples.dtype.isnative:
-        samples = samples.astype(samples.dtype.newbyteorder("<"))
-    return np.ascontiguousarray(samples).data
+    return np.ascontiguousarray(samples, samples.dtype.newbyteorder("<")).data
 
 
 def _flat(values: Sequence[Any]) -> Samples:

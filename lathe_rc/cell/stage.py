@@ -325,11 +325,14 @@ class Stage(ABC):
             self.perform(action)
 
     def damage(self, fault: Fault) -> None:
-        """Suffer a fault of one of its ``devices``."""
+        """Suffer a fault of one of its ``devices``.
+
+        Stages with ``devices`` have their own; a fault of another's device never gets here, see `_check_fault`.
+        """
         raise NotImplementedError(fault.text)
 
     def mend(self) -> None:
-        """Be as before all of them."""
+        """Be as before all of them; stages with ``devices`` have their own, see `damage`."""
         raise NotImplementedError
 
     def _joint_states(self, first: int, joint: Joint, signals: Signals) -> list[Sparse]:

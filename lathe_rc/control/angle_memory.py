@@ -346,7 +346,8 @@ def step(
     angles, errors = windows[0, : angle.size + 3], windows[1, : angle.size + 3]
     if begins:
         _take(first, delay, grid / _TURN, angle, past_angle, error, whole, real, angles, errors)
-    stop = min(angle.size, start + max(delay, 1) if start >= delay - first else delay - first)
+    # What is read before the first error arrives is not checked, so nothing is learned ahead of it.
+    stop = angle.size if start >= delay - first else min(angle.size, delay - first)
     reached, reason = _learn(
         start, delay - first, grid, cycle, looks_ahead, learning, gain, ramp, ratio, reach, angle[:stop], lead, angles,
         errors, sample, work, chunk, scratch, memory, whole, real,

@@ -33,7 +33,7 @@ from lathe_rc.nodes.ports import latched_qos, message_class
 
 _DEPTH = 512  # of the queues: so many may be under way before readers must have acknowledged
 _ACKNOWLEDGED = 30.0  # [s] for a reader to take what was sent to it
-_CLOCK = "/clock"
+_CLOCK, _STATE = "/clock", "/cell_state"
 _CLOCK_END = 2**31 * 10**9  # [ns] that it cannot tell any more
 # [ns] of wall time until a message must have been acknowledged if others are to follow: a reader that puts messages in
 # the order of their publication need not wait much longer for one that is late
@@ -187,9 +187,10 @@ class Replayer:
             )
             announced.append(publisher)
         self._announced = announced
-        self._run_id = scenario.shared.run_id
-        self._state = self._node.create_publisher(CellState, "/cell_state", latched_qos(1))
         self._topics &= set(self._publishers)
+        self._publishers[_STATE] = self._node.create_publisher(CellState, _STATE, latched_qos(1))
+        self._waiting[_STATE] = 0
+        self._ended = CellState(run_id=scenario.shared.run_id, state=CellState.ENDED)
         self._window = scenario.shared.window
         self._master = f"/{remapped(cell.master.shared, 'encoder')}"
         self._node.get_logger().info("waiting for a recorder")
@@ -222,9 +223,8 @@ class Replayer:
     def _let_go(self) -> None:
         """Say that the cell has ended, once the recorder has all of it: then it leaves."""
         self._until(lambda: self._recorded >= self._blocks)
-        self._state.publish(CellState(run_id=self._run_id, state=CellState.ENDED))
-        if not self._state.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED)):
-            raise LatheError(f"the recorder has taken nothing for {_ACKNOWLEDGED:.0f} s")
+        self._send(_STATE, self._ended)
+        self._acknowledged(_STATE)
 
     def _chosen(self) -> Iterator[tuple[str, int, bytes]]:
         first = self._source.first_ns

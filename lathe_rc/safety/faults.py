@@ -200,7 +200,7 @@ class Disturbance:
         self.change(signals[self._field])
 
     def change(self, signal: Array) -> None:
-        """Change those of the field that the fault is of."""
+        """Change those of the field that the fault is of; kinds of more than one field have their own `during`."""
         raise NotImplementedError
 
     def after(self, signals: Signals) -> None:
@@ -231,11 +231,6 @@ class _Wrong(Disturbance):
     def change(self, signal: Array) -> None:
         signal *= self._values["scale"]
         signal += self._values["offset"]
-
-
-def prepare() -> None:
-    """Load what faults need of SciPy, which is loaded when it is first used: else that would be in mid-run."""
-    scipy.signal.lfilter([1.0], [1.0], np.zeros(1))
 
 
 class _Slow(Disturbance):
@@ -331,3 +326,8 @@ DISTURBANCES: Mapping[str, type[Disturbance]] = {
     "lost_counts": _LostCounts,
     "reversed": _Reversed,
 }
+
+
+def prepare() -> None:
+    """Load what faults need of SciPy, which is loaded when it is first used: else that would be in mid-run."""
+    scipy.signal.lfilter([1.0], [1.0], np.zeros(1))
