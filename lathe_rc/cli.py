@@ -135,7 +135,13 @@ class _Watch:
                 error=f"error {event['rms_error'] * 1e6:.3g} µm RMS",
             )
         elif kind == "stall":
-            self._bar.console.print(f"{event['member']} is silent at block {event['blocks']}: the cell waits for it")
+            self._bar.console.print(f"{event['member']} is silent at block {event['blocks']}: the cell stands still")
+        elif kind == "dead":
+            next_ = "another process goes on in its place" if event["restarts"] else "the cell goes to its safe state"
+            self._bar.console.print(f"{event['member']} has died at block {event['blocks']}: {next_}")
+        elif kind == "safe":
+            lost = ", ".join(event["lost"])
+            self._bar.console.print(f"safe state from sample {event['sample']} to {event['end']}, without {lost}")
 
 
 def _table(result: harness.Result) -> RichTable:

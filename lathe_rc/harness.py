@@ -50,6 +50,8 @@ Event = Mapping[str, Any]
 _SILENCE_LIMIT = 120.0  # [s] without any event: the first start on a machine compiles kernels
 _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag closed
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
+_MOST_RESTARTS = 8  # of a process
+_SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
 _LOOK = 0.05  # [s] between looks at what a process has written
 
 
@@ -327,6 +329,8 @@ class Processes:
         self._abandoned: set[str] = set()
         self._ended: set[str] = set()
         self._newest: dict[str, Event] = {}
+        self._killed = ""  # the process that was, while the cell goes to its safe state without it
+        self._restarts: dict[str, int] = {}
         self.pids: dict[str, int] = {}
         self.domain = -1
 
@@ -335,10 +339,10 @@ class Processes:
         try:
             self.domain = self._stack.enter_context(free_domain(self._wanted_domain))
             self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-log-")))
-            file = self._folder / "scenario.yaml"
-            file.write_text(self._scenario.to_yaml(), encoding="utf-8")
+            self._file = self._folder / "scenario.yaml"
+            self._file.write_text(self._scenario.to_yaml(), encoding="utf-8")
             for group in self._groups:
-                self._start(group, file)
+                self._start(group)
         except BaseException:
             self.stop()
             raise
@@ -350,7 +354,7 @@ class Processes:
         """End them."""
         self.stop()
 
-    def _start(self, group: Sequence[str], file: Path) -> None:
+    def _start(self, group: Sequence[str]) -> None:
         members = [f"{name}:{self._scenario.kind(name)}" for name in group]
         ours, theirs = socket.socketpair()
         environment = os.environ | {
@@ -361,11 +365,11 @@ class Processes:
         if all(getattr(table, "speed_factor", 0.0) == 0.0 for table in self._scenario.nodes.values()):
             environment[THROUGHPUT] = "1"
         name = "+".join(group)
-        with (self._folder / f"{group[0]}.log").open("wb") as log:
+        with (self._folder / f"{group[0]}.log").open("ab") as log:
             child = subprocess.Popen(
                 [
                     *(sys.executable, "-m", "lathe_rc.nodes.container", *members),
-                    *("--ros-args", "--params-file", str(file), "--enclave", f"/{group[0]}"),
+                    *("--ros-args", "--params-file", str(self._file), "--enclave", f"/{group[0]}"),
                 ],
                 env=environment,
                 pass_fds=(theirs.fileno(),),
@@ -398,7 +402,7 @@ class Processes:
             LatheError: nothing was heard for ``silence`` seconds.
         """
         while True:
-            wait = _FAREWELL if self._complete else silence
+            wait = _FAREWELL if self._complete else min(silence, _SETTLING) if self._killed else silence
             try:
                 event = self._events.get(timeout=wait)
             except queue.Empty:
@@ -407,12 +411,32 @@ class Processes:
                     continue
                 running = ", ".join(f"{name}{self._place(name)}" for name in self._running)
                 raise LatheError(
-                    f"no node has reported anything for {wait:.0f} s; still running: {running}{self._tails()}"
+                    f"{self._killed}no node has reported anything for {wait:.0f} s; still running: "
+                    f"{running}{self._tails()}"
                 ) from None
             self._newest[event["event"]] = event
-            if event["event"] == "exit":
+            if event["event"] == "exit" and not self._restarted(event):
                 self._ended.add(event["node"])
             yield event
+
+    def _restarted(self, event: Event) -> bool:
+        """Start a process that was killed once more, if others can take the place of all its nodes."""
+        name = event["node"]
+        group = name.split("+")
+        kept = all(getattr(self._scenario.nodes.get(node), "restart_file", "") for node in group)
+        if event["code"] >= 0 or not kept or not self._goes_on(name):
+            return False
+        self._restarts[name] = self._restarts.get(name, 0) + 1
+        if self._restarts[name] > _MOST_RESTARTS:
+            return False
+        self._start(group)
+        self._events.put({"event": "restarted", "node": name, "pid": self._children[name].pid})
+        return True
+
+    def _goes_on(self, name: str) -> bool:
+        """Whether the cell does something about the death of a process."""
+        masters = set(self._scenario.of_kind(SpindleEncoder.kind))
+        return "block0" in self._newest and not self._complete and not masters & set(name.split("+"))
 
     @property
     def _running(self) -> list[str]:
@@ -460,6 +484,8 @@ class Processes:
             self._raise_failure(event)
             if self._ended == set(self._children):
                 break
+        if self._killed:
+            raise LatheError(f"{self._killed}the cell did not get to its safe state{self._tails()}")
         if not {"block0", "complete", "closed"} <= set(self._newest):
             raise LatheError(f"the nodes ended before the run did{self._tails()}")
         return self._newest
@@ -471,10 +497,15 @@ class Processes:
             self._abandoned.update(name for name in self._children if node in name.split("+"))
         if event["event"] == "error":
             kinds = {InputError.exit_code: InputError, LossyRunError.exit_code: LossyRunError}
-            raise kinds.get(event["exit_code"], LatheError)(event["message"])
-        if event["event"] == "exit" and event["code"] and node not in self._abandoned:
+            raise kinds.get(event["exit_code"], LatheError)(f"{self._killed}{event['message']}")
+        if event["event"] == "exit" and event["code"] and node in self._ended - self._abandoned:
             if event["code"] < 0:
-                raise LatheError(f"{node} was killed by {signal.Signals(-event['code']).name}{self._crash(node)}")
+                killed = f"{node} was killed by {signal.Signals(-event['code']).name}{self._crash(node)}"
+                if not self._goes_on(node):
+                    raise LatheError(f"{self._killed}{killed}")
+                # The time master says how the cell came to its safe state, and that is the end.
+                self._killed += f"{killed}; "
+                return
             raise LatheError(f"{node} ended with exit code {event['code']}{self._tail(node)}")
 
     def _log(self, name: str) -> list[str]:

@@ -73,7 +73,7 @@ HOST_TOPICS = (
         latched=True,
         publishers=_SPINDLE,
         subscribers=_ALL,
-        doc="start, end and failure of the run",
+        doc="start, end, safe state and failure of the run",
     ),
     HostTopic(
         name="progress",
@@ -231,7 +231,8 @@ def _host() -> str:
     return f"""## Host topics
 
 They carry wall time or the state of the run, are no signals, and enter no digest. The recorder keeps `/diagnostics`
-and `cell_state`.
+and `cell_state`. Each node also offers `NODE/alive` (`std_msgs/msg/Empty`), on which no message is ever sent: its
+liveliness, with a lease of 80 ms, tells the time master who is silent, and all others whether the time master is.
 
 {_table(["topic", "type", "quality of service", "published by", "read by", "purpose"], rows)}"""
 

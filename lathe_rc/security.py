@@ -12,10 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lathe_rc import harness
+from lathe_rc.cell.messages import ALIVE
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.replayer import KIND as REPLAYER
 from lathe_rc.cell.rerun_bridge import KIND as RERUN_BRIDGE
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.topic_recorder import KIND as TOPIC_RECORDER
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
@@ -99,9 +101,12 @@ class _Maker:
             services.append("schedule")
         told = {topic.name for topic in HOST_TOPICS if kind in topic.publishers}
         heard = {topic.name for topic in HOST_TOPICS if kind in topic.subscribers}
+        masters = set(self._scenario.of_kind(SpindleEncoder.kind))
+        watched = set(self._scenario.nodes) - masters if name in masters else masters
+        heard |= {f"{other}/{ALIVE}" for other in watched - set(group)}
         profile = self._node(
             name,
-            publish=own | told | {f"{name}/transition_event"},
+            publish=own | told | {f"{name}/transition_event", f"{name}/{ALIVE}"},
             subscribe=reads - inside | heard,
             services=services,
         )

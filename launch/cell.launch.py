@@ -78,7 +78,10 @@ def place(scenario: Scenario, argument: str) -> Path:
 
 
 def end_with(event: ProcessExited, _context: LaunchContext) -> list[LaunchDescriptionEntity]:
-    """End the cell when one of its nodes has failed; those that are done leave one by one."""
-    if event.returncode == 0:
+    """End the cell when one of its nodes has failed; those that are done leave one by one.
+
+    When one was killed the time master brings the cell to its safe state, and then fails itself.
+    """
+    if event.returncode <= 0:
         return []
     return [Shutdown(reason=f"{event.process_name} ended with exit code {event.returncode}")]

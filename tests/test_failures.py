@@ -9,16 +9,20 @@ import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness
 from lathe_rc.bag import reader
+from lathe_rc.bag.check import check
+from lathe_rc.cell import messages
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import InputError, LatheError
 
-PISTON = Path(__file__).parents[1] / "config" / "piston.yaml"
+CONFIG = Path(__file__).parents[1] / "config"
+PISTON = CONFIG / "piston.yaml"
 NODES = ["spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder"]
 
 
@@ -58,6 +62,77 @@ def test_a_killed_node_is_named_and_the_bag_is_readable(node, tmp_path):
         assert sum(1 for _ in bags.messages()) > 100
     with next(bag.glob("*.mcap")).open("rb") as stream:
         assert sum(1 for _ in make_reader(stream).iter_messages()) > 100
+
+
+RUN = ["spindle_encoder.revolutions=100.0", "spindle_encoder.safe_time=0.1", "recorder.chunk_size=65536"]
+
+
+@pytest.mark.parametrize("node", ["learning_controller", "electrodynamic_actuator", "tool", "supervisor"])
+def test_the_death_of_a_member_ends_in_the_safe_state(node, tmp_path):
+    """All others go on to the end that the time master declares: the drive retracts by itself, nothing is lost."""
+    bag, events = tmp_path / "bag", []
+    scenario = load(CONFIG / "supervised.yaml", RUN)
+    killer = Killer(node, signal.SIGKILL)
+
+    def watch(event):
+        killer(event)
+        events.append(event)
+
+    with pytest.raises(
+        LatheError, match=rf"^{node} was killed by SIGKILL; /{node} died: safe state from sample \d+ on$"
+    ):
+        harness.run(scenario, mode="processes", bag=bag, watch=watch)
+    (safe,) = [event for event in events if event["event"] == "safe"]
+    assert safe["lost"] == [f"/{node}"]
+    assert safe["end"] == safe["sample"] + 6400
+    recording = reader.read(bag)
+    assert {signals.size for fields in recording.dense.values() for signals in fields.values()} == {safe["end"]}
+    state = recording.of_type(messages.STATE)
+    if node == "electrodynamic_actuator":
+        # It is the drive itself that is gone: its newest position stands for what nobody knows.
+        assert np.ptp(state["position"][safe["sample"] :]) == 0.0
+    else:
+        assert state["position"][-1] == pytest.approx(0.3e-3, abs=1e-6)
+        jumps = np.abs(np.diff(state["position"], 2)).max() * 64e3**2
+        assert jumps < 60.0, "the retraction is bounded [m/s²]"
+    if node != "supervisor":
+        (status,) = [each for each in recording.sparse["/safety/status"].values["monitor"] if each == "members_lost"]
+        assert status
+    found = check(bag)
+    assert not found.wrong
+    assert any("the node was lost" in line for line in found.lost)
+    held = reader.read(bag).dense
+    assert (
+        held.keys()
+        == harness.run(load(CONFIG / "supervised.yaml", ["spindle_encoder.revolutions=1"])).recording.dense.keys()
+    )
+
+
+def test_a_member_that_stalls_is_lost_if_the_cell_shall_not_wait(tmp_path):
+    sets = [*RUN, "spindle_encoder.stall_reaction=safe", "spindle_encoder.stall_time=5.0"]
+    killer = Killer("tool", signal.SIGSTOP)
+    with pytest.raises(LatheError, match=r"^/tool fell silent: safe state from sample \d+ on$"):
+        harness.run(load(PISTON, sets), mode="processes", bag=tmp_path / "bag", watch=killer)
+    assert not check(tmp_path / "bag").wrong
+    assert not alive(killer.pids["tool"])
+
+
+def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tmp_path):
+    """Under ros2 launch or by hand nobody ends them: they see that no sample follows, and the bag is closed."""
+    cell = harness.with_recorder(load(PISTON, RUN), tmp_path / "bag", keep=True)
+    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+        processes.wait_for("cycle")
+        os.kill(processes.pids["spindle_encoder"], signal.SIGKILL)
+        told = []
+        for event in processes.events(60.0):
+            told.append(event)
+            if [each["event"] for each in told].count("exit") == len(cell.nodes):
+                break
+    said = [event["message"] for event in told if event["event"] == "abandoned"]
+    assert said
+    assert any("/spindle_encoder, the time master, is lost: no sample follows" in line for line in said)
+    assert [event["complete"] for event in told if event["event"] == "closed"] == [False]
+    assert not check(tmp_path / "bag").wrong
 
 
 def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_is_lost(monkeypatch, tmp_path):

@@ -119,7 +119,7 @@ def test_the_commands_read_a_snapshot_as_a_bag(recorded):
 
 
 def test_the_first_complete_revolution_of_a_snapshot_has_the_number_that_it_has_in_the_run(tmp_path):
-    result = harness.run(cell(mode="both", pre=0.25), bag=tmp_path / "bag")
+    result = harness.run(cell(["revolution 7: freeze"], mode="both", pre=0.15), bag=tmp_path / "bag")
     path = result.snapshots[-1]
     angle = result.recording.of_type(messages.ENCODER)["angle_true"]
     begun = int(np.ceil(angle[told(path)["first_sample"]] / (2 * np.pi)))

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lathe_rc.bag import story
 from lathe_rc.bag.snapshot import SNAPSHOT, first_sample
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.trust import shown
@@ -127,6 +128,10 @@ def check(path: Path) -> Findings:
                 findings.wrong.append(f"{topic}: {counts[topic]} messages, {said.count} by the metadata")
         findings.messages = sum(counts.values())
     _ends(dense, findings, part=SNAPSHOT in source.about)
+    findings.lost += [
+        f"{topic}: from sample {first} on its newest value, held: the node was lost"
+        for topic, first in story.held(source.about).items()
+    ]
     if dense and not findings.lost and not findings.wrong:
         findings.digests = digester.result(sparse)
         _compare(path, findings)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The order of signal messages in a bag: by log time, then topic, then index, whoever arrived first."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 from lathe_rc.bag.rows import Dense, Plan, Sheet
@@ -11,6 +11,7 @@ from lathe_rc.cell.wire import Block
 from lathe_rc.errors import LatheError
 
 _ROWS = 16  # of a sheet
+_MOST = 2**63  # messages
 
 
 class _Single(NamedTuple):
@@ -35,6 +36,7 @@ class Merger:
         run_id: identity of the run.
         step_ns: sampling step [ns].
         samples: of a block; the last may be shorter.
+        repeating: sources whose sparse messages may come twice, from another process that goes on in their place.
 
     Attributes:
         rows: written so far.
@@ -52,6 +54,7 @@ class Merger:
         run_id: str,
         step_ns: int,
         samples: int,
+        repeating: Collection[str] = (),
     ) -> None:
         self._writer, self._run_id, self._step_ns, self._length = writer, run_id, step_ns, samples
         self._topics = [Dense(topic, *dense[topic], writer.channel(topic)) for topic in sorted(dense)]
@@ -64,7 +67,7 @@ class Merger:
         self._sheets: dict[int, Sheet] = {}  # by number
         self._free: list[Sheet] = []
         self._tail: Sheet | None = None  # the last row, if it is shorter
-        self._sparse = sparse
+        self._sparse, self._repeating = sparse, repeating
         self._sequence = dict.fromkeys(sparse, 0)
         self._received = dict.fromkeys(sparse.values(), 0)
         self._needs: list[tuple[int, str, int]] = []  # row, source and the messages that it says it has sent
@@ -127,9 +130,22 @@ class Merger:
 
     def add_sparse(self, topic: str, log_ns: int, data: bytes) -> None:
         """Take a sparse message."""
+        if self._sparse[topic] in self._repeating and self._has(topic, log_ns, data):
+            return
         self._sequence[topic] += 1
         self._waiting.append(_Single(log_ns, topic, self._sequence[topic], data))
         self._received[self._sparse[topic]] += 1
+
+    def _has(self, topic: str, log_ns: int, data: bytes) -> bool:
+        """Whether a sparse message has come before: then it waits, or the rows that waited for it are written."""
+        if self.rows and log_ns <= self.log_ns:
+            return True
+        return any(each.topic == topic and each.log_ns == log_ns and each.data == data for each in self._waiting)
+
+    def forget(self, sources: Collection[str]) -> None:
+        """Wait for no more sparse messages of sources that are lost."""
+        self._received |= dict.fromkeys(sources, _MOST)
+        self._needs = [need for need in self._needs if need[1] not in sources]
 
     def _check(self, place: int, first: int, samples: int, *, last: bool) -> int:
         """The row of the next block of a topic."""

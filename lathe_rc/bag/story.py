@@ -21,6 +21,7 @@ from lathe_rc.files import contents
 SCENARIO, NAME, VERSIONS = "lathe_rc.scenario", "lathe_rc.name", "lathe_rc.versions"
 RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"
 FILE = "lathe_rc.file."  #: and NODE.PARAM: what was in the file that the parameter names
+HELD = "lathe_rc.held"  #: samples from which on the newest value of a topic stands for those of a lost node
 RECOVERED = "lathe_rc.recovered"  #: that the bag was completed, and what that cost
 _MOST_FILE = 2**19  # longest such file that is kept [B]
 _LONGEST_NAME = 80  # characters of a file
@@ -54,6 +55,15 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
         SCENARIO: Scenario(scenario.name, nodes).to_yaml(),
         **files,
     }
+
+
+def held(about: Mapping[str, str]) -> dict[str, int]:
+    """Samples from which on the newest value of a topic stands for those of a lost node; empty if no node was lost."""
+    try:
+        told = json.loads(about.get(HELD, "{}"))
+        return {str(topic)[:256]: int(first) for topic, first in list(told.items())[:256]}
+    except (ValueError, TypeError, AttributeError, RecursionError, OverflowError):
+        raise InputError(f"{HELD} of the bag is not what a recorder writes; recover the bag") from None
 
 
 def _versions() -> dict[str, str]:

@@ -178,6 +178,14 @@ class ObedientParameters(NodeParameters):
     )
 
 
+class RestartParameters(NodeParameters):
+    """Of a node that another process may replace in mid-run."""
+
+    restart_file: str = parameter(
+        "", "the node's state is kept here, and another process of it goes on from there; empty: it is not", path=True
+    )
+
+
 def remapped(table: NodeParameters, topic: str) -> str:
     """The relative name of a topic after the node's ``remap`` rules.
 

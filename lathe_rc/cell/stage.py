@@ -81,6 +81,7 @@ _NOTHING = np.empty(0)
 
 _EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)(?:\s+to\s+([0-9.eE+-]+))?\s*:\s*(\S.*?)\s*")
 _FAULT, _REPAIR = "fault", "repair"  # verbs of the events that all stages know: fault FAULT, repair TARGET
+SAFE = "safe"  #: and of the one that only a host may ask for: members of the cell are lost
 
 
 class Stage(ABC):
@@ -227,6 +228,10 @@ class Stage(ABC):
         self.check_action(action)
         self._scheduled.append((index, action))
 
+    def lose(self, index: int) -> None:
+        """Go to its safe state at sample ``index``, which the host has not issued yet: members of the cell are lost."""
+        self._scheduled.append((index, SAFE))
+
     def _scheduled_actions(self, action: str) -> bool:
         """Whether the scenario lists an event with this action."""
         return any(trigger.action == action for trigger in self._triggers)
@@ -291,7 +296,8 @@ class Stage(ABC):
             sparse += self._compute(first, start, index - first, inputs, outputs)
             start = index - first
             self.act(action, index)
-            sparse.append(Sparse(f"{self.name}/events", messages.EVENT, index, {"action": action}))
+            if (topic := f"{self.name}/events") in self.sparse_topics:
+                sparse.append(Sparse(topic, messages.EVENT, index, {"action": action}))
         return sparse + self._compute(first, start, samples, inputs, outputs)
 
     def _compute(
@@ -309,7 +315,9 @@ class Stage(ABC):
     def act(self, action: str, index: int) -> None:
         """Carry out an event at sample ``index``, the next one."""
         verb, _, rest = action.partition(" ")
-        if verb == _FAULT:
+        if verb == SAFE:
+            self.go_safe()
+        elif verb == _FAULT:
             fault = faults.parse(rest, self.name)
             if faults.KINDS[fault.kind].what in self.devices:
                 self.damage(fault)
@@ -323,6 +331,9 @@ class Stage(ABC):
                 self.mend()
         else:
             self.perform(action)
+
+    def go_safe(self) -> None:  # noqa: B027 - most stages move nothing, and go on as they are
+        """Members of the cell are lost: do what can be done alone."""
 
     def damage(self, fault: Fault) -> None:
         """Suffer a fault of one of its ``devices``.

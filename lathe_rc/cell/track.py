@@ -3,6 +3,7 @@
 
 from collections.abc import Collection, Iterable, Mapping
 from math import ceil
+from typing import Any
 
 import numpy as np
 
@@ -52,6 +53,10 @@ class Track:
         self._base = -self.delay  # sample index of element 0
         self._block, self._views = block, dict[int, Signals]()
         self.end = 0  #: index after the newest sample
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is worth keeping: views of arrays would be kept as copies."""
+        return {**self.__dict__, "_views": {}}
 
     def _at(self, start: int, samples: int) -> Signals:
         """Views of ``samples`` elements from ``start`` on; those of whole blocks are made once."""

@@ -62,6 +62,11 @@ def motion(start: float, velocity: float, end: float | None, bounds: Bounds, ste
     return positions
 
 
+def prepare() -> None:
+    """Load what motions need of SciPy, which is loaded when it is first used: else that would be in mid-run."""
+    motion(0.0, 0.0, 0.0, Bounds(1.0, 1.0, 1.0), 1.0)
+
+
 def _last_two(before: Array, samples: Array) -> Array:
     return samples[-2:].copy() if samples.size > 1 else np.concatenate((before, samples))[-2:]
 
@@ -86,9 +91,7 @@ class Takeover:
     def __init__(self, bounds: Bounds, retracted: float, step: float) -> None:
         self._bounds, self._goal, self._step = bounds, retracted, step
         self._mode = Mode.FOLLOW
-        # Positions to come; of what is added to the command when it follows. None yet, but the first of them must not
-        # wait for SciPy to load what makes them.
-        self._path, self._place = motion(0.0, 0.0, 0.0, bounds, step), 1
+        self._path, self._place = np.zeros(0), 0  # positions to come; of what is added to the command when it follows
         self._given, self._wanted = np.zeros(2), np.zeros(2)  # the last two samples, after and before
 
     @property

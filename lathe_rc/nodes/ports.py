@@ -3,6 +3,7 @@
 
 import importlib
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from lathe_rc.bag.record import signal_depth
+from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import LatheError
@@ -53,6 +55,8 @@ class BlockQueue:
         inside: its blocks are handed over in this process.
         received: blocks so far, those that were lost included.
         lost: blocks that never came; always 0 unless the cell is free-running.
+        repeats: blocks may come twice: their source may be another process that goes on in its place.
+        held_from: sample from which on its newest sample is held, since its source is lost; None: it is not.
     """
 
     def __init__(self, topic: str, msgtype: str, parameters: NodeParameters, fields: list[str]) -> None:
@@ -61,10 +65,12 @@ class BlockQueue:
         self.source = ""
         self.inside = False
         self.received = self.lost = 0
+        self.held_from: int | None = None
         self._decoder = Decoder(msgtype, fields)
         self._decoder.prepare()
         self._run_id, self._step_ns, self._size = parameters.run_id, parameters.step_ns, parameters.block_size
         self._free_running = not parameters.window
+        self.repeats = False
         self._limit = 8 * signal_depth(parameters)
         self._expected: int | None = None
         self._newest: Block | None = None
@@ -73,20 +79,22 @@ class BlockQueue:
         """Accept blocks of this node alone, from sample 0 on."""
         self.source, self._expected = source, 0
 
-    def add(self, data: bytes) -> Block:
-        """Check a block and queue it.
+    def add(self, data: bytes) -> Block | None:
+        """Check a block and queue it; None if another already stands for it, see `hold`, or if it is a repeat.
 
         Raises:
             LatheError: a stranger, another run or step, a gap, a repeat, arrays of different lengths, or far more
                 blocks waiting than the window allows.
         """
+        if self.held_from is not None:
+            return None
         try:
             block = self._decoder.decode(data)
         except ValueError as error:
             raise LatheError(f"{self.topic}: {error}") from None
         return self.accept(block)
 
-    def take(self, block: Block) -> Block:
+    def take(self, block: Block) -> Block | None:
         """Queue a block that was handed over in this process.
 
         Raises:
@@ -101,7 +109,7 @@ class BlockQueue:
         self.blocks.append(block)
         return block
 
-    def accept(self, block: Block) -> Block:
+    def accept(self, block: Block) -> Block | None:
         """Check a block and queue it; see `add`."""
         if self._run_id and block.run_id != self._run_id:
             raise LatheError(
@@ -117,9 +125,61 @@ class BlockQueue:
             )
         if self._expected is None:
             self.source, self._expected = block.source, block.first_index
+        if self.repeats and block.first_index + block.samples <= self._expected:
+            return None
         if block.first_index != self._expected:
             self._gap(block, self._expected)
         return self._append(block)
+
+    def state(self) -> tuple[int, int, list[Block]]:
+        """What another process needs to go on: next sample, blocks received, and those that wait to be used."""
+        return self._expected or 0, self.received, list(self.blocks)
+
+    def resume(self, source: str, state: tuple[int, int, list[Block]]) -> None:
+        """Go on from the state of another process.
+
+        Raises:
+            LatheError: blocks between it and those that have come are missing.
+        """
+        come, self.blocks = self.blocks, deque(state[2])
+        self._expected, self.received, _ = state
+        self._newest = self.blocks[-1] if self.blocks else None
+        self.source, self.repeats = source, True
+        for block in come:
+            self.accept(block)
+
+    def hold(self, end: int, newest: Block | None = None) -> None:
+        """Let the newest sample stand for those of a source that is lost, up to sample ``end``, where the run ends.
+
+        Args:
+            end: of the run.
+            newest: the newest block with all its fields; None: with those that are read.
+        """
+        newest = newest or self._newest or self._zero()
+        self.held_from = self._expected or 0
+        for block in self._held(newest, self.held_from, end):
+            block.last = block.first_index + block.samples == end
+            self.blocks.append(block)
+            self.received += 1
+
+    def _zero(self) -> Block:
+        """A block that stands for those before the first."""
+        zeros = {name: np.zeros(1, dtype) for name, dtype in messages.sample_fields(self.type).items()}
+        return Block(self._run_id, self.source, 0, self._step_ns, False, 0, 0, 0, zeros)  # noqa: FBT003
+
+    def _held(self, newest: Block, first: int, end: int) -> Iterator[Block]:
+        """Blocks with the last sample of another."""
+        for start in range(first, end, self._size):
+            samples = min(self._size, end - start)
+            yield replace(
+                newest,
+                first_index=start,
+                samples=samples,
+                log_ns=messages.START_NS + (start + samples - 1) * self._step_ns,
+                signals={name: np.repeat(array[-1:], samples) for name, array in newest.signals.items()},
+                whole=None,
+                last=False,
+            )
 
     def _append(self, block: Block) -> Block:
         self._expected = block.first_index + block.samples
@@ -138,9 +198,7 @@ class BlockQueue:
             raise LatheError(f"{self.topic}: {block.source} goes from sample {expected} to {block.first_index}: {what}")
         if missing > self._limit * self._size:
             raise LatheError(f"{self.topic}: {block.source} jumps by {missing} samples")
-        for first in range(expected, block.first_index, self._size):
-            samples = min(self._size, block.first_index - first)
-            held = {name: np.repeat(array[-1:], samples) for name, array in self._newest.signals.items()}
-            self.blocks.append(replace(self._newest, first_index=first, samples=samples, signals=held, last=False))
+        for held in self._held(self._newest, expected, block.first_index):
+            self.blocks.append(held)
             self.received += 1
             self.lost += 1

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recorder: every signal topic of the cell into one bag, sorted, complete, and closed whatever happens."""
 
+import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
-from lathe_rc.cell.wire import Block, Encoder
+from lathe_rc.cell.wire import Block, Decoder, Encoder
 from lathe_rc.errors import LatheError, LossyRunError
 from lathe_rc.nodes.ports import BlockQueue, latched_qos
 from lathe_rc.nodes.shell import CellNode
@@ -57,6 +58,7 @@ class RecorderNode(CellNode):
         self._depth = signal_depth(self.table)
         self._queues: dict[str, BlockQueue] = {}
         self._sparse: dict[str, str] = {}  # topic -> source
+        self._newest: dict[str, bytes] = {}  # message of each topic that comes from another process
         self._encoders = _Encoders()
         self._merger: Merger | None = None
         self._ended: set[str] = set()  # topics whose last block has come
@@ -131,6 +133,7 @@ class RecorderNode(CellNode):
                 run_id=self.table.run_id,
                 step_ns=self.table.step_ns,
                 samples=self.table.block_size,
+                repeating={name for name in self.members if self.restarts(name)},
             )
         self.announce()
 
@@ -156,7 +159,25 @@ class RecorderNode(CellNode):
         queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
         if in_cell:
             queue.expect(source)
+            queue.repeats = self.restarts(source)
         self.listen(topic, msgtype, partial(self._on_message, queue), partial(self._on_block, queue))
+
+    def lose(self, lost: set[str], first: int, end: int) -> None:
+        """See `CellNode`; what they published is held, and the bag says from which sample on."""
+        for topic, queue in self._queues.items():
+            if queue.source in lost and queue.held_from is None:
+                data = self._newest.get(topic)
+                queue.hold(end, Decoder(queue.type).decode(data) if data else None)
+        held = {topic: queue.held_from for topic, queue in self._queues.items() if queue.held_from is not None}
+        if self.over or self._merger is None:
+            return
+        self._open.tell({story.HELD: json.dumps(held)})
+        self._merger.forget(lost)
+        for topic in held:
+            blocks = self._queues[topic].blocks
+            while blocks:
+                self._merger.add_block(topic, blocks.popleft())
+        self._drain()
 
     # ---- snapshots ----------------------------------------------------------------------------------
 
@@ -221,6 +242,9 @@ class RecorderNode(CellNode):
         if self.over:
             return
         block = queue.add(data)
+        if block is None:
+            return
+        self._newest[queue.topic] = data
         queue.blocks.clear()
         if self._merger is None:
             self._write_unsorted(queue, block, data)

@@ -2,6 +2,7 @@
 """The shell that all nodes share: lifecycle, membership and start handshake, progress, diagnostics, end."""
 
 import json
+import math
 import os
 import time
 import traceback
@@ -16,7 +17,9 @@ from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
+from std_msgs.msg import Empty
 
+from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.errors import InputError, LatheError
@@ -24,10 +27,13 @@ from lathe_rc.nodes import declare
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
 from lathe_rc.nodes.report import Reporter
+from lathe_rc.nodes.watch import Watch, liveliness, this_host
 
 _TICK = 0.02  # [s] between looks at the graph while members join
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _LATCHED_DEPTH = 256
+_PATIENCE = 2.0  # [s] for others to acknowledge the last messages
+_GIVEN_UP = 2.0  # [s] of silence after which a time master is lost in a cell that does not wait
 
 
 class CellNode(LifecycleNode):
@@ -46,7 +52,9 @@ class CellNode(LifecycleNode):
         failure: why it gave up.
         due: messages have come since it last worked.
         handled: messages received so far.
+        watch: whether those are alive that it cannot do without; there once it is active.
         outlets, inlets: publisher and subscription of each signal topic, by fully qualified name.
+        patience: for messages to be acknowledged [s].
         next_tick: monotonic time [s] at which it wants `tick` to be called.
     """
 
@@ -64,13 +72,15 @@ class CellNode(LifecycleNode):
         self.exchange = exchange
         self.over = self.done = False
         self.failure: LatheError | None = None
-        self.next_tick = time.monotonic()
+        self.next_tick, self.patience = time.monotonic(), _PATIENCE
         self.active = False
         self.handled, self.due = 0, False
         self.full_name = self.get_fully_qualified_name()
         self.members: dict[str, Member] = {}
         self.master: Member | None = None
-        self._ready = False
+        self._ready = self._safe = False
+        self._without: set[str] = set()  # members that are lost
+        self._cell: int | None = None  # what the time master has said
         self._progress_step = 1
         self._reported_blocks = 0
         self._heard_elsewhere = True  # whether anybody beside the time master reads the progress
@@ -127,6 +137,8 @@ class CellNode(LifecycleNode):
         }
         self.create_subscription(Member, "members", self.guarded(self._on_member), latched_qos(_LATCHED_DEPTH))
         self.create_subscription(CellState, "cell_state", self.guarded(self._on_cell_state), latched_qos(4))
+        self.create_publisher(Empty, f"~/{messages.ALIVE}", liveliness())
+        self.watch = Watch(self, lambda: self.attempt(self.look_after_others))
         self.active = True
         self.activate_part()
         self.announce()
@@ -152,6 +164,12 @@ class CellNode(LifecycleNode):
 
     def members_changed(self) -> None:
         """A member announced something new."""
+
+    def begin(self, *, joins: bool) -> None:
+        """Every input and output is matched; ``joins``: the cell is running already."""
+
+    def lose(self, lost: set[str], first: int, end: int) -> None:
+        """Do without lost members up to sample ``end``, the end of the run; be safe from sample ``first`` on."""
 
     def statistics(self) -> dict[str, object]:
         """Figures for the diagnostics."""
@@ -261,12 +279,16 @@ class CellNode(LifecycleNode):
             subscribes=self.subscriptions_wanted(),
             parameters=self._effective().model_dump_json(),
             message=str(self.failure or ""),
+            host=this_host(),
+            pid=os.getpid(),
         )
         self._host["members"].publish(own)
 
     def _membership(self) -> int:
         if self.failure:
             return int(Member.FAILED)
+        if self._safe:
+            return int(Member.SAFE)
         if self._ready:
             return int(Member.READY)
         return int(Member.WIRED if self.wired() else Member.JOINING)
@@ -307,8 +329,10 @@ class CellNode(LifecycleNode):
         self.members[member.name] = member
         if member.members:
             self.master = member
+            self.watch.follow(member)
         peers = self.master.members if self.master else ()
-        if member.state == Member.FAILED and member.name in peers and member.name != self.full_name:
+        others = member.name in peers and member.name != self.full_name and member.name not in self._without
+        if member.state == Member.FAILED and others and not self.over:
             self.fail(LatheError(f"{member.name} failed: {member.message}"), cause="abandoned")
         self.members_changed()
         self._settle()
@@ -316,10 +340,43 @@ class CellNode(LifecycleNode):
     def _on_cell_state(self, state: CellState) -> None:
         if state.run_id != self.table.run_id:
             return
+        self._cell = state.state
         if state.state == CellState.ENDED and self.over and not self.done:
             self._leave([])
         if state.state == CellState.FAILED:
             self.fail(LatheError(f"the cell failed: {state.message}"), cause="abandoned")
+        if state.state == CellState.SAFE and not self.over:
+            self._go_safe(state)
+
+    def _go_safe(self, state: CellState) -> None:
+        if self.full_name in state.lost:
+            self.fail(LatheError(f"{self.full_name}: the cell went to its safe state without it"), cause="abandoned")
+            return
+        self._without = set(state.lost)
+        self.get_logger().error(f"safe state from sample {state.first_index} on: {state.message}")
+        self.lose(set(state.lost), state.first_index, state.end_index)
+        self._safe = True
+        self.announce()
+
+    def look_after_others(self) -> None:
+        """Leave if the time master is gone: without it no sample follows."""
+        if self.master is None or self.failure or self.done or not self.master.members:
+            return
+        name = self.master.name
+        silent = time.monotonic() - self.watch.silent.get(name, math.inf)
+        if name in self.watch.ended() or (silent > _GIVEN_UP and self._does_not_wait(self.master)):
+            if self.over:
+                self._leave([])
+            else:
+                self.fail(LatheError(f"{name}, the time master, is lost: no sample follows"), cause="abandoned")
+
+    def _does_not_wait(self, master: Member) -> bool:
+        """Whether the cell shall not wait for a silent master either."""
+        return bool(json.loads(master.parameters).get("stall_reaction") == "safe")
+
+    def restarts(self, name: str) -> bool:
+        """Whether another process may go on in place of a member."""
+        return bool(json.loads(self.members[name].parameters).get("restart_file"))
 
     @property
     def complete(self) -> bool:
@@ -333,6 +390,7 @@ class CellNode(LifecycleNode):
         if any(self.members[name].state == Member.JOINING for name in self.master.members) or not self.matched():
             return
         self._ready = True
+        self.begin(joins=self._cell not in (None, CellState.WAITING))
         self.announce()
         self.reporter("ready", self.get_name())
 
@@ -381,7 +439,7 @@ class CellNode(LifecycleNode):
         from rclpy.duration import Duration
 
         for publisher in acknowledged:
-            if not publisher.wait_for_all_acked(Duration(seconds=2)):
+            if not publisher.wait_for_all_acked(Duration(seconds=self.patience)):
                 self.get_logger().warning(f"{publisher.topic}: not everybody has acknowledged the last message")
         self.done = True
         self.reporter("done", self.get_name(), cpu_s=time.process_time())
@@ -389,8 +447,10 @@ class CellNode(LifecycleNode):
     def tick(self, now: float) -> None:
         """Do what is due by the wall clock; nothing here touches a sample."""
         self.next_tick = now + _TICK if not self._ready else now + 0.1
-        if self.active and not self._ready:
-            self._settle()
+        if self.active:
+            if not self._ready:
+                self._settle()
+            self.attempt(self.look_after_others)
         if "progress" in self._host:
             self._heard_elsewhere = self._host["progress"].get_subscription_count() > 1
         if self.active and now >= self._diagnostics_due:

@@ -4,7 +4,7 @@
 import time
 from collections import deque
 
-from lathe_rc_msgs.msg import CellState, Progress
+from lathe_rc_msgs.msg import CellState, Member, Progress
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
@@ -16,7 +16,9 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.stage_node import StageNode
 
-_STALL = 0.1  # [s] of silence after which a member is named
+_STALL = 0.08  # [s] of silence after which a member is named
+_GONE = 0.2  # [s] for messages to be acknowledged, if who has died never will
+_LOOK = 0.02  # [s] between looks at the members
 _REPORT_PERIOD = 0.05  # [s] between reports of progress
 _BURST = 64  # blocks let go before other work gets its turn
 
@@ -48,7 +50,11 @@ class SpindleNode(StageNode):
         self._running = False
         self._schedule = 0.0  # monotonic time at which sample 0 would have been, were there no slips
         self._heard = time.monotonic()
-        self._stalled = ""
+        self._stalled: frozenset[str] = frozenset()
+        self._dead: dict[str, float] = {}  # monotonic time until which a member may be restarted
+        self._unsafe: set[str] = set()  # members that have not yet heard that others are lost
+        self._end = self.stage.samples
+        self._why = ""
         self._report_due = 0.0
         self.slipped = 0.0
         self._released: deque[float] = deque()  # monotonic times at which the blocks in flight were let go
@@ -79,7 +85,11 @@ class SpindleNode(StageNode):
         }
 
     def _say(self, state: int, first: int, why: str = "") -> None:
-        self._state.publish(CellState(run_id=self.table.run_id, state=state, first_index=first, message=why[:1024]))
+        said = CellState(run_id=self.table.run_id, state=state, first_index=first, message=why[:1024])
+        if self._without:
+            assert self._end is not None, "the safe state has an end"
+            said.end_index, said.lost = self._end, sorted(self._without)
+        self._state.publish(said)
 
     @property
     def _slowest(self) -> str:
@@ -88,13 +98,19 @@ class SpindleNode(StageNode):
     @property
     def _least(self) -> int:
         """Blocks that every member has completed."""
-        return min(self._completed.values(), default=self.blocks)
+        return min(self.blocks, *self._completed.values())
 
     # ---- start --------------------------------------------------------------------------------------
 
     def members_changed(self) -> None:
         """Begin when every member is ready and the cell passes its check."""
         super().members_changed()
+        for name in self._member_names:
+            if name in self.members:
+                self.watch.follow(self.members[name])
+        if self._unsafe:
+            self._unsafe -= {name for name in self._unsafe if self.members[name].state == Member.SAFE}
+            self.release()
         if self._running or not self._member_names:
             return
         known = [self.members.get(name) for name in self.member_names()]
@@ -119,13 +135,19 @@ class SpindleNode(StageNode):
     def _on_progress(self, progress: Progress) -> None:
         if progress.name not in self._completed or progress.run_id != self.table.run_id:
             return
-        if progress.blocks > self.blocks:
+        # Who reads only from lost members has its blocks to the end of the run already.
+        if progress.blocks > self.blocks and not self._without:
             raise LatheError(f"{progress.name} claims {progress.blocks} blocks; {self.blocks} were sent")
         before = self._least
-        self._completed[progress.name] = progress.blocks
+        # One that was restarted repeats some.
+        self._completed[progress.name] = max(progress.blocks, self._completed[progress.name])
         least = self._least
         self._heard = time.monotonic()
-        self._stalled = ""
+        self._stalled = frozenset()
+        self._after(before, least)
+
+    def _after(self, before: int, least: int) -> None:
+        """Every member has completed some more blocks."""
         if least > before:
             for _ in range(least - before):
                 self._latency.add(self._heard - self._released.popleft())
@@ -150,7 +172,7 @@ class SpindleNode(StageNode):
 
     def release(self) -> None:
         """Let go every block that credit and pace allow."""
-        if not self._running or self.failure or self.done:
+        if not self._running or self.failure or self.done or self._unsafe:
             return
         factor = self._pace.speed_factor
         size, step = self.table.block_size, self.table.step
@@ -169,11 +191,11 @@ class SpindleNode(StageNode):
                     # Less is made up by the next blocks. The schedule slips by more: no long burst to catch up.
                     self._schedule += late
                     self.slipped += late
-            rest = size if self.stage.samples is None else self.stage.samples - self.samples
+            rest = size if self._end is None else self._end - self.samples
             samples = min(size, rest)
             if self._completed:
                 self._released.append(time.monotonic())
-            self.compute(samples, [], last=samples == rest and self.stage.samples is not None)
+            self.compute(samples, [], last=samples == rest and self._end is not None)
         self.next_tick = time.monotonic()
 
     def advance(self) -> None:
@@ -183,13 +205,15 @@ class SpindleNode(StageNode):
 
     def ended(self) -> None:
         """Its last block is out; the run ends when all members have completed it."""
-        if not self._member_names:
+        if self._least == self.blocks:
             self._finish_run()
 
     def _finish_run(self) -> None:
-        self._say(CellState.ENDED, self.samples)
+        self._say(CellState.ENDED, self.samples, self._why)
         self.get_logger().info(f"run ended: {self.blocks} blocks, {self.samples} samples")
         self.end([*self.outlets.values(), self._state])
+        if self._without:
+            super().fail(LatheError(self._why))
 
     def fail(self, error: LatheError, *, cause: str = "error") -> None:
         """As the arbiter, fail the cell with it."""
@@ -206,8 +230,67 @@ class SpindleNode(StageNode):
         if not self._running and not self._member_names:
             self._begin()
         self.release()
-        name, blocks = self._slowest, self._least
-        if self._running and not self._credit() and now - self._heard > _STALL and self._stalled != name:
-            self._stalled = name
+        self.next_tick = min(self.next_tick, now + _LOOK)
+
+    # ---- those who stall, and those who die ---------------------------------------------------------
+
+    def look_after_others(self) -> None:
+        """Name the members that are dead or silent, and do what is to be done about them."""
+        if not self._running or self.over or self.failure:
+            return
+        now, lost = time.monotonic(), set[str]()
+        for name in self.watch.ended() & self._completed.keys() - self._dead.keys():
+            restarts, self.patience = self.restarts(name), _GONE
+            self._dead[name] = now + (self._pace.restart_time if restarts else 0.0)
+            self.get_logger().error(f"{name} has died at block {self._completed[name]}")
+            self.reporter("dead", self.get_name(), member=name, blocks=self._completed[name], restarts=restarts)
+        for name in self._dead.keys() - self.watch.ended():
+            del self._dead[name]
+            self._heard = now
+            self.reporter("back", self.get_name(), member=name)
+        lost |= {name for name, until in self._dead.items() if now >= until}
+        if lost:
+            self._lose(lost, "died")
+        elif not self._dead and not self._credit() and now - self._heard > _STALL:
+            self._name_the_silent()
+            if self._pace.stall_reaction == "safe" and now - self._heard > self._pace.stall_time:
+                self._lose(set(self._stalled), "fell silent")
+
+    def _go_safe(self, state: CellState) -> None:
+        """It has said so itself."""
+
+    def _name_the_silent(self) -> None:
+        # Who waits for a silent one is as slow as it is: first those that DDS does not hear any more.
+        names = frozenset(self.watch.silent.keys() & self._completed.keys()) or frozenset({self._slowest})
+        if names == self._stalled:
+            return
+        self._stalled = names
+        for name in sorted(names):
+            blocks = self._completed[name]
             self.get_logger().warning(f"{name} has been silent for {_STALL * 1e3:.0f} ms at block {blocks}")
             self.reporter("stall", self.get_name(), member=name, blocks=blocks)
+
+    def _lose(self, names: set[str], what: str) -> None:
+        """Bring the cell to its safe state without some members, from the next sample on: once all others know."""
+        who = f"{', '.join(sorted(names))} {what}"
+        if not self.table.window:
+            raise LatheError(f"{who} at sample {self.samples}; a cell with window = 0 cannot go on without it")
+        self._why = f"{self._why}; {who}" if self._why else f"{who}: safe state from sample {self.samples} on"
+        before = self._least
+        for name in names:
+            del self._completed[name]
+            self._dead.pop(name, None)
+        if not self._without and self._end != self.samples:
+            self._end = self.samples + max(1, round(self._pace.safe_time * self.table.sample_rate))
+            self._blocks_in_run = -(-self._end // self.table.block_size)
+        self._without |= names
+        self.patience = _GONE
+        self._unsafe = set(self._completed)
+        self._say(CellState.SAFE, self.samples, self._why)
+        self.get_logger().error(self._why)
+        self.reporter("safe", self.get_name(), sample=self.samples, end=self._end, lost=sorted(self._without))
+        self._heard = time.monotonic()
+        if self._completed:
+            self._after(before, self._least)
+        else:
+            self.release()

@@ -2,14 +2,15 @@
 """A stage as a ROS node."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from lathe_rc_msgs.srv import Schedule
 
-from lathe_rc.cell import messages
+from lathe_rc.cell import messages, state_file
 from lathe_rc.cell.framing import Framer
 from lathe_rc.cell.messages import Signals
-from lathe_rc.cell.stage import Stage, compile_kernels
+from lathe_rc.cell.stage import Input, Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wire import Encoder, Pool
@@ -38,6 +39,8 @@ class StageNode(CellNode):
         self.blocks = 0
         self.samples = 0
         self._started = False
+        self._restart_file = getattr(self.table, "restart_file", "")
+        self._keep_at = 0
         self._framer = Framer(self.table.run_id, self.full_name, self.table.step_ns)
         self._encoders = [
             (
@@ -52,11 +55,19 @@ class StageNode(CellNode):
         self._sparse_topics = {topic: self.topic(topic) for topic in self.stage.sparse_topics}
         self._queues: dict[str, BlockQueue] = {}
         self._tracks: dict[str, Track] = {}
-        ports = [(self.topic(port.topic), port) for port in self.stage.inputs]
+        ports = self._ports()
         for topic, port in ports:
             delays = longest_delays(p for other, p in ports if other == topic)
             self._queues[topic] = BlockQueue(topic, port.type, self.table, sorted(delays))
             self._tracks[topic] = Track(port.type, delays, self.table.block_size)
+        self._wire()
+
+    def _ports(self) -> list[tuple[str, Input]]:
+        return [(self.topic(port.topic), port) for port in self.stage.inputs]
+
+    def _wire(self) -> None:
+        """Put queues and tracks in the order in which they are read."""
+        ports = self._ports()
         self._inputs = [(self._queues[topic], self._tracks[topic], port.delay) for topic, port in ports]
         self._delayed = [port for port in self._inputs if port[2]]
         self._feedback = [self._queues[topic] for topic in dict.fromkeys(t for t, p in ports if p.delay)]
@@ -72,6 +83,8 @@ class StageNode(CellNode):
         self._outside, self._outside_due = set(self.outlets), 0.0
         # Computed in this process for readers to share, and nothing of their past is wanted: no need to copy.
         self._shared = [q for topic, q in self._queues.items() if q.inside and not self._tracks[topic].delay]
+        # Who may go on in place of another process does not know yet where.
+        self._waits = bool(self._restart_file)
         if self.stage.takes_events:
             self.create_service(Schedule, "~/schedule", self._on_schedule)
 
@@ -101,14 +114,19 @@ class StageNode(CellNode):
 
     def members_changed(self) -> None:
         """Learn whose blocks to accept, before the first of them."""
-        if self.master is None:
+        if self.master is None or self._waits:
             return
-        for name in self.master.members:
-            member = self.members.get(name)
-            for topic in member.publishes if member else ():
-                queue = self._queues.get(topic)
-                if queue and not queue.source:
-                    queue.expect(name)
+        for topic, name in self._sources().items():
+            queue = self._queues.get(topic)
+            if queue and not queue.source:
+                queue.expect(name)
+                queue.repeats = self.restarts(name)
+
+    def _sources(self) -> dict[str, str]:
+        """Who publishes each topic of the members."""
+        names = self.master.members if self.master else ()
+        known = [self.members[name] for name in names if name in self.members]
+        return {topic: member.name for member in known for topic in member.publishes}
 
     def statistics(self) -> dict[str, object]:
         """See `CellNode`."""
@@ -119,6 +137,67 @@ class StageNode(CellNode):
     def lost(self) -> int:
         """Blocks that never came, in a free-running cell."""
         return sum(queue.lost for queue in self._queues.values())
+
+    def matched(self) -> bool:
+        """See `CellNode`; and it knows whether the cell is running."""
+        return self._cell is not None and super().matched()
+
+    def begin(self, *, joins: bool) -> None:
+        """See `CellNode`.
+
+        Raises:
+            LatheError: the cell is running, and there is nothing to go on from.
+        """
+        if not self._restart_file:
+            if joins:
+                raise LatheError(
+                    f"{self.full_name}: the cell is running already, and this node cannot go on in mid-run"
+                )
+            return
+        if joins:
+            self._resume()
+        self._waits = False
+        self.members_changed()
+        self._keep()
+        self.due = True
+
+    def _keep(self) -> None:
+        """Keep the state, as long as those who supply it still hold the blocks that follow."""
+        self._keep_at = self.blocks + self.table.window
+        state = {
+            "run_id": self.table.run_id,
+            "blocks": self.blocks,
+            "samples": self.samples,
+            "companions": self._framer.companions,
+            "stage": self.stage,
+            "tracks": self._tracks,
+            "queues": {topic: queue.state() for topic, queue in self._queues.items()},
+        }
+        state_file.save(Path(self._restart_file), state)
+
+    def _resume(self) -> None:
+        """Go on from what another process has kept."""
+        state = state_file.load(Path(self._restart_file), self.table)
+        if state.get("run_id") != self.table.run_id or state["queues"].keys() != self._queues.keys():
+            raise LatheError(f"{self._restart_file}: the state of another run; expected {self.table.run_id!r}")
+        self.blocks, self.samples, self._started = state["blocks"], state["samples"], True
+        self._reported_blocks, self._framer.companions = self.blocks, state["companions"]
+        self.stage, self._tracks = state["stage"], state["tracks"]
+        sources = self._sources()
+        for topic, queue in self._queues.items():
+            queue.resume(sources[topic], state["queues"][topic])
+        self._wire()
+        self.get_logger().info(f"goes on from block {self.blocks}")
+        self.reporter("resumed", self.get_name(), blocks=self.blocks, sample=self.samples)
+
+    def lose(self, lost: set[str], first: int, end: int) -> None:
+        """See `CellNode`; what is read from them is held."""
+        for queue in self._queues.values():
+            if queue.source in lost and queue.held_from is None:
+                queue.hold(end)
+        if not self._safe:
+            self.stage.lose(first)
+        self.due = True
 
     # ---- events -------------------------------------------------------------------------------------
 
@@ -136,7 +215,7 @@ class StageNode(CellNode):
 
     def work(self) -> None:
         """Compute what the blocks that came allow."""
-        if self.active and not self.failure:
+        if self.active and not self.failure and not self._waits:
             self.attempt(self.advance)
 
     @staticmethod
@@ -232,6 +311,8 @@ class StageNode(CellNode):
         self.progressed(self.blocks, self.samples, last=last)
         if last:
             self.ended()
+        elif self._restart_file and self.blocks >= self._keep_at:
+            self._keep()
 
     def ended(self) -> None:
         """The last block has been computed."""

@@ -12,8 +12,8 @@ DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 CELL_STATE = f"{messages.PACKAGE}/msg/CellState"
 TYPES = frozenset({DIAGNOSTICS, CELL_STATE})
 
-_STATES = ("waiting", "running", "ended", "failed")
-_FAILED = 3
+_STATES = ("waiting", "running", "ended", "failed", "safe")
+_FAILED, _SAFE = 3, 4
 _ERROR = 2  # level of a status
 _MOST_NODES = 128
 _MOST_LINES = 50
@@ -94,6 +94,8 @@ class Host:
         named = _STATES[message.state] if message.state < len(_STATES) else f"state {message.state}"
         text = f"{named} from sample {message.first_index}" + (f": {message.message}" if message.message else "")
         self._line(self.states, text)
+        if message.state == _SAFE:
+            self._line(self.errors, f"safe state from sample {message.first_index} on: {message.message}")
         if message.state == _FAILED:
             self._line(self.errors, f"the cell failed at sample {message.first_index}: {message.message}")
 

@@ -13,12 +13,13 @@ from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Input, Joint, Output, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters
 from lathe_rc.cell.stages.drive import Drive, Limits
+from lathe_rc.cell.stages.retraction import OwnRetraction, RetractionParameters
 from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
 from lathe_rc.plants.linear import Discretisation
 from lathe_rc.signals.noise import Sensor
 
 
-class ElectrodynamicActuatorParameters(LimitedParameters):
+class ElectrodynamicActuatorParameters(LimitedParameters, RetractionParameters):
     """The drive closed by its own loops, e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), its limits and its sensor."""
 
     natural_frequency: Annotated[float, Gt(0)] = parameter(1038.0, "natural frequency ωn", "rad/s")
@@ -59,7 +60,7 @@ class ElectrodynamicActuator(Drive):
             step=parameters.step,
             method=parameters.discretisation,
         )
-        self._limited = LimitedCommand(name, parameters)
+        self._retraction, self._limited = OwnRetraction(parameters), LimitedCommand(name, parameters)
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         self.declare(
             inputs=[Input("coarse/command", messages.COMMAND, ("position",))],
@@ -76,10 +77,14 @@ class ElectrodynamicActuator(Drive):
         table = self.parameters
         return {"coarse/state": Limits(table.stroke, table.max_velocity, table.max_acceleration)}
 
+    def go_safe(self) -> None:
+        """See `Stage`."""
+        self._retraction.begin()
+
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         (command,), (state,) = inputs, outputs
-        given, told = self._limited.block(first, command["position"])
+        given, told = self._limited.block(first, self._retraction.block(command["position"]))
         self.drive.block(given, state["position"], state["velocity"], state["effort"])
         self._sensor.measure(state["position"], state["measured_position"])
         return told

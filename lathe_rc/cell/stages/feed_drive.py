@@ -95,6 +95,7 @@ class FeedDriveStage(Stage):
         )
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         self._motor, self._seen, self._load = (np.empty(messages.MAX_BLOCK) for _ in range(3))
+        self._safe = False
         axis, delay = parameters.axis, parameters.reaction_delay
         self.declare(
             inputs=[
@@ -104,11 +105,17 @@ class FeedDriveStage(Stage):
             outputs=[Output(f"{axis}/state", messages.STATE, Joint("position", "velocity", "effort"))],
         )
 
+    def go_safe(self) -> None:
+        """See `Stage`; the slide stops."""
+        self._safe = True
+
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         (servo, *safety), (state,) = inputs, outputs
         command = servo["command"]
-        if safety:
+        if self._safe:
+            command = np.zeros_like(command)
+        elif safety:
             command = np.where(safety[0]["reaction"] >= Reaction.HOLD, 0.0, command)
         size = command.size
         motor, seen = self._motor[:size], self._seen[:size]

@@ -266,12 +266,21 @@ class _Margins:
     def __init__(self, stage: LearningController) -> None:
         self._stage = stage
         self._speeds: list[float] = (stage.parameters.nominal_speed / 40 * np.arange(20, 61)).tolist()
+        self._models: dict[tuple[str, ...], Identified] = {}
         self._responses: dict[tuple[str, ...], Response] = {}
         self._suprema: dict[tuple[object, ...], float] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What cannot be had again: a response is computed when it is asked for."""
+        return {**self.__dict__, "_responses": {}}
 
     def _response(self, model: Identified) -> Response:
         # Three digits of a model are more than its margin is good for, and a steady one is computed once.
         key = _three_digits(model.natural_frequency, model.damping)
+        if key not in self._models:
+            _make_room(self._models)
+            self._models[key] = model
+        model = self._models[key]
         if key not in self._responses:
             _make_room(self._responses)
             parameters = self._stage.parameters

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from lathe_rc.cell.parameters import ObedientParameters, parameter
+from lathe_rc.cell.parameters import ObedientParameters, RestartParameters, parameter
+from lathe_rc.cell.stages.retraction import BoundedParameters
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.lead import LeadLaw, Preview
@@ -22,7 +23,7 @@ _Q_FILTERS: dict[str, Callable[[float, int], QFilter]] = {
 _CORRECTIONS = {law.name.lower(): law for law in CorrectionLaw}
 
 
-class LearningControllerParameters(SpeedLawParameters, ObedientParameters):
+class LearningControllerParameters(SpeedLawParameters, ObedientParameters, BoundedParameters, RestartParameters):
     """Law, lead, Q and correction of a channel, and the drive model that its stability margin is computed from.
 
     The speed deviations are what ``exact_preview`` knows in advance; no other law uses them.
@@ -83,9 +84,6 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters):
         "frozen", "falling back: the memory frozen, or moreover read with the lead angle of the nominal speed"
     )
     retract_position: float = parameter(0.0, "command when retracted", "m")
-    retract_velocity: Annotated[float, Gt(0)] = parameter(0.1, "largest velocity of a takeover", "m/s")
-    retract_acceleration: Annotated[float, Gt(0)] = parameter(50.0, "its largest acceleration", "m/s^2")
-    retract_jerk: Annotated[float, Gt(0)] = parameter(1e5, "its largest jerk", "m/s^3")
     memory_file: str = parameter("", "file that the events save and load write and read", path=True)
     allow_unstable: bool = parameter(default=False, doc="start although sup|Q - Z| is not below 1")
     identify: bool = parameter(default=True, doc="identify the drive from its command and measured position")

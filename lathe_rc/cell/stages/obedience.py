@@ -9,7 +9,8 @@ import numpy as np
 
 from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
-from lathe_rc.control.bounded import Bounds, Mode, Takeover
+from lathe_rc.control import bounded
+from lathe_rc.control.bounded import Mode, Takeover
 from lathe_rc.control.repetitive import RepetitiveController
 from lathe_rc.safety.state_machine import Reaction
 
@@ -30,8 +31,8 @@ class Obedience:
 
     def __init__(self, controller: RepetitiveController, parameters: LearningControllerParameters) -> None:
         self._controller, self._parameters = controller, parameters
-        bounds = Bounds(parameters.retract_velocity, parameters.retract_acceleration, parameters.retract_jerk)
-        self._takeover = Takeover(bounds, parameters.retract_position, parameters.step)
+        bounded.prepare()
+        self._takeover = Takeover(parameters.bounds(), parameters.retract_position, parameters.step)
         self._reaction = Reaction.NONE
         self._wants_to_learn = controller.learning
         self._forbidden = 0.0  # samples until learning is no longer forbidden

@@ -17,6 +17,7 @@ from lathe_rc.cell.stages.command_limits import LimitedCommand
 from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters
+from lathe_rc.cell.stages.retraction import OwnRetraction
 from lathe_rc.cell.stages.set_point import SetPoint
 from lathe_rc.errors import InputError
 from lathe_rc.plants.linear import Discretisation
@@ -112,6 +113,7 @@ class SeriesDriveStage(Drive):
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
         self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
+        self._retraction = OwnRetraction(coarse)
         self._limited = LimitedCommand(name, coarse, "coarse"), LimitedCommand(name, fine, "fine")
         self._set_point = SetPoint(name, fine, inside=(_COARSE,))
         # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
@@ -134,6 +136,10 @@ class SeriesDriveStage(Drive):
         """See `Drive`."""
         return {"coarse/state": self._limits}
 
+    def go_safe(self) -> None:
+        """See `Stage`; the carriage takes the tool out."""
+        self._retraction.begin()
+
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         command, *others = inputs
@@ -141,7 +147,7 @@ class SeriesDriveStage(Drive):
         set_point, noise = np.empty((2, coarse["position"].size))
         self._set_point.fill(others, set_point)
         self._coarse_noise.measure(np.zeros_like(noise), noise)
-        given, told = self._limited[0].block(first, command["position"])
+        given, told = self._limited[0].block(first, self._retraction.block(command["position"]))
         wanted, told_fine = self._limited[1].block(first, set_point)
         self.drive.block(
             first, given, wanted, noise,

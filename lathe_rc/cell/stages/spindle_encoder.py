@@ -2,7 +2,7 @@
 """Spindle and encoder: where time, angle and the run itself begin and end."""
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -29,6 +29,16 @@ class SpindleEncoderParameters(SpeedLawParameters):
     revolutions: Annotated[float, Ge(0)] = parameter(0.0, "length of the run; 0: until stopped", "rev")
     speed_factor: Annotated[float, Ge(0)] = parameter(
         1.0, "pace of the run against real time; 0: as fast as the members follow", "1"
+    )
+    stall_reaction: Literal["wait", "safe"] = parameter(
+        "wait", "what a member leads to that is silent; one whose process has died leads to the safe state"
+    )
+    stall_time: Annotated[float, Ge(0), Le(3600)] = parameter(
+        0.1, "wall time of silence after which the safe state is declared, if that is the reaction", "s"
+    )
+    safe_time: Annotated[float, Ge(0), Le(3600)] = parameter(0.2, "how long a run goes on in the safe state", "s")
+    restart_time: Annotated[float, Ge(0), Le(3600)] = parameter(
+        30.0, "wall time in which a member that can be restarted has to be back", "s"
     )
     members: list[str] = parameter([], "nodes that must be ready before block 0; empty: start alone")
     processes: list[str] = parameter(

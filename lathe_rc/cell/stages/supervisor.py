@@ -17,6 +17,7 @@ from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
 
 Asked = Literal["warn", "freeze", "fall_back", "hold", "retract", "stop"]
 
+MEMBERS_LOST = "members_lost"  #: stands for a monitor where the host says that members of the cell are lost
 _SENSOR, _COMMAND = ("measured_position", "effort"), ("position",)
 
 
@@ -100,7 +101,7 @@ class Supervisor(Stage):
         self._inputs = [Input("encoder", messages.ENCODER, ("angle", "speed", "index_pulse"))]
         self.monitors: list[Monitor] = []
         self.state, self.reaction = State.NOMINAL, Reaction.NONE
-        self._was_reset = False
+        self._was_reset = self._members_lost = False
         self._out = self._reads(f"{parameters.drives[0]}/state", messages.STATE, _SENSOR) if parameters.drives else None
         self._clearance = Clearance(parameters.clear_position, self._samples(parameters.clear_time))
         self._watch_spindle()
@@ -246,6 +247,18 @@ class Supervisor(Stage):
             for monitor in self.monitors:
                 monitor.reset()
 
+    def go_safe(self) -> None:
+        """See `Stage`: an alarm that nothing resets."""
+        self._members_lost = True
+        self._ask_for(Reaction.STOP)
+
+    def _ask_for(self, reaction: Reaction) -> None:
+        to = state_machine.after(self.state, reaction)
+        assert to is not None, "every reaction is known in every state"
+        if to is State.RETRACTING and self.state is not to:
+            self._clearance.begin()
+        self.state, self.reaction = to, max(self.reaction, reaction)
+
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         (safety,) = outputs
@@ -255,15 +268,14 @@ class Supervisor(Stage):
         if self._was_reset:
             sparse.append(self._status(first, RESET, "", 0.0, 0.0))
             self._was_reset = False
+        if self._members_lost:
+            sparse.append(self._status(first, MEMBERS_LOST, "", 0.0, 0.0))
+            self._members_lost = False
         reached = 0
         for place, monitor, value in sorted(found, key=lambda alarm: alarm[0]):
             self._fill(safety, inputs, first, reached, place, sparse)
             reached = place
-            to = state_machine.after(self.state, monitor.reaction)
-            assert to is not None, "every reaction is known in every state"
-            if to is State.RETRACTING and self.state is not to:
-                self._clearance.begin()
-            self.state, self.reaction = to, max(self.reaction, monitor.reaction)
+            self._ask_for(monitor.reaction)
             sparse.append(self._status(first + place, monitor.name, monitor.subject, value, monitor.limit))
         self._fill(safety, inputs, first, reached, samples, sparse)
         return sparse

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a drive of the tool does by itself when members of the cell are lost: nobody need command it."""
+
+from typing import Annotated
+
+from annotated_types import Gt
+
+from lathe_rc.cell.messages import Samples
+from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.control.bounded import Bounds, Mode, Takeover
+
+
+class BoundedParameters(NodeParameters):
+    """What a command that is taken over keeps within."""
+
+    retract_velocity: Annotated[float, Gt(0)] = parameter(0.1, "largest velocity of a takeover", "m/s")
+    retract_acceleration: Annotated[float, Gt(0)] = parameter(50.0, "its largest acceleration", "m/s^2")
+    retract_jerk: Annotated[float, Gt(0)] = parameter(1e5, "its largest jerk", "m/s^3")
+
+    def bounds(self) -> Bounds:
+        """The same for a motion."""
+        return Bounds(self.retract_velocity, self.retract_acceleration, self.retract_jerk)
+
+
+class RetractionParameters(BoundedParameters):
+    """Of a drive that takes the tool out of the part."""
+
+    safe_position: float = parameter(
+        0.3e-3, "where the drive goes by itself when members of the cell are lost: out of the part", "m"
+    )
+
+
+class OwnRetraction:
+    """The command of a drive, until the drive goes its own way.
+
+    Args:
+        parameters: its table.
+    """
+
+    def __init__(self, parameters: RetractionParameters) -> None:
+        self._takeover = Takeover(parameters.bounds(), parameters.safe_position, parameters.step)
+        self._begun = False
+
+    def begin(self) -> None:
+        """Retract from the next sample on, whatever is commanded."""
+        self._begun = True
+        self._takeover.change(Mode.RETRACT)
+
+    def block(self, command: Samples) -> Samples:
+        """What the drive follows [m], shape (n,)."""
+        followed = command.copy() if self._begun else command
+        self._takeover.apply(followed)
+        return followed

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a node keeps of itself in a file, so that another process can go on in its place, to the bit.
+
+Python's pickle, with two limits: parameter tables are not in it, the node that reads it has its own; and nothing but
+the classes of this package and arrays is made of it, so a file from elsewhere runs no code.
+"""
+
+import io
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lathe_rc.cell.parameters import Table
+from lathe_rc.errors import LatheError
+from lathe_rc.files import contents
+
+_MOST = 2**28  # longest such file [B]
+_TABLE = "table"
+_OF_NUMPY = frozenset({"_reconstruct", "scalar", "ndarray", "dtype", "_frombuffer"})
+_OF_PYTHON = frozenset({("collections", "deque"), ("builtins", "set"), ("builtins", "frozenset")})
+
+
+class _Writer(pickle.Pickler):
+    def persistent_id(self, each: Any) -> str | None:
+        return _TABLE if isinstance(each, Table) else None
+
+
+class _Reader(pickle.Unpickler):
+    def __init__(self, data: bytes, table: Table) -> None:
+        super().__init__(io.BytesIO(data))
+        self._table = table
+
+    def persistent_load(self, name: Any) -> Table:
+        if name != _TABLE:
+            raise pickle.UnpicklingError(f"{name!r:.80}")
+        return self._table
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) in _OF_PYTHON or (module.split(".", maxsplit=1)[0] == "numpy" and name in _OF_NUMPY):
+            return super().find_class(module, name)
+        if module.split(".", maxsplit=1)[0] == "lathe_rc":
+            found = super().find_class(module, name)
+            if isinstance(found, type):
+                return found
+        raise pickle.UnpicklingError(f"{module}.{name}")
+
+
+def save(path: Path, state: Mapping[str, object]) -> None:
+    """Write a state; who reads meanwhile, or after this process was killed, finds the one before or this one.
+
+    Raises:
+        LatheError: it cannot be written.
+    """
+    buffer = io.BytesIO()
+    _Writer(buffer, pickle.HIGHEST_PROTOCOL).dump(dict(state))
+    new = path.with_name(f"{path.name}.new")
+    try:
+        new.write_bytes(buffer.getbuffer())
+        new.replace(path)
+    except OSError as error:
+        raise LatheError(f"{path}: the state cannot be kept ({error.strerror})") from None
+
+
+def load(path: Path, table: Table) -> dict[str, Any]:
+    """Read a state.
+
+    Args:
+        path: of the file.
+        table: parameters of the node.
+
+    Raises:
+        LatheError: it cannot be read, or is none.
+    """
+    try:
+        state = _Reader(contents(path, _MOST), table).load()
+    except OSError as error:
+        raise LatheError(f"{path}: the state cannot be read ({error.strerror})") from None
+    except Exception as error:  # noqa: BLE001 - pickle lets through whatever a damaged file leads to
+        raise LatheError(f"{path}: not a state of this node ({type(error).__name__}: {error!s:.200})") from None
+    if not isinstance(state, dict):
+        raise LatheError(f"{path}: not a state of this node")
+    return state

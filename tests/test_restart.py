@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A controller that is killed goes on in another process, to the bit; a file from elsewhere runs no code."""
+
+import os
+import pickle
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lathe_rc import harness
+from lathe_rc.bag import reader
+from lathe_rc.bag.check import check as check_bag
+from lathe_rc.cell import state_file
+from lathe_rc.cell.messages import sample_fields
+from lathe_rc.cell.scenario import load
+from lathe_rc.cell.track import Track, longest_delays
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import LatheError
+
+CONFIG = Path(__file__).parents[1] / "config"
+BLOCK = 64
+OWN = "learning_controller"
+LAWS = {
+    "plain": ("piston", []),
+    "supervised": ("supervised", ["electrodynamic_actuator.faults=['revolution 8: coarse/command.position off']"]),
+    "exact": ("exact_invariance", []),
+    "inverse": ("piston", [f"{OWN}.correction=second_order_inverse", f"{OWN}.lead_time=0.36e-3"]),
+    "fir": ("piston", [f"{OWN}.q_filter=fir", f"{OWN}.allow_unstable=true"]),
+    "gaussian": ("piston", [f"{OWN}.q_filter=gaussian"]),
+}
+
+
+def samples(recording):
+    return recording.dense["/tool"]["error"].size
+
+
+def commands(cell, table, recording, keep_at, path):
+    """What the controller commands and says, block by block; it is kept and read again before some blocks."""
+    stage, tracks = Cell(cell.nodes).stages[OWN], {}
+    for port in stage.inputs:
+        if port.topic not in tracks:
+            ports = [each for each in stage.inputs if each.topic == port.topic]
+            tracks[port.topic] = Track(port.type, longest_delays(ports), BLOCK)
+    whole, said = [], []
+    for block in range(samples(recording) // BLOCK):
+        if block in keep_at:
+            state_file.save(path, {"stage": stage, "tracks": tracks})
+            state = state_file.load(path, table)
+            stage, tracks = state["stage"], state["tracks"]
+        for topic, track in tracks.items():
+            for name, array in track.extend(BLOCK).items():
+                array[:] = recording.dense[f"/{topic}"][name][block * BLOCK :][:BLOCK]
+        inputs = [tracks[port.topic].view(block * BLOCK - port.delay, BLOCK) for port in stage.inputs]
+        outputs = [{name: np.empty(BLOCK, kind) for name, kind in sample_fields(p.type).items()} for p in stage.outputs]
+        said += [(each.topic, each.index, str(each.values)) for each in stage.advance(block * BLOCK, inputs, outputs)]
+        whole.append(outputs[0]["position"])
+    return np.concatenate(whole), said
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_controller_goes_on_from_its_kept_state_to_the_bit(law, tmp_path):
+    name, sets = LAWS[law]
+    cell = load(CONFIG / f"{name}.yaml", [*sets, "spindle_encoder.revolutions=12.0"])
+    recording = harness.run(cell).recording
+    plain, said = commands(cell, cell.nodes[OWN], recording, (), tmp_path / "state")
+    assert np.array_equal(plain, recording.dense["/coarse/command"]["position"][: plain.size])
+
+    @given(st.sets(st.integers(0, samples(recording) // BLOCK - 1), max_size=8))
+    def check(keep_at):
+        again, told = commands(cell, cell.nodes[OWN], recording, keep_at, tmp_path / "state")
+        assert np.array_equal(again, plain)
+        assert told == said
+
+    check()
+
+
+# ---- nodes ----------------------------------------------------------------------------------------------
+
+
+class Killer:
+    """Sends SIGKILL to a node once the run has come to each of some samples, and keeps what it hears."""
+
+    def __init__(self, node, at):
+        self.node, self.at, self.pids, self.events = node, list(at), {}, []
+
+    def __call__(self, event):
+        self.events.append(event)
+        if event["event"] == "active":
+            self.pids[event["node"]] = event["pid"]
+        if self.at and event["event"] == "progress" and event["samples"] >= self.at[0]:
+            self.at.pop(0)
+            os.kill(self.pids[self.node], signal.SIGKILL)
+
+    def all(self, kind):
+        return [event for event in self.events if event["event"] == kind]
+
+
+def test_a_killed_controller_goes_on_in_another_process_to_the_bit(tmp_path):
+    """Twice in one run, under the supervisor: what it had sent before it comes twice, and is taken once."""
+    kept = [f"{OWN}.restart_file={tmp_path}/state", "spindle_encoder.revolutions=40.0"]
+    cell, killer = load(CONFIG / "supervised.yaml", kept), Killer(OWN, [30_000, 90_000])
+    result = harness.run(cell, mode="processes", bag=tmp_path / "bag", watch=killer)
+    assert result.digest == harness.run(cell).digest
+    assert reader.read(tmp_path / "bag").digests() == result.digest
+    assert check_bag(tmp_path / "bag").exit_code == 0
+    assert [event["member"] for event in killer.all("dead")] == [f"/{OWN}"] * 2
+    assert len(killer.all("resumed")) == 2
+    assert not killer.all("safe")
+
+
+def test_a_controller_whose_state_is_lost_is_not_waited_for(tmp_path):
+    path = tmp_path / "state"
+    cell = load(CONFIG / "piston.yaml", [f"{OWN}.restart_file={path}", "spindle_encoder.revolutions=40.0"])
+
+    class Vandal(Killer):
+        def __call__(self, event):
+            super().__call__(event)
+            if event["event"] == "exit":
+                path.write_bytes(b"nothing")
+
+    with pytest.raises(LatheError, match=f"{path}: not a state of this node"):
+        harness.run(cell, mode="processes", watch=Vandal(OWN, [30_000]))
+
+
+# ---- the file -------------------------------------------------------------------------------------------
+
+
+class Call:
+    """What pickle makes a call of."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"\x80", b"\x80\x04N.", pickle.dumps([1]), pickle.dumps(Path()), pickle.dumps(open)],
+)
+def test_what_is_no_state_is_refused(data, tmp_path):
+    path = tmp_path / "state"
+    path.write_bytes(data)
+    with pytest.raises(LatheError, match=f"^{path}: not a state of this node"):
+        state_file.load(path, load(CONFIG / "piston.yaml").nodes[OWN])
+
+
+def test_a_state_from_elsewhere_runs_no_code(tmp_path):
+    path, made = tmp_path / "state", tmp_path / "made"
+    path.write_bytes(pickle.dumps({"stage": Call(made)}))
+    with pytest.raises(LatheError, match=r"not a state of this node \(UnpicklingError: posix.mkdir\)"):
+        state_file.load(path, load(CONFIG / "piston.yaml").nodes[OWN])
+    assert not made.exists()
+
+
+def test_a_state_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(LatheError, match="cannot be read"):
+        state_file.load(tmp_path / "none", load(CONFIG / "piston.yaml").nodes[OWN])
