@@ -28,11 +28,12 @@ from lathe_rc.analysis import hysteresis_fit, reduced_order, step_fit
 from lathe_rc.bag import check, reader, recover, resim, story
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.writer import BagWriter, offered_qos
-from lathe_rc.cell import messages, scenario
+from lathe_rc.cell import messages, scenario, state_file
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.stages.trajectory import Trajectory, TrajectoryParameters
 from lathe_rc.cell.wire import Encoder
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.commands.fit import fit as fit_command
 from lathe_rc.control import memory_file
 from lathe_rc.control.predistortion import Predistortion
@@ -103,6 +104,23 @@ def _parameters(data: bytes) -> None:
 @functools.cache
 def _scenarios() -> list[bytes]:
     return [path.read_bytes() for path in sorted(CONFIG.glob("*.yaml"))]
+
+
+# ---- the state of a controller --------------------------------------------------------------------------
+
+
+def _state(data: bytes) -> None:
+    with _folder() as folder, refusals():
+        (folder / "state").write_bytes(data)
+        state_file.load(folder / "state", scenario.load(CONFIG / "piston.yaml").nodes["learning_controller"])
+
+
+@functools.cache
+def _states() -> list[bytes]:
+    with _folder() as folder:
+        cell = Cell(scenario.load(CONFIG / "piston.yaml").nodes)
+        state_file.save(folder / "state", {"stage": cell.stages["learning_controller"], "samples": 0})
+        return [(folder / "state").read_bytes()]
 
 
 # ---- tables ---------------------------------------------------------------------------------------------
@@ -459,6 +477,7 @@ TARGETS: Mapping[str, Target] = {
     "tables": Target(_tables, _csv, (mutate.some_lines,)),
     "fits": Target(_fits, lambda: _csv()[2:5], (mutate.some_lines,), slow=True),
     "memory": Target(_memory, _memories, (mutate.some_members, mutate.some_bytes)),
+    "state": Target(_state, _states, (mutate.some_bytes,)),
     "mcap": Target(_mcap, _mcaps, (mutate.some_records, mutate.some_records, mutate.some_bytes)),
     "folder": Target(_folders, _folder_seeds, (_storage, _text_of_folder, mutate.some_bytes)),
     "definitions": Target(_definitions, _definition_seeds, (mutate.some_lines,)),
