@@ -163,9 +163,10 @@ def _run(
     groups: list[list[str]] | None,
     bag: Path | None,
     domain: int | None = None,
+    namespace: str = "/",
 ) -> harness.Result:
     with _Watch(Console(stderr=True)) as watch:
-        return harness.run(scenario, mode=mode, groups=groups, bag=bag, watch=watch, domain=domain)
+        return harness.run(scenario, mode=mode, groups=groups, bag=bag, watch=watch, domain=domain, namespace=namespace)
 
 
 @main.command()
@@ -178,6 +179,7 @@ def _run(
 @click.option("--profile", type=click.Path(path_type=Path), help="CSV file to write the last revolution's profile to")
 @options.overrides
 @click.option("--domain", type=click.IntRange(0, 232), help="ROS domain, for others to listen; default: a free one")
+@click.option("--namespace", help="of the nodes, for two cells in one domain; default: /")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def run(
     scenario: str,
@@ -189,6 +191,7 @@ def run(
     profile: Path | None,
     overrides: tuple[str, ...],
     domain: int | None,
+    namespace: str | None,
     *,
     as_json: bool,
 ) -> None:
@@ -202,9 +205,10 @@ def run(
     split = options.split(loaded, groups)
     if groups and mode != "processes":
         raise InputError(f"--group with --mode {mode}; allowed: --mode processes")
-    if domain is not None and mode == "offline":
-        raise InputError(f"--domain {domain} with --mode offline; allowed: --mode processes or composed")
-    result = _run(loaded, mode=mode, groups=split, bag=bag, domain=domain)
+    for option, value in (("--domain", domain), ("--namespace", namespace)):
+        if value is not None and mode == "offline":
+            raise InputError(f"{option} {value} with --mode offline; allowed: --mode processes or composed")
+    result = _run(loaded, mode=mode, groups=split, bag=bag, domain=domain, namespace=namespace or "/")
     if profile:
         part.write_profile(profile, result.recording, result.part, [result.errors.rms.size - 1])
     if as_json:

@@ -42,6 +42,7 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.namespace import absolute, checked
 from lathe_rc.nodes.report import THROUGHPUT, VARIABLE
 
 Mode = Literal["offline", "composed", "processes"]
@@ -154,6 +155,7 @@ def run(
     bag: Path | None = None,
     watch: Callable[[Event], None] = _ignore,
     domain: int | None = None,
+    namespace: str = "/",
 ) -> Result:
     """Run a scenario to its end.
 
@@ -167,6 +169,7 @@ def run(
         watch: called with every event, from the thread that called `run`. The first is ``checked``, with the
             run's samples and step [s]: from then on nothing is refused.
         domain: ROS domain; None: a free one.
+        namespace: ROS namespace of the cell: two cells with one each can share a domain.
 
     Raises:
         InputError: the scenario cannot work, or the bag's folder exists.
@@ -179,7 +182,7 @@ def run(
         raise InputError(f"{cell.master.name}.revolutions = 0; the run needs an end: allowed above 0")
     if bag is not None:
         refuse_existing(bag)
-    result = _run(scenario, cell, mode, groups, bag, watch, domain)
+    result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace))
     if result.bag is not None:
         write_digests(result.bag, result.digest)
     return result
@@ -193,6 +196,7 @@ def _run(
     bag: Path | None,
     watch: Callable[[Event], None],
     domain: int | None,
+    namespace: str,
 ) -> Result:
     assert cell.master.samples is not None
     watch({"event": "checked", "node": cell.master.name, "samples": cell.master.samples, "step": scenario.shared.step})
@@ -206,7 +210,7 @@ def _run(
             place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-"))) / "bag"
         complete = with_recorder(scenario, place, keep=bag is not None, snapshots=folder)
         split = [list(complete.nodes)] if mode == "composed" else complete.processes(groups)
-        processes = stack.enter_context(Processes(complete, split, domain=domain))
+        processes = stack.enter_context(Processes(complete, split, domain=domain, namespace=namespace))
         try:
             events = processes.wait_for_end(watch)
         except BaseException:
@@ -312,14 +316,18 @@ class Processes:
         scenario: with a recorder, as `with_recorder` makes it.
         groups: names of the nodes in each process.
         domain: ROS domain; None: a free one.
+        namespace: ROS namespace of all nodes.
 
     Attributes:
         pids: process of each node.
         domain: the ROS domain in use.
     """
 
-    def __init__(self, scenario: Scenario, groups: Sequence[Sequence[str]], *, domain: int | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, groups: Sequence[Sequence[str]], *, domain: int | None = None, namespace: str = "/"
+    ) -> None:
         self._scenario, self._groups, self._wanted_domain = scenario, groups, domain
+        self._namespace = namespace
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._stack = contextlib.ExitStack()
         self._children: dict[str, subprocess.Popen[bytes]] = {}
@@ -365,7 +373,8 @@ class Processes:
             child = subprocess.Popen(
                 [
                     *(sys.executable, "-m", "lathe_rc.nodes.container", *members),
-                    *("--ros-args", "--params-file", str(file), "--enclave", f"/{group[0]}"),
+                    *("--ros-args", "--params-file", str(file), "-r", f"__ns:={self._namespace}"),
+                    *("--enclave", absolute(self._namespace, group[0])),
                 ],
                 env=environment,
                 pass_fds=(theirs.fileno(),),

@@ -70,7 +70,7 @@ class RecorderNode(CellNode):
         for topic, (kind, qos) in _HOST_TOPICS.items():
             full = self.topic(topic)
             self._open.add_topic(full, self._type_name(kind), offered_qos(qos.depth, "volatile"))
-            self.create_subscription(kind, full, self.guarded(self._host_writer(full)), qos, raw=True)
+            self.create_subscription(kind, full, self.guarded(partial(self._on_host, kind, full)), qos, raw=True)
 
     @staticmethod
     def _type_name(kind: Any) -> str:
@@ -81,8 +81,20 @@ class RecorderNode(CellNode):
         assert self._writer is not None, "the bag is closed"
         return self._writer
 
-    def _host_writer(self, topic: str) -> Any:
-        return lambda data: self._open.write(topic, self._log_ns, data) if self._writer else None
+    def _on_host(self, kind: Any, topic: str, data: bytes) -> None:
+        if self._writer is None:
+            return
+        try:
+            told = messages.decode(self._type_name(kind), data)
+        except ValueError:
+            return
+        # All cells of a domain share /diagnostics.
+        if kind is CellState:
+            ours = told.run_id == self.table.run_id
+        else:
+            ours = any(status.name in self.members for status in told.status)
+        if ours:
+            self._open.write(topic, self._log_ns, data)
 
     def publications(self) -> list[tuple[str, str, bool]]:
         """It publishes no signals."""
