@@ -109,6 +109,9 @@ class _Watch:
         now = time.monotonic()
         if kind == "stuck":
             self._bar.console.print(f"{event['node']} did not end{event['place']}; the run is complete, it was killed")
+        if kind == "stranger":
+            publishers = ", ".join(event["publishers"])
+            self._bar.console.print(f"{event['node']} refuses: {event['message']}; publishers: {publishers}")
         if self._bar.disable:
             self._log(event, now)
             return
@@ -150,9 +153,11 @@ def _table(result: harness.Result) -> RichTable:
 
 
 def _facts(result: harness.Result) -> list[str]:
+    refused = [f"{count} messages refused from {sender}" for sender, count in result.refused.items()]
     return [
         f"{result.blocks} blocks sent, {result.dropped} lost; {result.errors.rms.size} revolutions",
         f"{result.simulated_s:.2f} s simulated in {result.wall_s:.2f} s: {result.real_time_factor:.1f}x real time",
+        *refused,
     ]
 
 

@@ -19,6 +19,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -66,6 +67,7 @@ class Result:
         bag: where it is recorded; None if it was not to be kept, or in snapshots alone.
         snapshots: bags of parts of the run, see `lathe_rc.bag.snapshot`.
         recording: all signals.
+        refused: messages of strangers that the nodes refused, by sender.
     """
 
     scenario: Scenario
@@ -75,6 +77,7 @@ class Result:
     bag: Path | None
     snapshots: tuple[Path, ...]
     recording: Recording = field(repr=False)
+    refused: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def blocks(self) -> int:
@@ -130,6 +133,7 @@ class Result:
             "revolutions": int(errors.rms.size),
             "blocks": self.blocks,
             "dropped": self.dropped,
+            "refused": dict(self.refused),
             "error_um": {
                 "first": of(0),
                 "last": of(-1),
@@ -226,6 +230,7 @@ def _run(
             bag=kept,
             snapshots=tuple(_bags_in(folder)),
             recording=reader.read(place),
+            refused=processes.refused,
         )
 
 
@@ -321,10 +326,16 @@ class Processes:
     Attributes:
         pids: process of each node.
         domain: the ROS domain in use.
+        refused: messages of strangers that the nodes refused, by sender; known when they have ended.
     """
 
     def __init__(
-        self, scenario: Scenario, groups: Sequence[Sequence[str]], *, domain: int | None = None, namespace: str = "/"
+        self,
+        scenario: Scenario,
+        groups: Sequence[Sequence[str]],
+        *,
+        domain: int | None = None,
+        namespace: str = "/",
     ) -> None:
         self._scenario, self._groups, self._wanted_domain = scenario, groups, domain
         self._namespace = namespace
@@ -336,6 +347,7 @@ class Processes:
         self._ended: set[str] = set()
         self._newest: dict[str, Event] = {}
         self.pids: dict[str, int] = {}
+        self.refused: Counter[str] = Counter()
         self.domain = -1
 
     def __enter__(self) -> "Processes":
@@ -419,6 +431,8 @@ class Processes:
                     f"no node has reported anything for {wait:.0f} s; still running: {running}{self._tails()}"
                 ) from None
             self._newest[event["event"]] = event
+            if event["event"] == "refused":
+                self.refused.update(event["senders"])
             if event["event"] == "exit":
                 self._ended.add(event["node"])
             yield event

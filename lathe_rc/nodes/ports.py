@@ -11,8 +11,9 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from lathe_rc.bag.record import signal_depth
 from lathe_rc.cell.parameters import NodeParameters
-from lathe_rc.cell.wire import Block, Decoder
+from lathe_rc.cell.wire import Block, Decoder, NoBlockError
 from lathe_rc.errors import LatheError
+from lathe_rc.nodes.strangers import Stranger
 
 
 def message_class(msgtype: str) -> Any:
@@ -22,9 +23,12 @@ def message_class(msgtype: str) -> Any:
 
 
 def signal_qos(parameters: NodeParameters, topic: str = "") -> QoSProfile:
-    """Reliable, and deep enough for all blocks in flight, which a late match then still receives."""
+    """Reliable, and deep enough for all blocks in flight, which a late match then still receives.
+
+    A reader of a cell with a window keeps all until it takes them: a stranger's flood would push out what belongs.
+    """
     return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
+        history=HistoryPolicy.KEEP_ALL if topic and parameters.window else HistoryPolicy.KEEP_LAST,
         depth=signal_depth(parameters),
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.VOLATILE
@@ -49,7 +53,8 @@ class BlockQueue:
 
     Attributes:
         blocks: checked blocks that wait to be used.
-        source: the only node whose blocks are accepted; empty until the first block of a node alone.
+        source: the only node whose blocks are accepted; empty: until somebody is expected, nobody if there is a run,
+            and the first to come if there is none.
         inside: its blocks are handed over in this process.
         received: blocks so far, those that were lost included.
         lost: blocks that never came; always 0 unless the cell is free-running.
@@ -61,7 +66,7 @@ class BlockQueue:
         self.source = ""
         self.inside = False
         self.received = self.lost = 0
-        self._decoder = Decoder(msgtype, fields)
+        self._decoder = Decoder(msgtype, fields, self._admit)
         self._decoder.prepare()
         self._run_id, self._step_ns, self._size = parameters.run_id, parameters.step_ns, parameters.block_size
         self._free_running = not parameters.window
@@ -69,19 +74,37 @@ class BlockQueue:
         self._expected: int | None = None
         self._newest: Block | None = None
 
-    def expect(self, source: str) -> None:
-        """Accept blocks of this node alone, from sample 0 on."""
-        self.source, self._expected = source, 0
+    def expect(self, source: str, first: int | None = 0) -> None:
+        """Accept blocks of this node alone, from a sample on; None: whichever comes first."""
+        self.source, self._expected = source, first
+        self.blocks.clear()
+        self.received = self.lost = 0
+        self._newest = None
+
+    @property
+    def open(self) -> bool:
+        """Whether it is open with which sample its blocks begin."""
+        return self._expected is None
+
+    def _admit(self, run_id: str, source: str) -> None:
+        """Refuse who does not belong."""
+        if self._run_id and run_id != self._run_id:
+            raise Stranger(self.topic, source, run_id, f"expected run {self._run_id!r}")
+        if source != self.source and (self.source or self._run_id):
+            raise Stranger(self.topic, source, run_id, f"expected {self.source or 'nobody yet'}")
 
     def add(self, data: bytes) -> Block:
         """Check a block and queue it.
 
         Raises:
-            LatheError: a stranger, another run or step, a gap, a repeat, arrays of different lengths, or far more
+            Stranger: another source or run, or no block at all.
+            LatheError: another step, a gap, a repeat, arrays of different lengths, or far more
                 blocks waiting than the window allows.
         """
         try:
             block = self._decoder.decode(data)
+        except NoBlockError as error:
+            raise Stranger(self.topic, "", "", str(error)) from None
         except ValueError as error:
             raise LatheError(f"{self.topic}: {error}") from None
         return self.accept(block)
@@ -103,12 +126,7 @@ class BlockQueue:
 
     def accept(self, block: Block) -> Block:
         """Check a block and queue it; see `add`."""
-        if self._run_id and block.run_id != self._run_id:
-            raise LatheError(
-                f"{self.topic}: block of run {block.run_id!r} from {block.source}; expected {self._run_id!r}"
-            )
-        if self.source and block.source != self.source:
-            raise LatheError(f"{self.topic}: block from {block.source}; expected {self.source}")
+        self._admit(block.run_id, block.source)
         if block.step_ns != self._step_ns:
             raise LatheError(f"{self.topic}: {block.source} has a step of {block.step_ns} ns; expected {self._step_ns}")
         if block.samples > self._size:

@@ -15,6 +15,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.stage_node import StageNode
+from lathe_rc.nodes.strangers import Stranger
 
 _STALL = 0.1  # [s] of silence after which a member is named
 _REPORT_PERIOD = 0.05  # [s] between reports of progress
@@ -117,7 +118,10 @@ class SpindleNode(StageNode):
     # ---- run ----------------------------------------------------------------------------------------
 
     def _on_progress(self, progress: Progress) -> None:
-        if progress.name not in self._completed or progress.run_id != self.table.run_id:
+        if progress.run_id != self.table.run_id:
+            why = f"expected run {self.table.run_id!r}"
+            raise Stranger(self._host["progress"].topic_name, progress.name, progress.run_id, why)
+        if progress.blocks <= self._completed.get(progress.name, progress.blocks):
             return
         if progress.blocks > self.blocks:
             raise LatheError(f"{progress.name} claims {progress.blocks} blocks; {self.blocks} were sent")

@@ -101,14 +101,23 @@ class StageNode(CellNode):
 
     def members_changed(self) -> None:
         """Learn whose blocks to accept, before the first of them."""
-        if self.master is None:
-            return
-        for name in self.master.members:
+        peers = self.master.members if self.master else list(self.members)
+        for name in peers:
             member = self.members.get(name)
             for topic in member.publishes if member else ():
                 queue = self._queues.get(topic)
-                if queue and not queue.source:
-                    queue.expect(name)
+                if queue and (queue.open or queue.source not in peers):
+                    self._expect(queue, name)
+
+    def _expect(self, queue: BlockQueue, source: str) -> None:
+        """Accept a member's blocks: in a cell from the first on; alone, with a run, from whichever comes first."""
+        if self.master is None:
+            if self.table.run_id and not queue.source:
+                queue.expect(source, None)
+            return
+        if self._started:
+            raise LatheError(f"{queue.topic}: {queue.source} was heard before the cell of {source}; start anew")
+        queue.expect(source)
 
     def statistics(self) -> dict[str, object]:
         """See `CellNode`."""
