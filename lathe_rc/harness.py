@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Literal
 
 from lathe_rc import part
@@ -322,6 +322,7 @@ class Processes:
         groups: names of the nodes in each process.
         domain: ROS domain; None: a free one.
         namespace: ROS namespace of all nodes.
+        prefix: words that run a command somewhere else, as those of ``ip netns exec``, by the first node of a process.
 
     Attributes:
         pids: process of each node.
@@ -336,9 +337,10 @@ class Processes:
         *,
         domain: int | None = None,
         namespace: str = "/",
+        prefix: Mapping[str, Sequence[str]] = MappingProxyType({}),
     ) -> None:
         self._scenario, self._groups, self._wanted_domain = scenario, groups, domain
-        self._namespace = namespace
+        self._namespace, self._prefix = namespace, prefix
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._stack = contextlib.ExitStack()
         self._children: dict[str, subprocess.Popen[bytes]] = {}
@@ -384,6 +386,7 @@ class Processes:
         with (self._folder / f"{group[0]}.log").open("wb") as log:
             child = subprocess.Popen(
                 [
+                    *self._prefix.get(group[0], ()),
                     *(sys.executable, "-m", "lathe_rc.nodes.container", *members),
                     *("--ros-args", "--params-file", str(file), "-r", f"__ns:={self._namespace}"),
                     *("--enclave", absolute(self._namespace, group[0])),
