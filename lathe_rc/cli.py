@@ -107,8 +107,8 @@ class _Watch:
         """Take an event of the run."""
         kind, update = event["event"], self._bar.update
         now = time.monotonic()
-        if kind == "stuck":
-            self._bar.console.print(f"{event['node']} did not end{event['place']}; the run is complete, it was killed")
+        if text := _trouble(event):
+            self._bar.console.print(text)
         if self._bar.disable:
             self._log(event, now)
             return
@@ -136,12 +136,22 @@ class _Watch:
             )
         elif kind == "stall":
             self._bar.console.print(f"{event['member']} is silent at block {event['blocks']}: the cell stands still")
-        elif kind == "dead":
-            next_ = "another process goes on in its place" if event["restarts"] else "the cell goes to its safe state"
-            self._bar.console.print(f"{event['member']} has died at block {event['blocks']}: {next_}")
-        elif kind == "safe":
-            lost = ", ".join(event["lost"])
-            self._bar.console.print(f"safe state from sample {event['sample']} to {event['end']}, without {lost}")
+
+
+def _trouble(event: harness.Event) -> str:
+    """What is said of an event in any case; empty if nothing."""
+    kind = event["event"]
+    if kind == "stuck":
+        return f"{event['node']} did not end{event['place']}; the run is complete, it was killed"
+    if kind == "stranger":
+        return f"{event['node']} refuses: {event['message']}; publishers: {', '.join(event['publishers'])}"
+    if kind == "dead":
+        follows = "another process goes on in its place" if event["restarts"] else "the cell goes to its safe state"
+        return f"{event['member']} has died at block {event['blocks']}: {follows}"
+    if kind == "safe":
+        lost = ", ".join(event["lost"])
+        return f"safe state from sample {event['sample']} on, without {lost}; the run ends at sample {event['end']}"
+    return ""
 
 
 def _table(result: harness.Result) -> RichTable:
@@ -156,9 +166,11 @@ def _table(result: harness.Result) -> RichTable:
 
 
 def _facts(result: harness.Result) -> list[str]:
+    refused = [f"{count} messages refused from {sender}" for sender, count in result.refused.items()]
     return [
         f"{result.blocks} blocks sent, {result.dropped} lost; {result.errors.rms.size} revolutions",
         f"{result.simulated_s:.2f} s simulated in {result.wall_s:.2f} s: {result.real_time_factor:.1f}x real time",
+        *refused,
     ]
 
 
@@ -169,9 +181,10 @@ def _run(
     groups: list[list[str]] | None,
     bag: Path | None,
     domain: int | None = None,
+    namespace: str = "/",
 ) -> harness.Result:
     with _Watch(Console(stderr=True)) as watch:
-        return harness.run(scenario, mode=mode, groups=groups, bag=bag, watch=watch, domain=domain)
+        return harness.run(scenario, mode=mode, groups=groups, bag=bag, watch=watch, domain=domain, namespace=namespace)
 
 
 @main.command()
@@ -184,6 +197,7 @@ def _run(
 @click.option("--profile", type=click.Path(path_type=Path), help="CSV file to write the last revolution's profile to")
 @options.overrides
 @click.option("--domain", type=click.IntRange(0, 232), help="ROS domain, for others to listen; default: a free one")
+@click.option("--namespace", help="of the nodes, for two cells in one domain; default: /")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def run(
     scenario: str,
@@ -195,6 +209,7 @@ def run(
     profile: Path | None,
     overrides: tuple[str, ...],
     domain: int | None,
+    namespace: str | None,
     *,
     as_json: bool,
 ) -> None:
@@ -208,9 +223,10 @@ def run(
     split = options.split(loaded, groups)
     if groups and mode != "processes":
         raise InputError(f"--group with --mode {mode}; allowed: --mode processes")
-    if domain is not None and mode == "offline":
-        raise InputError(f"--domain {domain} with --mode offline; allowed: --mode processes or composed")
-    result = _run(loaded, mode=mode, groups=split, bag=bag, domain=domain)
+    for option, value in (("--domain", domain), ("--namespace", namespace)):
+        if value is not None and mode == "offline":
+            raise InputError(f"{option} {value} with --mode offline; allowed: --mode processes or composed")
+    result = _run(loaded, mode=mode, groups=split, bag=bag, domain=domain, namespace=namespace or "/")
     if profile:
         part.write_profile(profile, result.recording, result.part, [result.errors.rms.size - 1])
     if as_json:

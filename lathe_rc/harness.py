@@ -19,11 +19,12 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Literal
 
 from lathe_rc import part
@@ -42,6 +43,7 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.namespace import absolute, checked
 from lathe_rc.nodes.report import THROUGHPUT, VARIABLE
 
 Mode = Literal["offline", "composed", "processes"]
@@ -67,6 +69,7 @@ class Result:
         bag: where it is recorded; None if it was not to be kept, or in snapshots alone.
         snapshots: bags of parts of the run, see `lathe_rc.bag.snapshot`.
         recording: all signals.
+        refused: messages of strangers that the nodes refused, by sender.
     """
 
     scenario: Scenario
@@ -76,6 +79,7 @@ class Result:
     bag: Path | None
     snapshots: tuple[Path, ...]
     recording: Recording = field(repr=False)
+    refused: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def blocks(self) -> int:
@@ -131,6 +135,7 @@ class Result:
             "revolutions": int(errors.rms.size),
             "blocks": self.blocks,
             "dropped": self.dropped,
+            "refused": dict(self.refused),
             "error_um": {
                 "first": of(0),
                 "last": of(-1),
@@ -156,6 +161,7 @@ def run(
     bag: Path | None = None,
     watch: Callable[[Event], None] = _ignore,
     domain: int | None = None,
+    namespace: str = "/",
 ) -> Result:
     """Run a scenario to its end.
 
@@ -169,6 +175,7 @@ def run(
         watch: called with every event, from the thread that called `run`. The first is ``checked``, with the
             run's samples and step [s]: from then on nothing is refused.
         domain: ROS domain; None: a free one.
+        namespace: ROS namespace of the cell: two cells with one each can share a domain.
 
     Raises:
         InputError: the scenario cannot work, or the bag's folder exists.
@@ -181,7 +188,7 @@ def run(
         raise InputError(f"{cell.master.name}.revolutions = 0; the run needs an end: allowed above 0")
     if bag is not None:
         refuse_existing(bag)
-    result = _run(scenario, cell, mode, groups, bag, watch, domain)
+    result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace))
     if result.bag is not None:
         write_digests(result.bag, result.digest)
     return result
@@ -195,6 +202,7 @@ def _run(
     bag: Path | None,
     watch: Callable[[Event], None],
     domain: int | None,
+    namespace: str,
 ) -> Result:
     assert cell.master.samples is not None
     watch({"event": "checked", "node": cell.master.name, "samples": cell.master.samples, "step": scenario.shared.step})
@@ -208,7 +216,7 @@ def _run(
             place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-"))) / "bag"
         complete = with_recorder(scenario, place, keep=bag is not None, snapshots=folder)
         split = [list(complete.nodes)] if mode == "composed" else complete.processes(groups)
-        processes = stack.enter_context(Processes(complete, split, domain=domain))
+        processes = stack.enter_context(Processes(complete, split, domain=domain, namespace=namespace))
         try:
             events = processes.wait_for_end(watch)
         except BaseException:
@@ -224,6 +232,7 @@ def _run(
             bag=kept,
             snapshots=tuple(_bags_in(folder)),
             recording=reader.read(place),
+            refused=processes.refused,
         )
 
 
@@ -314,14 +323,26 @@ class Processes:
         scenario: with a recorder, as `with_recorder` makes it.
         groups: names of the nodes in each process.
         domain: ROS domain; None: a free one.
+        namespace: ROS namespace of all nodes.
+        prefix: words that run a command somewhere else, as those of ``ip netns exec``, by the first node of a process.
 
     Attributes:
         pids: process of each node.
         domain: the ROS domain in use.
+        refused: messages of strangers that the nodes refused, by sender; known when they have ended.
     """
 
-    def __init__(self, scenario: Scenario, groups: Sequence[Sequence[str]], *, domain: int | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        groups: Sequence[Sequence[str]],
+        *,
+        domain: int | None = None,
+        namespace: str = "/",
+        prefix: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    ) -> None:
         self._scenario, self._groups, self._wanted_domain = scenario, groups, domain
+        self._namespace, self._prefix = namespace, prefix
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._stack = contextlib.ExitStack()
         self._children: dict[str, subprocess.Popen[bytes]] = {}
@@ -332,6 +353,7 @@ class Processes:
         self._killed = ""  # the process that was, while the cell goes to its safe state without it
         self._restarts: dict[str, int] = {}
         self.pids: dict[str, int] = {}
+        self.refused: Counter[str] = Counter()
         self.domain = -1
 
     def __enter__(self) -> "Processes":
@@ -368,8 +390,10 @@ class Processes:
         with (self._folder / f"{group[0]}.log").open("ab") as log:
             child = subprocess.Popen(
                 [
+                    *self._prefix.get(group[0], ()),
                     *(sys.executable, "-m", "lathe_rc.nodes.container", *members),
-                    *("--ros-args", "--params-file", str(self._file), "--enclave", f"/{group[0]}"),
+                    *("--ros-args", "--params-file", str(self._file), "-r", f"__ns:={self._namespace}"),
+                    *("--enclave", absolute(self._namespace, group[0])),
                 ],
                 env=environment,
                 pass_fds=(theirs.fileno(),),
@@ -415,6 +439,8 @@ class Processes:
                     f"{running}{self._tails()}"
                 ) from None
             self._newest[event["event"]] = event
+            if event["event"] == "refused":
+                self.refused.update(event["senders"])
             if event["event"] == "exit" and not self._restarted(event):
                 self._ended.add(event["node"])
             yield event

@@ -5,7 +5,6 @@ DDS security knows processes, not nodes: an enclave is what one process may do, 
 Nothing is denied by name, since what no profile of an enclave allows is denied.
 """
 
-import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,13 +19,12 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.topic_recorder import KIND as TOPIC_RECORDER
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError
+from lathe_rc.namespace import absolute, checked
 from lathe_rc.reference import HOST_TOPICS
 from lathe_rc.view.rerun_signals import drawn
 
 OPERATOR = "operator"  #: people with the tools of ROS: they read everything and call every service
 
-_NAMESPACE = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+")
 _LOG, _PARAMETER_EVENTS, _CLOCK = "/rosout", "/parameter_events", "/clock"
 _PARAMETERS = (
     "describe_parameters",
@@ -69,11 +67,6 @@ class Profile:
 
 
 Policy = dict[str, list[Profile]]  #: profiles of each enclave, by its path
-
-
-def absolute(namespace: str, name: str) -> str:
-    """A name after its namespace has been put before it."""
-    return name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"
 
 
 class _Maker:
@@ -189,8 +182,7 @@ def policy(
     Raises:
         InputError: the scenario cannot be wired, a node in ``groups`` that there is not, or no ROS namespace.
     """
-    if not _NAMESPACE.fullmatch(namespace):
-        raise InputError(f"namespace {namespace!r}; allowed: / or /NAME or /NAME/NAME, of letters, digits and _")
+    checked(namespace)
     # The bag's folder is no matter of policy.
     complete = harness.with_recorder(scenario, Path(RECORDER), keep=True)
     maker = _Maker(complete, namespace)

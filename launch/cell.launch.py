@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start every node of a scenario, the recorder included: ``ros2 launch lathe_rc cell.launch.py``.
 
-``scenario`` names the ROS 2 parameter file, ``bag`` the folder to record to. The run ends when its last block has
-been recorded; without a number of revolutions it goes on until Ctrl-C. A node that fails ends the others.
+``scenario`` names the ROS 2 parameter file, ``bag`` the folder to record to, ``namespace`` that of the nodes. The run
+ends when its last block has been recorded; without a number of revolutions it goes on until Ctrl-C. A node that fails
+ends the others.
 """
 
 import atexit
@@ -21,6 +22,7 @@ from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.namespace import absolute, checked
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -37,6 +39,9 @@ def generate_launch_description() -> LaunchDescription:
                 default_value="",
                 description="folder to record to, which must not exist; empty: the scenario's, or bag_ and the run id",
             ),
+            DeclareLaunchArgument(
+                "namespace", default_value="/", description="of the nodes; two cells in one domain need one each"
+            ),
             OpaqueFunction(function=nodes),
         ]
     )
@@ -51,6 +56,7 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     path = resources.find(Path(LaunchConfiguration("scenario").perform(context)))
     scenario = scenarios.load(path)
     Cell(scenario.nodes).check()
+    namespace = checked(LaunchConfiguration("namespace").perform(context))
     bag = place(scenario, LaunchConfiguration("bag").perform(context))
     refuse_existing(bag)
     complete = harness.with_recorder(scenario, bag, keep=True)
@@ -61,9 +67,10 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         Node(
             package="lathe_rc",
             executable="container",
+            namespace=namespace,
             arguments=[f"{name}:{complete.kind(name)}" for name in group],
             parameters=[file.name],
-            ros_arguments=["--enclave", f"/{group[0]}"],
+            ros_arguments=["--enclave", absolute(namespace, group[0])],
             output="screen",
             on_exit=end_with,
         )

@@ -239,6 +239,12 @@ class TestLaunch:
         assert len(together.arguments) == 13
         assert together.arguments[3:5] == ["fine_controller:learning_controller", "piezo_actuator:piezo_actuator"]
 
+    def test_puts_the_cell_into_a_namespace(self, start: Callable[..., Any]) -> None:
+        nodes = start(namespace="/left")
+        assert {(node.namespace, *node.ros_arguments) for node in nodes} == {
+            ("/left", "--enclave", f"/left/{name}") for name in FIVE
+        }
+
     def test_refuses_a_bag_that_exists(self, start: Callable[..., Any], tmp_path: Path) -> None:
         with pytest.raises(InputError, match="exists"):
             start(bag=str(tmp_path))

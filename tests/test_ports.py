@@ -11,6 +11,7 @@ from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.ports import BlockQueue
+from lathe_rc.nodes.strangers import Stranger, Strangers
 
 SIZE = 4
 
@@ -39,15 +40,67 @@ def test_blocks_in_order_are_taken():
     ("data", "words"),
     [
         (block(4), "/spindle begins at sample 4; expected 0|goes from sample 0 to 4: 4 samples are missing"),
-        (block(0, run_id="other"), "block of run 'other' from /spindle; expected 'run'"),
-        (block(0, source="/stranger"), "block from /stranger; expected /spindle"),
         (block(0, size=5), "/spindle sends 5 samples in a block; expected 4 at most"),
         (block(0, step_ns=20_000), "/spindle has a step of 20000 ns; expected 15625"),
     ],
 )
-def test_a_block_that_does_not_belong_is_refused(data, words):
-    with pytest.raises(LatheError, match=words):
+def test_a_block_that_its_source_should_not_send_is_an_error(data, words):
+    with pytest.raises(LatheError, match=words) as error:
         queue().add(data)
+    assert not isinstance(error.value, Stranger)
+
+
+def uneven(source) -> bytes:
+    """A block whose arrays have different lengths."""
+    made = messages.decode(messages.ENCODER, block(0, source=source))
+    made.index_pulse = made.index_pulse[:1]
+    return messages.encode(messages.ENCODER, made)
+
+
+def test_arrays_of_different_lengths_are_an_error_of_their_source():
+    with pytest.raises(LatheError, match=r"/spindle sends arrays of \[1, 4\] samples in one block") as error:
+        queue().add(uneven("/spindle"))
+    assert not isinstance(error.value, Stranger)
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (block(0, run_id="other"), "^/encoder: message of run 'other' from /spindle; expected run 'run'$"),
+        (block(0, source="/ghost"), "^/encoder: message of run 'run' from /ghost; expected /spindle$"),
+        (block(4, source="/ghost", size=5, step_ns=1, angle=np.nan), "from /ghost; expected /spindle"),
+        (uneven("/ghost"), "from /ghost; expected /spindle"),
+        (b"", r"from \?; .* cannot be decoded"),
+        (bytes(3), r"from \?; .* cannot be decoded"),
+        (b"\0\1\0\0" + b"\xff" * 400, r"from \?; .* cannot be decoded"),
+        (block(0)[:-40], r"from \?; .* cannot be decoded"),
+    ],
+)
+def test_a_stranger_is_refused_and_changes_nothing(data, words):
+    taken = queue()
+    for first in (0, 4, 8):
+        with pytest.raises(Stranger, match=words):
+            taken.add(data)
+        taken.add(block(first))
+    assert [b.first_index for b in taken.blocks] == [0, 4, 8]
+
+
+def test_who_was_heard_before_the_cell_is_forgotten():
+    taken = BlockQueue("/encoder", messages.ENCODER, ToolParameters(block_size=SIZE), ["angle"])
+    taken.add(block(400, source="/ghost"))
+    taken.expect("/spindle")
+    taken.add(block(0))
+    assert [b.source for b in taken.blocks] == ["/spindle"]
+
+
+def test_too_many_strangers_are_counted_together_and_told_once():
+    told = []
+    strangers = Strangers(told.append)
+    for number in [*range(1000), *range(1000)]:
+        strangers.refuse(Stranger("/encoder", f"/ghost_{number}" + "x" * 10_000, "run", ""))
+    assert len(told) == len(strangers.senders) - 1 == 16
+    assert sum(strangers.senders.values()) == 2000
+    assert len(str(strangers)) < 16 * 400
 
 
 @pytest.mark.parametrize(("second", "words"), [(0, "a block came twice"), (8, "4 samples are missing")])

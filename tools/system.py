@@ -28,7 +28,8 @@ def provide() -> str:
         What stands against the tests, in one line; empty: nothing.
     """
     if os.geteuid() != 0:
-        return "./lathe test --system mounts a small file system, for which it must be root: sudo ./lathe test --system"
+        needs = "mounts a small file system and makes network namespaces"
+        return f"./lathe test --system {needs}, for which it must be root: sudo ./lathe test --system"
     if shutil.which("dpkg-query") is None or shutil.which("apt-get") is None:
         return f"./lathe test --system needs {', '.join(packages())}, which it can install on Debian and Ubuntu only"
     if not (wanted := missing()):

@@ -8,7 +8,7 @@ does not match the layout is decoded by rosbags and learned anew: CDR itself is 
 """
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -254,16 +254,23 @@ class Encoder:
         return log_ns, scratch.message(log_ns, first, self._step_ns, last=last, companions=companions)
 
 
+class NoBlockError(ValueError):
+    """Bytes that are no block: nobody can say from whom."""
+
+
 class Decoder:
     """Reads the blocks of one topic.
 
     Args:
         msgtype: message type.
         fields: those whose samples are wanted; default: all.
+        admit: called with run and source of a block unlike the one before, ahead of all else; may raise.
     """
 
-    def __init__(self, msgtype: str, fields: list[str] | None = None) -> None:
-        self._type = msgtype
+    def __init__(
+        self, msgtype: str, fields: list[str] | None = None, admit: Callable[[str, str], None] | None = None
+    ) -> None:
+        self._type, self._admit = msgtype, admit
         self._fields = list(messages.sample_fields(msgtype)) if fields is None else fields
         self._layout: Layout | None = None
 
@@ -275,6 +282,7 @@ class Decoder:
         """A block from its bytes.
 
         Raises:
+            NoBlockError: it is none.
             ValueError: the arrays of the block have different lengths, or it has none.
         """
         layout = self._layout
@@ -337,7 +345,12 @@ class Decoder:
         )
 
     def _learn(self, data: bytes) -> Layout:
-        message = messages.decode(self._type, data)
+        try:
+            message = messages.decode(self._type, data)
+        except ValueError as error:
+            raise NoBlockError(str(error)) from None
+        if self._admit is not None:
+            self._admit(message.block.run_id, message.block.source)
         lengths = sorted({getattr(message, name).size for name in messages.sample_fields(self._type)})
         info = message.block
         if len(lengths) != 1 or lengths[0] == 0:

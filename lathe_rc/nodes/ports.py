@@ -13,8 +13,9 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from lathe_rc.bag.record import signal_depth
 from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import NodeParameters
-from lathe_rc.cell.wire import Block, Decoder
+from lathe_rc.cell.wire import Block, Decoder, NoBlockError
 from lathe_rc.errors import LatheError
+from lathe_rc.nodes.strangers import Stranger
 
 
 def message_class(msgtype: str) -> Any:
@@ -24,9 +25,12 @@ def message_class(msgtype: str) -> Any:
 
 
 def signal_qos(parameters: NodeParameters, topic: str = "") -> QoSProfile:
-    """Reliable, and deep enough for all blocks in flight, which a late match then still receives."""
+    """Reliable, and deep enough for all blocks in flight, which a late match then still receives.
+
+    A reader of a cell with a window keeps all until it takes them: a stranger's flood would push out what belongs.
+    """
     return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
+        history=HistoryPolicy.KEEP_ALL if topic and parameters.window else HistoryPolicy.KEEP_LAST,
         depth=signal_depth(parameters),
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.VOLATILE
@@ -51,7 +55,8 @@ class BlockQueue:
 
     Attributes:
         blocks: checked blocks that wait to be used.
-        source: the only node whose blocks are accepted; empty until the first block of a node alone.
+        source: the only node whose blocks are accepted; empty: until somebody is expected, nobody if there is a run,
+            and the first to come if there is none.
         inside: its blocks are handed over in this process.
         received: blocks so far, those that were lost included.
         lost: blocks that never came; always 0 unless the cell is free-running.
@@ -66,7 +71,7 @@ class BlockQueue:
         self.inside = False
         self.received = self.lost = 0
         self.held_from: int | None = None
-        self._decoder = Decoder(msgtype, fields)
+        self._decoder = Decoder(msgtype, fields, self._admit)
         self._decoder.prepare()
         self._run_id, self._step_ns, self._size = parameters.run_id, parameters.step_ns, parameters.block_size
         self._free_running = not parameters.window
@@ -75,21 +80,39 @@ class BlockQueue:
         self._expected: int | None = None
         self._newest: Block | None = None
 
-    def expect(self, source: str) -> None:
-        """Accept blocks of this node alone, from sample 0 on."""
-        self.source, self._expected = source, 0
+    def expect(self, source: str, first: int | None = 0) -> None:
+        """Accept blocks of this node alone, from a sample on; None: whichever comes first."""
+        self.source, self._expected = source, first
+        self.blocks.clear()
+        self.received = self.lost = 0
+        self._newest = None
+
+    @property
+    def open(self) -> bool:
+        """Whether it is open with which sample its blocks begin."""
+        return self._expected is None
+
+    def _admit(self, run_id: str, source: str) -> None:
+        """Refuse who does not belong."""
+        if self._run_id and run_id != self._run_id:
+            raise Stranger(self.topic, source, run_id, f"expected run {self._run_id!r}")
+        if source != self.source and (self.source or self._run_id):
+            raise Stranger(self.topic, source, run_id, f"expected {self.source or 'nobody yet'}")
 
     def add(self, data: bytes) -> Block | None:
         """Check a block and queue it; None if another already stands for it, see `hold`, or if it is a repeat.
 
         Raises:
-            LatheError: a stranger, another run or step, a gap, a repeat, arrays of different lengths, or far more
+            Stranger: another source or run, or no block at all.
+            LatheError: another step, a gap, a repeat, arrays of different lengths, or far more
                 blocks waiting than the window allows.
         """
         if self.held_from is not None:
             return None
         try:
             block = self._decoder.decode(data)
+        except NoBlockError as error:
+            raise Stranger(self.topic, "", "", str(error)) from None
         except ValueError as error:
             raise LatheError(f"{self.topic}: {error}") from None
         return self.accept(block)
@@ -111,12 +134,7 @@ class BlockQueue:
 
     def accept(self, block: Block) -> Block | None:
         """Check a block and queue it; see `add`."""
-        if self._run_id and block.run_id != self._run_id:
-            raise LatheError(
-                f"{self.topic}: block of run {block.run_id!r} from {block.source}; expected {self._run_id!r}"
-            )
-        if self.source and block.source != self.source:
-            raise LatheError(f"{self.topic}: block from {block.source}; expected {self.source}")
+        self._admit(block.run_id, block.source)
         if block.step_ns != self._step_ns:
             raise LatheError(f"{self.topic}: {block.source} has a step of {block.step_ns} ns; expected {self._step_ns}")
         if block.samples > self._size:
@@ -136,17 +154,11 @@ class BlockQueue:
         return self._expected or 0, self.received, list(self.blocks)
 
     def resume(self, source: str, state: tuple[int, int, list[Block]]) -> None:
-        """Go on from the state of another process.
-
-        Raises:
-            LatheError: blocks between it and those that have come are missing.
-        """
-        come, self.blocks = self.blocks, deque(state[2])
-        self._expected, self.received, _ = state
-        self._newest = self.blocks[-1] if self.blocks else None
+        """Go on from the state of another process; what comes from before it is a repeat."""
+        self._expected, self.received, waiting = state
+        self.blocks = deque(waiting)
+        self._newest = waiting[-1] if waiting else None
         self.source, self.repeats = source, True
-        for block in come:
-            self.accept(block)
 
     def hold(self, end: int, newest: Block | None = None) -> None:
         """Let the newest sample stand for those of a source that is lost, up to sample ``end``, where the run ends.

@@ -29,6 +29,7 @@ from lathe_rc.nodes.spindle_node import SpindleNode
 from lathe_rc.nodes.stage_node import StageNode
 
 _PR_SET_TIMERSLACK = 29  # from <linux/prctl.h>
+_LONGEST_BURST = 0.02  # [s] of taking messages until nodes compute
 _LONGEST_WAIT = 0.1  # [s] until signals and the harness are looked at again
 
 
@@ -109,9 +110,12 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
         executor.spin_once(timeout_sec=min(max(wait, 0.0), _LONGEST_WAIT))
         # Take what else has arrived before computing: a burst in makes a burst out, and neighbours wake up once
         # for all of it. Waking them is the dearest part of a hop.
-        handled = -1
+        # A flood must not keep anybody from signals and from its neighbours.
+        handled, end = -1, time.monotonic() + _LONGEST_BURST
         while handled < (handled := sum(node.handled for node in nodes)) and not stop.signal:
             executor.spin_once(timeout_sec=0.0)
+            if time.monotonic() >= end:
+                break
         _work(nodes, stop, due)
 
 
@@ -164,6 +168,8 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
     finally:
         for node in nodes:
             node.finish()
+            if node.strangers.senders:
+                reporter("refused", node.get_name(), senders=node.strangers.senders)
         # The nodes are not destroyed: Fast DDS may wait for itself for ever while others are leaving, too.
         rclpy.try_shutdown()
 

@@ -24,6 +24,7 @@ from lathe_rc.cell.wire import Block, Decoder, Encoder
 from lathe_rc.errors import LatheError, LossyRunError
 from lathe_rc.nodes.ports import BlockQueue, latched_qos
 from lathe_rc.nodes.shell import CellNode
+from lathe_rc.nodes.strangers import Stranger
 
 _HOST_TOPICS = {
     "/diagnostics": (DiagnosticArray, QoSProfile(depth=100)),
@@ -72,7 +73,7 @@ class RecorderNode(CellNode):
         for topic, (kind, qos) in _HOST_TOPICS.items():
             full = self.topic(topic)
             self._open.add_topic(full, self._type_name(kind), offered_qos(qos.depth, "volatile"))
-            self.create_subscription(kind, full, self.guarded(self._host_writer(full)), qos, raw=True)
+            self.create_subscription(kind, full, self.guarded(partial(self._on_host, kind, full)), qos, raw=True)
 
     @staticmethod
     def _type_name(kind: Any) -> str:
@@ -83,8 +84,20 @@ class RecorderNode(CellNode):
         assert self._writer is not None, "the bag is closed"
         return self._writer
 
-    def _host_writer(self, topic: str) -> Any:
-        return lambda data: self._open.write(topic, self._log_ns, data) if self._writer else None
+    def _on_host(self, kind: Any, topic: str, data: bytes) -> None:
+        if self._writer is None:
+            return
+        try:
+            told = messages.decode(self._type_name(kind), data)
+        except ValueError:
+            return
+        # All cells of a domain share /diagnostics.
+        if kind is CellState:
+            ours = told.run_id == self.table.run_id
+        else:
+            ours = any(status.name in self.members for status in told.status)
+        if ours:
+            self._open.write(topic, self._log_ns, data)
 
     def publications(self) -> list[tuple[str, str, bool]]:
         """It publishes no signals."""
@@ -116,11 +129,14 @@ class RecorderNode(CellNode):
         alone = any(member.stage == SpindleEncoder.kind and not member.members for member in self.members.values())
         if not alone and (self._queues or not self.complete):
             return
+        before = len(self._queues) + len(self._sparse)
         for name in list(self.members) if self.master is None else list(self.master.members):
             member = self.members[name]
             for topic, msgtype, sparse in zip(member.publishes, member.types, member.sparse, strict=True):
                 if topic not in self._queues and topic not in self._sparse:
                     self._subscribe(topic, msgtype, name, sparse=sparse, in_cell=not alone)
+        if len(self._queues) + len(self._sparse) == before:
+            return
         self._explain()
         dense = {topic: (queue.type, queue.source) for topic, queue in self._queues.items()}
         if self._snapshots is not None and dense:
@@ -154,12 +170,11 @@ class RecorderNode(CellNode):
         self._open.add_topic(topic, msgtype, offered_qos(self._depth, "transient_local"))
         if sparse:
             self._sparse[topic] = source
-            self.listen(topic, msgtype, *[partial(self._on_sparse, topic)] * 2)
+            self.listen(topic, msgtype, partial(self._on_message_at, topic, msgtype), partial(self._on_sparse, topic))
             return
         queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
-        if in_cell:
-            queue.expect(source)
-            queue.repeats = self.restarts(source)
+        queue.expect(source, 0 if in_cell else None)
+        queue.repeats = in_cell and self.restarts(source)
         self.listen(topic, msgtype, partial(self._on_message, queue), partial(self._on_block, queue))
 
     def lose(self, lost: set[str], first: int, end: int) -> None:
@@ -226,6 +241,23 @@ class RecorderNode(CellNode):
         if self._writer is not None and now >= self._flush_due:
             self._flush_due = now + FLUSH_PERIOD
             self.attempt(self._writer.flush)
+
+    def _on_message_at(self, topic: str, msgtype: str, data: bytes) -> None:
+        """A message at a chosen sample, of a node in another process."""
+        try:
+            message = messages.decode(msgtype, data)
+        except ValueError as error:
+            raise Stranger(topic, "", "", str(error)) from None
+        # Messages that are not of lathe_rc do not say who sent them.
+        source, run_id = getattr(message, "source", self._sparse[topic]), getattr(message, "run_id", self.table.run_id)
+        if source != self._sparse[topic] or (self.table.run_id and run_id != self.table.run_id):
+            raise Stranger(topic, source, run_id, f"expected {self._sparse[topic]} of run {self.table.run_id!r}")
+        sample, rest = divmod(messages.stamp_ns(message) - messages.START_NS, self.table.step_ns)
+        begin = self._merger.samples if self._merger else 0
+        end = begin + self._depth * self.table.block_size if self._merger else sample + 1
+        if rest or not begin <= sample < end:
+            raise Stranger(topic, source, run_id, f"expected a time of samples {begin} to {end - 1}")
+        self._on_sparse(topic, data)
 
     def _on_sparse(self, topic: str, data: bytes) -> None:
         if self.over:

@@ -22,11 +22,13 @@ from std_msgs.msg import Empty
 from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import TABLES
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import declare
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
 from lathe_rc.nodes.report import Reporter
+from lathe_rc.nodes.strangers import Stranger, Strangers
 from lathe_rc.nodes.watch import Watch, liveliness, this_host
 
 _TICK = 0.02  # [s] between looks at the graph while members join
@@ -34,6 +36,7 @@ _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _LATCHED_DEPTH = 256
 _PATIENCE = 2.0  # [s] for others to acknowledge the last messages
 _GIVEN_UP = 2.0  # [s] of silence after which a time master is lost in a cell that does not wait
+_MOST_MEMBERS = 256  # announced names that are kept
 
 
 class CellNode(LifecycleNode):
@@ -53,6 +56,7 @@ class CellNode(LifecycleNode):
         due: messages have come since it last worked.
         handled: messages received so far.
         watch: whether those are alive that it cannot do without; there once it is active.
+        strangers: what it has refused.
         outlets, inlets: publisher and subscription of each signal topic, by fully qualified name.
         patience: for messages to be acknowledged [s].
         next_tick: monotonic time [s] at which it wants `tick` to be called.
@@ -78,6 +82,7 @@ class CellNode(LifecycleNode):
         self.full_name = self.get_fully_qualified_name()
         self.members: dict[str, Member] = {}
         self.master: Member | None = None
+        self.strangers = Strangers(self._tell_stranger)
         self._ready = self._safe = False
         self._without: set[str] = set()  # members that are lost
         self._cell: int | None = None  # what the time master has said
@@ -194,8 +199,35 @@ class CellNode(LifecycleNode):
                 return
             try:
                 callback(message)
+            except Stranger as stranger:
+                self.strangers.refuse(stranger)
             except LatheError as error:
                 self.fail(error)
+
+        return call
+
+    def _tell_stranger(self, stranger: Stranger) -> None:
+        publishers = self._who_publishes(stranger.topic)
+        self.get_logger().warning(f"refused: {stranger}; publishers of {stranger.topic}: {', '.join(publishers)}")
+        self.reporter("stranger", self.get_name(), message=str(stranger), publishers=publishers)
+        self._diagnostics_due = time.monotonic()
+
+    def _who_publishes(self, topic: str) -> list[str]:
+        """Nodes that publish a topic, as the graph lists them."""
+        return sorted(_name(end) for end in self.get_publishers_info_by_topic(topic))
+
+    def _one_of_many(self, topic: str, callback: Callable[[bytes], object]) -> Callable[[bytes], None]:
+        """A callback whose errors name all publishers of its topic, if there are several: any of them may be it."""
+
+        def call(data: bytes) -> None:
+            try:
+                callback(data)
+            except Stranger:
+                raise
+            except LatheError as error:
+                if len(publishers := self._who_publishes(topic)) > 1:
+                    error.args = (f"{error}; publishers of {topic}: {', '.join(publishers)}",)
+                raise
 
         return call
 
@@ -230,7 +262,7 @@ class CellNode(LifecycleNode):
         self.inlets[topic] = self.create_subscription(
             message_class(msgtype),
             topic,
-            self.guarded(callback),
+            self.guarded(self._one_of_many(topic, callback)),
             signal_qos(self.table, topic),
             raw=True,
             event_callbacks=self.subscription_events(topic),
@@ -324,21 +356,45 @@ class CellNode(LifecycleNode):
         return []
 
     def _on_member(self, member: Member) -> None:
-        if self.table.run_id and member.run_id and member.run_id != self.table.run_id:
-            return
+        self._check_member(member)
         self.members[member.name] = member
         if member.members:
             self.master = member
             self.watch.follow(member)
         peers = self.master.members if self.master else ()
+        if len(self.members) > _MOST_MEMBERS:
+            del self.members[next(n for n in reversed(self.members) if n not in peers and n != self.full_name)]
         others = member.name in peers and member.name != self.full_name and member.name not in self._without
         if member.state == Member.FAILED and others and not self.over:
             self.fail(LatheError(f"{member.name} failed: {member.message}"), cause="abandoned")
         self.members_changed()
         self._settle()
 
+    def _check_member(self, member: Member) -> None:
+        """Refuse who is no member of this cell."""
+        why = ""
+        if self.table.run_id and member.run_id != self.table.run_id:
+            why = f"expected run {self.table.run_id!r}"
+        elif member.members and member.stage != SpindleEncoder.kind:
+            why = f"a time master is a {SpindleEncoder.kind}"
+        elif member.members and self.master is not None and member.name != self.master.name:
+            why = f"the time master is {self.master.name}"
+        elif not len(member.publishes) == len(member.types) == len(member.sparse):
+            why = "its topics, their types and what is sparse are lists of different lengths"
+        elif unknown := set(member.types) - messages.signal_types():
+            why = f"no signals are of type {min(unknown)}"
+        else:
+            try:
+                why = "" if isinstance(json.loads(member.parameters), dict) else "its parameters are no map"
+            except (ValueError, RecursionError):
+                why = "its parameters are no JSON"
+        if why:
+            raise Stranger(self._host["members"].topic_name, member.name, member.run_id, why)
+
     def _on_cell_state(self, state: CellState) -> None:
         if state.run_id != self.table.run_id:
+            if self.table.run_id:
+                raise Stranger(self.topic("cell_state"), "", state.run_id, f"expected run {self.table.run_id!r}")
             return
         self._cell = state.state
         if state.state == CellState.ENDED and self.over and not self.done:
@@ -457,13 +513,20 @@ class CellNode(LifecycleNode):
             self._diagnostics_due = now + _DIAGNOSTICS_PERIOD
             self._publish_diagnostics()
 
+    def _level(self) -> bytes:
+        if self.failure:
+            return bytes(DiagnosticStatus.ERROR)
+        return bytes(DiagnosticStatus.WARN if self.strangers.senders else DiagnosticStatus.OK)
+
     def _publish_diagnostics(self) -> None:
+        told = self.statistics() | {"refused": self.strangers}
+        told |= {f"publishers of {topic}": ", ".join(self._who_publishes(topic)) for topic in self.strangers.topics}
         status = DiagnosticStatus(
-            level=DiagnosticStatus.ERROR if self.failure else DiagnosticStatus.OK,
+            level=self._level(),
             name=self.full_name,
             message=str(self.failure or ("ready" if self._ready else "waiting for members")),
             hardware_id=self.kind,
-            values=[KeyValue(key=key, value=str(value)) for key, value in self.statistics().items()],
+            values=[KeyValue(key=key, value=str(value)) for key, value in told.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
@@ -471,4 +534,8 @@ class CellNode(LifecycleNode):
 
 
 def _names(endpoints: list[Any]) -> set[str]:
-    return {f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in endpoints}
+    return {_name(end) for end in endpoints}
+
+
+def _name(end: Any) -> str:
+    return f"{end.node_namespace.rstrip('/')}/{end.node_name}"

@@ -15,6 +15,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.stage_node import StageNode
+from lathe_rc.nodes.strangers import Stranger
 
 _STALL = 0.08  # [s] of silence after which a member is named
 _GONE = 0.2  # [s] for messages to be acknowledged, if who has died never will
@@ -133,7 +134,10 @@ class SpindleNode(StageNode):
     # ---- run ----------------------------------------------------------------------------------------
 
     def _on_progress(self, progress: Progress) -> None:
-        if progress.name not in self._completed or progress.run_id != self.table.run_id:
+        if progress.run_id != self.table.run_id:
+            why = f"expected run {self.table.run_id!r}"
+            raise Stranger(self._host["progress"].topic_name, progress.name, progress.run_id, why)
+        if progress.blocks <= self._completed.get(progress.name, progress.blocks):
             return
         # Who reads only from lost members has its blocks to the end of the run already.
         if progress.blocks > self.blocks and not self._without:

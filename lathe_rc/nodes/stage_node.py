@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """A stage as a ROS node."""
 
+from collections import deque
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from lathe_rc_msgs.srv import Schedule
 
+from lathe_rc.bag.record import signal_depth
 from lathe_rc.cell import messages, state_file
 from lathe_rc.cell.framing import Framer
 from lathe_rc.cell.messages import Signals
@@ -18,6 +21,7 @@ from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes.ports import BlockQueue, message_class, signal_qos
 from lathe_rc.nodes.shell import CellNode
 
+_EARLY = 4  # times the blocks in flight are kept until it is known where to go on
 _OUTSIDE_PERIOD = 0.1  # [s] between looks at who reads what in other processes
 
 
@@ -79,12 +83,15 @@ class StageNode(CellNode):
             self.outlets[topic] = self.create_publisher(message_class(msgtype), topic, signal_qos(self.table))
         for topic, queue in self._queues.items():
             queue.inside = self.exchange.has(topic)
-            self.listen(topic, queue.type, queue.add, queue.take)
+            self.listen(topic, queue.type, partial(self._take_in, queue), queue.take)
         self._outside, self._outside_due = set(self.outlets), 0.0
         # Computed in this process for readers to share, and nothing of their past is wanted: no need to copy.
         self._shared = [q for topic, q in self._queues.items() if q.inside and not self._tracks[topic].delay]
-        # Who may go on in place of another process does not know yet where.
+        # Who may go on in place of another process does not know yet where: what comes until then is looked at later.
         self._waits = bool(self._restart_file)
+        self._early: deque[tuple[BlockQueue, bytes]] = deque(
+            maxlen=_EARLY * signal_depth(self.table) * len(self._queues)
+        )
         if self.stage.takes_events:
             self.create_service(Schedule, "~/schedule", self._on_schedule)
 
@@ -112,21 +119,34 @@ class StageNode(CellNode):
         """See `CellNode`."""
         return list(self._queues) if hasattr(self, "stage") else []
 
+    def _take_in(self, queue: BlockQueue, data: bytes) -> None:
+        if self._waits:
+            self._early.append((queue, data))
+        else:
+            queue.add(data)
+
     def members_changed(self) -> None:
         """Learn whose blocks to accept, before the first of them."""
-        if self.master is None or self._waits:
+        if self._waits:
             return
-        for topic, name in self._sources().items():
-            queue = self._queues.get(topic)
-            if queue and not queue.source:
-                queue.expect(name)
-                queue.repeats = self.restarts(name)
+        peers = self.master.members if self.master else list(self.members)
+        for name in peers:
+            member = self.members.get(name)
+            for topic in member.publishes if member else ():
+                queue = self._queues.get(topic)
+                if queue and (queue.open or queue.source not in peers):
+                    self._expect(queue, name)
 
-    def _sources(self) -> dict[str, str]:
-        """Who publishes each topic of the members."""
-        names = self.master.members if self.master else ()
-        known = [self.members[name] for name in names if name in self.members]
-        return {topic: member.name for member in known for topic in member.publishes}
+    def _expect(self, queue: BlockQueue, source: str) -> None:
+        """Accept a member's blocks: in a cell from the first on; alone, with a run, from whichever comes first."""
+        if self.master is None:
+            if self.table.run_id and not queue.source:
+                queue.expect(source, None)
+            return
+        if self._started:
+            raise LatheError(f"{queue.topic}: {queue.source} was heard before the cell of {source}; start anew")
+        queue.expect(source)
+        queue.repeats = self.restarts(source)
 
     def statistics(self) -> dict[str, object]:
         """See `CellNode`."""
@@ -158,6 +178,8 @@ class StageNode(CellNode):
             self._resume()
         self._waits = False
         self.members_changed()
+        while self._early:
+            self.guarded(partial(self._take_in, self._early[0][0]))(self._early.popleft()[1])
         self._keep()
         self.due = True
 
@@ -183,7 +205,8 @@ class StageNode(CellNode):
         self.blocks, self.samples, self._started = state["blocks"], state["samples"], True
         self._reported_blocks, self._framer.companions = self.blocks, state["companions"]
         self.stage, self._tracks = state["stage"], state["tracks"]
-        sources = self._sources()
+        assert self.master is not None, "it has announced all members"
+        sources = {topic: name for name in self.master.members for topic in self.members[name].publishes}
         for topic, queue in self._queues.items():
             queue.resume(sources[topic], state["queues"][topic])
         self._wire()

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Publishers that do not belong to a cell, on its topics: refused, counted, named, and the cell goes on."""
+
+import contextlib
+import itertools
+import json
+import os
+import signal
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+from cells import scenario
+from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, ToolBlock
+from mcap.reader import make_reader
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+from rosbags.highlevel import AnyReader
+
+from lathe_rc import harness
+from lathe_rc.bag import reader
+from lathe_rc.cell import messages
+from lathe_rc.cell.wire import Encoder
+from lathe_rc.errors import LatheError
+from lathe_rc.nodes.ports import latched_qos
+
+STEP = 15_625
+
+
+@pytest.fixture
+def ghost(domain):
+    """A node that belongs to no cell."""
+    rclpy.init()
+    yield rclpy.create_node("ghost", namespace="/haunted")
+    rclpy.shutdown()
+
+
+def block(msgtype, first, source, run_id, *, step=STEP, size=64, fill=0.0):
+    signals = messages.allocate(msgtype, size)
+    for array in signals.values():
+        array[:] = fill if array.dtype == np.float64 else 0
+    return Encoder(msgtype, run_id, source, step).encode(first, signals, last=False, companions=0)[1]
+
+
+def uneven(msgtype, source, run_id):
+    made = messages.decode(msgtype, block(msgtype, 0, source, run_id))
+    name = next(iter(messages.sample_fields(msgtype)))
+    setattr(made, name, getattr(made, name)[:1])
+    return messages.encode(msgtype, made)
+
+
+def foreign(msgtype, own):
+    """Blocks that do not belong, on a topic of the node ``own`` in the run 'test'."""
+    return [
+        block(msgtype, 0, "/other", "test"),
+        block(msgtype, 0, own, "elsewhere"),
+        block(msgtype, 64, "/step", "test", step=20_000),
+        block(msgtype, 0, "/long", "test", size=8192),
+        uneven(msgtype, "/uneven", "test"),
+        block(msgtype, 0, "/nan", "test", fill=np.nan),
+        block(msgtype, 2**40, "/jump", "test"),
+        b"\0\1\0\0" + b"\xff" * 1000,
+    ]
+
+
+def senders(topic, own):
+    """What the refused of `foreign` are called."""
+    sources = ["/other", "/step", "/long", "/uneven", "/nan", "/jump"]
+    return {f"{source} of run 'test' on {topic}" for source in sources} | {
+        f"{own} of run 'elsewhere' on {topic}",
+        f"an unknown sender of run '' on {topic}",
+    }
+
+
+@contextlib.contextmanager
+def all_the_time(sends):
+    """Publishes the messages of ``sends``, pairs of publisher and message, again and again."""
+    over = threading.Event()
+
+    def work():
+        for publisher, message in itertools.cycle(sends):
+            publisher.publish(message)
+            if over.wait(0.002):
+                return
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def diagnostics(bag):
+    """Of each node, the last report in a bag."""
+    with next(bag.glob("*.mcap")).open("rb") as stream:
+        told = [message.data for _, _, message in make_reader(stream).iter_messages(topics=["/diagnostics"])]
+    arrays = [messages.decode("diagnostic_msgs/msg/DiagnosticArray", data) for data in told]
+    return {status.name: status for array in arrays for status in array.status}
+
+
+def test_a_cell_goes_on_among_strangers(ghost, domain, tmp_path):
+    cell = scenario(spindle_encoder={"revolutions": 30.0})
+    qos = QoSProfile(depth=10)
+    on = {"/encoder": (EncoderBlock, "/spindle_encoder"), "/tool": (ToolBlock, "/tool")}
+    sends = []
+    for topic, (kind, own) in on.items():
+        publisher = ghost.create_publisher(kind, topic, latched_qos(10))
+        sends += [(publisher, message) for message in foreign(f"lathe_rc_msgs/msg/{kind.__name__}", own)]
+    members = ghost.create_publisher(Member, "/members", latched_qos(10))
+    states = ghost.create_publisher(CellState, "/cell_state", latched_qos(10))
+    sends += [
+        (members, Member(run_id="elsewhere", name="/tool", state=Member.FAILED, message="no")),
+        (members, Member(run_id="test", name="/made_up", publishes=["/a"])),
+        (members, Member(run_id="test", name="/made_up", publishes=["/a"], types=["a/b/c"], sparse=[False])),
+        (members, Member(run_id="test", name="/usurper", members=["/usurper"], parameters="{}")),
+        (members, b"\0\1\0\0" + b"\xff" * 100),
+        (states, CellState(run_id="x", state=CellState.FAILED)),
+        (ghost.create_publisher(Progress, "/progress", qos), Progress(run_id="x", name="/tool", blocks=2**40)),
+        (ghost.create_publisher(Progress, "/progress", qos), Progress(run_id="test", name="/made_up", blocks=2**40)),
+    ]
+    with all_the_time(sends):
+        result = harness.run(cell, mode="processes", groups=[], domain=domain, bag=tmp_path / "bag")
+    assert result.digest == harness.run(cell).digest
+    expected = set.union(*(senders(topic, own) for topic, (_, own) in on.items()))
+    assert expected <= set(result.refused)
+    others = set(result.refused) - expected
+    assert {"/tool of run 'elsewhere' on /members", "/made_up of run 'test' on /members"} <= others
+    assert {"an unknown sender of run 'x' on /cell_state", "/tool of run 'x' on /progress"} <= others
+    values = {pair.key: pair.value for pair in diagnostics(tmp_path / "bag")["/learning_controller"].values}
+    assert "from /nan of run 'test' on /tool" in values["refused"]
+    assert "/haunted/ghost" in values["publishers of /tool"]
+
+
+def test_who_speaks_in_the_name_of_a_member_ends_the_run_and_all_publishers_are_named(ghost, domain, tmp_path):
+    """The same that a member gets which goes wrong itself: nobody can tell the two apart."""
+    cell, sent = scenario(spindle_encoder={"revolutions": 200.0, "speed_factor": 1.0}), []
+    publisher = ghost.create_publisher(ToolBlock, "/tool", latched_qos(10))
+
+    def watch(event):
+        if event["event"] == "cycle" and not sent:
+            sent.append(publisher.publish(block(messages.TOOL, 0, "/tool", "test")))
+
+    with pytest.raises(LatheError, match=r"^/tool: /tool goes from sample \d+ to 0: a block came twice; ") as error:
+        harness.run(cell, mode="processes", groups=[], domain=domain, bag=tmp_path / "bag", watch=watch)
+    assert str(error.value).endswith("; publishers of /tool: /haunted/ghost, /tool")
+    with AnyReader([tmp_path / "bag"]) as found:
+        assert sum(1 for _ in found.messages()) > 100
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (block(messages.TOOL, 0, "/tool", "test", step=20_000), "/tool: /tool has a step of 20000 ns; expected 15625"),
+        (block(messages.TOOL, 0, "/tool", "test", size=65), "/tool: /tool sends 65 samples in a block; expected 64"),
+        (uneven(messages.TOOL, "/tool", "test"), r"/tool: /tool sends arrays of \[1, 64\] samples in one block"),
+    ],
+)
+def test_a_member_that_goes_wrong_ends_the_run(ghost, domain, tmp_path, bad, words):
+    cell, sent = scenario(spindle_encoder={"revolutions": 200.0, "speed_factor": 1.0}), []
+    publisher = ghost.create_publisher(ToolBlock, "/tool", latched_qos(10))
+
+    def watch(event):
+        if event["event"] == "cycle" and not sent:
+            sent.append(publisher.publish(bad))
+
+    with pytest.raises(LatheError, match=words):
+        harness.run(cell, mode="processes", groups=[], domain=domain, bag=tmp_path / "bag", watch=watch)
+    with AnyReader([tmp_path / "bag"]) as found:
+        assert sum(1 for _ in found.messages()) > 100
+
+
+def resident(pid):
+    """Memory of a process [B]."""
+    line = next(line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmRSS"))
+    return int(line.split()[1]) * 1024
+
+
+def test_a_flood_takes_no_memory(ghost, domain, tmp_path):
+    """While the cell stands; what comes then is all the nodes have to do."""
+    plain = scenario(spindle_encoder={"revolutions": 30.0})
+    cell = harness.with_recorder(plain, tmp_path / "bag", keep=True)
+    encoder = ghost.create_publisher(EncoderBlock, "/encoder", latched_qos(500))
+    members = ghost.create_publisher(Member, "/members", latched_qos(500))
+
+    def flood(publisher, make, number):
+        for count in range(number):
+            publisher.publish(make(count))
+            if count % 250 == 249:
+                assert publisher.wait_for_all_acked(Duration(seconds=60))
+
+    def refused(words):
+        """Wait until the tool tells of a message."""
+        for event in processes.events(60.0):
+            processes._raise_failure(event)
+            if event["event"] == "stranger" and event["node"] == "tool" and words in event["message"]:
+                return
+
+    with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
+        processes.wait_for("cycle")
+        os.kill(processes.pids["electrodynamic_actuator"], signal.SIGSTOP)
+        before = resident(processes.pids["tool"])
+        flood(encoder, lambda count: block(messages.ENCODER, count, f"/ghost_{count % 8}", "test", size=2048), 20_000)
+        encoder.publish(block(messages.ENCODER, 0, "/spindle_encoder", "end of the flood"))
+        refused("end of the flood")
+        text = json.dumps({"filler": "x" * 40_000})
+        flood(members, lambda count: Member(run_id="test", name=f"/made_up_{count}", parameters=text), 4_000)
+        members.publish(Member(run_id="end of the members", name="/end"))
+        refused("end of the members")
+        grown = resident(processes.pids["tool"]) - before
+        os.kill(processes.pids["electrodynamic_actuator"], signal.SIGCONT)
+        processes.wait_for_end()
+    assert grown < 64e6
+    assert sum(processes.refused.values()) > 1000
+    assert reader.read(tmp_path / "bag").digests() == harness.run(plain).digest
+
+
+def test_who_comes_late_learns_the_state_of_the_cell_and_its_members(ghost, domain, tmp_path):
+    slow = scenario(spindle_encoder={"revolutions": 1000.0, "speed_factor": 0.1})
+    cell = harness.with_recorder(slow, tmp_path / "bag", keep=True)
+    heard = {}
+    with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
+        processes.wait_for("progress")
+        ghost.create_subscription(CellState, "/cell_state", lambda told: heard.update(state=told), latched_qos(1))
+        ghost.create_subscription(Member, "/members", lambda told: heard.update({told.name: told}), latched_qos(256))
+        executor = SingleThreadedExecutor()
+        executor.add_node(ghost)
+        while len(heard) < 1 + len(cell.nodes):
+            executor.spin_once(timeout_sec=1.0)
+        executor.shutdown()
+    assert (heard["state"].run_id, heard["state"].state) == ("test", CellState.RUNNING)
+    assert {name for name in heard if name != "state"} == {f"/{name}" for name in cell.nodes}
+    assert all(heard[f"/{name}"].state == Member.READY for name in cell.nodes)

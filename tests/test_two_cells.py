@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two cells in one ROS domain, in two namespaces, never mix."""
+
+import concurrent.futures
+import os
+import signal
+
+import pytest
+from cells import scenario
+from click.testing import CliRunner
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from lathe_rc import harness
+from lathe_rc.cell import messages
+from lathe_rc.cli import main
+
+LEFT = scenario({"run_id": "left"}, spindle_encoder={"revolutions": 60.0})
+RIGHT = scenario(
+    {"run_id": "right", "nominal_rpm": 1100.0, "block_size": 128},
+    spindle_encoder={"revolutions": 6.0},
+    learning_controller={"learning_gain": 0.5},
+)
+
+
+def alone(cell, namespace):
+    """Digests of the offline run, by the names that topics have in a namespace."""
+    return {f"{namespace}{topic}": digest for topic, digest in harness.run(cell).digest.items()}
+
+
+def mixed(bag, namespace):
+    """What is in a bag and of another cell: topics, and nodes in the diagnostics."""
+    with AnyReader([bag]) as found:
+        topics = {c.topic for c in found.connections if c.topic != "/diagnostics"}
+    with next(bag.glob("*.mcap")).open("rb") as stream:
+        told = [message.data for _, _, message in make_reader(stream).iter_messages(topics=["/diagnostics"])]
+    arrays = [messages.decode("diagnostic_msgs/msg/DiagnosticArray", data) for data in told]
+    names = {status.name for array in arrays for status in array.status}
+    return {name for name in topics | names if not name.startswith(f"{namespace}/")}
+
+
+class Pause:
+    """Stops a node at the first finished cycle."""
+
+    def __init__(self, node):
+        self.node, self.pids, self.stopped = node, {}, concurrent.futures.Future()
+
+    def __call__(self, event):
+        if event["event"] == "active":
+            self.pids[event["node"]] = event["pid"]
+        if event["event"] == "cycle" and not self.stopped.done():
+            os.kill(self.pids[self.node], signal.SIGSTOP)
+            self.stopped.set_result(self.pids[self.node])
+
+
+def test_a_cell_lives_in_the_middle_of_another(domain, tmp_path):
+    pause, options = Pause("tool"), {"mode": "processes", "domain": domain}
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        left = pool.submit(
+            harness.run, LEFT, **options, namespace="/left", bag=tmp_path / "left", watch=pause, groups=[]
+        )
+        concurrent.futures.wait([left, pause.stopped], return_when=concurrent.futures.FIRST_COMPLETED)
+        right = harness.run(RIGHT, **options, namespace="/shop/right", bag=tmp_path / "right", groups=[])
+        assert not left.done()
+        os.kill(pause.stopped.result(), signal.SIGCONT)
+        assert left.result().digest == alone(LEFT, "/left")
+    assert right.digest == alone(RIGHT, "/shop/right")
+    assert mixed(tmp_path / "left", "/left") == set()
+    assert mixed(tmp_path / "right", "/shop/right") == set()
+
+
+def test_two_composed_cells_start_at_once(domain, tmp_path):
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        runs = {
+            name: pool.submit(
+                harness.run, cell, mode="composed", domain=domain, namespace=f"/{name}", bag=tmp_path / name
+            )
+            for name, cell in (("left", LEFT), ("right", RIGHT))
+        }
+    assert runs["left"].result().digest == alone(LEFT, "/left")
+    assert runs["right"].result().digest == alone(RIGHT, "/right")
+    assert mixed(tmp_path / "left", "/left") == mixed(tmp_path / "right", "/right") == set()
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["--mode", "composed", "--namespace", "left"], "namespace 'left'; allowed: / or /NAME"),
+        (["--namespace", "/left"], "--namespace /left with --mode offline; allowed: --mode processes or composed"),
+    ],
+)
+def test_a_namespace_that_cannot_be_is_refused(words, why):
+    done = CliRunner().invoke(main, ["run", "piston", *words])
+    assert done.exit_code == 2
+    assert why in done.output
