@@ -34,7 +34,10 @@ STEP = 15_625
 def ghost(domain):
     """A node that belongs to no cell."""
     rclpy.init()
-    yield rclpy.create_node("ghost", namespace="/haunted")
+    node = rclpy.create_node("ghost", namespace="/haunted")
+    yield node
+    # What is latched would haunt the next test in the same domain.
+    node.destroy_node()
     rclpy.shutdown()
 
 
