@@ -81,10 +81,11 @@ class Takeover:
         bounds: of what it does itself.
         retracted: where the command is when retracted [m].
         step: sampling step [s].
+        carries: whether a motion begins with the velocity that the command has; one with steps and noise has none.
     """
 
-    def __init__(self, bounds: Bounds, retracted: float, step: float) -> None:
-        self._bounds, self._goal, self._step = bounds, retracted, step
+    def __init__(self, bounds: Bounds, retracted: float, step: float, *, carries: bool = True) -> None:
+        self._bounds, self._goal, self._step, self._carries = bounds, retracted, step, carries
         self._mode = Mode.FOLLOW
         # Positions to come; of what is added to the command when it follows. None yet, but the first of them must not
         # wait for SciPy to load what makes them.
@@ -105,9 +106,9 @@ class Takeover:
         """Take over, or give back, from the next sample on."""
         if mode is self._mode:
             return
-        velocity = (self._given[1] - self._given[0]) / self._step
+        velocity = (self._given[1] - self._given[0]) / self._step if self._carries else 0.0
         if mode is Mode.FOLLOW:
-            rest = velocity - (self._wanted[1] - self._wanted[0]) / self._step
+            rest = velocity - (self._wanted[1] - self._wanted[0]) / self._step if self._carries else 0.0
             self._path = motion(self._given[1] - self._wanted[1], rest, 0.0, self._bounds, self._step)
         else:
             goal = self._goal if mode is Mode.RETRACT else None

@@ -305,6 +305,7 @@ class FeedDrive:
     Attributes:
         table: its constants for `move` and `hold`.
         state: its memory for them.
+        integrates: whether the command stands for a speed.
         saturated: commands so far that were cut off.
         limited: samples so far at the greatest speed.
 
@@ -341,8 +342,8 @@ class FeedDrive:
         # What is exact for a command that is linear over a step is so for one that does not change in it.
         held = linear.weights[:, 0] + linear.weights[:, 1]
         # A model that integrates needs a certain command for a certain speed.
-        gain, integrates = _settles(model)
-        needed = speed_limit / gain if integrates and gain > 0.0 else np.inf
+        gain, self.integrates = _settles(model)
+        needed = speed_limit / gain if self.integrates and gain > 0.0 else np.inf
         self.table = DriveTable(
             transition=np.ascontiguousarray(linear.transition),
             weights=held,

@@ -9,13 +9,13 @@ from annotated_types import Ge, Gt, Le
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
-from lathe_rc.cell.parameters import ObedientParameters, parameter
+from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedParameters
+from lathe_rc.cell.stages.obedience import FeedObedientParameters, Obedience
 from lathe_rc.errors import InputError
 from lathe_rc.plants import feed
 from lathe_rc.plants.feed import Feedback, FeedDrive
-from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.example_002 import fill_disturbance
 from lathe_rc.signals.noise import Sensor
 from lathe_rc.transfer import TransferFunction
@@ -23,7 +23,7 @@ from lathe_rc.transfer import TransferFunction
 Axis = Literal["cross", "longitudinal"]
 
 
-class FeedDriveParameters(LimitedParameters, ObedientParameters):
+class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
     """Model from command to position, limits, backlash, and the position sensor."""
 
     axis: Axis = parameter("cross", "which slide; the first word of its topics")
@@ -113,22 +113,28 @@ class FeedDriveStage(Stage):
         self._clipped = np.empty(messages.MAX_BLOCK if limits.any else 0, np.uint8)
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         self._motor, self._seen, self._load = (np.empty(messages.MAX_BLOCK) for _ in range(3))
-        axis, delay = parameters.axis, parameters.reaction_delay
+        self._obedience = self._obeys() if parameters.reaction_delay else None
+        axis = parameters.axis
         self.declare(
             inputs=[
                 Input(f"{axis}/command", messages.SERVO, ("command",)),
-                *([Input("safety", messages.SAFETY, ("reaction",), delay)] if delay else []),
+                *parameters.listens(),
             ],
             outputs=[Output(f"{axis}/state", messages.STATE, Joint("position", "velocity", "effort"))],
             tells=limits.any,
         )
 
+    def _obeys(self) -> Obedience:
+        return self.parameters.obedience(lambda _: None, speed=self.drive.integrates, settled=0)
+
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         (servo, *safety), (state,) = inputs, outputs
         command = servo["command"]
-        if safety:
-            command = np.where(safety[0]["reaction"] >= Reaction.HOLD, 0.0, command)
+        if self._obedience:
+            command = command.copy()
+            for start, stop in self._obedience.pieces(safety[0]["reaction"]):
+                self._obedience.apply(command[start:stop])
         size = command.size
         motor, seen = self._motor[:size], self._seen[:size]
         load = self._load[: size if self.parameters.disturbance else 0]

@@ -17,12 +17,15 @@ from lathe_rc.cell.stage import Input, Output, Sparse, Stage, cut
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
 from lathe_rc.cell.stages.obedience import Obedience
 from lathe_rc.control import memory_file
+from lathe_rc.control.bounded import Bounds, Takeover
 from lathe_rc.control.correction import Correction
 from lathe_rc.control.identification import DriveIdentifier, Identified
 from lathe_rc.control.repetitive import AngleLostError, Cycle, RepetitiveController, largest_feedback_delay
 from lathe_rc.errors import InputError
 from lathe_rc.plants.linear import discretise, second_order
+from lathe_rc.safety.state_machine import Reaction
 
+_SETTLED = 4.0  # lead times until a drive has followed
 _MOST = 1024  # entries of a table of margins
 _FILE_ACTIONS = ("save", "load")
 
@@ -70,7 +73,8 @@ class LearningController(Stage):
         inputs += [Input(f"{drive}/state", messages.STATE, ("measured_position",), delay) for drive in parameters.finer]
         if parameters.identify:
             inputs.append(Input("coarse/state", messages.STATE, ("measured_position",), delay))
-        self._obedience = Obedience(self._controller, parameters) if parameters.reaction_delay else None
+        self._lost = False  # there is no angle that it could read its memory at
+        self._obedience = self._obeys() if parameters.reaction_delay else None
         if self._obedience:
             inputs.append(Input("safety", messages.SAFETY, ("reaction",), parameters.reaction_delay))
         self._identifier = DriveIdentifier(
@@ -85,6 +89,16 @@ class LearningController(Stage):
         self.sparse_topics["coarse/learning"] = messages.LEARNING
         if self._scheduled_actions("load") and not self._scheduled_actions("save"):
             self._read_memory()
+
+    def _obeys(self) -> Obedience:
+        parameters = self.parameters
+        bounds = Bounds(parameters.retract_velocity, parameters.retract_acceleration, parameters.retract_jerk)
+        settled = round(_SETTLED * parameters.lead_time / parameters.step) + parameters.feedback_delay
+        takeover = Takeover(bounds, parameters.retract_position, parameters.step)
+        return Obedience(self._learn, takeover, settled=settled)
+
+    def _learn(self, on: bool) -> None:  # noqa: FBT001 - the obedience calls it with nothing else
+        self._controller.learning = on
 
     def _check_identification(self) -> None:
         parameters = self.parameters
@@ -194,15 +208,20 @@ class LearningController(Stage):
     ) -> None:
         """The same, but without an angle that it can use the controller gives up, and the command stays."""
         assert self._obedience is not None, "without one there is nobody to take over"
-        if self._obedience.lost:
+        if self._lost:
             command[:] = self._obedience.newest
             return
         try:
             self._control(first, inputs, command, sparse)
         except AngleLostError as error:
-            self._obedience.lost = True
+            self._lost = True
             command[error.reached :] = command[error.reached - 1] if error.reached else self._obedience.newest
             sparse.append(Sparse(f"{self.name}/events", messages.EVENT, first + error.reached, {"action": "lost"}))
+
+    def _falls_back(self) -> bool:
+        """Whether the lead angle shall be that of the nominal speed."""
+        asked = self._obedience is not None and self._obedience.reaction >= Reaction.FALL_BACK
+        return asked and self.parameters.fall_back == "constant_lead"
 
     def _control(self, first: int, inputs: Sequence[Signals], command: Samples, sparse: list[Sparse]) -> None:
         """Fill the command; what is said of cycles goes to ``sparse``, also where the angle is lost after them."""
@@ -212,7 +231,7 @@ class LearningController(Stage):
         if parameters.law == "time_periodic":
             angle = parameters.nominal_speed * (parameters.step * np.arange(first, first + angle.size))
             past_angle = angle - parameters.nominal_speed * (parameters.step * parameters.feedback_delay)
-        if parameters.law == "time_periodic" or (self._obedience and self._obedience.constant_lead):
+        if parameters.law == "time_periodic" or self._falls_back():
             speed = np.full(angle.size, parameters.nominal_speed)
         for finer in others[: len(parameters.finer)]:
             error = error + finer["measured_position"]
