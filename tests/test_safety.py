@@ -18,6 +18,8 @@ from lathe_rc.bag.resim import resimulate
 from lathe_rc.cell import messages
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion
 from lathe_rc.errors import InputError
 from lathe_rc.safety import state_machine
@@ -287,7 +289,7 @@ def test_a_supervisor_that_sees_nothing_changes_nothing():
     with_it, without = harness.run(watched).digest, harness.run(alone).digest
     assert {topic: with_it[topic] for topic in without} == without
     assert set(with_it) - set(without) == {
-        "/safety", "/safety/status", "/supervisor/events", "/tool/events", "/spindle_encoder/events",
+        "/safety", "/safety/status", "/coarse/margin", "/supervisor/events", "/tool/events", "/spindle_encoder/events",
         "/electrodynamic_actuator/events",
     }  # fmt: skip
 
@@ -347,6 +349,69 @@ def test_a_broken_tool_stops_the_feed():
     velocity = result.recording.of_type(messages.STATE)["velocity"]
     assert velocity[index] > 1e-3
     assert abs(velocity[-1]) < 1e-9
+
+
+# ---- the stability margin
+
+# A slow swing of 5 % of the speed; at the top of it the margin is least.
+SWING = ["spindle_encoder.deviation_amplitude=[0.05]", "spindle_encoder.deviation_frequency=[3.0]"]
+
+
+def margin_of(result):
+    return result.recording.dense["/coarse/margin"]["stability_margin"]
+
+
+def test_the_margin_that_is_published_is_that_of_the_newest_cycle():
+    result = harness.run(supervised(*SWING))
+    told, margin = result.recording.sparse["/coarse/learning"].values, margin_of(result)
+    ends = [0, *told["sample_index"], margin.size]
+    assert told["stability_margin"][0] != margin[0] > 0.0
+    for value, (start, stop) in zip([margin[0], *told["stability_margin"]], itertools.pairwise(ends), strict=True):
+        assert np.all(margin[start:stop] == value)
+    # It rises and falls with the speed of the cycle.
+    speed = result.recording.of_type(messages.ENCODER)["speed_true"]
+    mean = [speed[start:stop].mean() for start, stop in itertools.pairwise(told["sample_index"])]
+    assert np.corrcoef(mean, told["stability_margin"][1:])[0, 1] < -0.99
+
+
+def test_the_margin_is_that_of_the_drive_as_it_is():
+    """A drive that is faster than was believed: the margin falls when that has been identified."""
+    faster = ["electrodynamic_actuator.natural_frequency=1200.0", "spindle_encoder.deviation_amplitude=[0.0]"]
+    loaded = supervised(*faster, "supervisor.margin_limit=[0.05]", "supervisor.error_limit=0.0")
+    result = harness.run(loaded)
+    margin = margin_of(result)
+    stage = LearningController("controller", loaded.nodes["learning_controller"])
+    drive = ElectrodynamicActuator("drive", loaded.nodes["electrodynamic_actuator"])
+    speed = stage.parameters.nominal_speed
+    true = 1.0 - stage.loop(drive.responses()["coarse/command"]).supremum(speed)
+    assert_allclose(margin[-1], true, rtol=1e-3)
+    assert margin[0] > 0.055
+    assert margin[-1] < 0.05
+    assert [told[0] for told in status(result)] == ["stability_margin"]
+
+
+def test_learning_stops_where_the_margin_falls_below_its_limit():
+    margin = margin_of(harness.run(supervised(*SWING)))
+    limit = 0.3 * margin.max() + 0.7 * margin.min()
+    result = harness.run(supervised(*SWING, f"supervisor.margin_limit=[{limit}]"))
+    ((monitor, state, reaction, index),) = status(result)
+    assert (monitor, state, reaction) == ("stability_margin", State.DEGRADED, Reaction.FREEZE)
+    assert index == np.flatnonzero(margin <= limit)[0]
+    told = result.recording.sparse["/coarse/learning"].values
+    frozen = [cycle > index + 3200 for cycle in told["sample_index"]]
+    assert [not learning for learning in told["learning"]] == frozen
+    assert any(frozen)
+    assert not all(frozen)
+
+
+def test_the_margin_is_watched_alike_in_every_host_and_block(tmp_path):
+    loaded = supervised(*SWING, "supervisor.margin_limit=[0.054]")
+    result = harness.run(loaded, bag=tmp_path / "bag")
+    assert status(result)[0][0] == "stability_margin"
+    assert harness.run(loaded, mode="composed").digest == result.digest
+    assert harness.run(supervised(*SWING, "supervisor.margin_limit=[0.054]", "block_size=17")).digest == result.digest
+    found = resimulate(tmp_path / "bag")
+    assert (found.changed, found.different, found.missing) == (False, [], [])
 
 
 # ---- the feed obeys
@@ -471,6 +536,8 @@ def test_a_re_simulation_reacts_in_the_same_way(tmp_path):
     ("overrides", "said"),
     [
         (["supervisor.following_limit=[1e-4, 2e-4]"], "allowed: one for each of coarse"),
+        (["learning_controller.publish_margin=false"], "supervisor reads coarse/margin, which no node"),
+        (["supervisor.margin_limit=[0.1, 0.1]"], "allowed: one for each of coarse"),
         (["supervisor.slide_limit=[1e-4]"], "allowed: one for each of none"),
         (["learning_controller.reaction_delay=32"], "feedback of safety is delayed by 32 samples, block_size = 64"),
         (["supervisor.speed_limit=-1"], "allowed: a finite number from 0"),

@@ -85,7 +85,11 @@ class LearningController(Stage):
             step=parameters.step,
             block=MAX_BLOCK,
         )
-        self.declare(inputs=inputs, outputs=[Output("coarse/command", messages.COMMAND)])
+        outputs = [Output("coarse/command", messages.COMMAND)]
+        if parameters.publish_margin:
+            outputs.append(Output("coarse/margin", messages.MARGIN))
+            self._margin = self._margins.untabulated(parameters.nominal_speed, self._model)
+        self.declare(inputs=inputs, outputs=outputs)
         self.sparse_topics["coarse/learning"] = messages.LEARNING
         if self._scheduled_actions("load") and not self._scheduled_actions("save"):
             self._read_memory()
@@ -191,17 +195,27 @@ class LearningController(Stage):
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
-        (command,) = outputs
+        command, *margin = outputs
         sparse: list[Sparse] = []
         if self._obedience is None:
             self._control(first, inputs, command["position"], sparse)
-            return sparse
-        *inputs, safety = inputs
-        for start, stop in self._obedience.pieces(safety["reaction"]):
-            read, written = cut(inputs, start, stop), command["position"][start:stop]
-            self._control_until_lost(first + start, read, written, sparse)
-            self._obedience.apply(written)
+        else:
+            *inputs, safety = inputs
+            for start, stop in self._obedience.pieces(safety["reaction"]):
+                read, written = cut(inputs, start, stop), command["position"][start:stop]
+                self._control_until_lost(first + start, read, written, sparse)
+                self._obedience.apply(written)
+        for published in margin:
+            self._fill_margin(first, published["stability_margin"], sparse)
         return sparse
+
+    def _fill_margin(self, first: int, margin: Samples, sparse: Sequence[Sparse]) -> None:
+        """Each sample has the margin of the newest cycle; ``sparse`` has the cycles that end in the block."""
+        margin.fill(self._margin)
+        for message in sparse:
+            if message.type == messages.LEARNING:
+                self._margin = message.values["stability_margin"]
+                margin[message.index - first :] = self._margin
 
     def _control_until_lost(
         self, first: int, inputs: Sequence[Signals], command: Samples, sparse: list[Sparse]
@@ -293,10 +307,17 @@ class _Margins:
         key = _three_digits(model.natural_frequency, model.damping)
         if key not in self._responses:
             _make_room(self._responses)
-            parameters = self._stage.parameters
-            a, b = second_order(model.natural_frequency, model.damping)
-            self._responses[key] = discretise(a, b, parameters.model_delay, parameters.step, "foh").response
+            self._responses[key] = self._computed(model)
         return self._responses[key]
+
+    def _computed(self, model: Identified) -> Response:
+        parameters = self._stage.parameters
+        a, b = second_order(model.natural_frequency, model.damping)
+        return discretise(a, b, parameters.model_delay, parameters.step, "foh").response
+
+    def untabulated(self, speed: float, model: Identified) -> float:
+        """The margin at ``speed`` [rad/s] of this very model; what was tabulated before and after does not matter."""
+        return 1.0 - self._stage.loop(self._computed(model)).supremum(speed)
 
     def _supremum(self, speed: float, model: Identified) -> float:
         inverted = self._stage.correction
