@@ -7,8 +7,9 @@ import pytest
 from cells import cuts, in_blocks
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
+from lathe_rc.control.limits import CommandLimits
 from lathe_rc.errors import InputError
 from lathe_rc.plants.feed import APPROXIMATE_LAGS, FULL_LAGS, FeedDrive, dc_screw, fourth_order, sampled
 from lathe_rc.transfer import LinearSystem, TransferFunction
@@ -244,3 +245,93 @@ def test_what_cannot_be_is_refused_in_one_line(make, message):
     with pytest.raises(InputError, match=message) as refusal:
         make()
     assert len(str(refusal.value).splitlines()) == 1
+
+
+# ---- limits of the motion that is commanded
+
+LIMITS = CommandLimits(2e-3, 2e-3, 20e-3, 0.5)
+
+
+def run_limited(model, command, limits, lengths=None, **options):
+    """Position, velocity, effort, motor, measured; and which samples are clipped."""
+    machine = FeedDrive(model, step=COARSE, limits=limits, **options)
+    motion, clipped = np.full((5, command.size), np.nan), np.empty(command.size, np.uint8)
+
+    def block(first, *parts):
+        *parts, told = parts
+        machine.block(first, *parts, clipped=told)
+
+    in_blocks(lengths or [command.size], block, command, *motion, clipped)
+    return motion, clipped
+
+
+def peaks(signal, period):
+    """Largest magnitude of a signal at rest at 0 before, and of its first three derivatives."""
+    whole = np.concatenate((np.zeros(3), signal))
+    return [np.abs(np.diff(whole, order)).max() / period**order for order in range(4)]
+
+
+LEVELS = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=6)
+
+
+@given(levels=LEVELS, divisor=st.sampled_from([1, 5, 20]), speed_limit=st.sampled_from([np.inf, 1.5e-3]))
+def test_a_commanded_speed_keeps_within_its_limits_and_the_slide_within_its_stroke(levels, divisor, speed_limit):
+    command = np.repeat(levels, 3000)
+    motion, clipped = run_limited(
+        MODELS["cross"], command, LIMITS, divisor=divisor, command_limit=1.0, speed_limit=speed_limit
+    )
+    position, _, effort, *_ = motion
+    speed, acceleration, jerk, _ = peaks(4.38e-3 * effort[::divisor], COARSE * divisor)
+    assert speed <= LIMITS.velocity * 1.001
+    assert acceleration <= LIMITS.acceleration * 1.001
+    assert jerk <= LIMITS.jerk * 1.001
+    assert np.abs(position).max() <= LIMITS.stroke * (1 + 1e-9)
+    held = command[np.arange(command.size) // divisor * divisor]
+    assert_array_equal(clipped > 0, effort != held)
+
+
+def test_a_slide_is_stopped_at_its_stroke_and_comes_back():
+    command = np.concatenate((np.ones(6000), -0.3 * np.ones(4000)))
+    (position, *_), clipped = run_limited(MODELS["approximate with a zero"], command, CommandLimits(stroke=1e-3))
+    assert_allclose(position[5999], 1e-3, rtol=1e-3)
+    assert position[-1] < 0.8e-3
+    assert not clipped[6000:].any()
+
+
+def test_a_commanded_position_keeps_within_its_limits():
+    limits, gain = CommandLimits(0.5, 0.4, 0.5, 2.0), 19.0 / 21.5
+    command = np.repeat([0.9, -0.2, 0.3, 0.3], 5000)
+    (_, _, effort, *_), clipped = run_limited(fourth_order(), command, limits)
+    for found, limit in zip(peaks(gain * effort, COARSE), (0.5, 0.4, 0.5, 2.0), strict=True):
+        assert found <= limit * 1.001
+    assert_allclose(gain * effort[4999], 0.5, rtol=1e-6)
+    assert_array_equal(effort[-4000:], command[-4000:])
+    assert clipped[:5000].all()
+    assert not clipped[-4000:].any()
+
+
+@pytest.mark.parametrize("name", ["cross", "approximate with a zero", "fourth_order"])
+def test_what_keeps_within_the_limits_goes_through_to_the_bit(name):
+    time = np.arange(8000) * COARSE
+    command = 0.02 * (1.0 - np.cos(time)) ** 2
+    for free, found in zip(
+        run(FeedDrive(MODELS[name], step=COARSE), command),
+        run_limited(MODELS[name], command, CommandLimits(1.0, 1.0, 5.0, 50.0))[0],
+        strict=True,
+    ):
+        assert_array_equal(free, found)
+
+
+@given(lengths=cuts, divisor=st.sampled_from([1, 7]))
+def test_the_cutting_of_a_limited_command_leaves_no_trace(lengths, divisor):
+    command = np.where(np.arange(sum(lengths)) % 400 < 200, 0.8, -0.5)
+    whole, parts = (run_limited(MODELS["cross"], command, LIMITS, cut, divisor=divisor) for cut in (None, lengths))
+    assert_array_equal(whole[0], parts[0])
+    assert_array_equal(whole[1], parts[1])
+
+
+def test_a_command_for_an_acceleration_has_no_such_limits():
+    twice = TransferFunction((1.0,), (1.0, 1.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="neither a position nor a speed"):
+        FeedDrive(twice, step=COARSE, limits=LIMITS)
+    FeedDrive(twice, step=COARSE)

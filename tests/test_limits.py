@@ -151,6 +151,50 @@ def test_both_commands_of_drives_in_series_have_limits(limit, said):
     assert said in result.recording.sparse["/series_drive/events"].values["action"]
 
 
+def test_a_series_drive_that_clips_is_re_simulated(tmp_path):
+    overrides = ["spindle_encoder.revolutions=5", "series_drive.coarse_command_velocity=0.005"]
+    harness.run(scenarios.load(CONFIG / "series.yaml", overrides), bag=tmp_path / "bag")
+    found = resimulate(tmp_path / "bag")
+    assert (found.changed, found.different, found.missing) == (False, [], [])
+
+
+FEED = ["spindle_encoder.revolutions=40", "longitudinal.command_acceleration=0.5", "longitudinal.command_jerk=500.0"]
+
+
+def turning(*overrides):
+    return scenarios.load(CONFIG / "force_turning.yaml", overrides)
+
+
+def test_the_feed_is_limited_and_says_so(tmp_path):
+    result = harness.run(turning(*FEED), bag=tmp_path / "bag")
+    told = result.recording.sparse["/longitudinal/events"].values["action"]
+    assert told[0] == "limited"
+    assert told[1].startswith("free: ")
+    speed = 12.4e-3 * result.recording.dense["/longitudinal/state"]["effort"]
+    assert np.abs(np.diff(speed)).max() / STEP <= 0.5 * 1.001
+    assert np.abs(np.diff(speed, 2)).max() / STEP**2 <= 500.0 * 1.001
+    unlimited = harness.run(turning(FEED[0]))
+    assert "/longitudinal/events" not in unlimited.recording.sparse
+    speed = 12.4e-3 * unlimited.recording.dense["/longitudinal/state"]["effort"]
+    assert np.abs(np.diff(speed)).max() / STEP > 0.5
+    found = resimulate(tmp_path / "bag")
+    assert (found.changed, found.different, found.missing) == (False, [], [])
+
+
+def test_the_feed_is_limited_alike_in_every_host_and_block():
+    loaded = turning(*FEED)
+    digest = harness.run(loaded).digest
+    assert harness.run(loaded, mode="composed").digest == digest
+    assert harness.run(turning(*FEED, "block_size=17")).digest == digest
+
+
+def test_the_slide_stays_within_its_stroke():
+    result = harness.run(turning(FEED[0], "longitudinal.command_stroke=2e-3"))
+    position = result.recording.dense["/longitudinal/state"]["position"]
+    assert 1.9e-3 < position.max() <= 2e-3 + 1e-12
+    assert "limited" in result.recording.sparse["/longitudinal/events"].values["action"]
+
+
 def test_without_limits_nothing_is_told():
     assert "/electrodynamic_actuator/events" not in run().recording.sparse
 

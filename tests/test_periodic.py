@@ -272,3 +272,20 @@ def test_what_cannot_be_is_refused(gains, options, message):
     with pytest.raises(InputError, match=message) as refusal:
         make(dataclasses.replace(GAINS, **gains), **options)
     assert len(str(refusal.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("memory_filter", [0.0, 0.03])
+def test_a_frozen_memory_repeats_what_it_holds_and_learns_nothing(memory_filter):
+    controller = make(memory_filter=memory_filter)
+    wanted, measured = signals(6 * SAMPLES)
+    drive(controller, wanted[: 3 * SAMPLES], measured[: 3 * SAMPLES])
+    controller.learning = False
+    integrator, nothing = controller.integrator, np.zeros(8 * SAMPLES)
+    # Long enough for the filters on r and y to forget; the adaptive part is 0 with y.
+    found = drive(controller, nothing, nothing, first=3 * SAMPLES)
+    assert_allclose(found[-SAMPLES:], found[-2 * SAMPLES : -SAMPLES], rtol=1e-9, atol=1e-9)
+    assert np.ptp(found[-SAMPLES:]) > 0.0
+    assert controller.integrator == integrator
+    controller.learning = True
+    drive(controller, wanted[3 * SAMPLES :], measured[3 * SAMPLES :], first=11 * SAMPLES)
+    assert controller.integrator != integrator

@@ -18,6 +18,8 @@ from lathe_rc.bag.resim import resimulate
 from lathe_rc.cell import messages
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion
 from lathe_rc.errors import InputError
 from lathe_rc.safety import state_machine
@@ -85,6 +87,23 @@ def test_a_command_that_is_retracted_and_given_back_never_jumps():
     assert np.abs(np.diff(out)).max() <= (0.1 + np.abs(np.diff(WAVE)).max() / STEP) * STEP * 1.001
     natural = np.abs(np.diff(WAVE, 2)).max() / STEP**2
     assert np.abs(np.diff(out, 2)).max() / STEP**2 <= 50.0 + 2.0 * natural
+
+
+def test_a_command_with_steps_is_taken_over_without_its_velocity():
+    takeover = Takeover(Bounds(10.0, 1000.0, math.inf), 0.0, STEP, carries=False)
+    steps = np.where(np.arange(40_000) % 2 > 0, 0.51, 0.5)
+    takeover.apply(steps[:100])
+    takeover.change(Mode.RETRACT)
+    takeover.apply(steps[100:20_000])
+    takeover.change(Mode.FOLLOW)
+    takeover.apply(steps[20_000:])
+    stopping = steps[99:20_000]
+    assert stopping[-1] == 0.0
+    assert stopping.max() == stopping[0]
+    assert stopping.min() == 0.0
+    assert np.abs(np.diff(stopping)).max() <= 10.0 * STEP * (1 + 1e-9)
+    assert steps[20_000:].max() <= 0.51
+    assert_array_equal(steps[-2:], [0.5, 0.51])
 
 
 @given(lengths=cuts)
@@ -270,7 +289,7 @@ def test_a_supervisor_that_sees_nothing_changes_nothing():
     with_it, without = harness.run(watched).digest, harness.run(alone).digest
     assert {topic: with_it[topic] for topic in without} == without
     assert set(with_it) - set(without) == {
-        "/safety", "/safety/status", "/supervisor/events", "/tool/events", "/spindle_encoder/events",
+        "/safety", "/safety/status", "/coarse/margin", "/supervisor/events", "/tool/events", "/spindle_encoder/events",
         "/electrodynamic_actuator/events",
     }  # fmt: skip
 
@@ -332,6 +351,181 @@ def test_a_broken_tool_stops_the_feed():
     assert abs(velocity[-1]) < 1e-9
 
 
+# ---- the stability margin
+
+# A slow swing of 5 % of the speed; at the top of it the margin is least.
+SWING = ["spindle_encoder.deviation_amplitude=[0.05]", "spindle_encoder.deviation_frequency=[3.0]"]
+
+
+def margin_of(result):
+    return result.recording.dense["/coarse/margin"]["stability_margin"]
+
+
+def test_the_margin_that_is_published_is_that_of_the_newest_cycle():
+    result = harness.run(supervised(*SWING))
+    told, margin = result.recording.sparse["/coarse/learning"].values, margin_of(result)
+    ends = [0, *told["sample_index"], margin.size]
+    assert told["stability_margin"][0] != margin[0] > 0.0
+    for value, (start, stop) in zip([margin[0], *told["stability_margin"]], itertools.pairwise(ends), strict=True):
+        assert np.all(margin[start:stop] == value)
+    # It rises and falls with the speed of the cycle.
+    speed = result.recording.of_type(messages.ENCODER)["speed_true"]
+    mean = [speed[start:stop].mean() for start, stop in itertools.pairwise(told["sample_index"])]
+    assert np.corrcoef(mean, told["stability_margin"][1:])[0, 1] < -0.99
+
+
+def test_the_margin_is_that_of_the_drive_as_it_is():
+    """A drive that is faster than was believed: the margin falls when that has been identified."""
+    faster = ["electrodynamic_actuator.natural_frequency=1200.0", "spindle_encoder.deviation_amplitude=[0.0]"]
+    loaded = supervised(*faster, "supervisor.margin_limit=[0.05]", "supervisor.error_limit=0.0")
+    result = harness.run(loaded)
+    margin = margin_of(result)
+    stage = LearningController("controller", loaded.nodes["learning_controller"])
+    drive = ElectrodynamicActuator("drive", loaded.nodes["electrodynamic_actuator"])
+    speed = stage.parameters.nominal_speed
+    true = 1.0 - stage.loop(drive.responses()["coarse/command"]).supremum(speed)
+    assert_allclose(margin[-1], true, rtol=1e-3)
+    assert margin[0] > 0.055
+    assert margin[-1] < 0.05
+    assert [told[0] for told in status(result)] == ["stability_margin"]
+
+
+def test_learning_stops_where_the_margin_falls_below_its_limit():
+    margin = margin_of(harness.run(supervised(*SWING)))
+    limit = 0.3 * margin.max() + 0.7 * margin.min()
+    result = harness.run(supervised(*SWING, f"supervisor.margin_limit=[{limit}]"))
+    ((monitor, state, reaction, index),) = status(result)
+    assert (monitor, state, reaction) == ("stability_margin", State.DEGRADED, Reaction.FREEZE)
+    assert index == np.flatnonzero(margin <= limit)[0]
+    told = result.recording.sparse["/coarse/learning"].values
+    frozen = [cycle > index + 3200 for cycle in told["sample_index"]]
+    assert [not learning for learning in told["learning"]] == frozen
+    assert any(frozen)
+    assert not all(frozen)
+
+
+def test_the_margin_is_watched_alike_in_every_host_and_block(tmp_path):
+    loaded = supervised(*SWING, "supervisor.margin_limit=[0.054]")
+    result = harness.run(loaded, bag=tmp_path / "bag")
+    assert status(result)[0][0] == "stability_margin"
+    assert harness.run(loaded, mode="composed").digest == result.digest
+    assert harness.run(supervised(*SWING, "supervisor.margin_limit=[0.054]", "block_size=17")).digest == result.digest
+    found = resimulate(tmp_path / "bag")
+    assert (found.changed, found.different, found.missing) == (False, [], [])
+
+
+# ---- the feed obeys
+
+PASSING = [
+    "spindle_encoder.revolutions=130", "cutting_process.faults=['revolution 60 to 61: cut hard_spot factor=2']",
+    "supervisor.events=['revolution 90: reset']",
+]  # fmt: skip
+
+
+def turning(*overrides):
+    return scenarios.load(CONFIG / "supervised_turning.yaml", [*PASSING, *overrides])
+
+
+@pytest.fixture(scope="module")
+def turned():
+    return harness.run(turning())
+
+
+def feed(result):
+    dense = result.recording.dense
+    return dense["/longitudinal/command"]["command"], dense["/longitudinal/state"]["effort"], dense["/cut"]["force"]
+
+
+def test_the_feed_is_brought_to_rest_along_a_bounded_profile(turned):
+    told = status(turned)
+    assert told[0][:3] == ("force", State.DEGRADED, Reaction.HOLD)
+    begin, end = told[0][3] + 64, told[-1][3]
+    given, effort, _ = feed(turned)
+    assert abs(given[begin - 1]) > 0.1
+    for whole in (given, effort):
+        part = whole[begin - 1 : end]
+        assert part[-1] == 0.0
+        assert np.abs(np.diff(part)).max() <= 10.0 * STEP * (1 + 1e-9)
+        assert np.abs(np.diff(part, 2)).max() <= 1000.0 * STEP**2 * (1 + 1e-3)
+
+
+def test_after_a_reset_the_force_comes_back_without_a_bump_and_without_overshoot(turned):
+    told = status(turned)
+    assert told[-1][:3] == (RESET, State.NOMINAL, Reaction.NONE)
+    given, _, force = feed(turned)
+    back = told[-1][3] + 64
+    assert np.abs(np.diff(given[back - 1 : back + 640])).max() < 0.005
+    # What the derivative makes of the ramp; a set point that is there at once would ask for 0.8 more.
+    assert np.abs(given[back : back + 640]).max() < 0.15
+    assert force[told[-1][3]] < 1.0
+    assert force[back:].max() < 1.05 * 150.0
+    assert_allclose(force[-32_000:].mean(), 150.0, atol=2.0)
+
+
+def test_a_frozen_force_controller_keeps_its_integral_and_goes_on():
+    fault = "cutting_process.faults=['revolution 60: cut.measured_force wrong scale=1.2']"
+    result = harness.run(turning("supervisor.force_reaction=freeze", fault))
+    ((monitor, _, reaction, index), *_) = status(result)
+    assert (monitor, reaction) == ("force", Reaction.FREEZE)
+    given, _, force = feed(result)
+    # P alone against 20 %: with the integral the force falls to 125 N.
+    settled = slice(index + 32_000, status(result)[-1][3])
+    assert force[settled].mean() > 127.0
+    assert np.ptp(given[settled]) > 0.0
+
+
+@pytest.mark.parametrize("mode", ["composed", "processes"])
+def test_the_feed_reacts_alike_in_every_host(mode, turned):
+    assert harness.run(turning(), mode=mode).digest == turned.digest
+
+
+def test_the_feed_reacts_alike_in_blocks_of_any_length(turned):
+    assert harness.run(turning("block_size=17")).digest == turned.digest
+
+
+def obedient(folder, name, node, *overrides):
+    """A scenario of one slide with a supervisor that watches the speed of the spindle."""
+    text = (CONFIG / f"{name}.yaml").read_text(encoding="utf-8")
+    text = text.replace("members: [", "members: [supervisor, ")
+    text = text.replace("ros__parameters:\n", "ros__parameters:\n    allow_faults: true\n", 1)
+    text += """
+/supervisor:
+  ros__parameters:
+    speed_limit: 1.0
+    speed_reaction: hold
+"""
+    (folder / "cell.yaml").write_text(text, encoding="utf-8")
+    delay = f"{node}.reaction_delay=64"
+    return scenarios.load(folder / "cell.yaml", [delay, "feed_drive.reaction_delay=64", *overrides])
+
+
+def test_a_slide_that_a_link_positions_stands_and_goes_on(tmp_path):
+    fault = "spindle_encoder.faults=['second 0.1 to 0.11: encoder.speed wrong scale=2']"
+    reset = "supervisor.events=['second 1.0: reset']"
+    result = harness.run(obedient(tmp_path, "approach", "position_controller", fault, reset))
+    position = result.recording.dense["/cross/state"]["position"]
+    stood = position[round(0.9 / STEP) : round(1.0 / STEP)]
+    # It coasts beyond the set point: what the link would have braked with comes no more.
+    assert stood[0] > 5.5e-3
+    assert np.ptp(stood) < 1e-6
+    assert_allclose(position[-1], 5e-3, atol=5e-6)
+
+
+def test_a_drive_that_is_commanded_a_position_stays_there(tmp_path):
+    fault = "spindle_encoder.faults=['second 40 to 41: encoder.speed wrong scale=2']"
+    changes = [
+        "spindle_encoder.revolutions=60.0",
+        "position_controller.commands=position",
+        "supervisor.speed_limit=0.5",
+    ]
+    result = harness.run(obedient(tmp_path, "periodic", "position_controller", fault, *changes))
+    effort = result.recording.dense["/cross/state"]["effort"]
+    given = result.recording.dense["/cross/command"]["command"]
+    assert abs(effort[40_000]) > 0.05
+    assert effort[-1] == effort[41_000] != 0.0
+    assert given[-1] == given[41_000] != 0.0
+
+
 def test_a_re_simulation_reacts_in_the_same_way(tmp_path):
     harness.run(supervised(STUCK, "supervisor.events=['revolution 26: reset']"), bag=tmp_path / "bag")
     found = resimulate(tmp_path / "bag")
@@ -342,6 +536,8 @@ def test_a_re_simulation_reacts_in_the_same_way(tmp_path):
     ("overrides", "said"),
     [
         (["supervisor.following_limit=[1e-4, 2e-4]"], "allowed: one for each of coarse"),
+        (["learning_controller.publish_margin=false"], "supervisor reads coarse/margin, which no node"),
+        (["supervisor.margin_limit=[0.1, 0.1]"], "allowed: one for each of coarse"),
         (["supervisor.slide_limit=[1e-4]"], "allowed: one for each of none"),
         (["learning_controller.reaction_delay=32"], "feedback of safety is delayed by 32 samples, block_size = 64"),
         (["supervisor.speed_limit=-1"], "allowed: a finite number from 0"),

@@ -86,10 +86,11 @@ class Takeover:
         bounds: of what it does itself.
         retracted: where the command is when retracted [m].
         step: sampling step [s].
+        carries: whether a motion begins with the velocity that the command has; one with steps and noise has none.
     """
 
-    def __init__(self, bounds: Bounds, retracted: float, step: float) -> None:
-        self._bounds, self._goal, self._step = bounds, retracted, step
+    def __init__(self, bounds: Bounds, retracted: float, step: float, *, carries: bool = True) -> None:
+        self._bounds, self._goal, self._step, self._carries = bounds, retracted, step, carries
         self._mode = Mode.FOLLOW
         self._path, self._place = np.zeros(0), 0  # positions to come; of what is added to the command when it follows
         self._given, self._wanted = np.zeros(2), np.zeros(2)  # the last two samples, after and before
@@ -108,9 +109,9 @@ class Takeover:
         """Take over, or give back, from the next sample on."""
         if mode is self._mode:
             return
-        velocity = (self._given[1] - self._given[0]) / self._step
+        velocity = (self._given[1] - self._given[0]) / self._step if self._carries else 0.0
         if mode is Mode.FOLLOW:
-            rest = velocity - (self._wanted[1] - self._wanted[0]) / self._step
+            rest = velocity - (self._wanted[1] - self._wanted[0]) / self._step if self._carries else 0.0
             self._path = motion(self._given[1] - self._wanted[1], rest, 0.0, self._bounds, self._step)
         else:
             goal = self._goal if mode is Mode.RETRACT else None

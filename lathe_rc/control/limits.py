@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limits of a command: stroke, velocity, acceleration, jerk.
 
-A command that keeps within all of them goes through as it is, to the bit. The stroke counts before it is reached: from
-a velocity towards it the other limits must still be able to stop. A command that does not is followed as fast as they
-allow. With e what is missing, the velocity relative to that of the command is at most min(√(A·e/2), (J·e²/9)^(1/3)),
-from which they can bring it to rest there; with Δv what is missing of that, the acceleration relative to that of the
-command is at most √(J·Δv/2), and towards a limit of the velocity at most √(J·Δv). Samples that are not what was
+A command is a position or a velocity. One that keeps within all of them goes through as it is, to the bit. Stroke and
+velocity count before they are reached: the other limits must still be able to stop there. A command that does not is
+followed as fast as they allow. With e what is missing, the velocity relative to that of the command is at most
+min(√(A·e/2), (J·e²/9)^(1/3)), from which they can bring it to rest there; with Δv what is missing of that, the
+acceleration relative to that of the command is at most √(J·Δv/2), and towards a limit of the velocity at most √(J·Δv).
+What would come too near to a limit by its acceleration, taken back by the jerk, brakes. Samples that are not what was
 commanded are counted.
 """
 
@@ -65,45 +66,153 @@ def _reach(jerk: float, change: float) -> float:
 
 
 @kernel
+def _keeps(v: float, a: float, before: float, velocity: float, acceleration: float, jerk: float, step: float) -> bool:
+    """Whether a velocity and an acceleration keep within the limits, now and when the jerk takes the acceleration back.
+
+    ``before`` is the acceleration of the sample before.
+    """
+    rise = max(abs(a) * (0.5 * abs(a) / jerk - 0.5 * step), 0.0) if v * a > 0.0 else 0.0
+    return (
+        abs(v) <= velocity * _CLOSE
+        and abs(v) + rise <= velocity * _CLOSE
+        and abs(a) <= acceleration * _CLOSE
+        and abs(a - before) <= jerk * step * _CLOSE
+    )
+
+
+@kernel
+def _can_stop(coming: float, v: float, a: float, stroke: float, acceleration: float, jerk: float, step: float) -> bool:
+    """Whether a sample with this velocity and acceleration leaves room to stop, the acceleration taken back first."""
+    if stroke == np.inf:
+        return True
+    needs = abs(a) / jerk
+    then = v + 0.5 * a * needs
+    room = stroke - np.sign(then) * (coming + v * step + (v + a * needs / 3.0) * needs)
+    return abs(then) <= _stopping(room, acceleration, jerk, step) * _CLOSE
+
+
+@kernel
+def _towards(
+    v_wanted: float, pulling: float, v: float, a: float, velocity: float, acceleration: float, jerk: float, step: float
+) -> float:
+    """The acceleration of a sample that goes as fast as the limits allow for a velocity that itself changes."""
+    change = v_wanted - v
+    a_wanted = pulling + np.sign(change) * min(_reach(0.5 * jerk, abs(change)), abs(change) / step)
+    if v * a_wanted > 0.0:
+        left = velocity - abs(v)
+        a_wanted = _clip(a_wanted, min(_reach(jerk, left), max(left, 0.0) / step))
+    return a + _clip(_clip(a_wanted, acceleration) - a, jerk * step)
+
+
+@kernel
+def _next(
+    v_goal: float, v_wanted: float, pulling: float, coming: float, v: float, a: float,
+    stroke: float, velocity: float, acceleration: float, jerk: float, step: float,
+) -> tuple[bool, float]:  # fmt: skip
+    """Whether the next sample can be as wanted, and its acceleration.
+
+    Args:
+        v_goal: velocity of a sample that is as wanted.
+        v_wanted: velocity otherwise, before its limits.
+        pulling: acceleration of what is wanted.
+        coming: position at which a velocity of 0 comes to rest.
+        v: velocity of the sample before.
+        a: its acceleration.
+        stroke: see `CommandLimits`, as the next three.
+        velocity: to each side.
+        acceleration: to each side.
+        jerk: to each side.
+        step: sampling step [s].
+    """
+    a_goal = (v_goal - v) / step
+    if _keeps(v_goal, a_goal, a, velocity, acceleration, jerk, step) and _can_stop(
+        coming, v_goal, a_goal, stroke, acceleration, jerk, step
+    ):
+        return True, a_goal
+    allowed = velocity
+    if stroke < np.inf:
+        room = stroke - np.sign(v_wanted) * coming
+        allowed = min(allowed, _stopping(room, acceleration, jerk, step), max(0.5 * room / step, 0.0))
+    found = _towards(_clip(v_wanted, _SHORT_OF * allowed), pulling, v, a, velocity, acceleration, jerk, step)
+    after = v + found * step
+    too_fast = abs(after + 0.5 * found * abs(found) / jerk) > velocity
+    if too_fast or not _can_stop(coming, after, found, stroke, acceleration, jerk, step):
+        found = _towards(0.0, 0.0, v, a, velocity, acceleration, jerk, step)
+    return False, found
+
+
+@kernel
+def keep_position(
+    stroke: float, velocity: float, acceleration: float, jerk: float, step: float, state: Array, wanted: float
+) -> bool:
+    """Keep one more sample of a wanted position within limits; returns whether it is clipped.
+
+    Args:
+        stroke: see `CommandLimits`, as the next three.
+        velocity: to each side.
+        acceleration: to each side.
+        jerk: to each side.
+        step: sampling step [s].
+        state: position, velocity, acceleration of what was given; position and velocity of what was wanted; changed,
+            the first is what is given now.
+        wanted: the command.
+    """
+    p, v, a, goal_before, moving_before = state[0], state[1], state[2], state[3], state[4]
+    goal = _clip(wanted, stroke)
+    moving = _clip((goal - goal_before) / step, velocity)
+    pulling = _clip((moving - moving_before) / step, acceleration)
+    behind = goal_before - p
+    v_wanted = moving + np.sign(behind) * _stopping(abs(behind), acceleration, jerk, step)
+    v_goal = (goal - p) / step
+    free, found = _next(v_goal, v_wanted, pulling, p, v, a, stroke, velocity, acceleration, jerk, step)
+    if free:
+        p, v = goal, v_goal
+    else:
+        v += found * step
+        p += v * step
+    state[0], state[1], state[2], state[3], state[4] = p, v, found, goal, moving
+    return not free or goal != wanted
+
+
+@kernel
+def keep_velocity(
+    stroke: float, velocity: float, acceleration: float, jerk: float, step: float, state: Array, coming: float,
+    wanted: float,
+) -> bool:  # fmt: skip
+    """Keep one more sample of a wanted velocity within limits; returns whether it is clipped.
+
+    Args:
+        stroke: see `CommandLimits`, as the next three.
+        velocity: to each side.
+        acceleration: to each side.
+        jerk: to each side.
+        step: sampling step [s].
+        state: velocity and acceleration of what was given, velocity that was wanted; changed, the first is what is
+            given now.
+        coming: position where what is driven comes to rest if 0 is given from now on.
+        wanted: the command.
+    """
+    v, a, moving_before = state[0], state[1], state[2]
+    moving = _clip(wanted, velocity)
+    pulling = _clip((moving - moving_before) / step, acceleration)
+    free, found = _next(moving, moving, pulling, coming, v, a, stroke, velocity, acceleration, jerk, step)
+    state[0], state[1], state[2] = (moving if free else v + found * step), found, moving
+    return not free or moving != wanted
+
+
+@kernel
 def _limit(
     stroke: float, velocity: float, acceleration: float, jerk: float, step: float, state: Array, wanted: Array,
     given: Array, clipped: npt.NDArray[np.uint8],
 ) -> None:  # fmt: skip
-    """The state: position, velocity, acceleration of what was given; position and velocity of what was wanted."""
-    p, v, a, goal_before, moving_before = state
     for k in range(wanted.size):
-        goal = _clip(wanted[k], stroke)
-        moving = _clip((goal - goal_before) / step, velocity)
-        pulling = _clip((moving - moving_before) / step, acceleration)
-        behind = goal_before - p
-        goal_before, moving_before = goal, moving
-        v_goal = (goal - p) / step
-        a_goal = (v_goal - v) / step
-        inside = velocity
-        if stroke < np.inf:
-            inside = min(inside, _stopping(max(stroke - np.sign(v_goal) * p, 0.0), acceleration, jerk, step))
-        if (
-            abs(v_goal) <= inside * _CLOSE
-            and abs(a_goal) <= acceleration * _CLOSE
-            and abs(a_goal - a) <= jerk * step * _CLOSE
-        ):
-            clipped[k] = goal != wanted[k]
-            p, v, a = goal, v_goal, a_goal
-        else:
-            clipped[k] = 1
-            v_wanted = moving + np.sign(behind) * _stopping(abs(behind), acceleration, jerk, step)
-            room = max(stroke - np.sign(v_wanted) * p, 0.0)
-            stopping = _stopping(room, acceleration, jerk, step) if stroke < np.inf else velocity
-            v_wanted = _clip(v_wanted, _SHORT_OF * min(velocity, stopping))
-            change = v_wanted - v
-            a_wanted = pulling + np.sign(change) * min(_reach(0.5 * jerk, abs(change)), abs(change) / step)
-            if v * a_wanted > 0.0:
-                a_wanted = _clip(a_wanted, _reach(jerk, velocity - abs(v)))
-            a += _clip(_clip(a_wanted, acceleration) - a, jerk * step)
-            v += a * step
-            p += v * step
-        given[k] = p
-    state[0], state[1], state[2], state[3], state[4] = p, v, a, goal_before, moving_before
+        clipped[k] = keep_position(stroke, velocity, acceleration, jerk, step, state, wanted[k])
+        given[k] = state[0]
+
+
+def rest() -> Array:
+    """The state for `keep_position` or `keep_velocity` of a command at rest at 0."""
+    return np.zeros(5)
 
 
 class CommandLimiter:
@@ -119,7 +228,7 @@ class CommandLimiter:
 
     def __init__(self, limits: CommandLimits, step: float) -> None:
         self._limits, self._step = limits, step
-        self._state = np.zeros(5)
+        self._state = rest()
         self.clipped = 0
 
     def block(self, wanted: Array, given: Array) -> npt.NDArray[np.uint8]:

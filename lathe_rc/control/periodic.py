@@ -35,8 +35,8 @@ Array = npt.NDArray[np.float64]
 _REACH = 5.0  # of the Gaussian, in standard deviations
 _CHUNK = 128  # samples of the memory that are smoothed at a time, if the period allows
 # Places in the state: I, δ̃, the integral of eq. 15, its lower bound, the least distance of both so far, the largest
-# demand |u|, the largest |sample| stored.
-_INTEGRATOR, _SWITCH, _POPOV, _BOUND, _CLEARANCE, _DEMAND, _MEMORY = range(7)
+# demand |u|, the largest |sample| stored; whether it is frozen.
+_INTEGRATOR, _SWITCH, _POPOV, _BOUND, _CLEARANCE, _DEMAND, _MEMORY, _FROZEN, _SIZE = range(9)
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class PeriodicState(NamedTuple):
     """What the law remembers, for kernels.
 
     Attributes:
-        values: scalars, shape (7,).
+        values: scalars, shape (8,).
         reference, output: states of the filters.
         ring: stored samples of u1, shape (samples + reach,); sample n stands at n modulo its length.
         smoothed: what is read in the chunk at hand.
@@ -219,7 +219,10 @@ def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, me
     demand = stored + (law.h11 * values[_INTEGRATOR] + law.h12 * s * weighted) * s
     applied = min(max(demand, -law.limit), law.limit)
     winding = (applied - demand) * v < 0.0
-    if winding and law.anti_windup:
+    frozen = values[_FROZEN] > 0.0
+    if frozen:
+        stored = state.ring[(n - law.samples) % state.ring.size]
+    elif winding and law.anti_windup:
         stored = min(max(read, -law.limit), law.limit)
     else:
         values[_INTEGRATOR] += law.step * s * weighted
@@ -227,7 +230,8 @@ def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, me
     values[_SWITCH] = law.keep * values[_SWITCH] + (1.0 - law.keep) * (law.switch_low if winding else 1.0)
     values[_DEMAND] = max(values[_DEMAND], abs(demand))
     values[_MEMORY] = max(values[_MEMORY], abs(stored))
-    _monitor(law, state, n, wanted, v, applied)
+    if not frozen:
+        _monitor(law, state, n, wanted, v, applied)
     return quantise(applied, law.command_step), applied != demand
 
 
@@ -327,7 +331,7 @@ class PeriodicController:
             knows_ideal=ideal is not None,
         )
         self.state = PeriodicState(
-            values=np.zeros(7),
+            values=np.zeros(_SIZE),
             reference=rest(system),
             output=rest(system),
             ring=np.zeros(samples + reach),
@@ -343,6 +347,15 @@ class PeriodicController:
     def block(self, first: int, reference: Array, measurement: Array, command: Array) -> None:
         """Step from sample ``first`` on; arrays of shape (n,) [1]; ``command`` is limited and quantised."""
         self.saturated += _block(self.law, self.state, first, reference, measurement, command)
+
+    @property
+    def learning(self) -> bool:
+        """Whether memory and I change; otherwise the memory repeats what it holds, and eq. 15 is not watched."""
+        return not self.state.values[_FROZEN]
+
+    @learning.setter
+    def learning(self, on: bool) -> None:
+        self.state.values[_FROZEN] = not on
 
     @property
     def integrator(self) -> float:

@@ -8,6 +8,9 @@ Where the command is at a limit and the error drives it further out, the integra
 round: the measurement to the step of the ADC, the command to that of the DAC. A set point that may change only so
 fast, and that is approached in the end as 1 - e^{-t/T}, enters the cut without overshoot of the force.
 
+The integral can be told to stand still. A controller that waits, since another gives the command, lets a set point with
+ramp or approach go with the measurement: when it goes on, the set point comes from there as it did at the start.
+
 Source: paper 004, Figs 11 and 12. The paper has mm, N and % of the full command; here they are m, N and 1.
 """
 
@@ -25,7 +28,7 @@ from lathe_rc.transfer import TransferFunction
 Array = npt.NDArray[np.float64]
 
 # Places in the state of a controller.
-_INTEGRAL, _SLOPE, _ERROR, _SET_POINT, _COMMAND, SATURATED, CLAMPED, SLOWED, _SIZE = range(9)
+_INTEGRAL, _SLOPE, _ERROR, _SET_POINT, _COMMAND, SATURATED, CLAMPED, SLOWED, _STANDS, _WAITS, _SIZE = range(11)
 
 
 @dataclass(frozen=True)
@@ -110,12 +113,14 @@ def control(pid: PidTable, state: Array, n: int, set_point: float, measurement: 
     if pid.ramp > 0.0:
         move = min(max(move, -pid.ramp), pid.ramp)
     wanted = set_point if move == way else state[_SET_POINT] + move
+    read = quantise(measurement, pid.adc)
+    if state[_WAITS] > 0.0 and (pid.ramp > 0.0 or pid.approach < 1.0):
+        wanted = read
     state[SLOWED] += wanted != set_point
     state[_SET_POINT] = wanted
-    read = quantise(measurement, pid.adc)
     error = wanted - read
     slope = pid.decay * state[_SLOPE] + pid.derivative * (error - state[_ERROR])
-    more = pid.integral * (error + state[_ERROR])
+    more = 0.0 if state[_STANDS] > 0.0 else pid.integral * (error + state[_ERROR])
     rest = pid.proportional * error + slope
     demand = rest + state[_INTEGRAL] + more
     if (demand > pid.high and more > 0.0) or (demand < pid.low and more < 0.0):
@@ -193,6 +198,24 @@ class Pid:
             divisor=divisor,
         )
         self.state = np.zeros(_SIZE)
+
+    @property
+    def integrates(self) -> bool:
+        """Whether the integral goes on; it stands still otherwise."""
+        return not self.state[_STANDS]
+
+    @integrates.setter
+    def integrates(self, on: bool) -> None:
+        self.state[_STANDS] = not on
+
+    @property
+    def waits(self) -> bool:
+        """Whether another gives the command."""
+        return bool(self.state[_WAITS])
+
+    @waits.setter
+    def waits(self, on: bool) -> None:
+        self.state[_WAITS] = on
 
     @property
     def saturated(self) -> int:

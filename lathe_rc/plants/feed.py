@@ -16,6 +16,16 @@ sample does not depend on the command of the same sample.
 The states are the position of the motor and its derivatives, so that a limit of the speed can hold them: a motor that
 would go beyond its greatest speed stays at it without acceleration, as if its command were no larger than what that
 speed needs. Nothing is left to unwind when the command falls.
+
+Limits of stroke, velocity, acceleration and jerk are those of the motion that the command u asks for. What it asks for
+is where the model settles: of a model that integrates the speed k·u, of any other the position k·u, with its gain k.
+
+    position  |k·u| ≤ stroke, |k·du/dt| ≤ velocity, |k·d²u/dt²| ≤ acceleration, |k·d³u/dt³| ≤ jerk
+    speed     |x∞| ≤ stroke, |k·u| ≤ velocity, |k·du/dt| ≤ acceleration, |k·d²u/dt²| ≤ jerk
+
+x∞ is where the motor would come to rest if the command were 0 from now on: with the denominator p·(a1 + a2·p + …) the
+motor's position x + (a2·dx/dt + a3·d²x/dt² + …)/a1, which moves with k·u.
+How they are kept is in `lathe_rc.control.limits`.
 """
 
 from collections.abc import Sequence
@@ -25,6 +35,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from lathe_rc.control.limits import CommandLimits, keep_position, keep_velocity, rest
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.backlash import follow
@@ -40,6 +51,8 @@ Feedback = Literal["motor", "load"]
 _DISTURBANCE, _EFFORT, _LOAD = -3, -2, -1
 
 _UNDISTURBED = np.empty(0)
+_UNTOLD = np.empty(0, np.uint8)
+_FREE = CommandLimits()
 
 APPROXIMATE_LAGS = (0.17, 0.22)  #: [s] of W1, 11.79/((0.17p+1)(0.22p+1)) (paper 004)
 FULL_LAGS = (0.11304, 0.2679, 0.01659, 0.01659)  #: [s] of the W1 that meets the step data printed in paper 004
@@ -110,6 +123,37 @@ class DriveTable(NamedTuple):
     half: float
 
 
+class LimitTable(NamedTuple):
+    """Limits of a drive's command for kernels, as `lathe_rc.control.limits` has them; all in the command's unit.
+
+    Attributes:
+        stroke, velocity, acceleration, jerk: of the position or the velocity that the command is.
+        step: from one taken command to the next [s].
+        coming: of a velocity: weights of the states in x∞, shape (m,); of a position: empty.
+    """
+
+    stroke: float
+    velocity: float
+    acceleration: float
+    jerk: float
+    step: float
+    coming: Array
+
+
+@kernel
+def _keep(limits: LimitTable, memory: Array, state: Array, command: float) -> bool:
+    """Keep a command within its limits; ``state`` is the drive's. The first of ``memory`` is what is given."""
+    stroke, velocity, acceleration, jerk, step = (
+        limits.stroke, limits.velocity, limits.acceleration, limits.jerk, limits.step
+    )  # fmt: skip
+    if limits.coming.size == 0:
+        return keep_position(stroke, velocity, acceleration, jerk, step, memory, command)
+    coming = 0.0
+    for row in range(limits.coming.size):
+        coming += limits.coming[row] * state[row]
+    return keep_velocity(stroke, velocity, acceleration, jerk, step, memory, coming, command)
+
+
 @kernel
 def motor_of(state: Array) -> float:
     """Position of the motor [m], in a drive's state."""
@@ -157,7 +201,9 @@ def hold(table: DriveTable, state: Array, command: float) -> bool:
 @kernel
 def _advance(
     table: DriveTable,
+    limits: LimitTable,
     state: Array,
+    memory: Array,
     divisor: int,
     resolution: float,
     from_load: bool,  # noqa: FBT001 - kernels take everything by position
@@ -169,14 +215,24 @@ def _advance(
     effort: Array,
     motor: Array,
     measured: Array,
+    clipped: npt.NDArray[np.uint8],
 ) -> tuple[int, int]:
-    """Step through a block; returns the commands that were cut off and the samples at the greatest speed."""
+    """Step through a block; returns the commands that were cut off and the samples at the greatest speed.
+
+    ``memory`` is that of the limits, and whether the command that is held is clipped.
+    """
     saturated = limited = 0
     for k in range(command.size):
         before = state[_LOAD]
         limited += move(table, state)
         if (first + k) % divisor == 0:
-            saturated += hold(table, state, command[k])
+            wanted = command[k]
+            if clipped.size:
+                memory[-1] = 1.0 if _keep(limits, memory, state, wanted) else 0.0
+                wanted = memory[0]
+            saturated += hold(table, state, wanted)
+        if clipped.size:
+            clipped[k] = memory[-1] > 0.0
         state[_DISTURBANCE] = disturbance[k] if disturbance.size else 0.0
         motor[k], position[k], effort[k] = state[0], state[_LOAD], state[_EFFORT]
         # Within the gap the slide stands.
@@ -206,6 +262,32 @@ def _realise(model: TransferFunction) -> tuple[Array, Array]:
     return a, np.asarray(markov[1:])
 
 
+def _settles(model: TransferFunction) -> tuple[float, bool]:
+    """What a command of 1 asks for, 0 if neither a position nor a speed, and whether it is a speed."""
+    integrates = model.denominator[-1] == 0.0
+    divisor = model.denominator[-2 if integrates else -1]
+    return (abs(model.numerator[-1] / divisor) if divisor else 0.0), integrates
+
+
+def _limits(model: TransferFunction, limits: CommandLimits, command_limit: float, step: float) -> LimitTable:
+    """The limits of a drive's command, taken every ``step`` [s]."""
+    gain, integrates = _settles(model)
+    if limits.any and not gain:
+        raise InputError(
+            f"feed drive {model}: its command stands for neither a position nor a speed, so that there is no limit of "
+            "stroke, velocity, acceleration or jerk for it; allowed: a gain, and one pole at 0 at most"
+        )
+    gain = gain or 1.0
+    stroke, velocity, acceleration, jerk = (
+        limit / gain for limit in (limits.stroke, limits.velocity, limits.acceleration, limits.jerk)
+    )
+    if integrates:
+        bottom = np.trim_zeros(np.array(model.denominator), "f")
+        coming = bottom[-2::-1] / (bottom[-2] * gain) if limits.any else np.empty(0)
+        return LimitTable(stroke, min(velocity, command_limit), acceleration, jerk, step, coming)
+    return LimitTable(min(stroke, command_limit), velocity, acceleration, jerk, step, np.empty(0))
+
+
 class FeedDrive:
     """The drive as a machine: command in, motion of the slide and of the motor out.
 
@@ -218,15 +300,18 @@ class FeedDrive:
         backlash: width of the gap between motor and slide [m].
         resolution: of the position sensor [m]; 0 for none.
         feedback: where the position sensor is.
+        limits: of the motion that the command asks for.
 
     Attributes:
         table: its constants for `move` and `hold`.
         state: its memory for them.
+        integrates: whether the command stands for a speed.
         saturated: commands so far that were cut off.
         limited: samples so far at the greatest speed.
 
     Raises:
-        InputError: a model whose speed would jump with the command, or a value that is out of range.
+        InputError: a model whose speed would jump with the command, a value that is out of range, or limits for a
+            command that stands for neither a position nor a speed.
     """
 
     def __init__(
@@ -240,6 +325,7 @@ class FeedDrive:
         backlash: float = 0.0,
         resolution: float = 0.0,
         feedback: Feedback = "load",
+        limits: CommandLimits = _FREE,
     ) -> None:
         for name, value, allowed in (
             ("divisor", divisor, divisor >= 1),
@@ -256,8 +342,8 @@ class FeedDrive:
         # What is exact for a command that is linear over a step is so for one that does not change in it.
         held = linear.weights[:, 0] + linear.weights[:, 1]
         # A model that integrates needs a certain command for a certain speed.
-        gain = abs(model.numerator[-1] / model.denominator[-2]) if model.denominator[-1] == 0.0 else 0.0
-        needed = speed_limit / gain if gain > 0.0 else np.inf
+        gain, self.integrates = _settles(model)
+        needed = speed_limit / gain if self.integrates and gain > 0.0 else np.inf
         self.table = DriveTable(
             transition=np.ascontiguousarray(linear.transition),
             weights=held,
@@ -269,6 +355,8 @@ class FeedDrive:
             half=backlash / 2.0,
         )
         self.state = np.zeros(2 * held.size + 3)
+        self._limited, self._limits = limits.any, _limits(model, limits, command_limit, divisor * step)
+        self._memory = np.append(rest(), 0.0)
         self.saturated = self.limited = 0
         self._step, self._sampling = step, (divisor, float(resolution), feedback == "load")
 
@@ -290,8 +378,9 @@ class FeedDrive:
         motor: Array,
         measured: Array,
         disturbance: Array = _UNDISTURBED,
+        clipped: npt.NDArray[np.uint8] = _UNTOLD,
     ) -> None:
-        """Step from sample ``first`` on; at rest at 0 before sample 0. Arrays of shape (n,), the last five filled.
+        """Step from sample ``first`` on; at rest at 0 before sample 0. Arrays of shape (n,); the motion is filled.
 
         Args:
             first: index of the first sample.
@@ -302,10 +391,15 @@ class FeedDrive:
             motor: position of the motor, on the slide's scale [m].
             measured: that of the two which the sensor sees, as it reads it [m].
             disturbance: adds to the limited command, in its unit (f of paper 002, eq. 2); none if empty.
+            clipped: filled with 1 where the limits do not let the command be what it was when it was taken; needed if
+                there are limits, and empty without.
         """
+        assert bool(clipped.size) == (self._limited and bool(command.size)), "room for what is clipped"
         saturated, limited = _advance(
             self.table,
+            self._limits,
             self.state,
+            self._memory,
             *self._sampling,
             first,
             command,
@@ -315,6 +409,7 @@ class FeedDrive:
             effort,
             motor,
             measured,
+            clipped,
         )
         self.saturated += saturated
         self.limited += limited

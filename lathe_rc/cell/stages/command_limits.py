@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of what a drive of the tool is commanded, and what is said of samples that are clipped."""
+"""Limits of what a drive is commanded, and what is said of samples that are clipped."""
 
 from typing import Annotated
 
@@ -47,26 +47,40 @@ class LimitedCommand:
     def __init__(self, node: str, parameters: LimitedParameters, which: str = "") -> None:
         limits = parameters.command_limits()
         self.on = limits.any
-        self._topic, self._limiter = f"{node}/events", CommandLimiter(limits, parameters.step)
-        self._which = f" {which}" if which else ""
-        self._begins = f"{LIMITED}:{self._which}" if which else LIMITED
-        self._quiet = round(_QUIET * parameters.sample_rate)
-        self._before, self._left = 0, 0  # clipped samples when it was last free; samples until it is free again
+        self._limiter, self._clipping = CommandLimiter(limits, parameters.step), Clipping(node, parameters, which)
 
     def block(self, first: int, command: Samples) -> tuple[Samples, list[Sparse]]:
         """What the drive gets [m], shape (n,), and the events of samples ``first`` on."""
         if not self.on:
             return command, []
         given = np.empty_like(command)
-        count = self._limiter.clipped
-        clipped = self._limiter.block(command, given)
-        if not self._left and self._limiter.clipped == count:
-            return given, []
-        return given, self._told(first, clipped, count)
+        return given, self._clipping.told(first, self._limiter.block(command, given))
 
-    def _told(self, first: int, clipped: Samples, count: int) -> list[Sparse]:
-        """The events of a block; ``count`` samples were clipped before it."""
-        found, place, samples = [], 0, clipped.size
+
+class Clipping:
+    """Says with which sample a command begins to be clipped, and when it is free again.
+
+    Args:
+        node: whose command it is.
+        parameters: its table.
+        which: of its commands; empty if it has one.
+    """
+
+    def __init__(self, node: str, parameters: NodeParameters, which: str = "") -> None:
+        self._topic = f"{node}/events"
+        self._which = f" {which}" if which else ""
+        self._begins = f"{LIMITED}:{self._which}" if which else LIMITED
+        self._quiet = round(_QUIET * parameters.sample_rate)
+        # Clipped samples so far, and when it was last free; samples until it is free again.
+        self._clipped, self._before, self._left = 0, 0, 0
+
+    def told(self, first: int, clipped: Samples) -> list[Sparse]:
+        """The events of samples ``first`` on, of which some are ``clipped``, shape (n,)."""
+        found: list[Sparse] = []
+        count, place, samples = self._clipped, 0, clipped.size
+        self._clipped += int(clipped.sum())
+        if not self._left and self._clipped == count:
+            return found
         while place < samples:
             ahead = np.flatnonzero(clipped[place : place + self._left] if self._left else clipped[place:])
             if self._left and ahead.size:

@@ -9,8 +9,11 @@ from annotated_types import Ge, Gt, Le
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
-from lathe_rc.cell.parameters import ObedientParameters, parameter
+from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedParameters
+from lathe_rc.cell.stages.obedience import FeedObedientParameters, Obedience
+from lathe_rc.errors import InputError
 from lathe_rc.plants import feed
 from lathe_rc.plants.feed import Feedback, FeedDrive
 from lathe_rc.safety.state_machine import Reaction
@@ -21,7 +24,7 @@ from lathe_rc.transfer import TransferFunction
 Axis = Literal["cross", "longitudinal"]
 
 
-class FeedDriveParameters(ObedientParameters):
+class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
     """Model from command to position, limits, backlash, and the position sensor."""
 
     axis: Axis = parameter("cross", "which slide; the first word of its topics")
@@ -48,6 +51,14 @@ class FeedDriveParameters(ObedientParameters):
     command_limit: Annotated[float, Ge(0)] = parameter(
         1.0, "largest command to each side, in its unit; the full command is 1; 0: none"
     )
+    command_stroke: Annotated[float, Ge(0)] = parameter(
+        0.0, "what is commanded stops the slide within this to each side; 0: none", "m"
+    )
+    command_velocity: Annotated[float, Ge(0)] = parameter(
+        0.0, "largest velocity that is commanded: gain times command, or its change for a position; 0: none", "m/s"
+    )
+    command_acceleration: Annotated[float, Ge(0)] = parameter(0.0, "largest change of that velocity; 0: none", "m/s^2")
+    command_jerk: Annotated[float, Ge(0)] = parameter(0.0, "largest change of that acceleration; 0: none", "m/s^3")
     speed_limit: Annotated[float, Ge(0)] = parameter(0.0, "greatest speed of the motor; 0: none", "m/s")
     disturbance: float = parameter(
         0.0, "amplitude of f(t) = A·sin²(0.04πt s⁻¹), added to the limited command; 0.5 in eq. 18 of paper 002"
@@ -80,30 +91,42 @@ class FeedDriveStage(Stage):
 
     kind = "feed_drive"
     Parameters = FeedDriveParameters
+    announces = (LIMITED, FREE)
 
     def __init__(self, name: str, parameters: FeedDriveParameters) -> None:
         super().__init__(name, parameters)
         self.parameters = parameters
-        self.drive = FeedDrive(
-            parameters.transfer(),
-            step=parameters.step,
-            divisor=parameters.divisor,
-            command_limit=parameters.command_limit or np.inf,
-            speed_limit=parameters.speed_limit or np.inf,
-            backlash=parameters.backlash,
-            feedback=parameters.feedback,
-        )
+        limits = parameters.command_limits()
+        try:
+            self.drive = FeedDrive(
+                parameters.transfer(),
+                step=parameters.step,
+                divisor=parameters.divisor,
+                command_limit=parameters.command_limit or np.inf,
+                speed_limit=parameters.speed_limit or np.inf,
+                backlash=parameters.backlash,
+                feedback=parameters.feedback,
+                limits=limits,
+            )
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from None
+        self._clipping = Clipping(name, parameters)
+        self._clipped = np.empty(messages.MAX_BLOCK if limits.any else 0, np.uint8)
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         self._motor, self._seen, self._load = (np.empty(messages.MAX_BLOCK) for _ in range(3))
-        self._safe = False
-        axis, delay = parameters.axis, parameters.reaction_delay
+        self._obedience, self._safe = self._obeys(), False
+        axis = parameters.axis
         self.declare(
             inputs=[
                 Input(f"{axis}/command", messages.SERVO, ("command",)),
-                *([Input("safety", messages.SAFETY, ("reaction",), delay)] if delay else []),
+                *parameters.listens(),
             ],
             outputs=[Output(f"{axis}/state", messages.STATE, Joint("position", "velocity", "effort"))],
+            tells=limits.any,
         )
+
+    def _obeys(self) -> Obedience:
+        return self.parameters.obedience(None, speed=self.drive.integrates, settled=0)
 
     def go_safe(self) -> None:
         """See `Stage`; the slide stops."""
@@ -113,14 +136,22 @@ class FeedDriveStage(Stage):
         """See `Stage`."""
         (servo, *safety), (state,) = inputs, outputs
         command = servo["command"]
-        if self._safe:
-            command = np.zeros_like(command)
-        elif safety:
-            command = np.where(safety[0]["reaction"] >= Reaction.HOLD, 0.0, command)
+        if self._safe or safety:
+            command = command.copy()
+            reaction = safety[0]["reaction"] if safety else np.zeros(command.size, np.uint8)
+            if self._safe:
+                reaction = np.full_like(reaction, Reaction.STOP)
+            for start, stop in self._obedience.pieces(reaction):
+                self._obedience.apply(command[start:stop])
+        else:
+            self._obedience.apply(command)  # which it leaves as it is
         size = command.size
         motor, seen = self._motor[:size], self._seen[:size]
         load = self._load[: size if self.parameters.disturbance else 0]
         fill_disturbance(first, self.parameters.step, self.parameters.disturbance, load)
-        self.drive.block(first, command, state["position"], state["velocity"], state["effort"], motor, seen, load)
+        clipped = self._clipped[:size]
+        self.drive.block(
+            first, command, state["position"], state["velocity"], state["effort"], motor, seen, load, clipped
+        )
         self._sensor.measure(seen, state["measured_position"])
-        return []
+        return self._clipping.told(first, clipped)

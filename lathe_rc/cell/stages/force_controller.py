@@ -48,19 +48,33 @@ class ForceController(Stage):
         self.pid = parameters.pid(
             parameters.proportional, parameters.integral, parameters.derivative, parameters.derivative_filter
         )
+        self._obedience = parameters.obeys(self)
         self.declare(
             inputs=[
                 # The angle itself is not used: the spindle's blocks say which samples are due.
                 Input("encoder", messages.ENCODER, ("angle",)),
                 Input("cut", messages.CUT, ("measured_force",), parameters.feedback_delay),
+                *parameters.listens(),
             ],
             outputs=[Output("longitudinal/command", messages.SERVO)],
         )
 
+    def may_learn(self, *, on: bool) -> None:
+        """See `lathe_rc.cell.stages.obedience.Learner`."""
+        self.pid.integrates = on
+
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
-        (_, cut), (servo,) = inputs, outputs
-        self.trajectory.block(first, servo["set_point"])
-        self.pid.block(first, servo["set_point"], cut["measured_force"], servo["command"])
-        np.subtract(servo["set_point"], cut["measured_force"], out=servo["error"])
+        (_, cut, *safety), (servo,) = inputs, outputs
+        wanted, force, command = servo["set_point"], cut["measured_force"], servo["command"]
+        self.trajectory.block(first, wanted)
+        np.subtract(wanted, force, out=servo["error"])
+        if self._obedience is None:
+            self.pid.block(first, wanted, force, command)
+            return []
+        for start, stop in self._obedience.pieces(safety[0]["reaction"]):
+            self.pid.waits = self._obedience.held
+            part = slice(start, stop)
+            self.pid.block(first + start, wanted[part], force[part], command[part])
+            self._obedience.apply(command[part])
         return []

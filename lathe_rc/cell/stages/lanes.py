@@ -99,7 +99,7 @@ def _measure(sensors: Sequence[Sensor], true: Array, measured: Array) -> None:
 
 
 class LearningLanes(LaneStage[LearningController]):
-    """Self-learning controllers without correction, events, identification or supervisor, with an exponential Q."""
+    """Self-learning controllers without correction, events, identification, margin or supervisor; an exponential Q."""
 
     def __init__(self, stages: Sequence[LearningController]) -> None:
         super().__init__(stages)
@@ -141,6 +141,7 @@ class LearningLanes(LaneStage[LearningController]):
             and table.make_q().chunk == first.make_q().chunk
             and not table.identify
             and not table.reaction_delay
+            and not table.publish_margin
             and table.cycle_points == first.cycle_points
             and table.points_per_revolution == first.points_per_revolution
             for table, stage in zip(tables, stages, strict=True)

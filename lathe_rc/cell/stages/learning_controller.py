@@ -16,13 +16,16 @@ from lathe_rc.cell.messages import MAX_BLOCK, Samples, Signals
 from lathe_rc.cell.stage import Input, Output, Sparse, Stage, cut
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
 from lathe_rc.cell.stages.obedience import Obedience
-from lathe_rc.control import memory_file
+from lathe_rc.control import bounded, memory_file
+from lathe_rc.control.bounded import Takeover
 from lathe_rc.control.correction import Correction
 from lathe_rc.control.identification import DriveIdentifier, Identified
 from lathe_rc.control.repetitive import AngleLostError, Cycle, RepetitiveController, largest_feedback_delay
 from lathe_rc.errors import InputError
 from lathe_rc.plants.linear import discretise, second_order
+from lathe_rc.safety.state_machine import Reaction
 
+_SETTLED = 4.0  # lead times until a drive has followed
 _MOST = 1024  # entries of a table of margins
 _FILE_ACTIONS = ("save", "load")
 
@@ -70,7 +73,8 @@ class LearningController(Stage):
         inputs += [Input(f"{drive}/state", messages.STATE, ("measured_position",), delay) for drive in parameters.finer]
         if parameters.identify:
             inputs.append(Input("coarse/state", messages.STATE, ("measured_position",), delay))
-        self._obedience = Obedience(self._controller, parameters) if parameters.reaction_delay else None
+        self._lost = False  # there is no angle that it could read its memory at
+        self._obedience = self._obeys() if parameters.reaction_delay else None
         if self._obedience:
             inputs.append(Input("safety", messages.SAFETY, ("reaction",), parameters.reaction_delay))
         self._identifier = DriveIdentifier(
@@ -81,10 +85,25 @@ class LearningController(Stage):
             step=parameters.step,
             block=MAX_BLOCK,
         )
-        self.declare(inputs=inputs, outputs=[Output("coarse/command", messages.COMMAND)])
+        outputs = [Output("coarse/command", messages.COMMAND)]
+        if parameters.publish_margin:
+            outputs.append(Output("coarse/margin", messages.MARGIN))
+            self._margin = self._margins.untabulated(parameters.nominal_speed, self._model)
+        self.declare(inputs=inputs, outputs=outputs)
         self.sparse_topics["coarse/learning"] = messages.LEARNING
         if self._scheduled_actions("load") and not self._scheduled_actions("save"):
             self._read_memory()
+
+    def _obeys(self) -> Obedience:
+        parameters = self.parameters
+        settled = round(_SETTLED * parameters.lead_time / parameters.step) + parameters.feedback_delay
+        bounded.prepare()
+        takeover = Takeover(parameters.bounds(), parameters.retract_position, parameters.step)
+        return Obedience(self, takeover, settled=settled)
+
+    def may_learn(self, *, on: bool) -> None:
+        """See `lathe_rc.cell.stages.obedience.Learner`."""
+        self._controller.learning = on
 
     def _check_identification(self) -> None:
         parameters = self.parameters
@@ -177,32 +196,47 @@ class LearningController(Stage):
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
-        (command,) = outputs
+        command, *margin = outputs
         sparse: list[Sparse] = []
         if self._obedience is None:
             self._control(first, inputs, command["position"], sparse)
-            return sparse
-        *inputs, safety = inputs
-        for start, stop in self._obedience.pieces(safety["reaction"]):
-            read, written = cut(inputs, start, stop), command["position"][start:stop]
-            self._control_until_lost(first + start, read, written, sparse)
-            self._obedience.apply(written)
+        else:
+            *inputs, safety = inputs
+            for start, stop in self._obedience.pieces(safety["reaction"]):
+                read, written = cut(inputs, start, stop), command["position"][start:stop]
+                self._control_until_lost(first + start, read, written, sparse)
+                self._obedience.apply(written)
+        for published in margin:
+            self._fill_margin(first, published["stability_margin"], sparse)
         return sparse
+
+    def _fill_margin(self, first: int, margin: Samples, sparse: Sequence[Sparse]) -> None:
+        """Each sample has the margin of the newest cycle; ``sparse`` has the cycles that end in the block."""
+        margin.fill(self._margin)
+        for message in sparse:
+            if message.type == messages.LEARNING:
+                self._margin = message.values["stability_margin"]
+                margin[message.index - first :] = self._margin
 
     def _control_until_lost(
         self, first: int, inputs: Sequence[Signals], command: Samples, sparse: list[Sparse]
     ) -> None:
         """The same, but without an angle that it can use the controller gives up, and the command stays."""
         assert self._obedience is not None, "without one there is nobody to take over"
-        if self._obedience.lost:
+        if self._lost:
             command[:] = self._obedience.newest
             return
         try:
             self._control(first, inputs, command, sparse)
         except AngleLostError as error:
-            self._obedience.lost = True
+            self._lost = True
             command[error.reached :] = command[error.reached - 1] if error.reached else self._obedience.newest
             sparse.append(Sparse(f"{self.name}/events", messages.EVENT, first + error.reached, {"action": "lost"}))
+
+    def _falls_back(self) -> bool:
+        """Whether the lead angle shall be that of the nominal speed."""
+        asked = self._obedience is not None and self._obedience.reaction >= Reaction.FALL_BACK
+        return asked and self.parameters.fall_back == "constant_lead"
 
     def _control(self, first: int, inputs: Sequence[Signals], command: Samples, sparse: list[Sparse]) -> None:
         """Fill the command; what is said of cycles goes to ``sparse``, also where the angle is lost after them."""
@@ -212,7 +246,7 @@ class LearningController(Stage):
         if parameters.law == "time_periodic":
             angle = parameters.nominal_speed * (parameters.step * np.arange(first, first + angle.size))
             past_angle = angle - parameters.nominal_speed * (parameters.step * parameters.feedback_delay)
-        if parameters.law == "time_periodic" or (self._obedience and self._obedience.constant_lead):
+        if parameters.law == "time_periodic" or self._falls_back():
             speed = np.full(angle.size, parameters.nominal_speed)
         for finer in others[: len(parameters.finer)]:
             error = error + finer["measured_position"]
@@ -283,10 +317,17 @@ class _Margins:
         model = self._models[key]
         if key not in self._responses:
             _make_room(self._responses)
-            parameters = self._stage.parameters
-            a, b = second_order(model.natural_frequency, model.damping)
-            self._responses[key] = discretise(a, b, parameters.model_delay, parameters.step, "foh").response
+            self._responses[key] = self._computed(model)
         return self._responses[key]
+
+    def _computed(self, model: Identified) -> Response:
+        parameters = self._stage.parameters
+        a, b = second_order(model.natural_frequency, model.damping)
+        return discretise(a, b, parameters.model_delay, parameters.step, "foh").response
+
+    def untabulated(self, speed: float, model: Identified) -> float:
+        """The margin at ``speed`` [rad/s] of this very model; what was tabulated before and after does not matter."""
+        return 1.0 - self._stage.loop(self._computed(model)).supremum(speed)
 
     def _supremum(self, speed: float, model: Identified) -> float:
         inverted = self._stage.correction

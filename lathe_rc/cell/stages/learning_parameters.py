@@ -86,6 +86,9 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters, Bound
     retract_position: float = parameter(0.0, "command when retracted", "m")
     memory_file: str = parameter("", "file that the events save and load write and read", path=True)
     allow_unstable: bool = parameter(default=False, doc="start although sup|Q - Z| is not below 1")
+    publish_margin: bool = parameter(
+        default=False, doc="publish the stability margin sample by sample as well, on coarse/margin, for a supervisor"
+    )
     identify: bool = parameter(default=True, doc="identify the drive from its command and measured position")
     identification_bandwidth: Annotated[float, Gt(0)] = parameter(
         1000.0, "bandwidth of its filters: above the profile's harmonics, below the noise", "rad/s"

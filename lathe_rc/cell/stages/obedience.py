@@ -1,54 +1,107 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a learning controller does when the supervisor asks for a reaction."""
+"""What a controller or a feed drive does when the supervisor asks for a reaction."""
 
 import math
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import Annotated, Protocol
 
 import numpy as np
+from annotated_types import Gt
 
+from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
-from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
+from lathe_rc.cell.parameters import ObedientParameters, parameter
+from lathe_rc.cell.stage import Input
 from lathe_rc.control import bounded
-from lathe_rc.control.bounded import Mode, Takeover
-from lathe_rc.control.repetitive import RepetitiveController
+from lathe_rc.control.bounded import Bounds, Mode, Takeover
 from lathe_rc.safety.state_machine import Reaction
 
-_SETTLED = 4.0  # lead times until a drive has followed
+
+class FeedObedientParameters(ObedientParameters):
+    """Of a node of the feed that obeys the supervisor."""
+
+    stop_rate: Annotated[float, Gt(0)] = parameter(
+        10.0, "largest rate of the command while it is brought to rest, and of what is left of that when given back",
+        "1/s",
+    )  # fmt: skip
+    stop_rate_change: Annotated[float, Gt(0)] = parameter(1000.0, "largest change of that rate", "1/s^2")
+
+    def listens(self) -> list[Input]:
+        """The input with the reactions, if anybody is listened to."""
+        return [Input("safety", messages.SAFETY, ("reaction",), self.reaction_delay)] if self.reaction_delay else []
+
+    def obedience(self, learner: "Learner | None", *, speed: bool, settled: int) -> "Obedience":
+        """What obeys for a command of the feed.
+
+        A command for a speed goes to 0, one for a position stays: so the slide stands. Nothing is taken out of the
+        part along the slide.
+
+        Args:
+            learner: see `Obedience`.
+            speed: whether the command stands for a speed.
+            settled: see `Obedience`.
+        """
+        bounds = Bounds(self.stop_rate, self.stop_rate_change, math.inf)
+        if self.reaction_delay:
+            bounded.prepare()
+        rest = Mode.RETRACT if speed else Mode.HOLD
+        takeover = Takeover(bounds, 0.0, self.step, carries=False)
+        return Obedience(learner, takeover, settled=settled, hold=rest, retract=rest)
+
+
+class Learner(Protocol):
+    """Who learns."""
+
+    def may_learn(self, *, on: bool) -> None:
+        """Learn, or do not."""
 
 
 class Obedience:
-    """Stops learning, falls back, holds or retracts the command, and gives it back when the reaction is over.
+    """Stops learning, holds or retracts the command, and gives it back when the reaction is over.
 
     Args:
-        controller: that obeys.
-        parameters: of its stage.
+        learner: that learns at first; None: there is nothing to learn.
+        takeover: of the command.
+        settled: samples from where a command is given back until errors are worth learning from.
+        hold: what to hold is.
+        retract: what to retract and to stop are.
 
     Attributes:
-        lost: the controller cannot go on: the angle is none that it could read its memory at.
-        constant_lead: whether the lead angle shall be that of the nominal speed.
+        reaction: that is obeyed.
     """
 
-    def __init__(self, controller: RepetitiveController, parameters: LearningControllerParameters) -> None:
-        self._controller, self._parameters = controller, parameters
-        bounded.prepare()
-        self._takeover = Takeover(parameters.bounds(), parameters.retract_position, parameters.step)
-        self._reaction = Reaction.NONE
-        self._wants_to_learn = controller.learning
+    def __init__(
+        self,
+        learner: Learner | None,
+        takeover: Takeover,
+        *,
+        settled: int,
+        hold: Mode = Mode.HOLD,
+        retract: Mode = Mode.RETRACT,
+    ) -> None:
+        self._learner, self._takeover, self._settled = learner, takeover, settled
+        self._hold, self._retract = hold, retract
+        self.reaction = Reaction.NONE
+        self._wants_to_learn = True
         self._forbidden = 0.0  # samples until learning is no longer forbidden
-        self.lost = self.constant_lead = False
 
     @property
     def newest(self) -> float:
-        """The command of the last sample [m]."""
+        """The command of the last sample, in its unit."""
         return self._takeover.newest
+
+    @property
+    def held(self) -> bool:
+        """Whether the command is not the controller's."""
+        return self.reaction >= Reaction.HOLD
 
     def pieces(self, reaction: Samples) -> Iterator[tuple[int, int]]:
         """Pieces of a block in which the reaction stays the same; it is obeyed when its piece is handed out."""
-        if not (self._reaction or self._forbidden or reaction.any()):
+        if not (self.reaction or self._forbidden or reaction.any()):
             yield 0, reaction.size
             return
-        changes = np.flatnonzero(np.diff(reaction, prepend=reaction.dtype.type(self._reaction))).tolist()
+        changes = np.flatnonzero(np.diff(reaction, prepend=reaction.dtype.type(self.reaction))).tolist()
         for start, stop in pairwise([0, *(change for change in changes if change), reaction.size]):
             if start in changes:
                 self._obey(Reaction(reaction[start]))
@@ -64,7 +117,8 @@ class Obedience:
     def learn(self, *, wanted: bool) -> None:
         """Learn or freeze as soon as no reaction forbids it."""
         self._wants_to_learn = wanted
-        self._controller.learning = wanted and not self._forbidden
+        if self._learner:
+            self._learner.may_learn(on=wanted and not self._forbidden)
 
     def _forbid(self, samples: float) -> None:
         """Let nobody learn for so many samples."""
@@ -72,18 +126,15 @@ class Obedience:
         self.learn(wanted=self._wants_to_learn)
 
     def _obey(self, reaction: Reaction) -> None:
-        self._reaction = reaction
-        self.constant_lead = reaction >= Reaction.FALL_BACK and self._parameters.fall_back == "constant_lead"
-        following = Mode.HOLD if reaction == Reaction.HOLD else Mode.FOLLOW
-        self._takeover.change(Mode.RETRACT if reaction >= Reaction.RETRACT else following)
+        self.reaction = reaction
+        following = self._hold if reaction == Reaction.HOLD else Mode.FOLLOW
+        self._takeover.change(self._retract if reaction >= Reaction.RETRACT else following)
         if reaction >= Reaction.FREEZE:
             self._forbid(math.inf)
         elif self._forbidden:
             # The errors of the way back are nothing to learn from; they come late.
-            table = self._parameters
-            settled = round(_SETTLED * table.lead_time / table.step)
-            self._forbid(float(self._takeover.remaining + settled + table.feedback_delay))
+            self._forbid(float(self._takeover.remaining + self._settled))
 
     def apply(self, command: Samples) -> None:
-        """Make of what the controller wants what the drive gets; in place [m]."""
+        """Make of what the controller wants what the drive gets; in place, in its unit."""
         self._takeover.apply(command)

@@ -12,13 +12,13 @@ from lathe_rc import resources
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import Input, Output, Sparse, Stage
+from lathe_rc.cell.stage import Input, Output, Sparse, Stage, cut
 from lathe_rc.cell.stages.feed_drive import Axis
 from lathe_rc.cell.stages.servo import ServoParameters
 from lathe_rc.cell.stages.trajectory import Trajectory
 from lathe_rc.control import periodic
 from lathe_rc.control.periodic import PeriodicController
-from lathe_rc.control.pid import POSITION
+from lathe_rc.control.pid import POSITION, Pid
 from lathe_rc.control.predistortion import Predistortion
 from lathe_rc.control.sampled_link import SampledLink
 from lathe_rc.signals.example_002 import PERIOD
@@ -103,7 +103,8 @@ class PositionController(Stage):
             inputs.append(Input("longitudinal/state", messages.STATE, ("measured_position",), delay))
         self._offset = np.empty(messages.MAX_BLOCK)
         self._largest, self._held = 0.0, 0.0
-        self.declare(inputs=inputs, outputs=[Output(f"{axis}/command", messages.SERVO)])
+        self._obedience = parameters.obeys(self)
+        self.declare(inputs=[*inputs, *parameters.listens()], outputs=[Output(f"{axis}/command", messages.SERVO)])
         if parameters.law == "periodic_hyperstable":
             self.sparse_topics[f"{axis}/periodic"] = messages.PERIODIC
 
@@ -138,6 +139,7 @@ class PositionController(Stage):
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         (_, state, *others), (servo,) = inputs, outputs
+        reaction = others.pop()["reaction"] if self._obedience else None
         wanted, position = servo["set_point"], state["measured_position"]
         self.trajectory.block(first, wanted)
         if self.parameters.measures == "edge":
@@ -148,6 +150,25 @@ class PositionController(Stage):
             self._path.block(others[-1]["measured_position"], offset)
             wanted -= offset
         np.subtract(wanted, position, out=servo["error"])
+        if self._obedience is None or reaction is None:
+            return self._control(first, wanted, position, servo)
+        sparse: list[Sparse] = []
+        for start, stop in self._obedience.pieces(reaction):
+            if isinstance(self.law, Pid):
+                self.law.waits = self._obedience.held
+            (written,) = cut([servo], start, stop)
+            sparse += self._control(first + start, wanted[start:stop], position[start:stop], written)
+            self._obedience.apply(written["command"])
+        return sparse
+
+    def may_learn(self, *, on: bool) -> None:
+        """Let the law learn, or not; a sampled link has nothing that it could learn with."""
+        if isinstance(self.law, Pid):
+            self.law.integrates = on
+        elif isinstance(self.law, PeriodicController):
+            self.law.learning = on
+
+    def _control(self, first: int, wanted: Samples, position: Samples, servo: Signals) -> list[Sparse]:
         if isinstance(self.law, PeriodicController):
             return self._periodic(first, self.law, wanted, position, servo)
         self.law.block(first, wanted, position, servo["command"])

@@ -13,7 +13,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import Input, Joint, Output, Sparse
-from lathe_rc.cell.stages.command_limits import LimitedCommand
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand
 from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters
@@ -86,6 +86,7 @@ class SeriesDriveStage(Drive):
 
     kind = "series_drive"
     Parameters = SeriesDriveParameters
+    announces = (LIMITED, FREE)
 
     def __init__(self, name: str, parameters: SeriesParameters) -> None:
         super().__init__(name, parameters)

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """What servo controllers have in common: a PID, converters, and a feedback edge."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.stages.obedience import FeedObedientParameters, Learner, Obedience
 from lathe_rc.cell.stages.trajectory import TrajectoryParameters
 from lathe_rc.control.pid import Pid, PidGains
 
 
-class ServoParameters(TrajectoryParameters):
+class ServoParameters(TrajectoryParameters, FeedObedientParameters):
     """Set point, feedback, converters, limits, and the gains of the PID."""
 
     feedback_delay: Annotated[int, Ge(1), Le(2**31 - 1)] = parameter(
@@ -31,6 +32,16 @@ class ServoParameters(TrajectoryParameters):
     set_point_smoothing: Annotated[float, Ge(0)] = parameter(
         0.0, "pid: time constant with which the set point is approached; 0: at once", "s"
     )
+
+    commands: Literal["speed", "position"] = parameter(
+        "speed", "what the command stands for at the drive; to stop the slide a speed goes to 0, and a position stays"
+    )
+
+    def obeys(self, learner: Learner) -> Obedience | None:
+        """What obeys the supervisor; None if nobody is listened to."""
+        if not self.reaction_delay:
+            return None
+        return self.obedience(learner, speed=self.commands == "speed", settled=self.feedback_delay)
 
     def pid(self, proportional: float, integral: float, derivative: float, filter_: float) -> Pid:
         """The PID of a table.

@@ -18,7 +18,7 @@ from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
 Asked = Literal["warn", "freeze", "fall_back", "hold", "retract", "stop"]
 
 MEMBERS_LOST = "members_lost"  #: stands for a monitor where the host says that members of the cell are lost
-_SENSOR, _COMMAND = ("measured_position", "effort"), ("position",)
+_SENSOR, _COMMAND, _MARGIN = ("measured_position", "effort"), ("position",), ("stability_margin",)
 
 
 class SupervisorParameters(NodeParameters):
@@ -65,6 +65,12 @@ class SupervisorParameters(NodeParameters):
     growth_cycles: Annotated[int, Ge(1), Le(1000)] = parameter(3, "so many times in a row", "rev")
     growth_floor: Annotated[float, Ge(0)] = parameter(1e-6, "RMS error that does not count", "m")
     growth_reaction: Asked = parameter("freeze", "what is asked for then")
+    margin_limit: list[Annotated[float, Ge(0)]] = parameter(
+        [],
+        "drives: smallest stability margin of the channel that commands one, which has publish_margin; one for each, "
+        "or none",
+    )
+    margin_reaction: Asked = parameter("freeze", "what is asked for then")
     force_limit: Annotated[float, Ge(0)] = parameter(0.0, "cut: measured force", "N")
     force_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
     force_low: Annotated[float, Ge(0)] = parameter(0.0, "cut: measured force below this is lost", "N")
@@ -107,6 +113,7 @@ class Supervisor(Stage):
         self._watch_spindle()
         self._watch_error()
         self._watch_drives()
+        self._watch_margins()
         self._watch_cut()
         self.declare(inputs=self._inputs, outputs=[Output("safety", messages.SAFETY)])
         self.sparse_topics["safety/status"] = messages.SAFETY_STATUS
@@ -215,6 +222,14 @@ class Supervisor(Stage):
                 state = self._reads(f"{subject}/state", messages.STATE, _SENSOR)
                 reaction, samples = self._reaction(f"{what}_reaction"), self._samples(seconds)
                 add(Threshold(what, subject, limit, reaction, signal=(state, field), samples=samples))
+
+    def _watch_margins(self) -> None:
+        for drive, limit in self._each("margin_limit", self.parameters.drives):
+            place, reaction = (
+                self._reads(f"{drive}/margin", messages.MARGIN, _MARGIN),
+                self._reaction("margin_reaction"),
+            )
+            self.monitors.append(Below("stability_margin", drive, limit, reaction, signal=(place, *_MARGIN)))
 
     def _watch_cut(self) -> None:
         table = self.parameters
