@@ -183,6 +183,10 @@ class LearningController(Stage):
             self._control(first, inputs, command["position"], sparse)
             return sparse
         *inputs, safety = inputs
+        if self._obedience.idle(safety["reaction"]):
+            self._control_until_lost(first, inputs, command["position"], sparse)
+            self._obedience.apply(command["position"])
+            return sparse
         for start, stop in self._obedience.pieces(safety["reaction"]):
             read, written = cut(inputs, start, stop), command["position"][start:stop]
             self._control_until_lost(first + start, read, written, sparse)
