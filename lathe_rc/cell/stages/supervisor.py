@@ -251,6 +251,10 @@ class Supervisor(Stage):
         (safety,) = outputs
         samples = safety["state"].size
         found = self._lookout.look(inputs)
+        if not (found or self._was_reset or self.state is State.RETRACTING):
+            safety["state"].fill(self.state)
+            safety["reaction"].fill(self.reaction)
+            return []
         sparse: list[Sparse] = []
         if self._was_reset:
             sparse.append(self._status(first, RESET, "", 0.0, 0.0))
