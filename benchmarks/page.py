@@ -20,6 +20,7 @@ _TITLES = {
     "engine": "Offline engine",
     "ros": "Over ROS",
     "real_time": "Real time",
+    "supervisor": "Supervisor",
     "start": "Cold start",
     "recorder": "Recorder",
     "viewer": "Viewer",
@@ -295,7 +296,7 @@ def page(result: Mapping[str, Any]) -> str:
         "",
         *_targets(result),
     ]
-    for part in ("engine", "ros", "real_time", "start"):
+    for part in ("engine", "ros", "real_time", "supervisor", "start"):
         if part in result:
             lines += [f"## {_TITLES[part]}", "", *_about(part)]
             lines += _ros(result[part]) if part == "ros" else _part(part, result[part])

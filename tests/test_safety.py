@@ -23,7 +23,7 @@ from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion
 from lathe_rc.errors import InputError
 from lathe_rc.safety import state_machine
-from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Rate, Threshold
+from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Lookout, Rate, Threshold
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
 from lathe_rc.view import happened
 
@@ -259,6 +259,94 @@ def test_what_is_not_a_number_is_beyond_every_limit():
     inputs[ENCODER]["speed"][777] = np.nan
     ((sample, _),) = alarms(CASES["speed"][0](), inputs)
     assert sample == 777
+
+
+TURN = 2 * np.pi
+
+
+def lasting(beyond, needed, begin=0):
+    """First sample at which so many in a row are beyond."""
+    run = 0
+    for k in range(begin, len(beyond)):
+        run = run + 1 if beyond[k] else 0
+        if run >= needed:
+            return k
+    return None
+
+
+def index_fault(angle, pulse, limit):
+    last = math.nan
+    for k in range(angle.size):
+        since = angle[k] - last
+        if since > TURN + limit or since < -limit or (pulse[k] and since < TURN - limit):
+            return k, abs(since - TURN)
+        last = angle[k] if pulse[k] else last
+    return None, None
+
+
+def growth_fault(angle, error, limit, needed, floor):
+    turn, squares, count, before, grown = 0.0, 0.0, 0, math.nan, 0
+    for k in range(angle.size):
+        now = np.floor(angle[k] / TURN)
+        if now != turn:
+            rms = math.sqrt(squares / count) if count else math.nan
+            grown = grown + 1 if rms > limit * before and rms > floor else 0
+            if grown >= needed:
+                return k, rms / before
+            turn, squares, count, before = now, 0.0, 0, rms
+        squares, count = squares + error[k] * error[k], count + 1
+    return None, None
+
+
+def taken_one_by_one(angle, speed, pulse, error):
+    """Alarms of the monitors below, from their definitions."""
+    over = angle >= angle[0] + 1.5 * TURN
+    begin = int(np.argmax(over)) if over.any() else angle.size
+    change = np.abs(speed - np.concatenate((np.zeros(5), speed))[: speed.size])
+    watched = {
+        "speed": (lasting(~(np.abs(speed - 0.5) <= 3.0), 3), np.abs(speed - 0.5)),
+        "gap": (lasting(~(np.abs(error - speed - 0.0) <= 4.0), 1), np.abs(error - speed)),
+        "late": (lasting(~(np.abs(error) <= 2.0), 1, begin), np.abs(error)),
+        "low": (lasting(~(speed >= -2.0), 2, begin), speed),
+        "rate": (lasting(~(change <= 5.0), 1), change),
+    }
+    found = [(name, sample, values[sample]) for name, (sample, values) in watched.items() if sample is not None]
+    for name, (sample, value) in (
+        ("index_pulses", index_fault(angle, pulse, 0.7)),
+        ("error_growth", growth_fault(angle, error, 1.2, 2, 0.1)),
+    ):
+        if sample is not None:
+            found.append((name, sample, value))
+    return sorted(found)
+
+
+@given(data=st.data(), size=st.integers(1, 700), seed=st.integers(0, 2**32 - 1), loud=st.floats(0.05, 2.0))
+def test_all_monitors_at_once_find_what_their_definitions_say(data, size, seed, loud):
+    random = np.random.default_rng(seed)
+    speed, error = (loud * random.standard_normal(size) for _ in range(2))
+    error *= 1.0 + np.arange(size) / size * random.integers(0, 5)
+    angle = np.cumsum(random.uniform(0.0, 0.1, size))
+    pulse = (np.diff(np.floor(angle / TURN), prepend=-1.0) > 0).astype(np.uint8)
+    for broken in data.draw(st.lists(st.integers(0, size - 1), max_size=3)):
+        random.choice([speed, error, angle])[broken] = random.choice([np.nan, np.inf, -5.0, 30.0])
+        pulse[random.integers(size)] ^= 1
+    monitors = [
+        Threshold("speed", "e", 3.0, Reaction.STOP, signal=(0, "speed"), offset=0.5, samples=3),
+        Threshold("gap", "e", 4.0, Reaction.STOP, signal=(1, "measured_error"), other=(0, "speed")),
+        Threshold("late", "t", 2.0, Reaction.STOP, signal=(1, "measured_error"), after=1.5),
+        Below("low", "e", -2.0, Reaction.STOP, signal=(0, "speed"), samples=2, after=1.5),
+        Rate("rate", "e", 5.0, Reaction.STOP, signal=(0, "speed"), window=5, step=1 / 5, before=0.0),
+        IndexPulses(0.7, Reaction.STOP, encoder=0),
+        Growth(1.2, Reaction.STOP, encoder=0, tool=1, cycles=2, floor=0.1),
+    ]
+    inputs = [{"angle": angle, "speed": speed, "index_pulse": pulse}, {"measured_error": error}]
+    lookout, found = Lookout(monitors), []
+    marks = sorted({0, size, *data.draw(st.lists(st.integers(0, size), max_size=6))})
+    for first, stop in itertools.pairwise(marks):
+        told = lookout.look([{name: array[first:stop] for name, array in part.items()} for part in inputs])
+        assert [alarm.place for _, alarm in told] == sorted(alarm.place for _, alarm in told)
+        found += [(monitor.name, first + alarm.place, alarm.value) for monitor, alarm in told]
+    assert repr(sorted(found)) == repr([(n, s, float(v)) for n, s, v in taken_one_by_one(angle, speed, pulse, error)])
 
 
 def test_the_tool_is_out_when_it_has_been_for_long_enough():

@@ -121,6 +121,9 @@ class Takeover:
     def apply(self, command: Array) -> None:
         """Make of what the controller wants what the drive gets; in place, shape (n,) [m]."""
         wanted = _last_two(self._wanted, command)
+        if self._mode is Mode.FOLLOW and self._place >= self._path.size and command.size > 1:
+            self._given = self._wanted = wanted
+            return
         if self._mode is not Mode.FOLLOW or self._place < self._path.size:
             ahead = self._path[self._place : self._place + command.size]
             self._place += ahead.size

@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is watched: signals against thresholds, sample by sample, whatever the blocks."""
+"""What is watched: signals against thresholds, sample by sample, whatever the blocks.
+
+One kernel goes through the samples for all monitors of a `Lookout`: a row of a table says which rule reads which
+signals and where its memory is. A rule first asks whether there is anything in a stretch of samples, which the compiler
+makes vectors of, and takes them one by one only where there is. A monitor that is no rule of the table has its own
+`Monitor.watch`.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -9,12 +15,16 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.cell.messages import Signals
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined, kernel
 from lathe_rc.safety.state_machine import Reaction
 
 Array = npt.NDArray[np.float64]
+Places = npt.NDArray[np.int64]
+Pulses = npt.NDArray[np.uint8]
 
+_THRESHOLD, _RATE, _INDEX, _GROWTH = range(4)  # rules of the table
 _TURN = 2.0 * np.pi
+_STRETCH = 128  # samples
 
 
 @dataclass(frozen=True)
@@ -61,32 +71,50 @@ class Monitor(ABC):
         self.raised = False
 
 
-@kernel
-def _beyond(signal: Array, other: Array, offset: float, limit: float) -> int:
-    """How many samples of |signal - other - offset| are beyond the limit, or not a number."""
-    count = 0
-    if other.size == 0:
-        for k in range(signal.size):
-            count += not abs(signal[k] - offset) <= limit
-    else:
-        for k in range(signal.size):
-            count += not abs(signal[k] - other[k] - offset) <= limit
-    return count
+class Ruled(Monitor):
+    """A monitor whose rule is one of the table.
 
+    Args:
+        name, subject, limit, reaction: see `Monitor`.
+        rule: which.
+        signal: place of the input and field.
+        other: the same of a second signal; None: there is none.
+        memory: what the rule knows, its limits among it; the table has it from then on.
 
-@kernel
-def _lasting(signal: Array, other: Array, offset: float, limit: float, needed: int, run: int) -> tuple[int, int]:
-    """First sample at which ``needed`` in a row were beyond the limit, or -1, and how many were up to the last."""
-    found = -1
-    for k in range(signal.size):
-        value = signal[k] - (other[k] if other.size else 0.0) - offset
-        run = 0 if abs(value) <= limit else run + 1
-        if run >= needed and found < 0:
-            found = k
-    return found, run
+    Attributes:
+        rule, signal, other, memory: as given.
+    """
 
+    def __init__(
+        self,
+        name: str,
+        subject: str,
+        limit: float,
+        reaction: Reaction,
+        *,
+        rule: int,
+        signal: tuple[int, str],
+        other: tuple[int, str] | None = None,
+        memory: Sequence[float] | Array,
+    ) -> None:
+        super().__init__(name, subject, limit, reaction)
+        self.rule, self.signal, self.other = rule, signal, other
+        self.memory = np.array(memory, np.float64)
 
-_NOTHING = np.empty(0)
+    @property
+    def settled(self) -> bool:
+        """Whether `alarm` has nothing to do where the rule finds nothing."""
+        return True
+
+    def watch(self, inputs: Sequence[Signals]) -> Alarm | None:
+        """See `Monitor`; alone."""
+        table = Table([self])
+        table.walk(inputs)
+        return self.alarm(inputs, int(table.places[0]))
+
+    @abstractmethod
+    def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
+        """The alarm where the rule has found something; place −1: it has not."""
 
 
 class Patience:
@@ -100,17 +128,20 @@ class Patience:
         self._turn = revolutions * _TURN
         self._until: float | None = None
 
+    @property
+    def over(self) -> bool:
+        """Whether nothing is forgiven any more."""
+        return not self._turn or self._until == -np.inf
+
     def left(self, inputs: Sequence[Signals]) -> int:
         """How many samples of the block are still forgiven."""
-        if not self._turn:
+        if self.over:
             return 0
         angle = inputs[0]["angle"]
         if self._until is None:
             if not angle.size:
                 return 0
             self._until = float(angle[0]) + self._turn
-        if self._until == -np.inf:
-            return 0
         over = angle >= self._until
         begin = int(np.argmax(over)) if over.any() else angle.size
         if begin < angle.size:
@@ -122,7 +153,41 @@ class Patience:
         self._until = None
 
 
-class Threshold(Monitor):
+@inlined
+def _beyond(value: float, offset: float, low: float, high: float) -> bool:
+    """Whether a value is beyond its limits, or not a number."""
+    return not low <= value - offset <= high
+
+
+@kernel
+def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
+    """0 if a sample is beyond, or -1; the memory: offset, lower and upper limit."""
+    offset, low, high = memory[0], memory[1], memory[2]
+    count = 0
+    if other.size:
+        for k in range(signal.size):
+            count += _beyond(signal[k] - other[k], offset, low, high)
+    else:
+        for k in range(signal.size):
+            count += _beyond(signal[k], offset, low, high)
+    return 0 if count else -1
+
+
+@kernel
+def _lasting(signal: Array, other: Array, memory: Array, needed: int, run: int) -> tuple[int, int]:
+    """First sample at which ``needed`` in a row were beyond, or -1, and how many were up to it or the last."""
+    for k in range(signal.size):
+        value = signal[k] - (other[k] if other.size else 0.0)
+        run = run + 1 if _beyond(value, memory[0], memory[1], memory[2]) else 0
+        if run >= needed:
+            return k, run
+    return -1, run
+
+
+_NOTHING = np.empty(0)
+
+
+class Threshold(Ruled):
     """|signal - other - offset| beyond the limit for some samples in a row.
 
     Args:
@@ -147,24 +212,29 @@ class Threshold(Monitor):
         samples: int = 1,
         after: float = 0.0,
     ) -> None:
-        super().__init__(name, subject, limit, reaction)
-        self._signal, self._other, self._offset, self._samples = signal, other, offset, samples
-        self._patience, self._run = Patience(after), 0
+        memory = (offset, -limit, limit)
+        super().__init__(name, subject, limit, reaction, rule=_THRESHOLD, signal=signal, other=other, memory=memory)
+        self._samples, self._patience, self._run = samples, Patience(after), 0
 
-    def watch(self, inputs: Sequence[Signals]) -> Alarm | None:
-        """See `Monitor`."""
-        signal = inputs[self._signal[0]][self._signal[1]]
-        other = _NOTHING if self._other is None else inputs[self._other[0]][self._other[1]]
+    @property
+    def settled(self) -> bool:
+        """See `Ruled`."""
+        return not self._run and self._patience.over
+
+    def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
+        """See `Ruled`."""
+        signal = inputs[self.signal[0]][self.signal[1]]
+        other = _NOTHING if self.other is None else inputs[self.other[0]][self.other[1]]
         begin = self._patience.left(inputs)
         signal, other = signal[begin:], other[begin:]
-        if not _beyond(signal, other, self._offset, self.limit):
-            self._run = 0
-            return None
-        place, self._run = _lasting(signal, other, self._offset, self.limit, self._samples, self._run)
+        place, self._run = _lasting(signal, other, self.memory, self._samples, self._run)
         if place < 0:
             return None
-        value = signal[place] - (other[place] if other.size else 0.0) - self._offset
-        return Alarm(begin + place, abs(float(value)))
+        return Alarm(begin + place, self._told(float(signal[place] - (other[place] if other.size else 0.0))))
+
+    def _told(self, value: float) -> float:
+        """What an alarm says of what is beyond the limit."""
+        return abs(value - float(self.memory[0]))
 
     def reset(self) -> None:
         """See `Monitor`."""
@@ -173,7 +243,63 @@ class Threshold(Monitor):
         self._run = 0
 
 
-class Rate(Monitor):
+class Below(Threshold):
+    """A signal below the limit for some samples in a row; nothing is subtracted from it."""
+
+    def __init__(
+        self,
+        name: str,
+        subject: str,
+        limit: float,
+        reaction: Reaction,
+        *,
+        signal: tuple[int, str],
+        samples: int = 1,
+        after: float = 0.0,
+    ) -> None:
+        super().__init__(name, subject, limit, reaction, signal=signal, samples=samples, after=after)
+        self.memory[:] = 0.0, limit, np.inf
+
+    def _told(self, value: float) -> float:
+        """See `Threshold`."""
+        return value
+
+
+@inlined
+def _differ(after: float, before: float, limit: float) -> bool:
+    return not abs(after - before) <= limit
+
+
+@kernel
+def _changing(signal: Array, memory: Array) -> int:
+    """First sample that differs by more than the limit from the one a window before, or -1.
+
+    The memory: limit, by how much it differs, and the samples of a window up to now.
+    """
+    limit, past, size = memory[0], memory[2:], signal.size
+    window = past.size
+    late, early = signal[window:], signal[: max(size - window, 0)]
+    count = 0
+    for k in range(min(size, window)):
+        count += _differ(signal[k], past[k], limit)
+    for k in range(late.size):
+        count += _differ(late[k], early[k], limit)
+    found = -1
+    for k in range(size if count else 0):
+        before = past[k] if k < window else signal[k - window]
+        if _differ(signal[k], before, limit):
+            found = k
+            memory[1] = abs(signal[k] - before)
+            break
+    kept = max(window - size, 0)
+    for k in range(kept):
+        past[k] = past[k + size]
+    for k in range(kept, window):
+        past[k] = signal[size - window + k]
+    return found
+
+
+class Rate(Ruled):
     """How fast a signal changes, over a window of samples.
 
     Args:
@@ -196,80 +322,103 @@ class Rate(Monitor):
         step: float,
         before: float,
     ) -> None:
-        super().__init__(name, subject, limit, reaction)
-        self._signal, self._span = signal, window * step
-        self._past = np.full(window, before)
+        self._span = window * step
+        memory = np.concatenate(((limit * self._span, np.nan), np.full(window, before)))
+        super().__init__(name, subject, limit, reaction, rule=_RATE, signal=signal, memory=memory)
 
-    def watch(self, inputs: Sequence[Signals]) -> Alarm | None:
-        """See `Monitor`."""
-        signal = inputs[self._signal[0]][self._signal[1]]
-        whole = np.concatenate((self._past, signal))
-        past, self._past = whole[: signal.size], whole[signal.size :]
-        limit = self.limit * self._span
-        if not _beyond(signal, past, 0.0, limit):
-            return None
-        place, _ = _lasting(signal, past, 0.0, limit, 1, 0)
-        return Alarm(place, abs(float(signal[place] - past[place])) / self._span)
+    def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
+        """See `Ruled`."""
+        return Alarm(place, float(self.memory[1]) / self._span) if place >= 0 else None
+
+
+@inlined
+def _off(since: float, limit: float) -> bool:
+    """Whether no angle since an index pulse can be this, to the limit; nothing is known before the first pulse: NaN."""
+    return since > _TURN + limit or since < -limit
 
 
 @kernel
-def _index(angle: Array, pulse: npt.NDArray[np.uint8], limit: float, state: Array) -> int:
-    """First sample that does not fit the pulses, or -1; the state: angle of the last pulse, what was found."""
-    found = -1
-    for k in range(angle.size):
-        since = angle[k] - state[0]
-        # Nothing is known before the first pulse: a comparison with NaN is false.
-        wrong = since > _TURN + limit or since < -limit or (pulse[k] > 0 and since < _TURN - limit)
-        if wrong and found < 0:
-            found = k
-            state[1] = abs(since - _TURN)
-        if pulse[k] > 0 or since > _TURN + limit:
-            state[0] = angle[k]
-    return found
+def _index(angle: Array, pulse: Pulses, memory: Array) -> int:
+    """First sample that does not fit the pulses, or -1; the memory: limit, angle of the last pulse, what was found."""
+    limit = memory[0]
+    for start in range(0, angle.size, _STRETCH):
+        angles, pulses, last = angle[start : start + _STRETCH], pulse[start : start + _STRETCH], memory[1]
+        count = 0
+        for k in range(pulses.size):
+            count += pulses[k] > 0
+        for k in range(angles.size):
+            count += _off(angles[k] - last, limit)
+        if not count:
+            continue
+        for k in range(angles.size):
+            since = angles[k] - memory[1]
+            if _off(since, limit) or (pulses[k] > 0 and since < _TURN - limit):
+                memory[2] = abs(since - _TURN)
+                return start + k
+            if pulses[k] > 0:
+                memory[1] = angles[k]
+    return -1
 
 
-class IndexPulses(Monitor):
+class IndexPulses(Ruled):
     """One revolution of the measured angle from index pulse to index pulse, and never backwards."""
 
     def __init__(self, limit: float, reaction: Reaction, *, encoder: int) -> None:
-        super().__init__("index_pulses", "encoder", limit, reaction)
-        self._encoder, self._state = encoder, np.array([np.nan, np.nan])
+        signal, memory = (encoder, "angle"), (limit, np.nan, np.nan)
+        super().__init__("index_pulses", "encoder", limit, reaction, rule=_INDEX, signal=signal, memory=memory)
 
-    def watch(self, inputs: Sequence[Signals]) -> Alarm | None:
-        """See `Monitor`."""
-        encoder = inputs[self._encoder]
-        place = _index(encoder["angle"], encoder["index_pulse"], self.limit, self._state)
-        return Alarm(place, float(self._state[1])) if place >= 0 else None
+    def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
+        """See `Ruled`."""
+        return Alarm(place, float(self.memory[2])) if place >= 0 else None
 
     def reset(self) -> None:
         """See `Monitor`."""
         super().reset()
-        self._state[:] = np.nan
+        self.memory[1:] = np.nan
+
+
+@inlined
+def _add_squares(total: float, values: Array) -> float:
+    for k in range(values.size):
+        total += values[k] * values[k]
+    return total
 
 
 @kernel
-def _growing(angle: Array, error: Array, floor: float, limit: float, needed: int, state: Array) -> int:
-    """First sample at which the RMS error has grown ``needed`` revolutions in a row, or -1.
+def _growing(angle: Array, error: Array, memory: Array) -> int:
+    """First sample at which the RMS error has grown often enough, or -1.
 
-    The state: revolution, sum of squares, samples, RMS of the one before, how many have grown, by how much.
+    The memory: limit, floor, revolutions needed; revolution, sum of squares, samples, RMS of the one before, how many
+    have grown, by how much.
     """
-    found = -1
-    for k in range(angle.size):
-        turn = np.floor(angle[k] / _TURN)
-        if turn != state[0]:
-            rms = np.sqrt(state[1] / state[2]) if state[2] > 0.0 else np.nan
-            grown = rms > limit * state[3] and rms > floor
-            state[4] = state[4] + 1.0 if grown else 0.0
-            if grown and state[4] >= needed and found < 0:
-                found = k
-                state[5] = rms / state[3]
-            state[0], state[1], state[2], state[3] = turn, 0.0, 0.0, rms
-        state[1] += error[k] * error[k]
-        state[2] += 1.0
-    return found
+    limit, floor, needed, state = memory[0], memory[1], memory[2], memory[3:]
+    for start in range(0, angle.size, _STRETCH):
+        angles, errors = angle[start : start + _STRETCH], error[start : start + _STRETCH]
+        count, turn = 0, state[0]
+        for k in range(angles.size):
+            count += np.floor(angles[k] / _TURN) != turn
+        total, first = state[1], 0
+        for k in range(angles.size if count else 0):
+            turn = np.floor(angles[k] / _TURN)
+            if turn != state[0]:
+                total = _add_squares(total, errors[first:k])
+                samples = state[2] + (k - first)
+                rms = np.sqrt(total / samples) if samples > 0.0 else np.nan
+                grown = rms > limit * state[3] and rms > floor
+                state[4] = state[4] + 1.0 if grown else 0.0
+                if grown and state[4] >= needed:
+                    state[5] = rms / state[3]
+                    return start + k
+                state[0], state[2], state[3], total, first = turn, 0.0, rms, 0.0, k
+        state[1] = _add_squares(total, errors[first:])
+        state[2] += angles.size - first
+    return -1
 
 
-class Growth(Monitor):
+_UNKNOWN = (0.0, 0.0, 0.0, np.nan, 0.0, np.nan)  # what is known of the growth at first
+
+
+class Growth(Ruled):
     """The RMS error grows from revolution to revolution.
 
     Args:
@@ -281,20 +430,25 @@ class Growth(Monitor):
     """
 
     def __init__(self, limit: float, reaction: Reaction, *, encoder: int, tool: int, cycles: int, floor: float) -> None:
-        super().__init__("error_growth", "tool", limit, reaction)
-        self._places, self._cycles, self._floor = (encoder, tool), cycles, floor
-        self._state = np.array([0.0, 0.0, 0.0, np.nan, 0.0, np.nan])
+        super().__init__(
+            "error_growth",
+            "tool",
+            limit,
+            reaction,
+            rule=_GROWTH,
+            signal=(encoder, "angle"),
+            other=(tool, "measured_error"),
+            memory=(limit, floor, cycles, *_UNKNOWN),
+        )
 
-    def watch(self, inputs: Sequence[Signals]) -> Alarm | None:
-        """See `Monitor`."""
-        angle, error = inputs[self._places[0]]["angle"], inputs[self._places[1]]["measured_error"]
-        place = _growing(angle, error, self._floor, self.limit, self._cycles, self._state)
-        return Alarm(place, float(self._state[5])) if place >= 0 else None
+    def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
+        """See `Ruled`."""
+        return Alarm(place, float(self.memory[-1])) if place >= 0 else None
 
     def reset(self) -> None:
         """See `Monitor`."""
         super().reset()
-        self._state[:] = 0.0, 0.0, 0.0, np.nan, 0.0, np.nan
+        self.memory[3:] = _UNKNOWN
 
 
 @kernel
@@ -304,17 +458,6 @@ def _clear(position: Array, beyond: float, needed: int, run: int) -> tuple[int, 
         if run >= needed:
             return k, run
     return -1, run
-
-
-class Below(Threshold):
-    """A signal below the limit for some samples in a row; nothing is subtracted from it."""
-
-    def watch(self, inputs: Sequence[Signals]) -> Alarm | None:
-        """See `Monitor`."""
-        begin = self._patience.left(inputs)
-        signal = inputs[self._signal[0]][self._signal[1]][begin:]
-        place, self._run = _clear(-signal, -self.limit, self._samples, self._run)
-        return Alarm(begin + place, float(signal[place])) if place >= 0 else None
 
 
 class Clearance:
@@ -336,3 +479,101 @@ class Clearance:
         """First sample at which it is."""
         place, self._run = _clear(position, self._beyond, self._samples, self._run)
         return place if place >= 0 else None
+
+
+@kernel
+def _walk(signals: tuple[Array, ...], pulse: Pulses, rows: Places, memory: Array, places: Places) -> int:
+    """Fill in where each rule finds something, or -1, and say how many do.
+
+    Args:
+        signals: all that are watched, each shape (n,); the last is empty, for "no other".
+        pulse: index pulses of the encoder, shape (n,).
+        rows: rule, its two signals, begin and end of its memory, shape (rows, 5).
+        memory: of all of them.
+        places: filled in, shape (rows,).
+    """
+    found = 0
+    for row in range(places.size):
+        rule, own = rows[row, 0], memory[rows[row, 3] : rows[row, 4]]
+        signal, other = signals[rows[row, 1]], signals[rows[row, 2]]
+        if rule == _THRESHOLD:
+            place = _any_beyond(signal, other, own)
+        elif rule == _RATE:
+            place = _changing(signal, own)
+        elif rule == _INDEX:
+            place = _index(signal, pulse, own)
+        else:
+            place = _growing(signal, other, own)
+        places[row] = place
+        found += place >= 0
+    return found
+
+
+class Table:
+    """The rules of some monitors.
+
+    Args:
+        monitors: their memory becomes part of the table's.
+
+    Attributes:
+        places: what each rule has found in the last block: a sample, or −1.
+    """
+
+    def __init__(self, monitors: Sequence[Ruled]) -> None:
+        self._signals = list(
+            dict.fromkeys(place for monitor in monitors for place in (monitor.signal, monitor.other) if place)
+        )
+        self._memory = np.concatenate([np.empty(0), *(monitor.memory for monitor in monitors)])
+        self._rows = np.zeros((len(monitors), 5), np.int64)
+        self.places = np.zeros(len(monitors), np.int64)
+        end = 0
+        for row, monitor in zip(self._rows, monitors, strict=True):
+            begin, end = end, end + monitor.memory.size
+            other = self._signals.index(monitor.other) if monitor.other else len(self._signals)
+            row[:] = monitor.rule, self._signals.index(monitor.signal), other, begin, end
+            monitor.memory = self._memory[begin:end]
+
+    def walk(self, inputs: Sequence[Signals]) -> int:
+        """How many rules find something in the next samples."""
+        signals = (*[inputs[place][name] for place, name in self._signals], _NOTHING)
+        return _walk(signals, inputs[0]["index_pulse"], self._rows, self._memory, self.places)
+
+
+class Lookout:
+    """All monitors of a cell; the first input is the encoder.
+
+    Args:
+        monitors: in the order in which alarms at the same sample are told.
+    """
+
+    def __init__(self, monitors: Sequence[Monitor]) -> None:
+        self._monitors = monitors
+        self._ruled = [monitor for monitor in monitors if isinstance(monitor, Ruled)]
+        self._table = Table(self._ruled)
+        self._free = len(self._ruled) < len(monitors)  # some watch by themselves
+        self._settled = False  # all that are ruled
+
+    def look(self, inputs: Sequence[Signals]) -> list[tuple[Monitor, Alarm]]:
+        """Alarms of the next samples, by sample."""
+        if not self._table.walk(inputs) and self._settled and not self._free:
+            return []
+        places = dict(zip(map(id, self._ruled), self._table.places.tolist(), strict=True))
+        found = []
+        for monitor in self._monitors:
+            if not isinstance(monitor, Ruled):
+                alarm = monitor.look(inputs)
+            elif not monitor.raised and (places[id(monitor)] >= 0 or not monitor.settled):
+                alarm = monitor.alarm(inputs, places[id(monitor)])
+                monitor.raised = alarm is not None
+            else:
+                alarm = None
+            if alarm:
+                found.append((monitor, alarm))
+        self._settled = all(monitor.raised or monitor.settled for monitor in self._ruled)
+        return sorted(found, key=lambda one: one[1].place)
+
+    def reset(self) -> None:
+        """Watch as from the first sample."""
+        self._settled = False
+        for monitor in self._monitors:
+            monitor.reset()

@@ -201,14 +201,22 @@ class LearningController(Stage):
         if self._obedience is None:
             self._control(first, inputs, command["position"], sparse)
         else:
-            *inputs, safety = inputs
-            for start, stop in self._obedience.pieces(safety["reaction"]):
-                read, written = cut(inputs, start, stop), command["position"][start:stop]
-                self._control_until_lost(first + start, read, written, sparse)
-                self._obedience.apply(written)
+            self._obey(first, inputs, command["position"], sparse)
         for published in margin:
             self._fill_margin(first, published["stability_margin"], sparse)
         return sparse
+
+    def _obey(self, first: int, inputs: Sequence[Signals], command: Samples, sparse: list[Sparse]) -> None:
+        """The same under the supervisor, whose reactions are the last of the inputs."""
+        assert self._obedience is not None, "that is what listens"
+        *inputs, safety = inputs
+        if self._obedience.idle(safety["reaction"]):
+            self._control_until_lost(first, inputs, command, sparse)
+            self._obedience.apply(command)
+            return
+        for start, stop in self._obedience.pieces(safety["reaction"]):
+            self._control_until_lost(first + start, cut(inputs, start, stop), command[start:stop], sparse)
+            self._obedience.apply(command[start:stop])
 
     def _fill_margin(self, first: int, margin: Samples, sparse: Sequence[Sparse]) -> None:
         """Each sample has the margin of the newest cycle; ``sparse`` has the cycles that end in the block."""

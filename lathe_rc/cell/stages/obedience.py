@@ -96,11 +96,12 @@ class Obedience:
         """Whether the command is not the controller's."""
         return self.reaction >= Reaction.HOLD
 
+    def idle(self, reaction: Samples) -> bool:
+        """Whether a block is one piece without a reaction, and nothing of an earlier one is left to wait for."""
+        return not (self.reaction or self._forbidden or np.count_nonzero(reaction))
+
     def pieces(self, reaction: Samples) -> Iterator[tuple[int, int]]:
         """Pieces of a block in which the reaction stays the same; it is obeyed when its piece is handed out."""
-        if not (self.reaction or self._forbidden or reaction.any()):
-            yield 0, reaction.size
-            return
         changes = np.flatnonzero(np.diff(reaction, prepend=reaction.dtype.type(self.reaction))).tolist()
         for start, stop in pairwise([0, *(change for change in changes if change), reaction.size]):
             if start in changes:

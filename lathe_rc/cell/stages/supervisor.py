@@ -12,7 +12,7 @@ from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import Input, Output, Sparse, Stage
 from lathe_rc.errors import InputError
 from lathe_rc.safety import state_machine
-from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Monitor, Rate, Threshold
+from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Lookout, Monitor, Rate, Threshold
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
 
 Asked = Literal["warn", "freeze", "fall_back", "hold", "retract", "stop"]
@@ -115,6 +115,7 @@ class Supervisor(Stage):
         self._watch_drives()
         self._watch_margins()
         self._watch_cut()
+        self._lookout = Lookout(self.monitors)
         self.declare(inputs=self._inputs, outputs=[Output("safety", messages.SAFETY)])
         self.sparse_topics["safety/status"] = messages.SAFETY_STATUS
 
@@ -259,8 +260,7 @@ class Supervisor(Stage):
         to = state_machine.after(self.state, action)
         if to is not None and self.reaction is not Reaction.STOP:
             self.state, self.reaction, self._was_reset = to, Reaction.NONE, True
-            for monitor in self.monitors:
-                monitor.reset()
+            self._lookout.reset()
 
     def go_safe(self) -> None:
         """See `Stage`: an alarm that nothing resets."""
@@ -278,7 +278,11 @@ class Supervisor(Stage):
         """See `Stage`."""
         (safety,) = outputs
         samples = safety["state"].size
-        found = [(alarm.place, monitor, alarm.value) for monitor in self.monitors if (alarm := monitor.look(inputs))]
+        found = self._lookout.look(inputs)
+        if not (found or self._was_reset or self._members_lost or self.state is State.RETRACTING):
+            safety["state"].fill(self.state)
+            safety["reaction"].fill(self.reaction)
+            return []
         sparse: list[Sparse] = []
         if self._was_reset:
             sparse.append(self._status(first, RESET, "", 0.0, 0.0))
@@ -287,11 +291,11 @@ class Supervisor(Stage):
             sparse.append(self._status(first, MEMBERS_LOST, "", 0.0, 0.0))
             self._members_lost = False
         reached = 0
-        for place, monitor, value in sorted(found, key=lambda alarm: alarm[0]):
-            self._fill(safety, inputs, first, reached, place, sparse)
-            reached = place
+        for monitor, alarm in found:
+            self._fill(safety, inputs, first, reached, alarm.place, sparse)
+            reached = alarm.place
             self._ask_for(monitor.reaction)
-            sparse.append(self._status(first + place, monitor.name, monitor.subject, value, monitor.limit))
+            sparse.append(self._status(first + reached, monitor.name, monitor.subject, alarm.value, monitor.limit))
         self._fill(safety, inputs, first, reached, samples, sparse)
         return sparse
 
@@ -299,16 +303,16 @@ class Supervisor(Stage):
         self, safety: Signals, inputs: Sequence[Signals], first: int, start: int, stop: int, sparse: list[Sparse]
     ) -> None:
         """State and reaction of some samples without an alarm; the tool may be out at one of them."""
+        state, reaction = safety["state"][start:stop], safety["reaction"][start:stop]
         if self.state is State.RETRACTING and self._out is not None:
             place = self._clearance.first(inputs[self._out]["measured_position"][start:stop])
             if place is not None:
-                safety["state"][start : start + place] = self.state
-                safety["reaction"][start : start + place] = self.reaction
-                start += place
+                state[:place].fill(self.state)
+                state = state[place:]
                 self.state = State.SAFE
-                sparse.append(self._status(first + start, RETRACTED, self.parameters.drives[0], 0.0, 0.0))
-        safety["state"][start:stop] = self.state
-        safety["reaction"][start:stop] = self.reaction
+                sparse.append(self._status(first + start + place, RETRACTED, self.parameters.drives[0], 0.0, 0.0))
+        state.fill(self.state)
+        reaction.fill(self.reaction)
 
     def _status(self, index: int, monitor: str, subject: str, value: float, limit: float) -> Sparse:
         values = {
