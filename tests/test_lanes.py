@@ -94,6 +94,7 @@ def test_each_lane_has_the_bits_of_its_cell_alone(lanes):
     [
         ("piston", ["learning_controller.identify=true"]),
         ("piston", ["learning_controller.q_filter=gaussian"]),
+        ("piston", ["learning_controller.identify=false", "learning_controller.publish_margin=true"]),
         ("two_channel", ["piezo_actuator.hysteresis=bouc_wen", "electrodynamic_actuator.noise_rms=1e-8"]),
         ("two_channel", ["learning_controller.events=['revolution 3: freeze']"]),
         ("direct_compensation", []),

@@ -15,7 +15,8 @@ ROWS = [(kind, name) for kind, table in TABLES.items() for name in table.rows()]
 WRONG = {bool: [1, "true"], int: [1.5, "1", True], float: ["1", True], str: [1, 1.5, False]}
 SI = {
     "1", "m", "rad", "s", "Hz", "rad/s", "m/s", "m/s^2", "kg", "N", "N/A", "N/m", "N/s", "Pa", "V", "1/m", "1/N", "1/s",
-    "1/(m*s)", "1/(N*s)", "s/m", "s/N", "m/rev", "1/min", "m/s^3", "rad/s^2", "A or V", "rev", "sample", "block", "B",
+    "1/s^2", "1/(m*s)", "1/(N*s)", "s/m", "s/N", "m/rev", "1/min", "m/s^3", "rad/s^2", "A or V", "rev", "sample",
+    "block", "B",
 }  # fmt: skip
 
 
