@@ -2,7 +2,7 @@
 """The offline host: all stages of a cell in one loop."""
 
 import gc
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Protocol
 
 from lathe_rc.cell.messages import MAX_BLOCK, Signals, sample_fields
@@ -54,11 +54,13 @@ class Engine:
         # What is there now stays: the garbage collector need not walk through it again and again.
         gc.freeze()
         try:
-            self._run(list(sinks))
+            for _ in self.steps(list(sinks)):
+                pass
         finally:
             gc.unfreeze()
 
-    def _run(self, receivers: Sequence[Sink]) -> None:
+    def steps(self, sinks: Sequence[Sink]) -> Iterator[int]:
+        """Run chunk by chunk; the sample index after each."""
         for first in range(0, self.samples, self._chunk):
             samples = min(self._chunk, self.samples - first)
             dense: dict[str, Signals] = {}
@@ -66,8 +68,9 @@ class Engine:
             for stage, ports, topics in self._stages:
                 for message in stage.advance(first, *ports.open(first, samples, dense)):
                     sparse.setdefault(topics[message.topic], []).append(message)
-            for sink in receivers:
+            for sink in sinks:
                 sink.chunk(first, samples, dense, sparse)
+            yield first + samples
 
 
 def chunk_size(cell: Cell, most: int) -> int:
