@@ -9,7 +9,7 @@ Parts, short by default, and with ``--long``:
 - stop: SIGSTOP and SIGCONT of random nodes at 6 (100) random moments of one run, which keeps its digest;
 - cells: two cells at once in one domain, 1 (20) times, each with its own digest.
 
-A full disk and a link that loses and delays are in tests/system (./lathe test --system). Exit code 1 if anything failed.
+A full disk and a link that loses and delays are in tests/system (./lathe test --system). Exit code 1: something failed.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from random import Random
+from statistics import median
 from typing import Any
 
 from lathe_rc import harness
@@ -96,11 +97,17 @@ class At:
     Args:
         moments: sample and node, in order.
         act: gets the process of the node.
+
+    Attributes:
+        seen: events of each kind.
+        noticed: times from an act until the time master named somebody dead or silent [s].
     """
 
     def __init__(self, moments: Sequence[tuple[int, str]], act: Callable[[int], None]) -> None:
         self._moments, self._act = list(moments), act
         self._pids: dict[str, int] = {}
+        self._acted = 0
+        self.noticed: list[float] = []
         self.seen: Counter[str] = Counter()
 
     def __call__(self, event: harness.Event) -> None:
@@ -111,12 +118,17 @@ class At:
         if event["event"] in ("progress", "block0"):
             while self._moments and event.get("samples", 0) >= self._moments[0][0]:
                 self._act(self._pids[self._moments.pop(0)[1]])
+                self._acted = time.monotonic_ns()
+        if self._acted and event["event"] in ("dead", "stall"):
+            self.noticed.append((event["monotonic_ns"] - self._acted) * 1e-9)
+            self._acted = 0
 
 
 def kill(scale: int, random: Random) -> Mapping[str, Any]:
     """See the module."""
     told: Counter[str] = Counter()
     failures: list[str] = []
+    noticed: list[float] = []
     with tempfile.TemporaryDirectory(prefix="lathe-soak-") as name:
         folder = Path(name)
         sets = ["spindle_encoder.revolutions=40.0", f"{OWN}.restart_file={folder}/state", "recorder.chunk_size=65536"]
@@ -128,10 +140,20 @@ def kill(scale: int, random: Random) -> Mapping[str, Any]:
             bag, watch = folder / f"bag{number}", At([(sample, node)], lambda pid: os.kill(pid, signal.SIGKILL))
             outcome = _killed(scenario, node, bag, watch, plain.digest)
             told[f"{node}: {outcome}"] += 1
+            noticed += watch.noticed
             if outcome not in _ALLOWED[node == OWN]:
                 failures.append(f"{node} at sample {sample}: {outcome}")
             print(f"kill {number + 1}: {node} at sample {sample}: {outcome}", flush=True)
-    return {"outcomes": dict(sorted(told.items())), "failures": failures, "failed": len(failures)}
+    return {
+        "outcomes": dict(sorted(told.items())),
+        "noticed_after_ms": _times(noticed),
+        "failures": failures,
+        "failed": len(failures),
+    }
+
+
+def _times(seconds: Sequence[float]) -> dict[str, float]:
+    return {name: round(of(seconds) * 1e3, 1) for name, of in (("median", median), ("largest", max)) if seconds}
 
 
 _SAFE, _SAME, _ENDED = "safe state, bag readable", "goes on, same digest", "ended, bag readable"

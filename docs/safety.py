@@ -96,7 +96,9 @@ def states() -> list[str]:
 def noticed(name: str, node: str, fault: str, revolution: int) -> str:
     """A row of the table of faults: one run."""
     overrides = [f"{node}.faults=['revolution {revolution}: {fault}']"]
-    recording = harness.run(scenario.load(CONFIG / f"{name}.yaml", overrides)).recording
+    result = harness.run(scenario.load(CONFIG / f"{name}.yaml", overrides))
+    recording = result.recording
+    lost = str(sum(result.samples - next(iter(signals.values())).size for signals in recording.dense.values()))
     begin = recording.sparse[f"/{node}/events"].values["sample_index"][0]
     status = recording.sparse["/safety/status"].values
     found = list(zip(status["sample_index"], status["state"], strict=True)) if status else []
@@ -106,7 +108,7 @@ def noticed(name: str, node: str, fault: str, revolution: int) -> str:
     depth = [f"{error[begin:safe].max() * 1e6:.3g}" for error in tools] or [""]
     row = [name, f"`{fault}` at {node}"]
     if not status:
-        return f"| {' | '.join([*row, 'not noticed', '', '', *depth])} |"
+        return f"| {' | '.join([*row, 'not noticed', '', '', *depth, lost])} |"
     angle = recording.of_type(messages.ENCODER)["angle_true"]
     first, step = found[0][0], 1.0 / 64000
     by = (
@@ -114,7 +116,7 @@ def noticed(name: str, node: str, fault: str, revolution: int) -> str:
     )
     end = State(status["state"][-1]).name.lower()
     after = end if safe is None else f"{end} after {(safe - begin) * step * 1e3:.3g} ms"
-    return f"| {' | '.join([*row, by, Reaction(max(status['reaction'])).name.lower(), after, *depth])} |"
+    return f"| {' | '.join([*row, by, Reaction(max(status['reaction'])).name.lower(), after, *depth, lost])} |"
 
 
 def main() -> None:
@@ -122,8 +124,9 @@ def main() -> None:
     print("\n".join([*kinds(), "", *states()]))
     if "--static" in sys.argv:
         return
-    print("\n| scenario | fault | noticed by, after [ms, rev] | reaction | state at the end | too deep by [µm] |")
-    print("| --- | --- | --- | --- | --- | ---: |")
+    columns = ("scenario", "fault", "noticed by, after [ms, rev]", "reaction", "state at the end")
+    print(f"\n| {' | '.join(columns)} | too deep by [µm] | samples lost |")
+    print("| --- | --- | --- | --- | --- | ---: | ---: |")
     for name, (revolution, faults) in CASES.items():
         for node, texts in faults.items():
             for fault in texts:
