@@ -129,7 +129,14 @@ def with_controller(scenario: Scenario, file: Path) -> Scenario:
     return Scenario(scenario.name, nodes)
 
 
-def _refuse_snapshot(source: Source) -> None:
+def _refuse_part(source: Source) -> None:
+    held = story.held(source.about)
+    if held:
+        topic, sample = next(iter(held.items()))
+        raise InputError(
+            f"{source.path}: nodes were lost on the way, {topic} is held from sample {sample} on; allowed: a bag of a "
+            "run that nothing interrupted"
+        )
     first = first_sample(source.about)
     if first:
         raise InputError(
@@ -170,7 +177,7 @@ def resimulate(
     if output is not None:
         refuse_existing(output)
     with Source(path) as source, tempfile.TemporaryDirectory(prefix="lathe-resim-") as folder:
-        _refuse_snapshot(source)
+        _refuse_part(source)
         recorded = Recorded(source, topics or {})
         original = None if scenario is not None else _of_bag(recorded, source, Path(folder))
         if scenario is not None:
