@@ -12,6 +12,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness
+from lathe_rc.bag.resim import resimulate
 from lathe_rc.cell import messages
 from lathe_rc.cli import main
 
@@ -80,6 +81,8 @@ def test_two_composed_cells_start_at_once(domain, tmp_path):
     assert runs["left"].result().digest == alone(LEFT, "/left")
     assert runs["right"].result().digest == alone(RIGHT, "/right")
     assert mixed(tmp_path / "left", "/left") == mixed(tmp_path / "right", "/right") == set()
+    again = resimulate(tmp_path / "right")
+    assert again.digest == again.recorded == harness.run(RIGHT).digest
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lathe_rc.bag import story
 from lathe_rc.bag.source import Source
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
@@ -45,13 +46,14 @@ class Recorded:
 
     Attributes:
         path: of the bag.
+        namespace: of the cell that it was recorded from; empty if it had none.
 
     Raises:
         InputError: a topic is named that the bag has not.
     """
 
     def __init__(self, source: Source, names: Mapping[str, str]) -> None:
-        self.path = source.path
+        self.path, self.namespace = source.path, story.namespace(source.about)
         self._source, self._names = source, dict(names)
         for name, topic in names.items():
             if topic not in source.topics:
@@ -79,7 +81,7 @@ class Recorded:
         Raises:
             InputError: it is of another type.
         """
-        topic = self._names.get(name, messages.full(name))
+        topic = self._names.get(name, self.namespace + messages.full(name))
         said = self._source.topics.get(topic)
         if said is None or not said.count:
             return None

@@ -214,7 +214,8 @@ def resimulate(
             if writer is not None:
                 writer.close()
         wall = time.monotonic() - start
-    digest_of_bag = recorded_digests(path) if original is not None else {}
+    found = recorded_digests(path) if original is not None else {}
+    digest_of_bag = {topic.removeprefix(recorded.namespace): digest for topic, digest in found.items()}
     before = errors
     if changed and compared is None:
         before = ErrorsByRevolution({name: said.type for name, said in source.topics.items()})

@@ -66,6 +66,15 @@ def held(about: Mapping[str, str]) -> dict[str, int]:
         raise InputError(f"{HELD} of the bag is not what a recorder writes; recover the bag") from None
 
 
+def namespace(about: Mapping[str, str]) -> str:
+    """Namespace of the cell, as it stands before its topics; empty if it has none, or the bag does not tell."""
+    try:
+        topics = [str(topic)[:256] for topic in json.loads(about.get(HOST_TOPICS, "[]"))[:256]]
+    except (ValueError, TypeError, RecursionError, KeyError):
+        return ""
+    return next((topic.removesuffix("/cell_state") for topic in topics if topic.endswith("/cell_state")), "")
+
+
 def _versions() -> dict[str, str]:
     found = {"lathe_rc": __version__, "python": platform.python_version(), "machine": platform.machine()}
     for name in _PACKAGES:
