@@ -405,7 +405,7 @@ class CellNode(LifecycleNode):
             self._go_safe(state)
 
     def _go_safe(self, state: CellState) -> None:
-        if self.full_name in state.lost:
+        if self.full_name in state.lost or not self._ready:
             self.fail(LatheError(f"{self.full_name}: the cell went to its safe state without it"), cause="abandoned")
             return
         self._without = set(state.lost)

@@ -99,7 +99,7 @@ class SpindleNode(StageNode):
     @property
     def _least(self) -> int:
         """Blocks that every member has completed."""
-        return min(self.blocks, *self._completed.values())
+        return min([self.blocks, *self._completed.values()])
 
     # ---- start --------------------------------------------------------------------------------------
 
@@ -143,8 +143,7 @@ class SpindleNode(StageNode):
         if progress.blocks > self.blocks and not self._without:
             raise LatheError(f"{progress.name} claims {progress.blocks} blocks; {self.blocks} were sent")
         before = self._least
-        # One that was restarted repeats some.
-        self._completed[progress.name] = max(progress.blocks, self._completed[progress.name])
+        self._completed[progress.name] = progress.blocks
         least = self._least
         self._heard = time.monotonic()
         self._stalled = frozenset()
@@ -242,9 +241,9 @@ class SpindleNode(StageNode):
         """Name the members that are dead or silent, and do what is to be done about them."""
         if not self._running or self.over or self.failure:
             return
-        now, lost = time.monotonic(), set[str]()
+        now = time.monotonic()
         for name in self.watch.ended() & self._completed.keys() - self._dead.keys():
-            restarts, self.patience = self.restarts(name), _GONE
+            restarts, self.patience = self.restarts(name) and not self._without, _GONE
             self._dead[name] = now + (self._pace.restart_time if restarts else 0.0)
             self.get_logger().error(f"{name} has died at block {self._completed[name]}")
             self.reporter("dead", self.get_name(), member=name, blocks=self._completed[name], restarts=restarts)
@@ -252,10 +251,9 @@ class SpindleNode(StageNode):
             del self._dead[name]
             self._heard = now
             self.reporter("back", self.get_name(), member=name)
-        lost |= {name for name, until in self._dead.items() if now >= until}
-        if lost:
-            self._lose(lost, "died")
-        elif not self._dead and not self._credit() and now - self._heard > _STALL:
+        if any(now >= until for until in self._dead.values()):
+            self._lose(set(self._dead), "died")  # who was waited for as well: it could not join any more
+        elif not self._dead and (self._unsafe or not self._credit()) and now - self._heard > _STALL:
             self._name_the_silent()
             if self._pace.stall_reaction == "safe" and now - self._heard > self._pace.stall_time:
                 self._lose(set(self._stalled), "fell silent")
@@ -265,7 +263,8 @@ class SpindleNode(StageNode):
 
     def _name_the_silent(self) -> None:
         # Who waits for a silent one is as slow as it is: first those that DDS does not hear any more.
-        names = frozenset(self.watch.silent.keys() & self._completed.keys()) or frozenset({self._slowest})
+        silent = self.watch.silent.keys() & self._completed.keys()
+        names = frozenset(silent or self._unsafe or {self._slowest})
         if names == self._stalled:
             return
         self._stalled = names
