@@ -249,7 +249,9 @@ class TestLaunch:
         with pytest.raises(InputError, match="exists"):
             start(bag=str(tmp_path))
 
-    @pytest.mark.parametrize(("code", "ends"), [(0, False), (1, True), (-9, True)])
-    def test_a_failed_node_ends_the_others(self, start: Callable[..., Any], code: int, *, ends: bool) -> None:
+    @pytest.mark.parametrize(("code", "ends"), [(0, False), (1, True), (-9, False)])
+    def test_a_failed_node_ends_the_others_and_a_killed_one_none(
+        self, start: Callable[..., Any], code: int, *, ends: bool
+    ) -> None:
         react = start()[0].on_exit
         assert bool(react(SimpleNamespace(returncode=code, process_name="tool-1"), None)) == ends

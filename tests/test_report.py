@@ -281,7 +281,7 @@ class TestHost:
         assert host.errors == ["/spindle: broken"]
         state = messages.store().types[CELL_STATE]
         for k in range(200):
-            host.add(CELL_STATE, messages.encode(CELL_STATE, state("run", 3, k, "no tool")))
+            host.add(CELL_STATE, messages.encode(CELL_STATE, state("run", 3, k, "no tool", 0, [])))
             host.add(DIAGNOSTICS, diagnostics(1.0, name=f"/n{k}"))
         assert host.errors[1] == "the cell failed at sample 0: no tool"
         assert len(host.errors) <= 50

@@ -442,7 +442,11 @@ def test_a_broken_tool_stops_the_feed():
 # ---- the stability margin
 
 # A slow swing of 5 % of the speed; at the top of it the margin is least.
-SWING = ["spindle_encoder.deviation_amplitude=[0.05]", "spindle_encoder.deviation_frequency=[3.0]"]
+SWING = [
+    "spindle_encoder.deviation_amplitude=[0.05]",
+    "spindle_encoder.deviation_frequency=[3.0]",
+    "supervisor.margin_after=0.0",
+]
 
 
 def margin_of(result):

@@ -290,7 +290,7 @@ def test_service_says_why_there_is_no_snapshot(domain, tmp_path):
 
 @pytest.mark.parametrize("node", ["tool", "recorder"])
 def test_a_killed_node_leaves_the_last_seconds(node, tmp_path, whole):
-    """Those of a node's death, or, of the recorder's, what had come to the disk of the snapshot under way."""
+    """Those before and after a node's death, or, of the recorder's, what had come to the disk of the one under way."""
     pids = {}
 
     def kill(event):
@@ -305,9 +305,8 @@ def test_a_killed_node_leaves_the_last_seconds(node, tmp_path, whole):
         harness.run(running, mode="processes", groups=[], bag=tmp_path / "bag", watch=kill)
     (path,) = (tmp_path / "bag_snapshots").iterdir()
     found = told(path)
-    assert found["whole"] is False
-    cause = "learning_controller: freeze" if node == "recorder" else "recorder: interrupted"
-    assert found["triggers"][0][1] == cause
+    assert found["whole"] is (node == "tool")
+    assert found["triggers"][0][1] == ("learning_controller: freeze" if node == "recorder" else "cell: lost /tool")
     read(path)
 
 

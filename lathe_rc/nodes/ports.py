@@ -44,6 +44,15 @@ def latched_qos(depth: int) -> QoSProfile:
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+def all_latched_qos() -> QoSProfile:
+    """To read those: all are kept until they are taken, a stranger's flood pushes none out."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_ALL,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
+
+
 class BlockQueue:
     """Blocks of one topic, checked and in order.
 

@@ -186,6 +186,8 @@ class RecorderNode(CellNode):
         held = {topic: queue.held_from for topic, queue in self._queues.items() if queue.held_from is not None}
         if self.over or self._merger is None:
             return
+        if self._snapshots is not None and not self._safe:
+            self._snapshots.trigger(f"cell: lost {', '.join(sorted(lost))}", first)
         self._open.tell({story.HELD: json.dumps(held)})
         self._merger.forget(lost)
         for topic in held:

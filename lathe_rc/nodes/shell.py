@@ -26,7 +26,7 @@ from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import declare
 from lathe_rc.nodes.exchange import Exchange
-from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
+from lathe_rc.nodes.ports import all_latched_qos, latched_qos, message_class, signal_qos
 from lathe_rc.nodes.report import Reporter
 from lathe_rc.nodes.strangers import Stranger, Strangers
 from lathe_rc.nodes.watch import Watch, liveliness, this_host
@@ -141,7 +141,7 @@ class CellNode(LifecycleNode):
             "diagnostics": add(DiagnosticArray, "/diagnostics", QoSProfile(depth=100)),
         }
         self.create_subscription(Member, "members", self.guarded(self._on_member), latched_qos(_LATCHED_DEPTH))
-        self.create_subscription(CellState, "cell_state", self.guarded(self._on_cell_state), latched_qos(4))
+        self.create_subscription(CellState, "cell_state", self.guarded(self._on_cell_state), all_latched_qos())
         self.create_publisher(Empty, f"~/{messages.ALIVE}", liveliness())
         self.watch = Watch(self, lambda: self.attempt(self.look_after_others))
         self.active = True

@@ -159,8 +159,8 @@ class StageNode(CellNode):
         return sum(queue.lost for queue in self._queues.values())
 
     def matched(self) -> bool:
-        """See `CellNode`; and it knows whether the cell is running."""
-        return self._cell is not None and super().matched()
+        """See `CellNode`; who may join in mid-run must know whether the cell is running."""
+        return (self._cell is not None or not self._restart_file) and super().matched()
 
     def begin(self, *, joins: bool) -> None:
         """See `CellNode`.

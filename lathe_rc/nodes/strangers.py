@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from lathe_rc.errors import LatheError
 
-_MOST = 16  # senders that are told apart
+_MOST = 32  # senders that are told apart
 _LONGEST = 256  # characters of a name that is kept
 
 

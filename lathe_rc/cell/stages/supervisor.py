@@ -70,6 +70,9 @@ class SupervisorParameters(NodeParameters):
         "drives: smallest stability margin of the channel that commands one, which has publish_margin; one for each, "
         "or none",
     )
+    margin_after: Annotated[float, Ge(0)] = parameter(
+        10.0, "after so many from the start or a reset: the drive has to be identified", "rev"
+    )
     margin_reaction: Asked = parameter("freeze", "what is asked for then")
     force_limit: Annotated[float, Ge(0)] = parameter(0.0, "cut: measured force", "N")
     force_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
@@ -226,11 +229,9 @@ class Supervisor(Stage):
 
     def _watch_margins(self) -> None:
         for drive, limit in self._each("margin_limit", self.parameters.drives):
-            place, reaction = (
-                self._reads(f"{drive}/margin", messages.MARGIN, _MARGIN),
-                self._reaction("margin_reaction"),
-            )
-            self.monitors.append(Below("stability_margin", drive, limit, reaction, signal=(place, *_MARGIN)))
+            reaction, after = self._reaction("margin_reaction"), self.parameters.margin_after
+            signal = (self._reads(f"{drive}/margin", messages.MARGIN, _MARGIN), *_MARGIN)
+            self.monitors.append(Below("stability_margin", drive, limit, reaction, signal=signal, after=after))
 
     def _watch_cut(self) -> None:
         table = self.parameters
