@@ -54,6 +54,7 @@ _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag c
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
 _MOST_RESTARTS = 8  # of a process
 _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
+_NO_SIGN_OF_LIFE = {"stall", "stranger"}  # events that come while nothing goes on
 _LOOK = 0.05  # [s] between looks at what a process has written
 
 
@@ -425,10 +426,11 @@ class Processes:
         Raises:
             LatheError: nothing was heard for ``silence`` seconds.
         """
+        heard = time.monotonic()
         while True:
-            wait = _FAREWELL if self._complete else min(silence, _SETTLING) if self._killed else silence
+            wait = _FAREWELL if self._complete else min(silence, self._settling) if self._killed else silence
             try:
-                event = self._events.get(timeout=wait)
+                event = self._events.get(timeout=max(heard + wait - time.monotonic(), 0.0))
             except queue.Empty:
                 if self._complete and self._running:
                     self._end_the_silent()
@@ -439,11 +441,18 @@ class Processes:
                     f"{running}{self._tails()}"
                 ) from None
             self._newest[event["event"]] = event
+            if event["event"] not in _NO_SIGN_OF_LIFE:
+                heard = time.monotonic()
             if event["event"] == "refused":
                 self.refused.update(event["senders"])
             if event["event"] == "exit" and not self._restarted(event):
                 self._ended.add(event["node"])
             yield event
+
+    @property
+    def _settling(self) -> float:
+        """How long a cell may take to its safe state without an event [s]."""
+        return _SETTLING + max(getattr(table, "restart_time", 0.0) for table in self._scenario.nodes.values())
 
     def _restarted(self, event: Event) -> bool:
         """Start a process that was killed once more, if others can take the place of all its nodes."""

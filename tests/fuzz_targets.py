@@ -111,16 +111,21 @@ def _scenarios() -> list[bytes]:
 
 def _state(data: bytes) -> None:
     with _folder() as folder, refusals():
-        (folder / "state").write_bytes(data)
-        state_file.load(folder / "state", scenario.load(CONFIG / "piston.yaml").nodes["learning_controller"])
+        path = folder / "state"
+        path.write_bytes(data)
+        path.chmod(0o600)
+        cell = _kept()
+        state_file.load(path, cell.stages["learning_controller"].shared, {"stage": cell.stages["learning_controller"]})
+
+
+@functools.cache
+def _kept() -> Cell:
+    return Cell(scenario.load(CONFIG / "piston.yaml").nodes)
 
 
 @functools.cache
 def _states() -> list[bytes]:
-    with _folder() as folder:
-        cell = Cell(scenario.load(CONFIG / "piston.yaml").nodes)
-        state_file.save(folder / "state", {"stage": cell.stages["learning_controller"], "samples": 0})
-        return [(folder / "state").read_bytes()]
+    return [state_file.dump({"stage": _kept().stages["learning_controller"]})]
 
 
 # ---- tables ---------------------------------------------------------------------------------------------

@@ -49,7 +49,8 @@ def commands(cell, table, recording, keep_at, path):
     for block in range(samples(recording) // BLOCK):
         if block in keep_at:
             state_file.save(path, {"stage": stage, "tracks": tracks})
-            state = state_file.load(path, table)
+            fresh = {"stage": Cell(cell.nodes).stages[OWN], "tracks": tracks}
+            state = state_file.load(path, table, fresh)
             stage, tracks = state["stage"], state["tracks"]
         for topic, track in tracks.items():
             for name, array in track.extend(BLOCK).items():
@@ -129,35 +130,76 @@ def test_a_controller_whose_state_is_lost_is_not_waited_for(tmp_path):
 # ---- the file -------------------------------------------------------------------------------------------
 
 
+def loaded(path):
+    cell = load(CONFIG / "piston.yaml")
+    return state_file.load(path, cell.nodes[OWN], {"stage": Cell(cell.nodes).stages[OWN]})
+
+
 class Call:
     """What pickle makes a call of."""
 
-    def __init__(self, path):
-        self.path = path
+    def __init__(self, function, *arguments):
+        self.function, self.arguments = function, arguments
 
     def __reduce__(self):
-        return os.mkdir, (str(self.path),)
+        return self.function, self.arguments
+
+
+def named(module, name, *arguments):
+    """A pickle that calls what has a dotted name in a module, with texts."""
+    texts = b"".join(b"\x8c" + bytes([len(text)]) + text.encode() for text in arguments)
+    start = b"\x80\x04\x8c" + bytes([len(module)]) + module.encode() + b"\x8c" + bytes([len(name)]) + name.encode()
+    return start + b"\x93(" + texts + b"tR."
 
 
 @pytest.mark.parametrize(
     "data",
-    [b"", b"\x80", b"\x80\x04N.", pickle.dumps([1]), pickle.dumps(Path()), pickle.dumps(open)],
+    [
+        b"",
+        b"\x80",
+        b"\x80\x04N.",
+        pickle.dumps([1]),
+        pickle.dumps({"stage": 1, "more": 2}),
+        pickle.dumps(Path()),
+        pickle.dumps(np.zeros(3)),
+        named("lathe_rc.analysis.angle_domain", "np.f2py.subprocess.Popen", "true"),
+        named("lathe_rc.bag.writer", "BagWriter", "bag"),
+    ],
 )
 def test_what_is_no_state_is_refused(data, tmp_path):
     path = tmp_path / "state"
     path.write_bytes(data)
+    path.chmod(0o600)
     with pytest.raises(LatheError, match=f"^{path}: not a state of this node"):
-        state_file.load(path, load(CONFIG / "piston.yaml").nodes[OWN])
+        loaded(path)
 
 
 def test_a_state_from_elsewhere_runs_no_code(tmp_path):
     path, made = tmp_path / "state", tmp_path / "made"
-    path.write_bytes(pickle.dumps({"stage": Call(made)}))
-    with pytest.raises(LatheError, match=r"not a state of this node \(UnpicklingError: STACK_GLOBAL|posix.mkdir\)"):
-        state_file.load(path, load(CONFIG / "piston.yaml").nodes[OWN])
+    path.write_bytes(pickle.dumps({"stage": Call(os.mkdir, str(made))}))
+    path.chmod(0o600)
+    with pytest.raises(LatheError, match=r"not a state of this node \(UnpicklingError: posix.mkdir\)"):
+        loaded(path)
     assert not made.exists()
+
+
+def test_an_array_takes_no_more_than_its_bytes(tmp_path):
+    path = tmp_path / "state"
+    pickled = state_file.dump({"stage": np.zeros(8)}).replace(b"<f8", b"|O8")
+    path.write_bytes(pickled)
+    path.chmod(0o600)
+    with pytest.raises(LatheError, match="not a state of this node"):
+        loaded(path)
+
+
+def test_a_state_that_others_may_write_is_refused(tmp_path):
+    path = tmp_path / "state"
+    state_file.save(path, {"stage": 1})
+    path.chmod(0o620)
+    with pytest.raises(LatheError, match="another user owns or may write this state; allowed: your own file, mode 600"):
+        loaded(path)
 
 
 def test_a_state_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(LatheError, match="cannot be read"):
-        state_file.load(tmp_path / "none", load(CONFIG / "piston.yaml").nodes[OWN])
+        loaded(tmp_path / "none")

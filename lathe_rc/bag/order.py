@@ -137,9 +137,7 @@ class Merger:
         self._received[self._sparse[topic]] += 1
 
     def _has(self, topic: str, log_ns: int, data: bytes) -> bool:
-        """Whether a sparse message has come before: then it waits, or the rows that waited for it are written."""
-        if self.rows and log_ns <= self.log_ns:
-            return True
+        """Whether a sparse message that no row has been written with has come before."""
         return any(each.topic == topic and each.log_ns == log_ns and each.data == data for each in self._waiting)
 
     def forget(self, sources: Collection[str]) -> None:

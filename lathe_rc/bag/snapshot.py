@@ -180,6 +180,8 @@ class Snapshots:
     def tell(self, about: Mapping[str, str]) -> None:
         """See `Output`; every bag says so."""
         self._about.update(about)
+        if self._open is not None:
+            self._open[1].tell(about)
 
     def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
         """See `Output`."""

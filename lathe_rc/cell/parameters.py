@@ -182,7 +182,7 @@ class RestartParameters(NodeParameters):
     """Of a node that another process may replace in mid-run."""
 
     restart_file: str = parameter(
-        "", "the node's state is kept here, and another process of it goes on from there; empty: it is not", path=True
+        "", "the node's state is kept in this file, and another process of it goes on from there; empty: it is not"
     )
 
 

@@ -22,7 +22,10 @@ TABLES[RECORDER] = RecorderParameters
 
 _EVERYONE = "/**"
 # What changes neither a sample nor a message of a run, and so not its identity.
-_HOST_PARAMETERS = {"run_id", "speed_factor", "window", "members", "processes", "autostart"}
+_HOST_PARAMETERS = {
+    *("run_id", "speed_factor", "window", "members", "processes", "autostart"),
+    *("stall_reaction", "stall_time", "safe_time", "restart_time", "restart_file"),
+}
 
 
 def kind_of(node: str, values: Mapping[str, object]) -> str:

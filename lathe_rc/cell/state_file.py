@@ -1,59 +1,105 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a node keeps of itself in a file, so that another process can go on in its place, to the bit.
 
-Python's pickle, with limits: parameter tables are not in it, the node that reads it has its own; nothing but the
-classes of stages and arrays is made of it, by no other operations than a pickler writes. So a file from elsewhere runs
-no code, and needs no more memory than its length asks for.
+Python's pickle, with limits. Arrays are written as type, shape and bytes, parameter tables not at all: the node that
+reads has its own. Of classes there are only those that a fresh state of the node is made of. A file that another user
+owns or may write is refused, since what is in it is believed.
 """
 
+import enum
 import io
+import os
 import pickle
-import pickletools
+import stat
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from lathe_rc.cell.parameters import Table
 from lathe_rc.errors import LatheError
 from lathe_rc.files import contents
 
 _MOST = 2**28  # longest such file [B]
-_TABLE = "table"
-_OF_NUMPY = frozenset({"_reconstruct", "scalar", "ndarray", "dtype", "_frombuffer"})
-_PACKAGES = ("analysis", "cell", "control", "plants", "safety", "signals")  # of this package
-_OPERATIONS = """
-    PROTO FRAME STOP MEMOIZE BINGET LONG_BINGET MARK BINPERSID STACK_GLOBAL REDUCE BUILD NEWOBJ NEWOBJ_EX
-    NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 BINFLOAT SHORT_BINUNICODE BINUNICODE SHORT_BINBYTES BINBYTES
-    EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_LIST APPEND APPENDS EMPTY_DICT SETITEM SETITEMS EMPTY_SET ADDITEMS
-    FROZENSET BYTEARRAY8
-""".split()  # noqa: SIM905 - one line each would be a page
-_OF_PYTHON = frozenset({("collections", "deque"), ("builtins", "set"), ("builtins", "frozenset")})
+_TABLE, _ARRAY, _NUMBER, _KIND, _ENUM = "table", "array", "number", "kind", "enum"
+_NUMBERS = "biuf"  # kinds of elements
+_Name = tuple[str, str]
 
 
 class _Writer(pickle.Pickler):
-    def persistent_id(self, each: Any) -> str | None:
-        return _TABLE if isinstance(each, Table) else None
+    def __init__(self, buffer: io.BytesIO) -> None:
+        super().__init__(buffer, pickle.HIGHEST_PROTOCOL)
+        self._arrays: dict[int, int] = {}
+
+    def persistent_id(self, each: Any) -> object:
+        if isinstance(each, Table):
+            return _TABLE
+        if isinstance(each, np.ndarray):
+            known = id(each) in self._arrays
+            number = self._arrays.setdefault(id(each), len(self._arrays))
+            return (_ARRAY, number) if known else (_ARRAY, number, each.dtype.str, each.shape, each.tobytes())
+        if isinstance(each, np.generic):
+            return _NUMBER, each.dtype.str, each.tobytes()
+        if isinstance(each, np.dtype):
+            return _KIND, each.str
+        if isinstance(each, enum.Enum):
+            return _ENUM, type(each).__module__, type(each).__qualname__, each.value
+        return None
+
+
+def _dtype(text: object) -> np.dtype[Any]:
+    found = np.dtype(str(text))
+    if found.kind not in _NUMBERS:
+        raise pickle.UnpicklingError(f"elements {text!r:.80}")
+    return found
 
 
 class _Reader(pickle.Unpickler):
-    def __init__(self, data: bytes, table: Table) -> None:
-        super().__init__(io.BytesIO(data))
-        self._table = table
+    """Args: the file's content, parameters of the node, and names of classes; without these any, and they are noted."""
 
-    def persistent_load(self, name: Any) -> Table:
-        if name != _TABLE:
-            raise pickle.UnpicklingError(f"{name!r:.80}")
-        return self._table
+    def __init__(self, data: bytes, table: Table, classes: frozenset[_Name] | None) -> None:
+        super().__init__(io.BytesIO(data))
+        self._table, self._classes = table, classes
+        self._arrays: dict[int, np.ndarray] = {}
+        self.met: set[_Name] = set()
+
+    def persistent_load(self, told: Any) -> Any:
+        if told == _TABLE:
+            return self._table
+        kind, *rest = told
+        if kind == _ARRAY and len(rest) == 1:
+            return self._arrays[rest[0]]
+        if kind == _ARRAY:
+            number, dtype, shape, data = rest
+            self._arrays[number] = np.frombuffer(data, _dtype(dtype)).reshape(shape).copy()
+            return self._arrays[number]
+        if kind == _NUMBER:
+            (number,) = np.frombuffer(rest[1], _dtype(rest[0]))
+            return number
+        if kind == _KIND:
+            return _dtype(rest[0])
+        if kind == _ENUM:
+            found = self.find_class(*rest[:2])
+            if issubclass(found, enum.Enum):
+                return found(rest[2])
+        raise pickle.UnpicklingError(f"{kind!r:.80}")
 
     def find_class(self, module: str, name: str) -> Any:
-        if (module, name) in _OF_PYTHON or (module.split(".", maxsplit=1)[0] == "numpy" and name in _OF_NUMPY):
+        if (module, name) == ("collections", "deque"):
+            return deque
+        if self._classes is None or (module, name) in self._classes:
+            self.met.add((module, name))
             return super().find_class(module, name)
-        root, _, rest = module.partition(".")
-        if root == "lathe_rc" and rest.split(".")[0] in _PACKAGES:
-            found = super().find_class(module, name)
-            if isinstance(found, type):
-                return found
-        raise pickle.UnpicklingError(f"{module}.{name}")
+        raise pickle.UnpicklingError(f"{module}.{name}"[:160])
+
+
+def dump(state: Mapping[str, object]) -> bytes:
+    """What a file of a state holds."""
+    buffer = io.BytesIO()
+    _Writer(buffer).dump(dict(state))
+    return buffer.getvalue()
 
 
 def save(path: Path, state: Mapping[str, object]) -> None:
@@ -62,40 +108,46 @@ def save(path: Path, state: Mapping[str, object]) -> None:
     Raises:
         LatheError: it cannot be written.
     """
-    buffer = io.BytesIO()
-    _Writer(buffer, pickle.HIGHEST_PROTOCOL).dump(dict(state))
     new = path.with_name(f"{path.name}.new")
     try:
-        new.write_bytes(buffer.getbuffer())
+        new.unlink(missing_ok=True)
+        with open(new, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
+            file.write(dump(state))
         new.replace(path)
     except OSError as error:
         raise LatheError(f"{path}: the state cannot be kept ({error.strerror})") from None
 
 
-def _plain(data: bytes) -> bytes:
-    for operation, _, _ in pickletools.genops(data):
-        if operation.name not in _OPERATIONS:
-            raise pickle.UnpicklingError(operation.name)
-    return data
+def _check_owner(path: Path) -> None:
+    about = path.stat()
+    if about.st_uid != os.getuid() or about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise LatheError(f"{path}: another user owns or may write this state; allowed: your own file, mode 600")
 
 
-def load(path: Path, table: Table) -> dict[str, Any]:
+def load(path: Path, table: Table, fresh: Mapping[str, object], *others: type) -> dict[str, Any]:
     """Read a state.
 
     Args:
         path: of the file.
         table: parameters of the node.
+        fresh: a state of the same node: it may be made of the same classes.
+        others: classes that may be there as well.
 
     Raises:
-        LatheError: it cannot be read, or is none.
+        LatheError: it cannot be read, somebody else may have written it, or it is none.
     """
+    own = _Reader(dump(fresh), table, None)
+    own.load()
+    classes = own.met | {(each.__module__, each.__qualname__) for each in others}
     try:
-        data = contents(path, _MOST)
-        state = _Reader(_plain(data), table).load()
+        _check_owner(path)
+        state = _Reader(contents(path, _MOST), table, frozenset(classes)).load()
+    except LatheError:
+        raise
     except OSError as error:
         raise LatheError(f"{path}: the state cannot be read ({error.strerror})") from None
     except Exception as error:  # noqa: BLE001 - pickle lets through whatever a damaged file leads to
         raise LatheError(f"{path}: not a state of this node ({type(error).__name__}: {error!s:.200})") from None
-    if not isinstance(state, dict):
+    if not isinstance(state, dict) or state.keys() != fresh.keys():
         raise LatheError(f"{path}: not a state of this node")
     return state

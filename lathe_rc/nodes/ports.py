@@ -158,15 +158,14 @@ class BlockQueue:
             self._gap(block, self._expected)
         return self._append(block)
 
-    def state(self) -> tuple[int, int, list[Block]]:
-        """What another process needs to go on: next sample, blocks received, and those that wait to be used."""
-        return self._expected or 0, self.received, list(self.blocks)
+    def state(self) -> tuple[int, int, list[Block], Block | None]:
+        """What another process needs to go on: next sample, blocks received, those that wait, and the newest."""
+        return self._expected or 0, self.received, list(self.blocks), self._newest
 
-    def resume(self, source: str, state: tuple[int, int, list[Block]]) -> None:
+    def resume(self, source: str, state: tuple[int, int, list[Block], Block | None]) -> None:
         """Go on from the state of another process; what comes from before it is a repeat."""
-        self._expected, self.received, waiting = state
+        self._expected, self.received, waiting, self._newest = state
         self.blocks = deque(waiting)
-        self._newest = waiting[-1] if waiting else None
         self.source, self.repeats = source, True
 
     def hold(self, end: int, newest: Block | None = None) -> None:

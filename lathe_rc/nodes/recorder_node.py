@@ -59,6 +59,8 @@ class RecorderNode(CellNode):
         self._depth = signal_depth(self.table)
         self._queues: dict[str, BlockQueue] = {}
         self._sparse: dict[str, str] = {}  # topic -> source
+        self._repeating: set[str] = set()  # members that another process may go on for
+        self._last_held = 0  # sample up to which blocks of lost members are held
         self._newest: dict[str, bytes] = {}  # message of each topic that comes from another process
         self._encoders = _Encoders()
         self._merger: Merger | None = None
@@ -141,6 +143,7 @@ class RecorderNode(CellNode):
         dense = {topic: (queue.type, queue.source) for topic, queue in self._queues.items()}
         if self._snapshots is not None and dense:
             self._prepare(self._snapshots, dense)
+        self._repeating = {name for name in self.members if self.restarts(name)}
         if not alone and self.table.window:
             self._merger = Merger(
                 self._open,
@@ -149,7 +152,7 @@ class RecorderNode(CellNode):
                 run_id=self.table.run_id,
                 step_ns=self.table.step_ns,
                 samples=self.table.block_size,
-                repeating={name for name in self.members if self.restarts(name)},
+                repeating=self._repeating,
             )
         self.announce()
 
@@ -183,14 +186,16 @@ class RecorderNode(CellNode):
             if queue.source in lost and queue.held_from is None:
                 data = self._newest.get(topic)
                 queue.hold(end, Decoder(queue.type).decode(data) if data else None)
-        held = {topic: queue.held_from for topic, queue in self._queues.items() if queue.held_from is not None}
+        held_from = {topic: queue.held_from for topic, queue in self._queues.items()}
+        held = {topic: sample for topic, sample in held_from.items() if sample is not None and sample < end}
+        self._last_held = end
         if self.over or self._merger is None:
             return
         if self._snapshots is not None and not self._safe:
             self._snapshots.trigger(f"cell: lost {', '.join(sorted(lost))}", first)
         self._open.tell({story.HELD: json.dumps(held)})
         self._merger.forget(lost)
-        for topic in held:
+        for topic in self._queues:
             blocks = self._queues[topic].blocks
             while blocks:
                 self._merger.add_block(topic, blocks.popleft())
@@ -257,6 +262,9 @@ class RecorderNode(CellNode):
         sample, rest = divmod(messages.stamp_ns(message) - messages.START_NS, self.table.step_ns)
         begin = self._merger.samples if self._merger else 0
         end = begin + self._depth * self.table.block_size if self._merger else sample + 1
+        if sample < begin and source in self._repeating:
+            return  # from another process that goes on in the place of the first
+        end = max(end, self._last_held)
         if rest or not begin <= sample < end:
             raise Stranger(topic, source, run_id, f"expected a time of samples {begin} to {end - 1}")
         self._on_sparse(topic, data)

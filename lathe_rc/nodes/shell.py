@@ -401,7 +401,7 @@ class CellNode(LifecycleNode):
             self._leave([])
         if state.state == CellState.FAILED:
             self.fail(LatheError(f"the cell failed: {state.message}"), cause="abandoned")
-        if state.state == CellState.SAFE and not self.over:
+        if state.state == CellState.SAFE:
             self._go_safe(state)
 
     def _go_safe(self, state: CellState) -> None:
@@ -410,7 +410,8 @@ class CellNode(LifecycleNode):
             return
         self._without = set(state.lost)
         self.get_logger().error(f"safe state from sample {state.first_index} on: {state.message}")
-        self.lose(set(state.lost), state.first_index, state.end_index)
+        if not self.over:
+            self.lose(set(state.lost), state.first_index, state.end_index)
         self._safe = True
         self.announce()
 
@@ -505,7 +506,7 @@ class CellNode(LifecycleNode):
         self.next_tick = now + _TICK if not self._ready else now + 0.1
         if self.active:
             if not self._ready:
-                self._settle()
+                self.attempt(self._settle)
             self.attempt(self.look_after_others)
         if "progress" in self._host:
             self._heard_elsewhere = self._host["progress"].get_subscription_count() > 1

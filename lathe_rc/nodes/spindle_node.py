@@ -247,7 +247,8 @@ class SpindleNode(StageNode):
             self._dead[name] = now + (self._pace.restart_time if restarts else 0.0)
             self.get_logger().error(f"{name} has died at block {self._completed[name]}")
             self.reporter("dead", self.get_name(), member=name, blocks=self._completed[name], restarts=restarts)
-        for name in self._dead.keys() - self.watch.ended():
+        ready = {name for name in self._dead if self.members[name].state == Member.READY}
+        for name in ready - self.watch.ended():
             del self._dead[name]
             self._heard = now
             self.reporter("back", self.get_name(), member=name)
@@ -256,7 +257,11 @@ class SpindleNode(StageNode):
         elif not self._dead and (self._unsafe or not self._credit()) and now - self._heard > _STALL:
             self._name_the_silent()
             if self._pace.stall_reaction == "safe" and now - self._heard > self._pace.stall_time:
-                self._lose(set(self._stalled), "fell silent")
+                self._lose(self._silent_for(now, self._pace.stall_time) or set(self._stalled), "fell silent")
+
+    def _silent_for(self, now: float, seconds: float) -> set[str]:
+        """Members that DDS has not heard for so long."""
+        return {name for name, since in self.watch.silent.items() if now - since > seconds} & self._completed.keys()
 
     def _go_safe(self, state: CellState) -> None:
         """It has said so itself."""
@@ -286,9 +291,10 @@ class SpindleNode(StageNode):
         if not self._without and self._end != self.samples:
             self._end = self.samples + max(1, round(self._pace.safe_time * self.table.sample_rate))
             self._blocks_in_run = -(-self._end // self.table.block_size)
+        # After the first time all know what to do, and need only hear whom to do without.
+        self._unsafe = self._unsafe - names if self._without else set(self._completed)
         self._without |= names
         self.patience = _GONE
-        self._unsafe = set(self._completed)
         self._say(CellState.SAFE, self.samples, self._why)
         self.get_logger().error(self._why)
         self.reporter("safe", self.get_name(), sample=self.samples, end=self._end, lost=sorted(self._without))

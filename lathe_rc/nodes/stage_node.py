@@ -15,8 +15,9 @@ from lathe_rc.cell.framing import Framer
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.stage import Input, Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.track import Track, longest_delays
-from lathe_rc.cell.wire import Encoder, Pool
+from lathe_rc.cell.wire import Block, Encoder, Pool
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes.ports import BlockQueue, message_class, signal_qos
 from lathe_rc.nodes.shell import CellNode
@@ -45,6 +46,9 @@ class StageNode(CellNode):
         self._started = False
         self._restart_file = getattr(self.table, "restart_file", "")
         self._keep_at = 0
+        self._reach: int | None = None  # sample up to which it may go, if no input holds it back
+        if self._restart_file and not self.table.window:
+            raise InputError(f"{self.get_name()}.restart_file with window = 0: nobody waits for a restart; allowed: ''")
         self._framer = Framer(self.table.run_id, self.full_name, self.table.step_ns)
         self._encoders = [
             (
@@ -127,6 +131,8 @@ class StageNode(CellNode):
 
     def members_changed(self) -> None:
         """Learn whose blocks to accept, before the first of them."""
+        if self._waits and any(m.stage == SpindleEncoder.kind and not m.members for m in self.members.values()):
+            self._waits = False  # alone with a spindle, it joins where it can
         if self._waits:
             return
         peers = self.master.members if self.master else list(self.members)
@@ -186,8 +192,13 @@ class StageNode(CellNode):
     def _keep(self) -> None:
         """Keep the state, as long as those who supply it still hold the blocks that follow."""
         self._keep_at = self.blocks + self.table.window
-        state = {
-            "run_id": self.table.run_id,
+        state_file.save(Path(self._restart_file), self._kept())
+
+    def _kept(self) -> dict[str, object]:
+        """All that the next block depends on, and of which start of the cell it is."""
+        assert self.master is not None, "it has announced all members"
+        return {
+            "of": (self.full_name, self.table.run_id, self.master.host, self.master.pid),
             "blocks": self.blocks,
             "samples": self.samples,
             "companions": self._framer.companions,
@@ -195,13 +206,13 @@ class StageNode(CellNode):
             "tracks": self._tracks,
             "queues": {topic: queue.state() for topic, queue in self._queues.items()},
         }
-        state_file.save(Path(self._restart_file), state)
 
     def _resume(self) -> None:
         """Go on from what another process has kept."""
-        state = state_file.load(Path(self._restart_file), self.table)
-        if state.get("run_id") != self.table.run_id or state["queues"].keys() != self._queues.keys():
-            raise LatheError(f"{self._restart_file}: the state of another run; expected {self.table.run_id!r}")
+        fresh = self._kept()
+        state = state_file.load(Path(self._restart_file), self.table, fresh, Block)
+        if state["of"] != fresh["of"]:
+            raise LatheError(f"{self._restart_file}: the state of another node or run; expected {fresh['of']}")
         self.blocks, self.samples, self._started = state["blocks"], state["samples"], True
         self._reported_blocks, self._framer.companions = self.blocks, state["companions"]
         self.stage, self._tracks = state["stage"], state["tracks"]
@@ -220,17 +231,42 @@ class StageNode(CellNode):
                 queue.hold(end)
         if not self._safe:
             self.stage.lose(first)
+        if self._forward and all(queue.held_from is not None for queue in self._forward) and self._reach is None:
+            self._follow_the_master(first)
         self.due = True
+
+    def _follow_the_master(self, first: int) -> None:
+        """Who reads from lost members alone would run ahead to the end: go no further than the spindle has come."""
+        assert self.master is not None, "it has declared the safe state"
+        self._reach = first
+        topic = next(
+            topic for topic, sparse in zip(self.master.publishes, self.master.sparse, strict=True) if not sparse
+        )
+        pace = BlockQueue(topic, messages.ENCODER, self.table, [])
+        pace.expect(self.master.name, first)
+        pace.repeats = True
+
+        def come(block: Block | None) -> None:
+            pace.blocks.clear()
+            if block is not None:
+                self._reach = block.first_index + block.samples
+
+        self.listen(topic, messages.ENCODER, lambda data: come(pace.add(data)), lambda block: come(pace.take(block)))
 
     # ---- events -------------------------------------------------------------------------------------
 
     def _on_schedule(self, request: Any, response: Any) -> Any:
         index = max(self.samples, int(request.not_before))
+        if self._waits:
+            response.message = f"{self.full_name} is not ready yet; ask again"
+            return response
         try:
             self.stage.schedule(request.action, index)
         except InputError as error:
             response.message = str(error)
             return response
+        if self._restart_file and not self.over:
+            self.attempt(self._keep)  # another process has to know of it
         response.accepted, response.sample_index = True, index
         return response
 
@@ -259,6 +295,8 @@ class StageNode(CellNode):
             if not queue.blocks:
                 return None
         head = self._forward[0].blocks[0]
+        if self._reach is not None and head.first_index + head.samples > self._reach:
+            return None
         if not self._started:
             # Alone, a node may join a stream that is under way; in a cell it begins at 0.
             self._join(head.first_index)

@@ -73,6 +73,8 @@ class Watch:
                 self._processes[member.name] = os.pidfd_open(member.pid)
             except ProcessLookupError:
                 self._processes[member.name] = os.open(os.devnull, os.O_RDONLY)  # always readable: it has ended
+            except (OSError, OverflowError) as error:  # no process has such a number, or none may be watched
+                self._node.get_logger().warning(f"{member.name}: its process {member.pid} is not watched ({error})")
 
     def _changed(self, name: str, status: Any) -> None:
         before = name in self.silent

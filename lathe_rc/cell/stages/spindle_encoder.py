@@ -36,7 +36,7 @@ class SpindleEncoderParameters(SpeedLawParameters):
     stall_time: Annotated[float, Ge(0), Le(3600)] = parameter(
         0.1, "wall time of silence after which the safe state is declared, if that is the reaction", "s"
     )
-    safe_time: Annotated[float, Ge(0), Le(3600)] = parameter(0.2, "how long a run goes on in the safe state", "s")
+    safe_time: Annotated[float, Ge(0), Le(10)] = parameter(0.2, "how long a run goes on in the safe state", "s")
     restart_time: Annotated[float, Ge(0), Le(3600)] = parameter(
         30.0, "wall time in which a member that can be restarted has to be back", "s"
     )
