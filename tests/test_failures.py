@@ -54,7 +54,7 @@ def test_a_killed_node_is_named_and_the_bag_is_readable(node, tmp_path):
     bag = tmp_path / "bag"
     killer = Killer(node, signal.SIGKILL)
     scenario = load(PISTON, ["spindle_encoder.revolutions=200.0", "recorder.chunk_size=65536"])
-    ends = "" if node == "spindle_encoder" else rf"; /{node} died: safe state from sample \\d+ on"
+    ends = "" if node == "spindle_encoder" else rf"; /{node} died: safe state from sample \d+ on"
     with pytest.raises(LatheError, match=f"^{node} was killed by SIGKILL{ends}$") as failure:
         harness.run(scenario, mode="processes", bag=bag, watch=killer)
     assert failure.value.exit_code == 1
