@@ -221,17 +221,13 @@ class Tape:
     """A dense topic of a bag, read as it is needed.
 
     Args:
-        path: the bag.
+        source: the bag; open as long as it is read.
         topic: fully qualified.
-
-    Raises:
-        InputError: not a bag.
     """
 
-    def __init__(self, path: Path, topic: str) -> None:
-        self._source = Source(path)
-        self._dense = _Dense(topic, self._source.topics[topic].type)
-        self._batches = self._source.batches({topic})
+    def __init__(self, source: Source, topic: str) -> None:
+        self._dense = _Dense(topic, source.topics[topic].type)
+        self._batches = source.batches({topic})
 
     def take(self, samples: int) -> Signals:
         """The next samples, arrays of shape (samples,); see `take_into`."""
