@@ -141,7 +141,9 @@ def test_many_blocks_read_at_once_are_those_read_one_by_one(data, block):
         encoded.append(encoder.encode(first, signals, last=last, companions=first % 7)[1])
         first += samples
     singles = [decoder.decode(message) for message in encoded]
-    joined = list(Decoder(messages.ENCODER).decode_all(encoded))
+    edges = np.cumsum([0, *map(len, encoded)])
+    places = np.stack([edges[:-1], edges[1:]], axis=1)
+    joined = list(Decoder(messages.ENCODER).decode_all(b"".join(encoded), places))
     assert sum(each.samples for each in joined) == sum(each.samples for each in singles)
     for name in singles[0].signals:
         whole = np.concatenate([each.signals[name] for each in joined])

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.bag.recorded import Recorded
-from lathe_rc.bag.stream import Tape
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import remapped
@@ -52,7 +51,7 @@ class Comparison:
         self.topics = topics
         self._encoder = remapped(cell.master.shared, "encoder")
         self._tool = remapped(tool.shared, tool.outputs[0].topic)
-        self._tapes = [(Tape(recorded.path, topic), field) for topic, field in topics]
+        self._tapes = [(recorded.tape(topic), field) for topic, field in topics]
         self._recorded, self._between = ErrorsByRevolution(_TYPES), ErrorsByRevolution(_TYPES)
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:

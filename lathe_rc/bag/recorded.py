@@ -8,6 +8,7 @@ import numpy as np
 
 from lathe_rc.bag import story
 from lathe_rc.bag.source import Source
+from lathe_rc.bag.stream import Tape
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.errors import InputError, LatheError
@@ -94,6 +95,10 @@ class Recorded:
         others = [t for t, said in sorted(self._source.topics.items()) if said.type == msgtype and said.count]
         options = " or ".join(f"--topic {name}={topic}" for topic in others or ["/TOPIC"])
         return f"{msgtype.rpartition('/')[2]} on {messages.full(name)} (or {options})"
+
+    def tape(self, topic: str) -> Tape:
+        """A topic to be read along with a run."""
+        return Tape(self._source, topic)
 
     def step_ns(self, topic: str) -> int:
         """Sampling step [ns]; 0 if there is no block."""

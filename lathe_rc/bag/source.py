@@ -29,7 +29,7 @@ from rosbags.rosbag2 import Reader
 
 from lathe_rc.bag import trust
 from lathe_rc.bag.trust import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record, shown
-from lathe_rc.bag.walk import walk
+from lathe_rc.bag.walk import Places, walk
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import InputError, LatheError
 
@@ -43,6 +43,36 @@ _CHANNELS = 2**16  # numbers that a channel may have
 _AT_ONCE = 2**14  # messages of a batch
 _CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
 _SQLITE = b"SQLite format 3\0"
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Messages that stand in the same bytes.
+
+    Attributes:
+        whole: the bytes.
+        topics: by channel.
+        places: channel, log time [ns], begin and end of each message, shape (messages, 4).
+    """
+
+    whole: bytes
+    topics: Mapping[int, str]
+    places: Places
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self.places)
+
+    def __iter__(self) -> Iterator[Message]:
+        """Topic, log time [ns] and bytes of each."""
+        for channel, log_ns, begin, end in self.places.tolist():
+            yield self.topics[channel], log_ns, self.whole[begin:end]
+
+    @classmethod
+    def of(cls, message: Message) -> "Batch":
+        """A batch of one."""
+        topic, log_ns, data = message
+        return cls(data, {0: topic}, np.array([[0, log_ns, 0, len(data)]], np.uint64))
 
 
 @dataclass(frozen=True)
@@ -181,8 +211,8 @@ def _check_storage(path: Path) -> None:
         raise ValueError(why)
 
 
-def _messages(whole: bytes, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[list[Message]]:
-    """Topic, log time and bytes of the wanted messages among the records of a chunk, by log time."""
+def _batches(whole: bytes, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[Batch]:
+    """The wanted messages among the records of a chunk, by log time."""
     found = walk(whole)
     wanted = np.zeros(_CHANNELS, dtype=bool)
     wanted[list(topics)] = True
@@ -192,8 +222,7 @@ def _messages(whole: bytes, topics: Mapping[int, str], start_ns: int, stop_ns: i
     if np.any(found[1:, 1] < found[:-1, 1]):
         found = found[np.argsort(found[:, 1], kind="stable")]
     for first in range(0, len(found), _AT_ONCE):
-        rows = found[first : first + _AT_ONCE].tolist()
-        yield [(topics[channel], log_ns, whole[begin:end]) for channel, log_ns, begin, end in rows]
+        yield Batch(whole, topics, found[first : first + _AT_ONCE])
 
 
 class Source:
@@ -285,7 +314,7 @@ class Source:
         """Close it."""
         self._reader.close()
 
-    def _chunks(self, storage: Any, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[list[Message]]:
+    def _chunks(self, storage: Any, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[Batch]:
         """Messages of the wanted connections of an MCAP file, by its index."""
         chunks = [
             chunk
@@ -296,11 +325,11 @@ class Source:
         ]
         with Path(str(storage.path)).open("rb") as stream:
 
-            def read(chunk: Any) -> Iterator[list[Message]]:
+            def read(chunk: Any) -> Iterator[Batch]:
                 stream.seek(chunk.chunk_start_offset)
                 record = read_record(stream, chunk.chunk_start_offset + chunk.chunk_length)
                 whole = read_chunk(record[1] if record else b"", chunk.chunk_start_offset)
-                return _messages(whole, topics, start_ns, stop_ns)
+                return _batches(whole, topics, start_ns, stop_ns)
 
             def late(chunk: Any) -> Iterator[Message]:
                 yield "", chunk.message_start_time, b""  # a chunk is not read before its time
@@ -312,7 +341,7 @@ class Source:
                 return
             for message in heapq.merge(*map(late, chunks), key=itemgetter(1)):
                 if message[0]:
-                    yield [message]
+                    yield Batch.of(message)
 
     def blocks(self, topic: str, *, start_ns: int | None = None) -> Iterator[Block]:
         """The blocks of a dense topic, from a log time [ns] on.
@@ -345,8 +374,8 @@ class Source:
 
     def batches(
         self, topics: set[str] | None = None, *, start_ns: int | None = None, stop_ns: int | None = None
-    ) -> Iterator[list[Message]]:
-        """Topic, log time [ns] and bytes of each message, in the order of log times, as many at a time as come handy.
+    ) -> Iterator[Batch]:
+        """Messages in the order of log times, as many at a time as come handy.
 
         Args:
             topics: those wanted; None: all.
@@ -367,13 +396,14 @@ class Source:
                     found = self._chunks(storage, channels, start_ns or 0, _NEVER if stop_ns is None else stop_ns)
                 else:
                     single = storage.messages(wanted, start=start_ns, stop=stop_ns)
-                    found = ([(connection.topic, log_ns, data)] for connection, log_ns, data in single)
-                yield from map(self._unpacked, found) if self._packed else found
+                    found = (Batch.of((connection.topic, log_ns, data)) for connection, log_ns, data in single)
+                yield from chain.from_iterable(map(self._unpacked, found)) if self._packed else found
         except (LatheError, MemoryError):
             raise
         except Exception as error:  # noqa: BLE001 - the libraries raise whatever broken bytes lead to
             raise InputError(f"{self.path}: broken ({shown(error)}); lathe bag check says more") from None
 
-    def _unpacked(self, batch: list[Message]) -> list[Message]:
+    def _unpacked(self, batch: Batch) -> Iterator[Batch]:
         """Messages that are compressed one by one; rosbags would unpack each to whatever size it says."""
-        return [(topic, log_ns, unpack("zstd", data, unpacked_size(data[:18]))) for topic, log_ns, data in batch]
+        for topic, log_ns, data in batch:
+            yield Batch.of((topic, log_ns, unpack("zstd", data, unpacked_size(data[:18]))))

@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lathe_rc.bag.snapshot import first_sample
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.trust import shown
+from lathe_rc.bag.walk import Places
 from lathe_rc.cell import messages
 from lathe_rc.cell.engine import Sink
 from lathe_rc.cell.messages import START_NS, Signals
@@ -68,24 +71,24 @@ class _Dense:
         self.read()
         return True
 
-    def add_all(self, data: Iterable[bytes]) -> None:
-        """Take messages and read them.
-
-        Raises:
-            LatheError: see `read`.
-        """
-        self._messages += data
-        self.read()
-
     def read(self) -> None:
         """Read the messages that have been taken.
 
         Raises:
-            LatheError: samples are missing or repeated, or a block is broken.
+            LatheError: see `read_all`.
         """
         messages, self._messages, self._bytes = self._messages, [], 0
+        ends = np.cumsum([0, *map(len, messages)])
+        self.read_all(b"".join(messages), np.stack([ends[:-1], ends[1:]], axis=1))
+
+    def read_all(self, whole: bytes, places: Places) -> None:
+        """Read messages that stand somewhere in ``whole``; begin and end of each, shape (messages, 2).
+
+        Raises:
+            LatheError: samples are missing or repeated, or a block is broken.
+        """
         try:
-            for block in self._decoder.decode_all(messages):
+            for block in self._decoder.decode_all(whole, places):
                 self._append(block)
         except ValueError as error:
             raise LatheError(f"{self.topic}: {shown(error)}") from None
@@ -218,17 +221,13 @@ class Tape:
     """A dense topic of a bag, read as it is needed.
 
     Args:
-        path: the bag.
+        source: the bag; open as long as it is read.
         topic: fully qualified.
-
-    Raises:
-        InputError: not a bag.
     """
 
-    def __init__(self, path: Path, topic: str) -> None:
-        self._source = Source(path)
-        self._dense = _Dense(topic, self._source.topics[topic].type)
-        self._batches = self._source.batches({topic})
+    def __init__(self, source: Source, topic: str) -> None:
+        self._dense = _Dense(topic, source.topics[topic].type)
+        self._batches = source.batches({topic})
 
     def take(self, samples: int) -> Signals:
         """The next samples, arrays of shape (samples,); see `take_into`."""
@@ -247,7 +246,7 @@ class Tape:
             found = next(self._batches, None)
             if found is None:
                 raise LatheError(f"{self._dense.topic} ends at sample {self._dense.end}")
-            self._dense.add_all(data for _, _, data in found)
+            self._dense.read_all(found.whole, found.places[:, 2:])
         self._dense.take_into(signals)
 
 

@@ -8,7 +8,7 @@ does not match the layout is decoded by rosbags and learned anew: CDR itself is 
 """
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -78,6 +78,11 @@ class Layout:
         # Everything else is the same in each block: texts, lengths, padding.
         bounds = np.flatnonzero(np.diff(changing.astype(np.int8), prepend=1, append=1))
         self.constant = [(int(a), int(b), self.template[a:b]) for a, b in zip(bounds[::2], bounds[1::2], strict=True)]
+
+    @cached_property
+    def same(self) -> Samples:
+        """Places of the bytes that are the same in every block."""
+        return np.concatenate([np.arange(begin, end) for begin, end, _ in self.constant])
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:
@@ -304,20 +309,26 @@ class Decoder:
             {name: np.frombuffer(data, fields[name][0], samples, fields[name][1]) for name in self._fields},
         )
 
-    def decode_all(self, data: Sequence[bytes]) -> Iterator[Block]:
+    def decode_all(self, whole: bytes, places: Samples) -> Iterator[Block]:
         """Blocks from their bytes, those that follow one another joined to one: a fraction of the time that each takes.
+
+        Args:
+            whole: the bytes of all, and maybe others.
+            places: begin and end of each block, shape (blocks, 2).
 
         Raises:
             ValueError: see `decode`.
         """
+        begins, lengths = places[:, 0], places[:, 1] - places[:, 0]
         start = 0
-        while start < len(data):
-            first = self.decode(data[start])
+        while start < len(places):
+            begin, length = int(begins[start]), int(lengths[start])
+            first = self.decode(whole[begin : begin + length])
             assert self._layout is not None, "that has been learned"
-            lengths = np.fromiter(map(len, data[start:]), np.int64)
-            alike = np.flatnonzero(lengths != lengths[0])
-            stop = start + int(alike[0]) if alike.size else len(data)
-            records = np.frombuffer(b"".join(data[start:stop]), self._layout.dtype)
+            other = np.flatnonzero(lengths[start:] != length)
+            stop = start + int(other[0]) if other.size else len(places)
+            anywhere: Samples = np.ndarray(len(whole) - length + 1, f"V{length}", whole, strides=(1,))
+            records = anywhere[begins[start:stop]].view(self._layout.dtype)
             count = self._following(records, first)
             yield self._joined(records[:count], first)
             start += count
@@ -325,12 +336,11 @@ class Decoder:
     def _following(self, records: Samples, first: Block) -> int:
         """How many of the records, from the first on, are blocks that follow one another."""
         assert self._layout is not None, "that has been learned"
-        plain = records.view(np.uint8).reshape(records.size, -1)
+        constant = records.view(np.uint8).reshape(records.size, -1)[:, self._layout.same]
+        fits = (constant == constant[0]).all(axis=1)
         counts = np.arange(records.size, dtype=np.uint64) * np.uint64(first.samples)
-        fits = records["first_index"] == np.uint64(first.first_index) + counts
+        fits &= records["first_index"] == np.uint64(first.first_index) + counts
         fits &= records["step_ns"] == first.step_ns
-        for begin, end, text in self._layout.constant:
-            fits &= (plain[:, begin:end] == np.frombuffer(text, np.uint8)).all(axis=1)
         return int(np.argmin(fits)) if not fits.all() else records.size
 
     def _joined(self, records: Samples, first: Block) -> Block:
