@@ -98,9 +98,9 @@ def test_too_many_strangers_are_counted_together_and_told_once():
     strangers = Strangers(told.append)
     for number in [*range(1000), *range(1000)]:
         strangers.refuse(Stranger("/encoder", f"/ghost_{number}" + "x" * 10_000, "run", ""))
-    assert len(told) == len(strangers.senders) - 1 == 16
+    assert len(told) == len(strangers.senders) - 1 == 32
     assert sum(strangers.senders.values()) == 2000
-    assert len(str(strangers)) < 16 * 400
+    assert len(str(strangers)) < 32 * 400
 
 
 @pytest.mark.parametrize(("second", "words"), [(0, "a block came twice"), (8, "4 samples are missing")])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lathe_rc import harness
@@ -70,6 +70,7 @@ def test_a_controller_goes_on_from_its_kept_state_to_the_bit(law, tmp_path):
     plain, said = commands(cell, cell.nodes[OWN], recording, (), tmp_path / "state")
     assert np.array_equal(plain, recording.dense["/coarse/command"]["position"][: plain.size])
 
+    @settings(max_examples=6)
     @given(st.sets(st.integers(0, samples(recording) // BLOCK - 1), max_size=8))
     def check(keep_at):
         again, told = commands(cell, cell.nodes[OWN], recording, keep_at, tmp_path / "state")
@@ -103,6 +104,7 @@ class Killer:
 def test_a_killed_controller_goes_on_in_another_process_to_the_bit(tmp_path):
     """Twice in one run, under the supervisor: what it had sent before it comes twice, and is taken once."""
     kept = [f"{OWN}.restart_file={tmp_path}/state", "spindle_encoder.revolutions=40.0"]
+    kept += [f"{OWN}.events=['sample 9000: clear', 'sample 9000: clear']"]  # equal messages that are no repeats
     cell, killer = load(CONFIG / "supervised.yaml", kept), Killer(OWN, [30_000, 90_000])
     result = harness.run(cell, mode="processes", bag=tmp_path / "bag", watch=killer)
     assert result.digest == harness.run(cell).digest

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The order of signal messages in a bag: by log time, then topic, then index, whoever arrived first."""
 
+from collections import Counter
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
@@ -36,7 +37,6 @@ class Merger:
         run_id: identity of the run.
         step_ns: sampling step [ns].
         samples: of a block; the last may be shorter.
-        repeating: sources whose sparse messages may come twice, from another process that goes on in their place.
 
     Attributes:
         rows: written so far.
@@ -54,7 +54,6 @@ class Merger:
         run_id: str,
         step_ns: int,
         samples: int,
-        repeating: Collection[str] = (),
     ) -> None:
         self._writer, self._run_id, self._step_ns, self._length = writer, run_id, step_ns, samples
         self._topics = [Dense(topic, *dense[topic], writer.channel(topic)) for topic in sorted(dense)]
@@ -67,7 +66,8 @@ class Merger:
         self._sheets: dict[int, Sheet] = {}  # by number
         self._free: list[Sheet] = []
         self._tail: Sheet | None = None  # the last row, if it is shorter
-        self._sparse, self._repeating = sparse, repeating
+        self._sparse = sparse
+        self._repeats: Counter[tuple[str, int, bytes]] = Counter()
         self._sequence = dict.fromkeys(sparse, 0)
         self._received = dict.fromkeys(sparse.values(), 0)
         self._needs: list[tuple[int, str, int]] = []  # row, source and the messages that it says it has sent
@@ -130,15 +130,18 @@ class Merger:
 
     def add_sparse(self, topic: str, log_ns: int, data: bytes) -> None:
         """Take a sparse message."""
-        if self._sparse[topic] in self._repeating and self._has(topic, log_ns, data):
+        if self._repeats[topic, log_ns, data]:
+            self._repeats[topic, log_ns, data] -= 1
             return
         self._sequence[topic] += 1
         self._waiting.append(_Single(log_ns, topic, self._sequence[topic], data))
         self._received[self._sparse[topic]] += 1
 
-    def _has(self, topic: str, log_ns: int, data: bytes) -> bool:
-        """Whether a sparse message that no row has been written with has come before."""
-        return any(each.topic == topic and each.log_ns == log_ns and each.data == data for each in self._waiting)
+    def restarted(self, source: str) -> None:
+        """Another process goes on in the place of a source: what waits of its sparse messages comes once more."""
+        self._repeats = Counter(
+            (each.topic, each.log_ns, each.data) for each in self._waiting if self._sparse[each.topic] == source
+        )
 
     def forget(self, sources: Collection[str]) -> None:
         """Wait for no more sparse messages of sources that are lost."""

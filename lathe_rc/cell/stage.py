@@ -262,8 +262,6 @@ class Stage(ABC):
             else:
                 waiting.append(trigger)
         self._triggers = waiting
-        # An event that is listed twice for a sample happens once.
-        self._scheduled = list(dict.fromkeys(self._scheduled))
         due = sorted((event for event in self._scheduled if event[0] < first + samples), key=lambda event: event[0])
         self._scheduled = [event for event in self._scheduled if event[0] >= first + samples]
         return due

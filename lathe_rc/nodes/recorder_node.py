@@ -59,7 +59,7 @@ class RecorderNode(CellNode):
         self._depth = signal_depth(self.table)
         self._queues: dict[str, BlockQueue] = {}
         self._sparse: dict[str, str] = {}  # topic -> source
-        self._repeating: set[str] = set()  # members that another process may go on for
+        self._processes: dict[str, int] = {}  # of the members that another process may go on for
         self._last_held = 0  # sample up to which blocks of lost members are held
         self._newest: dict[str, bytes] = {}  # message of each topic that comes from another process
         self._encoders = _Encoders()
@@ -128,6 +128,10 @@ class RecorderNode(CellNode):
 
     def members_changed(self) -> None:
         """Subscribe once all members are known; beside a spindle that runs alone, to whatever is announced."""
+        for name, pid in self._processes.items():
+            if self._merger is not None and self.members[name].pid != pid:
+                self._processes[name] = self.members[name].pid
+                self._merger.restarted(name)
         alone = any(member.stage == SpindleEncoder.kind and not member.members for member in self.members.values())
         if not alone and (self._queues or not self.complete):
             return
@@ -143,7 +147,7 @@ class RecorderNode(CellNode):
         dense = {topic: (queue.type, queue.source) for topic, queue in self._queues.items()}
         if self._snapshots is not None and dense:
             self._prepare(self._snapshots, dense)
-        self._repeating = {name for name in self.members if self.restarts(name)}
+        self._processes = {name: member.pid for name, member in self.members.items() if self.restarts(name)}
         if not alone and self.table.window:
             self._merger = Merger(
                 self._open,
@@ -152,7 +156,6 @@ class RecorderNode(CellNode):
                 run_id=self.table.run_id,
                 step_ns=self.table.step_ns,
                 samples=self.table.block_size,
-                repeating=self._repeating,
             )
         self.announce()
 
@@ -262,7 +265,7 @@ class RecorderNode(CellNode):
         sample, rest = divmod(messages.stamp_ns(message) - messages.START_NS, self.table.step_ns)
         begin = self._merger.samples if self._merger else 0
         end = begin + self._depth * self.table.block_size if self._merger else sample + 1
-        if sample < begin and source in self._repeating:
+        if sample < begin and source in self._processes:
             return  # from another process that goes on in the place of the first
         end = max(end, self._last_held)
         if rest or not begin <= sample < end:
