@@ -144,7 +144,8 @@ def kill(scale: int, random: Random) -> Mapping[str, Any]:
             noticed += watch.noticed
             if outcome != {OWN: _SAME, "spindle_encoder": _ENDED}.get(node, _SAFE):
                 failures.append(f"{node} at sample {sample}: {outcome}")
-            print(f"kill {number + 1}: {node} at sample {sample}: {outcome}", flush=True)
+            after = "".join(f", noticed after {seconds * 1e3:.0f} ms" for seconds in watch.noticed)
+            print(f"kill {number + 1}: {node} at sample {sample}: {outcome}{after}", flush=True)
     return {
         "outcomes": dict(sorted(told.items())),
         "noticed_after_ms": _times(noticed),

@@ -179,9 +179,12 @@ class SpindleNode(StageNode):
             return
         factor = self._pace.speed_factor
         size, step = self.table.block_size, self.table.step
+        begun = time.monotonic()
         for _ in range(_BURST):
             if self.blocks == self._blocks_in_run or not self._credit():
                 return
+            if time.monotonic() - begun > _LOOK:
+                break  # DDS waits a while for a reader that has died: that shall be noticed
             if factor:
                 now = time.monotonic()
                 due = self._schedule + (self.blocks + 1) * size * step / factor
