@@ -352,7 +352,7 @@ class Processes:
         self._ended: set[str] = set()
         self._newest: dict[str, Event] = {}
         self._killed = ""  # the process that was, while the cell goes to its safe state without it
-        self._restarts: dict[str, int] = {}
+        self._restarts: Counter[str] = Counter()
         self.pids: dict[str, int] = {}
         self.refused: Counter[str] = Counter()
         self.domain = -1
@@ -461,7 +461,7 @@ class Processes:
         kept = all(getattr(self._scenario.nodes.get(node), "restart_file", "") for node in group)
         if event["code"] >= 0 or not kept or not self._goes_on(name):
             return False
-        self._restarts[name] = self._restarts.get(name, 0) + 1
+        self._restarts[name] += 1
         if self._restarts[name] > _MOST_RESTARTS:
             return False
         self._start(group)

@@ -139,7 +139,7 @@ class Merger:
 
     def restarted(self, source: str) -> None:
         """Another process goes on in the place of a source: what waits of its sparse messages comes once more."""
-        self._repeats = Counter(
+        self._repeats |= Counter(
             (each.topic, each.log_ns, each.data) for each in self._waiting if self._sparse[each.topic] == source
         )
 

@@ -87,11 +87,14 @@ class Takeover:
         retracted: where the command is when retracted [m].
         step: sampling step [s].
         carries: whether a motion begins with the velocity that the command has; one with steps and noise has none.
+
+    Attributes:
+        mode: who commands; see `change`.
     """
 
     def __init__(self, bounds: Bounds, retracted: float, step: float, *, carries: bool = True) -> None:
         self._bounds, self._goal, self._step, self._carries = bounds, retracted, step, carries
-        self._mode = Mode.FOLLOW
+        self.mode = Mode.FOLLOW
         self._path, self._place = np.zeros(0), 0  # positions to come; of what is added to the command when it follows
         self._given, self._wanted = np.zeros(2), np.zeros(2)  # the last two samples, after and before
 
@@ -107,7 +110,7 @@ class Takeover:
 
     def change(self, mode: Mode) -> None:
         """Take over, or give back, from the next sample on."""
-        if mode is self._mode:
+        if mode is self.mode:
             return
         velocity = (self._given[1] - self._given[0]) / self._step if self._carries else 0.0
         if mode is Mode.FOLLOW:
@@ -116,18 +119,18 @@ class Takeover:
         else:
             goal = self._goal if mode is Mode.RETRACT else None
             self._path = motion(self._given[1], velocity, goal, self._bounds, self._step)
-        self._mode, self._place = mode, 0
+        self.mode, self._place = mode, 0
 
     def apply(self, command: Array) -> None:
         """Make of what the controller wants what the drive gets; in place, shape (n,) [m]."""
         wanted = _last_two(self._wanted, command)
-        if self._mode is Mode.FOLLOW and self._place >= self._path.size and command.size > 1:
+        if self.mode is Mode.FOLLOW and self._place >= self._path.size and command.size > 1:
             self._given = self._wanted = wanted
             return
-        if self._mode is not Mode.FOLLOW or self._place < self._path.size:
+        if self.mode is not Mode.FOLLOW or self._place < self._path.size:
             ahead = self._path[self._place : self._place + command.size]
             self._place += ahead.size
-            if self._mode is Mode.FOLLOW:
+            if self.mode is Mode.FOLLOW:
                 command[: ahead.size] += ahead
             else:
                 command[: ahead.size], command[ahead.size :] = ahead, self._path[-1]

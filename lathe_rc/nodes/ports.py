@@ -39,15 +39,14 @@ def signal_qos(parameters: NodeParameters, topic: str = "") -> QoSProfile:
     )
 
 
-def latched_qos(depth: int) -> QoSProfile:
-    """Reliable; the newest message of each publisher reaches those who come late."""
-    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+def latched_qos(depth: int = 0) -> QoSProfile:
+    """Reliable; the newest message of each publisher reaches those who come late.
 
-
-def all_latched_qos() -> QoSProfile:
-    """To read those: all are kept until they are taken, a stranger's flood pushes none out."""
+    Without a depth, for readers: all are kept until they are taken, a stranger's flood pushes none out.
+    """
     return QoSProfile(
-        history=HistoryPolicy.KEEP_ALL,
+        history=HistoryPolicy.KEEP_LAST if depth else HistoryPolicy.KEEP_ALL,
+        depth=depth,
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL,
     )

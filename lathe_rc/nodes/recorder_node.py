@@ -60,7 +60,6 @@ class RecorderNode(CellNode):
         self._queues: dict[str, BlockQueue] = {}
         self._sparse: dict[str, str] = {}  # topic -> source
         self._processes: dict[str, int] = {}  # of the members that another process may go on for
-        self._last_held = 0  # sample up to which blocks of lost members are held
         self._newest: dict[str, bytes] = {}  # message of each topic that comes from another process
         self._encoders = _Encoders()
         self._merger: Merger | None = None
@@ -185,23 +184,21 @@ class RecorderNode(CellNode):
 
     def lose(self, lost: set[str], first: int, end: int) -> None:
         """See `CellNode`; what they published is held, and the bag says from which sample on."""
+        assert self._merger is not None, "only a cell with a window has a safe state"
+        held: dict[str, int] = {}
         for topic, queue in self._queues.items():
             if queue.source in lost and queue.held_from is None:
                 data = self._newest.get(topic)
                 queue.hold(end, Decoder(queue.type).decode(data) if data else None)
-        held_from = {topic: queue.held_from for topic, queue in self._queues.items()}
-        held = {topic: sample for topic, sample in held_from.items() if sample is not None and sample < end}
-        self._last_held = end
-        if self.over or self._merger is None:
-            return
+            if queue.held_from is not None and queue.held_from < end:
+                held[topic] = queue.held_from
         if self._snapshots is not None and not self._safe:
             self._snapshots.trigger(f"cell: lost {', '.join(sorted(lost))}", first)
         self._open.tell({story.HELD: json.dumps(held)})
         self._merger.forget(lost)
-        for topic in self._queues:
-            blocks = self._queues[topic].blocks
-            while blocks:
-                self._merger.add_block(topic, blocks.popleft())
+        for topic, queue in self._queues.items():
+            while queue.blocks:
+                self._merger.add_block(topic, queue.blocks.popleft())
         self._drain()
 
     # ---- snapshots ----------------------------------------------------------------------------------
@@ -267,7 +264,6 @@ class RecorderNode(CellNode):
         end = begin + self._depth * self.table.block_size if self._merger else sample + 1
         if sample < begin and source in self._processes:
             return  # from another process that goes on in the place of the first
-        end = max(end, self._last_held)
         if rest or not begin <= sample < end:
             raise Stranger(topic, source, run_id, f"expected a time of samples {begin} to {end - 1}")
         self._on_sparse(topic, data)

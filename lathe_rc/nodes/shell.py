@@ -26,7 +26,7 @@ from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import declare
 from lathe_rc.nodes.exchange import Exchange
-from lathe_rc.nodes.ports import all_latched_qos, latched_qos, message_class, signal_qos
+from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
 from lathe_rc.nodes.report import Reporter
 from lathe_rc.nodes.strangers import Stranger, Strangers
 from lathe_rc.nodes.watch import Watch, liveliness, this_host
@@ -141,7 +141,7 @@ class CellNode(LifecycleNode):
             "diagnostics": add(DiagnosticArray, "/diagnostics", QoSProfile(depth=100)),
         }
         self.create_subscription(Member, "members", self.guarded(self._on_member), latched_qos(_LATCHED_DEPTH))
-        self.create_subscription(CellState, "cell_state", self.guarded(self._on_cell_state), all_latched_qos())
+        self.create_subscription(CellState, "cell_state", self.guarded(self._on_cell_state), latched_qos())
         self.create_publisher(Empty, f"~/{messages.ALIVE}", liveliness())
         self.watch = Watch(self, lambda: self.attempt(self.look_after_others))
         self.active = True
@@ -421,19 +421,19 @@ class CellNode(LifecycleNode):
             return
         name = self.master.name
         silent = time.monotonic() - self.watch.silent.get(name, math.inf)
-        if name in self.watch.ended() or (silent > _GIVEN_UP and self._does_not_wait(self.master)):
+        if name in self.watch.ended() or (silent > _GIVEN_UP and self._parameter(name, "stall_reaction") == "safe"):
             if self.over:
                 self._leave([])
             else:
                 self.fail(LatheError(f"{name}, the time master, is lost: no sample follows"), cause="abandoned")
 
-    def _does_not_wait(self, master: Member) -> bool:
-        """Whether the cell shall not wait for a silent master either."""
-        return bool(json.loads(master.parameters).get("stall_reaction") == "safe")
+    def _parameter(self, name: str, key: str) -> object:
+        """What a member has announced of its parameters; None if it has no such."""
+        return json.loads(self.members[name].parameters).get(key)
 
     def restarts(self, name: str) -> bool:
         """Whether another process may go on in place of a member."""
-        return bool(json.loads(self.members[name].parameters).get("restart_file"))
+        return bool(self._parameter(name, "restart_file"))
 
     @property
     def complete(self) -> bool:

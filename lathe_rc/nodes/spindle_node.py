@@ -99,7 +99,7 @@ class SpindleNode(StageNode):
     @property
     def _least(self) -> int:
         """Blocks that every member has completed."""
-        return min([self.blocks, *self._completed.values()])
+        return min(self._completed.values(), default=self.blocks)
 
     # ---- start --------------------------------------------------------------------------------------
 
@@ -139,8 +139,7 @@ class SpindleNode(StageNode):
             raise Stranger(self._host["progress"].topic_name, progress.name, progress.run_id, why)
         if progress.blocks <= self._completed.get(progress.name, progress.blocks):
             return
-        # Who reads only from lost members has its blocks to the end of the run already.
-        if progress.blocks > self.blocks and not self._without:
+        if progress.blocks > self.blocks:
             raise LatheError(f"{progress.name} claims {progress.blocks} blocks; {self.blocks} were sent")
         before = self._least
         self._completed[progress.name] = progress.blocks
@@ -211,7 +210,7 @@ class SpindleNode(StageNode):
 
     def ended(self) -> None:
         """Its last block is out; the run ends when all members have completed it."""
-        if self._least == self.blocks:
+        if not self._completed:
             self._finish_run()
 
     def _finish_run(self) -> None:

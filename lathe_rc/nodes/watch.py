@@ -9,7 +9,7 @@ import os
 import select
 import time
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from lathe_rc.cell.messages import ALIVE
 LEASE = 0.08  # [s] after which a node that is not heard is silent
 
 
+@cache
 def this_host() -> str:
     """What processes have in common that can see each other's numbers: the boot of a machine, and the name space."""
     boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()

@@ -12,7 +12,7 @@ from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedParameters
-from lathe_rc.cell.stages.obedience import FeedObedientParameters, Obedience
+from lathe_rc.cell.stages.obedience import FeedObedientParameters, Obedience, listens
 from lathe_rc.errors import InputError
 from lathe_rc.plants import feed
 from lathe_rc.plants.feed import Feedback, FeedDrive
@@ -119,7 +119,7 @@ class FeedDriveStage(Stage):
         self.declare(
             inputs=[
                 Input(f"{axis}/command", messages.SERVO, ("command",)),
-                *parameters.listens(),
+                *listens(parameters),
             ],
             outputs=[Output(f"{axis}/state", messages.STATE, Joint("position", "velocity", "effort"))],
             tells=limits.any,
@@ -129,23 +129,20 @@ class FeedDriveStage(Stage):
         return self.parameters.obedience(None, speed=self.drive.integrates, settled=0)
 
     def go_safe(self) -> None:
-        """See `Stage`; the slide stops."""
+        """See `Stage`; the slide stops, and nobody is listened to any more."""
         self._safe = True
+        self._obedience.obey(Reaction.STOP)
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         (servo, *safety), (state,) = inputs, outputs
         command = servo["command"]
+        size = command.size
         if self._safe or safety:
             command = command.copy()
-            reaction = safety[0]["reaction"] if safety else np.zeros(command.size, np.uint8)
-            if self._safe:
-                reaction = np.full_like(reaction, Reaction.STOP)
-            for start, stop in self._obedience.pieces(reaction):
-                self._obedience.apply(command[start:stop])
-        else:
-            self._obedience.apply(command)  # which it leaves as it is
-        size = command.size
+        listening = safety and not self._safe
+        for start, stop in self._obedience.pieces(safety[0]["reaction"]) if listening else [(0, size)]:
+            self._obedience.apply(command[start:stop])
         motor, seen = self._motor[:size], self._seen[:size]
         load = self._load[: size if self.parameters.disturbance else 0]
         fill_disturbance(first, self.parameters.step, self.parameters.disturbance, load)

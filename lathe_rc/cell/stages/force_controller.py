@@ -11,6 +11,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Input, Output, Sparse, Stage
+from lathe_rc.cell.stages.obedience import listens
 from lathe_rc.cell.stages.servo import ServoParameters
 from lathe_rc.cell.stages.trajectory import Trajectory
 from lathe_rc.control.pid import FORCE
@@ -54,7 +55,7 @@ class ForceController(Stage):
                 # The angle itself is not used: the spindle's blocks say which samples are due.
                 Input("encoder", messages.ENCODER, ("angle",)),
                 Input("cut", messages.CUT, ("measured_force",), parameters.feedback_delay),
-                *parameters.listens(),
+                *listens(parameters),
             ],
             outputs=[Output("longitudinal/command", messages.SERVO)],
         )

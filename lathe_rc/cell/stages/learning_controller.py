@@ -15,7 +15,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import MAX_BLOCK, Samples, Signals
 from lathe_rc.cell.stage import Input, Output, Sparse, Stage, cut
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
-from lathe_rc.cell.stages.obedience import Obedience
+from lathe_rc.cell.stages.obedience import Obedience, listens
 from lathe_rc.control import bounded, memory_file
 from lathe_rc.control.bounded import Takeover
 from lathe_rc.control.correction import Correction
@@ -75,8 +75,7 @@ class LearningController(Stage):
             inputs.append(Input("coarse/state", messages.STATE, ("measured_position",), delay))
         self._lost = False  # there is no angle that it could read its memory at
         self._obedience = self._obeys() if parameters.reaction_delay else None
-        if self._obedience:
-            inputs.append(Input("safety", messages.SAFETY, ("reaction",), parameters.reaction_delay))
+        inputs += listens(parameters)
         self._identifier = DriveIdentifier(
             model_delay=parameters.model_delay,
             feedback_delay=delay,

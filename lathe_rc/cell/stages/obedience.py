@@ -18,6 +18,12 @@ from lathe_rc.control.bounded import Bounds, Mode, Takeover
 from lathe_rc.safety.state_machine import Reaction
 
 
+def listens(parameters: ObedientParameters) -> list[Input]:
+    """The input with the reactions, if anybody is listened to."""
+    delay = parameters.reaction_delay
+    return [Input("safety", messages.SAFETY, ("reaction",), delay)] if delay else []
+
+
 class FeedObedientParameters(ObedientParameters):
     """Of a node of the feed that obeys the supervisor."""
 
@@ -26,10 +32,6 @@ class FeedObedientParameters(ObedientParameters):
         "1/s",
     )  # fmt: skip
     stop_rate_change: Annotated[float, Gt(0)] = parameter(1000.0, "largest change of that rate", "1/s^2")
-
-    def listens(self) -> list[Input]:
-        """The input with the reactions, if anybody is listened to."""
-        return [Input("safety", messages.SAFETY, ("reaction",), self.reaction_delay)] if self.reaction_delay else []
 
     def obedience(self, learner: "Learner | None", *, speed: bool, settled: int) -> "Obedience":
         """What obeys for a command of the feed.
@@ -102,10 +104,13 @@ class Obedience:
 
     def pieces(self, reaction: Samples) -> Iterator[tuple[int, int]]:
         """Pieces of a block in which the reaction stays the same; it is obeyed when its piece is handed out."""
+        if self.idle(reaction):
+            yield 0, reaction.size
+            return
         changes = np.flatnonzero(np.diff(reaction, prepend=reaction.dtype.type(self.reaction))).tolist()
         for start, stop in pairwise([0, *(change for change in changes if change), reaction.size]):
             if start in changes:
-                self._obey(Reaction(reaction[start]))
+                self.obey(Reaction(reaction[start]))
             if 0 < self._forbidden < stop - start:
                 free = start + int(self._forbidden)
                 yield start, free
@@ -126,7 +131,8 @@ class Obedience:
         self._forbidden = samples
         self.learn(wanted=self._wants_to_learn)
 
-    def _obey(self, reaction: Reaction) -> None:
+    def obey(self, reaction: Reaction) -> None:
+        """Do what a reaction asks for, from the next sample on."""
         self.reaction = reaction
         following = self._hold if reaction == Reaction.HOLD else Mode.FOLLOW
         self._takeover.change(self._retract if reaction >= Reaction.RETRACT else following)

@@ -14,6 +14,7 @@ from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Input, Output, Sparse, Stage, cut
 from lathe_rc.cell.stages.feed_drive import Axis
+from lathe_rc.cell.stages.obedience import listens
 from lathe_rc.cell.stages.servo import ServoParameters
 from lathe_rc.cell.stages.trajectory import Trajectory
 from lathe_rc.control import periodic
@@ -104,7 +105,7 @@ class PositionController(Stage):
         self._offset = np.empty(messages.MAX_BLOCK)
         self._largest, self._held = 0.0, 0.0
         self._obedience = parameters.obeys(self)
-        self.declare(inputs=[*inputs, *parameters.listens()], outputs=[Output(f"{axis}/command", messages.SERVO)])
+        self.declare(inputs=[*inputs, *listens(parameters)], outputs=[Output(f"{axis}/command", messages.SERVO)])
         if parameters.law == "periodic_hyperstable":
             self.sparse_topics[f"{axis}/periodic"] = messages.PERIODIC
 

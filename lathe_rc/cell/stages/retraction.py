@@ -39,15 +39,13 @@ class OwnRetraction:
 
     def __init__(self, parameters: RetractionParameters) -> None:
         self._takeover = Takeover(parameters.bounds(), parameters.safe_position, parameters.step)
-        self._begun = False
 
     def begin(self) -> None:
         """Retract from the next sample on, whatever is commanded."""
-        self._begun = True
         self._takeover.change(Mode.RETRACT)
 
     def block(self, command: Samples) -> Samples:
         """What the drive follows [m], shape (n,)."""
-        followed = command.copy() if self._begun else command
+        followed = command if self._takeover.mode is Mode.FOLLOW else command.copy()
         self._takeover.apply(followed)
         return followed

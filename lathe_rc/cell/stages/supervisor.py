@@ -110,7 +110,7 @@ class Supervisor(Stage):
         self._inputs = [Input("encoder", messages.ENCODER, ("angle", "speed", "index_pulse"))]
         self.monitors: list[Monitor] = []
         self.state, self.reaction = State.NOMINAL, Reaction.NONE
-        self._was_reset = self._members_lost = False
+        self._told: list[str] = []  # what others than monitors have done to the state since the last sample
         self._out = self._reads(f"{parameters.drives[0]}/state", messages.STATE, _SENSOR) if parameters.drives else None
         self._clearance = Clearance(parameters.clear_position, self._samples(parameters.clear_time))
         self._watch_spindle()
@@ -260,12 +260,13 @@ class Supervisor(Stage):
         """See `Stage`: a reset; what is still wrong raises its alarm again."""
         to = state_machine.after(self.state, action)
         if to is not None and self.reaction is not Reaction.STOP:
-            self.state, self.reaction, self._was_reset = to, Reaction.NONE, True
+            self.state, self.reaction = to, Reaction.NONE
+            self._told.append(RESET)
             self._lookout.reset()
 
     def go_safe(self) -> None:
         """See `Stage`: an alarm that nothing resets."""
-        self._members_lost = True
+        self._told.append(MEMBERS_LOST)
         self._ask_for(Reaction.STOP)
 
     def _ask_for(self, reaction: Reaction) -> None:
@@ -280,17 +281,12 @@ class Supervisor(Stage):
         (safety,) = outputs
         samples = safety["state"].size
         found = self._lookout.look(inputs)
-        if not (found or self._was_reset or self._members_lost or self.state is State.RETRACTING):
+        if not (found or self._told or self.state is State.RETRACTING):
             safety["state"].fill(self.state)
             safety["reaction"].fill(self.reaction)
             return []
-        sparse: list[Sparse] = []
-        if self._was_reset:
-            sparse.append(self._status(first, RESET, "", 0.0, 0.0))
-            self._was_reset = False
-        if self._members_lost:
-            sparse.append(self._status(first, MEMBERS_LOST, "", 0.0, 0.0))
-            self._members_lost = False
+        sparse = [self._status(first, what, "", 0.0, 0.0) for what in self._told]
+        self._told.clear()
         reached = 0
         for monitor, alarm in found:
             self._fill(safety, inputs, first, reached, alarm.place, sparse)
