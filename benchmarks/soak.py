@@ -6,7 +6,8 @@ Parts, short by default, and with ``--long``:
 - blocks: 20 000 (10⁶) blocks of 8 samples without a lost sample; memory of each process, early and at the end;
 - kill: SIGKILL of a random node at 6 (100) random moments: a controller with a restart_file goes on, and the digest is
   that of an undisturbed run; without any other node the cell goes to its safe state, and the bag is readable;
-- stop: SIGSTOP and SIGCONT of random nodes at 6 (100) random moments of one run, which keeps its digest;
+- stop: SIGSTOP and SIGCONT of random nodes at 6 (100) random moments of one run, which keeps its digest; of the 100
+  stops, 5 are longer than DDS by default remembers a participant;
 - cells: two cells at once in one domain, 1 (20) times, each with its own digest.
 
 A full disk and a link that loses and delays are in tests/system (./lathe test --system). Exit code 1: something failed.
@@ -37,6 +38,7 @@ OWN = "learning_controller"
 _PAGE = os.sysconf("SC_PAGESIZE")
 _GROWTH = 32 * 2**20  # [B] that a process may grow after the first tenth of a run
 _STOPPED = 0.3  # [s] at most that a node is stopped
+_AWAY = 25.0  # [s] the long stops; DDS by default forgets who is silent for 20 s
 
 
 def memory(pid: int) -> int:
@@ -186,9 +188,11 @@ def stop(scale: int, random: Random) -> Mapping[str, Any]:
     nodes = sorted({*scenario.nodes, "recorder"})
     moments = sorted((random.randrange(plain.samples), random.choice(nodes)) for _ in range(count))
 
+    long = iter([(number + 1) % 20 == 0 for number in range(count)])
+
     def pause(pid: int) -> None:
         os.kill(pid, signal.SIGSTOP)
-        threading.Timer(random.random() * _STOPPED, os.kill, (pid, signal.SIGCONT)).start()
+        threading.Timer(_AWAY if next(long) else random.random() * _STOPPED, os.kill, (pid, signal.SIGCONT)).start()
 
     watch = At(moments, pause)
     result = harness.run(scenario, mode="processes", watch=watch)

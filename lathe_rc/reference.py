@@ -78,8 +78,8 @@ HOST_TOPICS = (
     HostTopic(
         name="progress",
         type=f"{messages.PACKAGE}/msg/Progress",
-        depth=100,
-        latched=False,
+        depth=1,
+        latched=True,
         publishers=_ALL,
         subscribers=_SPINDLE,
         doc="how far each member has come: the credit of the window",

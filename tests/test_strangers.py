@@ -15,9 +15,7 @@ import rclpy
 from cells import scenario
 from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, ToolBlock
 from mcap.reader import make_reader
-from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import QoSProfile
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness
@@ -108,7 +106,6 @@ def diagnostics(bag):
 
 def test_a_cell_goes_on_among_strangers(ghost, domain, tmp_path):
     cell = scenario(spindle_encoder={"revolutions": 30.0})
-    qos = QoSProfile(depth=10)
     on = {"/encoder": (EncoderBlock, "/spindle_encoder"), "/tool": (ToolBlock, "/tool")}
     sends = []
     for topic, (kind, own) in on.items():
@@ -116,6 +113,7 @@ def test_a_cell_goes_on_among_strangers(ghost, domain, tmp_path):
         sends += [(publisher, message) for message in foreign(f"lathe_rc_msgs/msg/{kind.__name__}", own)]
     members = ghost.create_publisher(Member, "/members", latched_qos(10))
     states = ghost.create_publisher(CellState, "/cell_state", latched_qos(10))
+    progress = ghost.create_publisher(Progress, "/progress", latched_qos(10))
     sends += [
         (members, Member(run_id="elsewhere", name="/tool", state=Member.FAILED, message="no")),
         (members, Member(run_id="test", name="/made_up", publishes=["/a"])),
@@ -123,8 +121,8 @@ def test_a_cell_goes_on_among_strangers(ghost, domain, tmp_path):
         (members, Member(run_id="test", name="/usurper", members=["/usurper"], parameters="{}")),
         (members, b"\0\1\0\0" + b"\xff" * 100),
         (states, CellState(run_id="x", state=CellState.FAILED)),
-        (ghost.create_publisher(Progress, "/progress", qos), Progress(run_id="x", name="/tool", blocks=2**40)),
-        (ghost.create_publisher(Progress, "/progress", qos), Progress(run_id="test", name="/made_up", blocks=2**40)),
+        (progress, Progress(run_id="x", name="/tool", blocks=2**40)),
+        (progress, Progress(run_id="test", name="/made_up", blocks=2**40)),
     ]
     with all_the_time(sends):
         result = harness.run(cell, mode="processes", groups=[], domain=domain, bag=tmp_path / "bag")
@@ -190,30 +188,33 @@ def test_a_flood_takes_no_memory(ghost, domain, tmp_path):
     encoder = ghost.create_publisher(EncoderBlock, "/encoder", latched_qos(500))
     members = ghost.create_publisher(Member, "/members", latched_qos(500))
 
-    def flood(publisher, make, number):
-        for count in range(number):
-            publisher.publish(make(count))
-            if count % 250 == 249:
-                assert publisher.wait_for_all_acked(Duration(seconds=60))
-
-    def refused(words):
-        """Wait until the tool tells of a message."""
-        for event in processes.events(60.0):
-            processes._raise_failure(event)
-            if event["event"] == "stranger" and event["node"] == "tool" and words in event["message"]:
-                return
+    def flood(publisher, make, end):
+        """Half as many at a time as the publisher keeps; ``end`` makes a message that the tool tells of."""
+        for part in range(10):
+            for count in range(250 * part, 250 * (part + 1)):
+                publisher.publish(make(count))
+            publisher.publish(end(f"end of part {part}"))
+            for event in processes.events(60.0):
+                processes._raise_failure(event)
+                words = f"run 'end of part {part}'"
+                if event["event"] == "stranger" and event["node"] == "tool" and words in event["message"]:
+                    break
 
     with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
         processes.wait_for("cycle")
         os.kill(processes.pids["electrodynamic_actuator"], signal.SIGSTOP)
         before = resident(processes.pids["tool"])
-        flood(encoder, lambda count: block(messages.ENCODER, count, f"/ghost_{count % 8}", "test", size=2048), 20_000)
-        encoder.publish(block(messages.ENCODER, 0, "/spindle_encoder", "end of the flood"))
-        refused("end of the flood")
+        flood(
+            encoder,
+            lambda count: block(messages.ENCODER, count, f"/ghost_{count % 8}", "test", size=2048),
+            lambda run: block(messages.ENCODER, 0, "/spindle_encoder", run),
+        )
         text = json.dumps({"filler": "x" * 40_000})
-        flood(members, lambda count: Member(run_id="test", name=f"/made_up_{count}", parameters=text), 4_000)
-        members.publish(Member(run_id="end of the members", name="/end"))
-        refused("end of the members")
+        flood(
+            members,
+            lambda count: Member(run_id="test", name=f"/made_up_{count}", parameters=text),
+            lambda run: Member(run_id=run, name="/end"),
+        )
         grown = resident(processes.pids["tool"]) - before
         os.kill(processes.pids["electrodynamic_actuator"], signal.SIGCONT)
         processes.wait_for_end()

@@ -158,7 +158,7 @@ class Replayer:
                 self._recorded = int(progress.blocks)
 
         self._node.create_subscription(Member, "/members", heard, latched_qos(256))
-        self._node.create_subscription(Progress, "/progress", progressed, QoSProfile(depth=1000))
+        self._node.create_subscription(Progress, "/progress", progressed, latched_qos(256))
         # The recorder puts the scenario's files into its bag as well, so they stay as long as the replayer.
         self._folder = tempfile.TemporaryDirectory(prefix="lathe-replay-")
         scenario = story.scenario_of(self._source.about, Path(self._folder.name))

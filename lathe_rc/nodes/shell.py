@@ -137,7 +137,7 @@ class CellNode(LifecycleNode):
         add = self.create_publisher
         self._host = {
             "members": add(Member, "members", latched_qos(1)),
-            "progress": add(Progress, "progress", QoSProfile(depth=100)),
+            "progress": add(Progress, "progress", latched_qos(1)),  # who was away for a while needs the newest
             "diagnostics": add(DiagnosticArray, "/diagnostics", QoSProfile(depth=100)),
         }
         self.create_subscription(Member, "members", self.guarded(self._on_member), latched_qos(_LATCHED_DEPTH))

@@ -66,7 +66,7 @@ class SpindleNode(StageNode):
         super().activate_part()
         self._state = self.create_publisher(CellState, "cell_state", latched_qos(1))
         self._clock_publisher = self.create_publisher(Clock, "/clock", QoSProfile(depth=10))
-        self.create_subscription(Progress, "progress", self.guarded(self._on_progress), QoSProfile(depth=1000))
+        self.create_subscription(Progress, "progress", self.guarded(self._on_progress), latched_qos())
         self.exchange.master = self.guarded(self._told.append)
         self._say(CellState.WAITING, 0)
 
