@@ -36,9 +36,10 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function of scalars and arrays; compiled code is kept between runs.
 
     Neither reassociation nor contraction is allowed (``fastmath`` off), so the same arithmetic gives the
-    same bits whatever the length of the block. Division by zero gives inf or NaN as in NumPy.
+    same bits whatever the length of the block. Division by zero gives inf or NaN as in NumPy. Other threads have the
+    interpreter meanwhile.
     """
-    compiled = numba.njit(cache=True, error_model="numpy")(function)
+    compiled = numba.njit(cache=True, error_model="numpy", nogil=True)(function)
     return cast("Callable[P, R]", compiled)
 
 

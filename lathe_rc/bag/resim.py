@@ -213,6 +213,7 @@ def resimulate(
         finally:
             if writer is not None:
                 writer.close()
+        digest = digests.result()
         wall = time.monotonic() - start
     found = recorded_digests(path) if original is not None else {}
     digest_of_bag = {topic.removeprefix(recorded.namespace): digest for topic, digest in found.items()}
@@ -225,7 +226,7 @@ def resimulate(
         changed=changed,
         samples=samples,
         wall_s=wall,
-        digest=digests.result(),
+        digest=digest,
         recorded=digest_of_bag,
         rms=errors.rms(),
         recorded_rms=compared.recorded_rms() if compared else before.rms(),

@@ -3,12 +3,15 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from lathe_rc.cell.messages import NOT_SIGNALS, Samples, Signals
+
+_PIECE = 2**15  # samples that are hashed in one go
 
 
 @dataclass(frozen=True)
@@ -60,26 +63,80 @@ class Recording:
 
 
 class Digester:
-    """Digests of a run whose signals come in pieces; see `Recording.digests`."""
+    """Digests of a run whose signals come in pieces; see `Recording.digests`.
+
+    A thread makes them: it needs no interpreter for it, so whoever brings the pieces computes on.
+    """
 
     def __init__(self) -> None:
-        self._fields: dict[str, dict[str, Any]] = {}
+        self._topics: dict[str, _Topic] = {}
+        self._thread = ThreadPoolExecutor(1)
 
     def dense(self, topic: str, signals: Signals) -> None:
-        """Take the next samples of a dense topic, arrays of shape (n,) by field."""
-        fields = self._fields.get(topic)
-        if fields is None:
-            fields = self._fields[topic] = {name: hashlib.sha256() for name in signals}
-        for name, samples in signals.items():
-            fields[name].update(_bytes(samples))
+        """Take the next samples of a dense topic, arrays of shape (n,) by field; they are copied."""
+        found = self._topics.get(topic)
+        if found is None:
+            found = self._topics[topic] = _Topic(signals, self._thread)
+        found.add(signals)
 
     def result(self, sparse: Mapping[str, SparseTopic]) -> dict[str, str]:
         """One digest for each topic, the sparse ones whole."""
-        found = {topic: [part.digest() for part in fields.values()] for topic, fields in self._fields.items()}
+        found = {topic: part.digests() for topic, part in self._topics.items()}
         for topic, part in sparse.items():
             arrays = [np.array(part.stamps, dtype=np.int64), *map(_flat, part.values.values())]
             found[topic] = [hashlib.sha256(_bytes(array)).digest() for array in arrays]
         return {topic: hashlib.sha256(b"".join(parts)).hexdigest() for topic, parts in sorted(found.items())}
+
+
+class _Topic:
+    """Digests of the fields of a dense topic.
+
+    Args:
+        signals: some of its samples.
+        thread: makes them.
+    """
+
+    def __init__(self, signals: Signals, thread: ThreadPoolExecutor) -> None:
+        self._hashes = [hashlib.sha256() for _ in signals]
+        self._filled, self._hashed = (
+            [np.empty(_PIECE, array.dtype.newbyteorder("<")) for array in signals.values()] for _ in range(2)
+        )
+        self._size = 0
+        self._thread = thread
+        self._at_work: Future[None] | None = None
+
+    def add(self, signals: Signals) -> None:
+        """Take the next samples."""
+        arrays = list(signals.values())
+        start, size = 0, arrays[0].size
+        while start < size:
+            end = min(size, start + _PIECE - self._size)
+            stop = self._size + end - start
+            for piece, array in zip(self._filled, arrays, strict=True):
+                piece[self._size : stop] = array[start:end]
+            start, self._size = end, stop
+            if stop == _PIECE:
+                self._hand_over()
+
+    def _hand_over(self) -> None:
+        self._wait()
+        self._filled, self._hashed = self._hashed, self._filled
+        self._at_work = self._thread.submit(self._hash, self._size)
+        self._size = 0
+
+    def _wait(self) -> None:
+        if self._at_work is not None:
+            self._at_work.result()
+
+    def _hash(self, size: int) -> None:
+        for made, piece in zip(self._hashes, self._hashed, strict=True):
+            made.update(piece[:size].data)
+
+    def digests(self) -> list[bytes]:
+        """Of each field, to the last sample."""
+        self._hand_over()
+        self._wait()
+        return [made.digest() for made in self._hashes]
 
 
 def _bytes(samples: Samples) -> memoryview:
