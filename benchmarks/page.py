@@ -24,6 +24,7 @@ _TITLES = {
     "start": "Cold start",
     "recorder": "Recorder",
     "viewer": "Viewer",
+    "resimulation": "Re-simulation",
     "growth": "Growth",
     "peers": "Drive and loop",
 }
@@ -296,7 +297,7 @@ def page(result: Mapping[str, Any]) -> str:
         "",
         *_targets(result),
     ]
-    for part in ("engine", "ros", "real_time", "supervisor", "start"):
+    for part in ("engine", "ros", "real_time", "supervisor", "resimulation", "start"):
         if part in result:
             lines += [f"## {_TITLES[part]}", "", *_about(part)]
             lines += _ros(result[part]) if part == "ros" else _part(part, result[part])

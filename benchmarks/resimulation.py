@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``lathe resim BAG`` with nothing changed: the spindle from the bag, all that stands behind it computed again.
+
+How many times faster than real time, digests and the comparison with the recorded ones included; opening the bag and
+wiring the cell are left out. Every run must come out to the bit.
+"""
+
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from benchmarks import sides
+from lathe_rc import harness, resources
+from lathe_rc.bag.resim import resimulate
+from lathe_rc.cell import scenario
+from lathe_rc.errors import LatheError
+
+_CELLS = ("piston", "two_channel")
+_TARGET = 50.0
+
+
+def again(bag: Path) -> float:
+    """Simulated time over wall time of one re-simulation.
+
+    Raises:
+        LatheError: it differs from the bag.
+    """
+    found = resimulate(bag)
+    if found.different or not found.recorded:
+        raise LatheError(f"{bag}: its re-simulation differs in {', '.join(found.different) or 'everything'}")
+    return found.simulated_s / found.wall_s
+
+
+def measure(*, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
+    """See the module."""
+    with tempfile.TemporaryDirectory(prefix="lathe-bench-") as folder:
+        bags = {name: Path(folder) / name for name in _CELLS}
+        for name, bag in bags.items():
+            say(f"  a bag of {name}")
+            sets = [f"spindle_encoder.revolutions={30.0 if quick else 300.0}"]
+            harness.run(scenario.load(resources.find(Path(f"{name}.yaml")), sets), bag=bag)
+            again(bag)  # compiles
+        say("  re-simulations")
+        found = sides.alternate({name: partial(again, bag) for name, bag in bags.items()}, 3 if quick else 15)
+    return {
+        name: {"real_time_factor": sides.spread(factors), "target_real_time_factor": _TARGET}
+        for name, factors in found.items()
+    }
