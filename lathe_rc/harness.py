@@ -44,6 +44,7 @@ from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.namespace import absolute, checked
+from lathe_rc.nodes import leftovers
 from lathe_rc.nodes.report import THROUGHPUT, VARIABLE
 
 Mode = Literal["offline", "composed", "processes"]
@@ -364,6 +365,7 @@ class Processes:
             self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-log-")))
             self._file = self._folder / "scenario.yaml"
             self._file.write_text(self._scenario.to_yaml(), encoding="utf-8")
+            leftovers.sweep()
             for group in self._groups:
                 self._start(group)
         except BaseException:

@@ -99,7 +99,7 @@ class _Topic:
     def __init__(self, signals: Signals, thread: ThreadPoolExecutor) -> None:
         self._hashes = [hashlib.sha256() for _ in signals]
         self._filled, self._hashed = (
-            [np.empty(_PIECE, array.dtype.newbyteorder("<")) for array in signals.values()] for _ in range(2)
+            [np.empty(0, array.dtype.newbyteorder("<")) for array in signals.values()] for _ in range(2)
         )
         self._size = 0
         self._thread = thread
@@ -112,6 +112,8 @@ class _Topic:
         while start < size:
             end = min(size, start + _PIECE - self._size)
             stop = self._size + end - start
+            if stop > self._filled[0].size:  # a topic with few samples takes little memory
+                self._filled = [np.resize(piece, min(2 * stop, _PIECE)) for piece in self._filled]
             for piece, array in zip(self._filled, arrays, strict=True):
                 piece[self._size : stop] = array[start:end]
             start, self._size = end, stop

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shared memory that killed processes have left behind.
+
+Fast DDS keeps the queue at which a process listens in /dev/shm/fastrtps_portN; N follows from the ROS domain, and who
+comes next uses the file again. A process that is killed while it uses the queue leaves it broken: messages to the next
+one get lost, and its cell stands still before the first block. So what nobody uses is removed before a node starts.
+"""
+
+import fcntl
+import os
+import re
+from contextlib import ExitStack
+from pathlib import Path
+
+FOLDER = Path("/dev/shm")  # noqa: S108 - where POSIX shared memory is on Linux
+_PORT = re.compile(r"fast(rtps|dds)_port\d{1,5}")
+_LOCKS = ("_el", "_sl")  # of who listens alone, and of those who listen together
+
+
+def sweep(folder: Path = FOLDER) -> list[str]:
+    """Remove the ports that this user's processes have left; their names.
+
+    A port is in use as long as one of its lock files is locked or a process has it in its memory.
+    """
+    ports = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [port.name for port in ports if _PORT.fullmatch(port.name) and _is_ours(port) and _remove(port)]
+
+
+def _is_ours(port: Path) -> bool:
+    try:
+        return port.stat().st_uid == os.geteuid()
+    except FileNotFoundError:  # somebody else has removed it
+        return False
+
+
+def _remove(port: Path) -> bool:
+    """Remove a port if nobody uses it; whether it has."""
+    alone, shared = (port.with_name(port.name + end) for end in _LOCKS)
+    made = not alone.exists()
+    locks = [*([shared] if shared.exists() else []), alone]
+    with ExitStack() as held:
+        try:
+            for lock in locks:
+                stream = held.enter_context(lock.open("ab" if lock is alone else "rb"))
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, FileNotFoundError):  # somebody listens, or has just removed it
+            return False
+        # As long as the locks are held, nobody can begin to listen; who had begun before has it in memory.
+        free = not _is_mapped(port)
+        for file in (port, *locks) if free else [alone][: int(made)]:
+            file.unlink(missing_ok=True)  # DDS takes a lock file that nobody holds for one of a dead process
+        return free
+
+
+def _is_mapped(file: Path) -> bool:
+    """Whether a process has a file in its memory."""
+    for maps in Path("/proc").glob("[0-9]*/maps"):
+        try:
+            if str(file) in maps.read_text(encoding="utf-8", errors="replace").split():
+                return True
+        except (FileNotFoundError, ProcessLookupError, PermissionError):
+            continue  # it has ended; or it is another user's, who cannot use this user's ports
+    return False

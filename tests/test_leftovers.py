@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shared memory of DDS that killed processes leave: removed before it is in the way, and never under anybody's feet."""
+
+import contextlib
+import fcntl
+import mmap
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lathe_rc.nodes import leftovers
+
+
+@pytest.fixture
+def port(tmp_path):
+    file = tmp_path / "fastrtps_port7661"
+    file.write_bytes(b"broken")
+    return file
+
+
+def test_what_nobody_uses_is_removed_and_nothing_else(port, tmp_path):
+    for name in ("fastrtps_port7661_el", "sem.fastrtps_port7661_mutex", "fastrtps_0123456789abcdef", "port7661"):
+        (tmp_path / name).touch()
+    assert leftovers.sweep(tmp_path) == [port.name]
+    assert not port.exists()
+    assert not list(tmp_path.glob("*_[es]l")), "DDS would take what comes next for a port of a dead process"
+    assert (tmp_path / "fastrtps_0123456789abcdef").exists()
+    assert leftovers.sweep(tmp_path) == []
+
+
+@pytest.mark.parametrize("end", ["_el", "_sl"])
+def test_who_listens_is_left_alone(port, end):
+    with port.with_name(port.name + end).open("ab") as lock:
+        fcntl.flock(lock, fcntl.LOCK_SH)
+        assert leftovers.sweep(port.parent) == []
+    assert leftovers.sweep(port.parent) == [port.name]
+
+
+def test_who_has_it_in_memory_is_left_alone(port):
+    with port.open("r+b") as stream, mmap.mmap(stream.fileno(), 0):
+        assert leftovers.sweep(port.parent) == []
+        assert [file.name for file in port.parent.iterdir()] == [port.name]
+    assert leftovers.sweep(port.parent) == [port.name]
+
+
+def test_a_machine_without_shared_memory(tmp_path):
+    assert leftovers.sweep(tmp_path / "nowhere") == []
+
+
+def listens_at(pid):
+    """Ports at which a process listens: those whose lock it has open."""
+    links = []
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # it has been closed
+            links.append(str(link.readlink()))
+    return {found[1] for link in links if (found := re.search(r"/(fastrtps_port\d+)_el$", link))}
+
+
+def there(names):
+    return {name for name in names if (leftovers.FOLDER / name).exists()}
+
+
+@pytest.fixture
+def start(domain):
+    """Starts a node; returns its process and the ports at which it listens."""
+    children = []
+
+    def started(name):
+        command = [sys.executable, "-m", "lathe_rc.nodes.container", f"{name}:tool"]
+        child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        children.append(child)
+        # One for discovery, one for messages; the locks come before the files.
+        while len(found := listens_at(child.pid)) < 2 or there(found) != found:
+            assert child.poll() is None
+            time.sleep(0.05)
+        return child, found
+
+    yield started
+    for child in children:
+        child.kill()
+        child.wait()
+
+
+def test_ports_of_a_killed_node_are_removed_and_those_of_a_living_one_are_not(start):
+    (dead, left), (alive, used) = start("dead"), start("alive")
+    dead.send_signal(signal.SIGKILL)
+    dead.wait()
+    left -= listens_at(alive.pid)
+    assert there(left)
+    leftovers.sweep()
+    # The living one still has those in memory to which it has sent.
+    assert there(used) == used
+    alive.kill()
+    alive.wait()
+    leftovers.sweep()
+    assert not there(left | used)
