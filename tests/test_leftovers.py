@@ -92,15 +92,16 @@ def test_ports_of_a_killed_node_are_removed_and_those_of_a_living_one_are_not(st
     (dead, left), (alive, used) = start("dead"), start("alive")
     dead.send_signal(signal.SIGKILL)
     dead.wait()
-    left -= listens_at(alive.pid)
-    assert there(left)
     leftovers.sweep()
     # The living one still has those in memory to which it has sent.
     assert there(used) == used
     alive.kill()
     alive.wait()
     leftovers.sweep()
-    assert not there(left | used)
+    # Those below are shared by all domains: other tests may use them meanwhile.
+    own = {name for name in left | used if int(name.removeprefix("fastrtps_port")) >= 7400}
+    assert own
+    assert not there(own)
 
 
 def test_a_cell_runs_where_killed_ones_have_left_broken_ports(domain):
