@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that a user can do something about; each is one line and has an exit code."""
+"""Errors that a user can do something about; each is one line, whatever it quotes, and has an exit code."""
 
 from typing import ClassVar
 
@@ -20,3 +20,9 @@ class LossyRunError(LatheError):
     """A free-running cell lost blocks; the message counts and names them."""
 
     exit_code: ClassVar[int] = 3
+
+
+def shown(text: object, longest: int = 200) -> str:
+    """What a library or a file says: its first line, of what prints, and not much of it."""
+    first = (str(text).strip().splitlines() or [type(text).__name__])[0]
+    return "".join(letter if letter.isprintable() else "\ufffd" for letter in first[:longest])

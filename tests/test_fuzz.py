@@ -25,7 +25,7 @@ from lathe_rc.bag.stream import Feeder
 from lathe_rc.bag.writer import BagWriter, offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.control import memory_file
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import InputError, LatheError, shown
 
 FAST = [name for name, target in TARGETS.items() if not target.slow]
 SLOW = [name for name, target in TARGETS.items() if target.slow]
@@ -334,7 +334,7 @@ def test_names_and_numbers_of_a_bag_are_what_they_should_be():
             trust.check_name(name)
     with pytest.raises(ValueError, match="does not unpack"):
         unpack("zstd", BOMB, 1000)
-    assert trust.shown("\x1b[2Ja\nb") == "\ufffd[2Ja"
+    assert shown("\x1b[2Ja\nb") == "\ufffd[2Ja"
 
 
 # ---- what a bag says of itself

@@ -4,11 +4,10 @@
 import contextlib
 import fcntl
 import mmap
+import os
 import re
+import select
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -67,36 +66,21 @@ def there(names):
     return {name for name in names if (leftovers.FOLDER / name).exists()}
 
 
-@pytest.fixture
-def start(domain):
-    """Starts a node; returns its process and the ports at which it listens."""
-    children = []
-
-    def started(name):
-        command = [sys.executable, "-m", "lathe_rc.nodes.container", f"{name}:tool"]
-        child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        children.append(child)
-        # One for discovery, one for messages; the locks come before the files.
-        while len(found := listens_at(child.pid)) < 2 or there(found) != found:
-            assert child.poll() is None
-            time.sleep(0.05)
-        return child, found
-
-    yield started
-    for child in children:
-        child.kill()
-        child.wait()
-
-
-def test_ports_of_a_killed_node_are_removed_and_those_of_a_living_one_are_not(start):
-    (dead, left), (alive, used) = start("dead"), start("alive")
-    dead.send_signal(signal.SIGKILL)
-    dead.wait()
-    leftovers.sweep()
-    # The living one still has those in memory to which it has sent.
-    assert there(used) == used
-    alive.kill()
-    alive.wait()
+def test_ports_of_a_killed_node_are_removed_and_those_of_a_living_one_are_not(domain):
+    nodes = ["tool", "learning_controller"]  # without a time master, the one does not mind the death of the other
+    with harness.Processes(scenario(), [[name] for name in nodes], domain=domain) as processes:
+        for _ in nodes:
+            processes.wait_for("active")
+        left, used = (listens_at(processes.pids[name]) for name in nodes)
+        assert left
+        assert used
+        dead = os.pidfd_open(processes.pids["tool"])
+        signal.pidfd_send_signal(dead, signal.SIGKILL)
+        select.select([dead], [], [])  # until it has ended
+        os.close(dead)
+        leftovers.sweep()
+        # The living one still has those in memory to which it has sent.
+        assert there(used) == used
     leftovers.sweep()
     # Those below are shared by all domains: other tests may use them meanwhile.
     own = {name for name in left | used if int(name.removeprefix("fastrtps_port")) >= 7400}

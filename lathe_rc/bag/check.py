@@ -12,11 +12,10 @@ import numpy as np
 from lathe_rc.bag import story
 from lathe_rc.bag.snapshot import SNAPSHOT, first_sample
 from lathe_rc.bag.source import Source
-from lathe_rc.bag.trust import shown
 from lathe_rc.cell import messages
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.wire import Block, Decoder
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, shown
 
 DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, as the harness found them
 _MOST_FINDINGS = 20  # that are told of one topic

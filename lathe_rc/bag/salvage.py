@@ -21,8 +21,8 @@ from rosbags.rosbag2.metadata import parse_qos
 
 from lathe_rc.bag import trust
 from lathe_rc.bag.source import read_chunk, unpack, unpack_file, unpacked_size
-from lathe_rc.bag.trust import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record, shown
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.bag.trust import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record
+from lathe_rc.errors import InputError, LatheError, shown
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message that is compressed by itself; CDR begins with a zero

@@ -28,10 +28,10 @@ from rosbags.interfaces import Qos
 from rosbags.rosbag2 import Reader
 
 from lathe_rc.bag import trust
-from lathe_rc.bag.trust import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record, shown
+from lathe_rc.bag.trust import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record
 from lathe_rc.bag.walk import Places, walk
 from lathe_rc.cell.wire import Block, Decoder
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import InputError, LatheError, shown
 
 Message = tuple[str, int, bytes]  #: topic, log time [ns] and bytes
 

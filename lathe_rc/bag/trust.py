@@ -77,12 +77,6 @@ def check_yaml(text: str, what: str) -> None:
         raise ValueError(f"{what}: not YAML (a character beyond Unicode)") from None
 
 
-def shown(text: object, longest: int = 200) -> str:
-    """What a library or a file says: its first line, of what prints, and not much of it."""
-    first = (str(text).strip().splitlines() or [type(text).__name__])[0]
-    return "".join(letter if letter.isprintable() else "\ufffd" for letter in first[:longest])
-
-
 def check_name(name: object) -> None:
     """Refuse the name of a topic or type that could not be shown in a line.
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.cell.parameters import Table
-from lathe_rc.errors import LatheError
+from lathe_rc.errors import LatheError, shown
 from lathe_rc.files import contents
 
 _MOST = 2**28  # longest such file [B]
@@ -147,7 +147,7 @@ def load(path: Path, table: Table, fresh: Mapping[str, object], *others: type) -
     except OSError as error:
         raise LatheError(f"{path}: the state cannot be read ({error.strerror})") from None
     except Exception as error:  # noqa: BLE001 - pickle lets through whatever a damaged file leads to
-        raise LatheError(f"{path}: not a state of this node ({type(error).__name__}: {str(error)!a:.200})") from None
+        raise LatheError(f"{path}: not a state of this node ({type(error).__name__}: {shown(error)})") from None
     if not isinstance(state, dict) or state.keys() != fresh.keys():
         raise LatheError(f"{path}: not a state of this node")
     return state

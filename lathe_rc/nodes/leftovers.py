@@ -47,8 +47,11 @@ def _remove(port: Path) -> bool:
             return False
         # As long as the locks are held, nobody can begin to listen; who had begun before has it in memory.
         free = not _is_mapped(port)
-        for file in (port, *locks) if free else [alone][: int(made)]:
-            file.unlink(missing_ok=True)  # DDS takes a lock file that nobody holds for one of a dead process
+        if free:
+            port.unlink(missing_ok=True)  # DDS removes some, too
+        # DDS takes a lock file that nobody holds for that of a dead process: none is left that was not there.
+        for lock in locks if free else [alone] if made else []:
+            lock.unlink(missing_ok=True)
         return free
 
 
