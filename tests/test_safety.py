@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monitors, the state machine, what controllers do about it: bounded, the same everywhere, nothing without a cause."""
 
+import functools
 import itertools
 import math
+import operator
 import subprocess
 import sys
 
@@ -285,16 +287,17 @@ def index_fault(angle, pulse, limit):
 
 
 def growth_fault(angle, error, limit, needed, floor):
-    turn, squares, count, before, grown = 0.0, 0.0, 0, math.nan, 0
+    turn, squares, count, before, grown = 0.0, [0.0] * 8, 0, math.nan, 0  # added up in an order that is quick
     for k in range(angle.size):
         now = np.floor(angle[k] / TURN)
         if now != turn:
-            rms = math.sqrt(squares / count) if count else math.nan
+            rms = math.sqrt(functools.reduce(operator.add, squares) / count) if count else math.nan
             grown = grown + 1 if rms > limit * before and rms > floor else 0
             if grown >= needed:
                 return k, rms / before
-            turn, squares, count, before = now, 0.0, 0, rms
-        squares, count = squares + error[k] * error[k], count + 1
+            turn, squares, count, before = now, [0.0] * 8, 0, rms
+        squares[count % 8] += error[k] * error[k]
+        count += 1
     return None, None
 
 

@@ -378,44 +378,78 @@ class IndexPulses(Ruled):
 
 
 @inlined
-def _add_squares(total: float, values: Array) -> float:
-    for k in range(values.size):
-        total += values[k] * values[k]
-    return total
+def _add_squares(sums: Array, count: int, values: Array) -> None:
+    """Add squares to sums of every eighth one of a revolution, the same whatever the blocks; ``count`` came before."""
+    head = min(-count & 7, values.size)
+    for k in range(head):
+        sums[count + k & 7] += values[k] * values[k]
+    end = values.size - (values.size - head & 7)
+    # Each has a name: what is in an array waits for the store of the one before.
+    s0, s1, s2, s3, s4, s5, s6, s7 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7]
+    for k in range(head, end, 8):
+        s0 += values[k] * values[k]
+        s1 += values[k + 1] * values[k + 1]
+        s2 += values[k + 2] * values[k + 2]
+        s3 += values[k + 3] * values[k + 3]
+        s4 += values[k + 4] * values[k + 4]
+        s5 += values[k + 5] * values[k + 5]
+        s6 += values[k + 6] * values[k + 6]
+        s7 += values[k + 7] * values[k + 7]
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7] = s0, s1, s2, s3, s4, s5, s6, s7
+    for k in range(end, values.size):
+        sums[count + k & 7] += values[k] * values[k]
+
+
+_NEAR = 1e-9  # of a revolution: so close to its ends its number is not taken for known
+
+
+@kernel
+def _turning(angle: Array, error: Array, memory: Array) -> int:
+    """See `_growing`, for samples among which a revolution may begin."""
+    limit, floor, needed, state, sums = memory[0], memory[1], memory[2], memory[3:8], memory[8:]
+    first = 0
+    for k in range(angle.size):
+        turn = np.floor(angle[k] / _TURN)
+        if turn != state[0]:
+            _add_squares(sums, int(state[1]), error[first:k])
+            samples = state[1] + (k - first)
+            rms = np.sqrt(np.sum(sums) / samples) if samples > 0.0 else np.nan
+            grown = rms > limit * state[2] and rms > floor
+            state[3] = state[3] + 1.0 if grown else 0.0
+            if grown and state[3] >= needed:
+                state[4] = rms / state[2]
+                return k
+            state[0], state[1], state[2], first = turn, 0.0, rms, k
+            sums[:] = 0.0
+    _add_squares(sums, int(state[1]), error[first:])
+    state[1] += angle.size - first
+    return -1
 
 
 @kernel
 def _growing(angle: Array, error: Array, memory: Array) -> int:
     """First sample at which the RMS error has grown often enough, or -1.
 
-    The memory: limit, floor, revolutions needed; revolution, sum of squares, samples, RMS of the one before, how many
-    have grown, by how much.
+    The memory: limit, floor, revolutions needed; revolution, samples, RMS of the one before, how many have grown, by
+    how much; eight sums of squares.
     """
-    limit, floor, needed, state = memory[0], memory[1], memory[2], memory[3:]
     for start in range(0, angle.size, _STRETCH):
         angles, errors = angle[start : start + _STRETCH], error[start : start + _STRETCH]
-        count, turn = 0, state[0]
+        low, high = (memory[3] + _NEAR) * _TURN, (memory[3] + 1.0 - _NEAR) * _TURN
+        count = 0
         for k in range(angles.size):
-            count += np.floor(angles[k] / _TURN) != turn
-        total, first = state[1], 0
-        for k in range(angles.size if count else 0):
-            turn = np.floor(angles[k] / _TURN)
-            if turn != state[0]:
-                total = _add_squares(total, errors[first:k])
-                samples = state[2] + (k - first)
-                rms = np.sqrt(total / samples) if samples > 0.0 else np.nan
-                grown = rms > limit * state[3] and rms > floor
-                state[4] = state[4] + 1.0 if grown else 0.0
-                if grown and state[4] >= needed:
-                    state[5] = rms / state[3]
-                    return start + k
-                state[0], state[2], state[3], total, first = turn, 0.0, rms, 0.0, k
-        state[1] = _add_squares(total, errors[first:])
-        state[2] += angles.size - first
+            count += _beyond(angles[k], 0.0, low, high)
+        if count:
+            found = _turning(angles, errors, memory)
+            if found >= 0:
+                return start + found
+        else:
+            _add_squares(memory[8:], int(memory[4]), errors)
+            memory[4] += errors.size
     return -1
 
 
-_UNKNOWN = (0.0, 0.0, 0.0, np.nan, 0.0, np.nan)  # what is known of the growth at first
+_UNKNOWN = (0.0, 0.0, np.nan, 0.0, np.nan, *[0.0] * 8)  # what is known of the growth at first
 
 
 class Growth(Ruled):
@@ -443,7 +477,7 @@ class Growth(Ruled):
 
     def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
         """See `Ruled`."""
-        return Alarm(place, float(self.memory[-1])) if place >= 0 else None
+        return Alarm(place, float(self.memory[7])) if place >= 0 else None
 
     def reset(self) -> None:
         """See `Monitor`."""
