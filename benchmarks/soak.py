@@ -104,13 +104,15 @@ class At:
     Attributes:
         seen: events of each kind.
         noticed: times from an act until the time master named somebody dead or silent [s].
+        ended: times from an act until the harness saw a process end [s].
     """
 
     def __init__(self, moments: Sequence[tuple[int, str]], act: Callable[[int], None]) -> None:
         self._moments, self._act = list(moments), act
         self._pids: dict[str, int] = {}
-        self._acted = 0
+        self._acted = self._hit = 0
         self.noticed: list[float] = []
+        self.ended: list[float] = []
         self.seen: Counter[str] = Counter()
 
     def __call__(self, event: harness.Event) -> None:
@@ -121,7 +123,10 @@ class At:
         if event["event"] in ("progress", "block0"):
             while self._moments and event.get("samples", 0) >= self._moments[0][0]:
                 self._act(self._pids[self._moments.pop(0)[1]])
-                self._acted = time.monotonic_ns()
+                self._acted = self._hit = time.monotonic_ns()
+        if self._hit and event["event"] == "exit":
+            self.ended.append((event["monotonic_ns"] - self._hit) * 1e-9)
+            self._hit = 0
         if self._acted and event["event"] in ("dead", "stall"):
             self.noticed.append((event["monotonic_ns"] - self._acted) * 1e-9)
             self._acted = 0
@@ -132,6 +137,7 @@ def kill(scale: int, random: Random) -> Mapping[str, Any]:
     told: Counter[str] = Counter()
     failures: list[str] = []
     noticed: list[float] = []
+    ended: list[float] = []
     with tempfile.TemporaryDirectory(prefix="lathe-soak-") as name:
         folder = Path(name)
         sets = ["spindle_encoder.revolutions=40.0", f"{OWN}.restart_file={folder}/state", "recorder.chunk_size=65536"]
@@ -144,6 +150,7 @@ def kill(scale: int, random: Random) -> Mapping[str, Any]:
             outcome = _killed(scenario, node, bag, watch, plain.digest)
             told[f"{node}: {outcome}"] += 1
             noticed += watch.noticed
+            ended += watch.ended
             if outcome != {OWN: _SAME, "spindle_encoder": _ENDED}.get(node, _SAFE):
                 failures.append(f"{node} at sample {sample}: {outcome}")
             after = "".join(f", noticed after {seconds * 1e3:.0f} ms" for seconds in watch.noticed)
@@ -151,6 +158,7 @@ def kill(scale: int, random: Random) -> Mapping[str, Any]:
     return {
         "outcomes": dict(sorted(told.items())),
         "noticed_after_ms": _times(noticed),
+        "seen_by_the_harness_after_ms": _times(ended),
         "failures": failures,
         "failed": len(failures),
     }

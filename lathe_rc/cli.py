@@ -148,9 +148,10 @@ def _trouble(event: harness.Event) -> str:
     if kind == "dead":
         follows = "another process goes on in its place" if event["restarts"] else "the cell goes to its safe state"
         return f"{event['member']} has died at block {event['blocks']}: {follows}"
+    if kind == "exit" and event["code"] < 0:
+        return harness.how_it_ended(event)
     if kind == "safe":
-        lost = ", ".join(event["lost"])
-        return f"safe state from sample {event['sample']} on, without {lost}; the run ends at sample {event['end']}"
+        return f"{event['why']}; the run ends at sample {event['end']}"
     return ""
 
 

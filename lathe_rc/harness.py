@@ -151,6 +151,14 @@ class Result:
         }
 
 
+def how_it_ended(event: Event) -> str:
+    """What is said of a process that did not end by itself and in order, from its ``exit``."""
+    code = event["code"]
+    return f"{event['node']} " + (
+        f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+    )
+
+
 def _ignore(event: Event) -> None:
     """Watch nothing."""
 
@@ -352,7 +360,7 @@ class Processes:
         self._abandoned: set[str] = set()
         self._ended: set[str] = set()
         self._newest: dict[str, Event] = {}
-        self._killed = ""  # the process that was, while the cell goes to its safe state without it
+        self._lost: list[str] = []  # what became of nodes while the cell goes to its safe state without them
         self._restarts: Counter[str] = Counter()
         self.pids: dict[str, int] = {}
         self.refused: Counter[str] = Counter()
@@ -430,7 +438,7 @@ class Processes:
         """
         heard = time.monotonic()
         while True:
-            wait = _FAREWELL if self._complete else min(silence, self._settling) if self._killed else silence
+            wait = _FAREWELL if self._complete else min(silence, self._settling) if self._lost else silence
             try:
                 event = self._events.get(timeout=max(heard + wait - time.monotonic(), 0.0))
             except queue.Empty:
@@ -439,8 +447,9 @@ class Processes:
                     continue
                 running = ", ".join(f"{name}{self._place(name)}" for name in self._running)
                 raise LatheError(
-                    f"{self._killed}no node has reported anything for {wait:.0f} s; still running: "
-                    f"{running}{self._tails()}"
+                    self._with_the_lost(
+                        f"no node has reported anything for {wait:.0f} s; still running: {running}{self._tails()}"
+                    )
                 ) from None
             self._newest[event["event"]] = event
             if event["event"] not in _NO_SIGN_OF_LIFE:
@@ -471,9 +480,10 @@ class Processes:
         return True
 
     def _goes_on(self, name: str) -> bool:
-        """Whether the cell does something about the death of a process."""
+        """Whether the cell does something about the end of a node or process: it waits, and goes to its safe state."""
         masters = set(self._scenario.of_kind(SpindleEncoder.kind))
-        return "block0" in self._newest and not self._complete and not masters & set(name.split("+"))
+        waits = all(self._scenario.nodes[master].window for master in masters)
+        return waits and "block0" in self._newest and not self._complete and not masters & set(name.split("+"))
 
     @property
     def _running(self) -> list[str]:
@@ -521,8 +531,8 @@ class Processes:
             self._raise_failure(event)
             if self._ended == set(self._children):
                 break
-        if self._killed:
-            raise LatheError(f"{self._killed}the cell did not get to its safe state{self._tails()}")
+        if self._lost and not self._complete:
+            raise LatheError(self._with_the_lost(f"the run did not come to its end{self._tails()}"))
         if not {"block0", "complete", "closed"} <= set(self._newest):
             raise LatheError(f"the nodes ended before the run did{self._tails()}")
         return self._newest
@@ -531,19 +541,29 @@ class Processes:
         """Raise what went wrong first; nodes that gave up because of another ("abandoned") are no cause."""
         node = event["node"]
         if event["event"] == "abandoned":
-            self._abandoned.update(name for name in self._children if node in name.split("+"))
+            self._is_no_cause(node)
         if event["event"] == "error":
             kinds = {InputError.exit_code: InputError, LossyRunError.exit_code: LossyRunError}
-            raise kinds.get(event["exit_code"], LatheError)(f"{self._killed}{event['message']}")
+            self._lose(node, event["message"], kinds.get(event["exit_code"], LatheError))
+            self._is_no_cause(node)
+        if event["event"] == "exit" and event["code"] < 0 and self._complete:
+            return  # a library crashed while it left; whoever watches has been told
         if event["event"] == "exit" and event["code"] and node in self._ended - self._abandoned:
-            if event["code"] < 0:
-                killed = f"{node} was killed by {signal.Signals(-event['code']).name}{self._crash(node)}"
-                if not self._goes_on(node):
-                    raise LatheError(f"{self._killed}{killed}")
-                # The time master says how the cell came to its safe state, and that is the end.
-                self._killed += f"{killed}; "
-                return
-            raise LatheError(f"{node} ended with exit code {event['code']}{self._tail(node)}")
+            self._lose(node, f"{how_it_ended(event)}{self._crash(node) if event['code'] < 0 else self._tail(node)}")
+
+    def _is_no_cause(self, node: str) -> None:
+        """The end of the process of a node needs no other explanation."""
+        self._abandoned.update(name for name in self._children if node in name.split("+"))
+
+    def _lose(self, name: str, why: str, error: type[LatheError] = LatheError) -> None:
+        """Raise why a node or process has ended, or keep it until the time master says how the cell went on."""
+        if not self._goes_on(name):
+            raise error(self._with_the_lost(why))
+        self._lost.append(why)
+
+    def _with_the_lost(self, message: str) -> str:
+        """A message after what became of nodes, as far as it does not say that itself."""
+        return "; ".join([*(why for why in self._lost if why not in message), message])
 
     def _log(self, name: str) -> list[str]:
         """The lines that a process has written."""

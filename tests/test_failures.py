@@ -2,6 +2,7 @@
 """What breaks is named, the rest is ended, and the bag is readable."""
 
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -107,6 +108,33 @@ def test_the_death_of_a_member_ends_in_the_safe_state(node, tmp_path):
         resimulate(bag)
 
 
+@pytest.mark.parametrize(
+    ("mode", "groups"),
+    [
+        ("processes", None),
+        ("processes", [["spindle_encoder", "tool"], ["learning_controller", "recorder"]]),
+        ("composed", None),
+    ],
+)
+def test_a_member_that_fails_by_an_error_ends_in_the_safe_state(mode, groups, tmp_path):
+    """The others go on, those of its own process among them, and the tool is taken out."""
+    bag, events, lost = tmp_path / "bag", [], tmp_path / "nowhere" / "memory.npz"
+    sets = [f"learning_controller.memory_file={lost}", "learning_controller.events=['revolution 10: save']"]
+    scenario = load(CONFIG / "supervised.yaml", [*RUN, *sets])
+    if groups:
+        groups = [*groups, *([name] for name in ("electrodynamic_actuator", "supervisor"))]
+    why = rf"{re.escape(str(lost))}: the memory cannot be saved \(No such file or directory\)"
+    with pytest.raises(LatheError, match=rf"^/learning_controller failed: {why}: safe state from sample \d+ on$"):
+        harness.run(scenario, mode=mode, groups=groups, bag=bag, watch=events.append)
+    (safe,) = [event for event in events if event["event"] == "safe"]
+    assert safe["lost"] == ["/learning_controller"]
+    recording = reader.read(bag)
+    assert {signals.size for fields in recording.dense.values() for signals in fields.values()} == {safe["end"]}
+    assert recording.of_type(messages.STATE)["position"][-1] == pytest.approx(0.3e-3, abs=1e-6)
+    assert "members_lost" in recording.sparse["/safety/status"].values["monitor"]
+    assert not check(bag).wrong
+
+
 def test_a_member_that_stalls_is_lost_if_the_cell_shall_not_wait(tmp_path):
     sets = [*RUN, "spindle_encoder.stall_reaction=safe", "spindle_encoder.stall_time=5.0"]
     killer = Killer("tool", signal.SIGSTOP)
@@ -150,6 +178,20 @@ def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_i
             processes.wait_for("cycle")
     assert [event["node"] for event in told if event["event"] == "stuck"] == ["held"]
     assert reader.read(bag).digests() == harness.run(load(PISTON, ["spindle_encoder.revolutions=6.0"])).digest
+
+
+def test_who_crashes_while_leaving_a_complete_run_is_named_and_nothing_is_lost(tmp_path):
+    told = []
+    cell = harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=6.0"]), tmp_path / "bag", keep=True)
+    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+        processes.wait_for("closed")
+        processes._children["crashed"] = child = subprocess.Popen(["/bin/sh", "-c", "kill -SEGV $$"])
+        thread = threading.Thread(target=processes._listen, args=("crashed", socket.socket(), child))
+        thread.start()
+        processes.wait_for_end(told.append)
+        thread.join()
+    (end,) = [event for event in told if event["event"] == "exit" and event["code"]]
+    assert harness.how_it_ended(end) == "crashed was killed by SIGSEGV"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

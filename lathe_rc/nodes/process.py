@@ -73,8 +73,8 @@ def _start(nodes: Sequence[CellNode], exchange: Exchange) -> None:
 
 
 def _due(nodes: Sequence[CellNode], now: float) -> float:
-    """When the next tick of a node is due; now if all are done."""
-    return min((node.next_tick for node in nodes if not node.done), default=now)
+    """When the next tick of a node is due; now if there is none."""
+    return min((node.next_tick for node in nodes if not (node.done or node.failure)), default=now)
 
 
 def _work(nodes: Sequence[CellNode], stop: _Stop, until: float) -> None:
@@ -99,7 +99,9 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
             for node in nodes:
                 if now >= node.next_tick and not (node.done or node.failure):
                     node.tick(now)
-            if all(node.done for node in nodes) or any(node.failure for node in nodes):
+            if all(node.done or node.failure for node in nodes):
+                return
+            if any(node.failure and not node.is_missed for node in nodes):
                 return
             if now >= look:
                 look = now + _LONGEST_WAIT

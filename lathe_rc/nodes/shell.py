@@ -170,6 +170,11 @@ class CellNode(LifecycleNode):
     def members_changed(self) -> None:
         """A member announced something new."""
 
+    def failed(self, member: Member) -> None:
+        """A member has given up; once the cell may be running, the time master says what is to be done."""
+        if not self._ready:
+            self.fail(LatheError(f"{member.name} failed: {member.message}"), cause="abandoned")
+
     def begin(self, *, joins: bool) -> None:
         """Every input and output is matched; ``joins``: the cell is running already."""
 
@@ -294,6 +299,11 @@ class CellNode(LifecycleNode):
         if self._host:
             self.announce()
 
+    @property
+    def is_missed(self) -> bool:
+        """Whether it has given up where others of its process may have to go on, to the cell's safe state."""
+        return bool(self.failure) and self._ready and self.master is not None and self.master.name != self.full_name
+
     # ---- membership ---------------------------------------------------------------------------------
 
     def announce(self) -> None:
@@ -366,7 +376,7 @@ class CellNode(LifecycleNode):
             del self.members[next(n for n in reversed(self.members) if n not in peers and n != self.full_name)]
         others = member.name in peers and member.name != self.full_name and member.name not in self._without
         if member.state == Member.FAILED and others and not self.over:
-            self.fail(LatheError(f"{member.name} failed: {member.message}"), cause="abandoned")
+            self.failed(member)
         self.members_changed()
         self._settle()
 

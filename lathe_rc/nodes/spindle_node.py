@@ -261,6 +261,16 @@ class SpindleNode(StageNode):
             if self._pace.stall_reaction == "safe" and now - self._heard > self._pace.stall_time:
                 self._lose(self._silent_for(now, self._pace.stall_time) or set(self._stalled), "fell silent")
 
+    def failed(self, member: Member) -> None:
+        """See `CellNode`: the others go on without it to their safe state, if they can wait until all know."""
+        if not (self._running and self.table.window):
+            self.fail(LatheError(f"{member.name} failed: {member.message}"), cause="abandoned")
+            return
+        self._dead.pop(member.name, None)
+        if self._dead:
+            self._lose(set(self._dead), "died")  # who is waited for could not join any more
+        self._lose({member.name}, f"failed: {member.message}")
+
     def _silent_for(self, now: float, seconds: float) -> set[str]:
         """Members that DDS has not heard for so long."""
         return {name for name, since in self.watch.silent.items() if now - since > seconds} & self._completed.keys()
@@ -299,7 +309,9 @@ class SpindleNode(StageNode):
         self.patience = _GONE
         self._say(CellState.SAFE, self.samples, self._why)
         self.get_logger().error(self._why)
-        self.reporter("safe", self.get_name(), sample=self.samples, end=self._end, lost=sorted(self._without))
+        self.reporter(
+            "safe", self.get_name(), sample=self.samples, end=self._end, lost=sorted(self._without), why=self._why
+        )
         self._heard = time.monotonic()
         if self._completed:
             self._after(before, self._least)
