@@ -290,6 +290,16 @@ def test_a_commanded_speed_keeps_within_its_limits_and_the_slide_within_its_stro
     assert_array_equal(clipped > 0, effort != held)
 
 
+@given(levels=LEVELS, divisor=st.sampled_from([1, 5]))
+def test_what_the_command_limit_alone_cuts_off_is_told(levels, divisor):
+    command = np.repeat(levels, 100)
+    lengths = [7] * (command.size // 7) + [command.size % 7]
+    motion, cut = run_limited(MODELS["cross"], command, CommandLimits(), lengths, divisor=divisor, command_limit=0.5)
+    held = command[np.arange(command.size) // divisor * divisor]
+    assert_array_equal(motion[2], held.clip(-0.5, 0.5))
+    assert_array_equal(cut > 0, np.abs(held) > 0.5)
+
+
 def test_a_slide_is_stopped_at_its_stroke_and_comes_back():
     command = np.concatenate((np.ones(6000), -0.3 * np.ones(4000)))
     (position, *_), clipped = run_limited(MODELS["approximate with a zero"], command, CommandLimits(stroke=1e-3))

@@ -121,6 +121,15 @@ def test_clipped_samples_are_counted_and_told():
         assert clipped[index - 640]
 
 
+def test_a_feed_drive_tells_of_what_its_command_limit_alone_cuts_off():
+    recording = harness.run(scenarios.load(CONFIG / "periodic.yaml", ["feed_drive.command_limit=0.2"])).recording
+    wanted, held = recording.of_type(messages.SERVO)["command"], recording.of_type(messages.STATE)["effort"]
+    assert np.abs(wanted).max() > 0.2 == np.abs(held).max()
+    actions = recording.sparse["/feed_drive/events"].values["action"]
+    assert actions[0] == "limited"
+    assert all(action == "limited" or action.startswith("free: ") for action in actions)
+
+
 @pytest.mark.parametrize("mode", ["composed"])
 def test_limits_are_the_same_in_every_host(mode):
     loaded = scenarios.load(CONFIG / "two_channel.yaml", CHANGES)
@@ -174,7 +183,7 @@ def test_the_feed_is_limited_and_says_so(tmp_path):
     assert np.abs(np.diff(speed)).max() / STEP <= 0.5 * 1.001
     assert np.abs(np.diff(speed, 2)).max() / STEP**2 <= 500.0 * 1.001
     unlimited = harness.run(turning(FEED[0]))
-    assert "/longitudinal/events" not in unlimited.recording.sparse
+    assert not unlimited.recording.sparse["/longitudinal/events"].stamps
     speed = 12.4e-3 * unlimited.recording.dense["/longitudinal/state"]["effort"]
     assert np.abs(np.diff(speed)).max() / STEP > 0.5
     found = resimulate(tmp_path / "bag")

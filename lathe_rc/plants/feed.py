@@ -207,6 +207,7 @@ def _advance(
     divisor: int,
     resolution: float,
     from_load: bool,  # noqa: FBT001 - kernels take everything by position
+    kept: bool,  # noqa: FBT001
     first: int,
     command: Array,
     disturbance: Array,
@@ -219,18 +220,20 @@ def _advance(
 ) -> tuple[int, int]:
     """Step through a block; returns the commands that were cut off and the samples at the greatest speed.
 
-    ``memory`` is that of the limits, and whether the command that is held is clipped.
+    ``memory`` is that of the limits, which are looked at if it is ``kept``, and whether the command held is clipped.
     """
     saturated = limited = 0
     for k in range(command.size):
         before = state[_LOAD]
         limited += move(table, state)
         if (first + k) % divisor == 0:
-            wanted = command[k]
-            if clipped.size:
-                memory[-1] = 1.0 if _keep(limits, memory, state, wanted) else 0.0
+            wanted, changed = command[k], False
+            if kept:
+                changed = _keep(limits, memory, state, wanted)
                 wanted = memory[0]
-            saturated += hold(table, state, wanted)
+            cut = hold(table, state, wanted)
+            saturated += cut
+            memory[-1] = 1.0 if changed or cut else 0.0
         if clipped.size:
             clipped[k] = memory[-1] > 0.0
         state[_DISTURBANCE] = disturbance[k] if disturbance.size else 0.0
@@ -355,10 +358,10 @@ class FeedDrive:
             half=backlash / 2.0,
         )
         self.state = np.zeros(2 * held.size + 3)
-        self._limited, self._limits = limits.any, _limits(model, limits, command_limit, divisor * step)
+        self._limits = _limits(model, limits, command_limit, divisor * step)
         self._memory = np.append(rest(), 0.0)
         self.saturated = self.limited = 0
-        self._step, self._sampling = step, (divisor, float(resolution), feedback == "load")
+        self._step, self._sampling = step, (divisor, float(resolution), feedback == "load", limits.any)
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
         """Motor over command, as the difference equation has it, at ``frequency`` [rad/s]; limits and divisor apart."""
@@ -391,10 +394,8 @@ class FeedDrive:
             motor: position of the motor, on the slide's scale [m].
             measured: that of the two which the sensor sees, as it reads it [m].
             disturbance: adds to the limited command, in its unit (f of paper 002, eq. 2); none if empty.
-            clipped: filled with 1 where the limits do not let the command be what it was when it was taken; needed if
-                there are limits, and empty without.
+            clipped: filled with 1 where the command that is held is not what it was when it was taken; or empty.
         """
-        assert bool(clipped.size) == (self._limited and bool(command.size)), "room for what is clipped"
         saturated, limited = _advance(
             self.table,
             self._limits,

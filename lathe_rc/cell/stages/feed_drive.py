@@ -111,7 +111,8 @@ class FeedDriveStage(Stage):
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
         self._clipping = Clipping(name, parameters)
-        self._clipped = np.empty(messages.MAX_BLOCK if limits.any else 0, np.uint8)
+        cuts = limits.any or bool(parameters.command_limit)
+        self._clipped = np.empty(messages.MAX_BLOCK if cuts else 0, np.uint8)
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         self._motor, self._seen, self._load = (np.empty(messages.MAX_BLOCK) for _ in range(3))
         self._obedience, self._safe = self._obeys(), False
@@ -122,7 +123,7 @@ class FeedDriveStage(Stage):
                 *listens(parameters),
             ],
             outputs=[Output(f"{axis}/state", messages.STATE, Joint("position", "velocity", "effort"))],
-            tells=limits.any,
+            tells=cuts,
         )
 
     def _obeys(self) -> Obedience:
