@@ -12,62 +12,63 @@ from lathe_rc.safety.faults import KINDS
 from lathe_rc.safety.state_machine import MEANING, Reaction, State, table
 
 CONFIG = Path(__file__).parents[1] / "config"
+SPINDLE = [
+    "encoder.angle off",
+    "encoder.angle stuck",
+    "encoder.angle garbage amplitude=100",
+    "encoder.angle wrong scale=1.001",
+    "encoder.speed wrong scale=1.2",
+    "encoder.angle slow time=0.01",
+    "encoder.angle delayed time=0.005",
+    "encoder.speed intermittent good=0.01 off=0.001",
+    "encoder.angle noisy rms=1e-4",
+    "encoder missed_index",
+    "encoder lost_counts angle=0.01",
+    "encoder reversed",
+]
+ERROR = [
+    "tool.measured_error off",
+    "tool.measured_error stuck",
+    "tool.measured_error garbage amplitude=1e-4",
+    "tool.measured_error wrong scale=-1",
+    "tool.measured_error delayed time=0.01",
+    "tool.measured_error noisy rms=2e-6",
+]
+
+
+def drive(channel: str) -> list[str]:
+    """Faults of a drive of the tool."""
+    told = [
+        "command.position off",
+        "command.position stuck",
+        "command.position delayed time=0.002",
+        "state.position stuck",
+        "state.measured_position off",
+        "state.measured_position stuck",
+        "state.measured_position garbage amplitude=1e-4",
+        "state.measured_position wrong scale=0.9 offset=1e-5",
+        "state.measured_position slow time=0.001",
+        "state.measured_position intermittent good=0.01 off=0.001",
+        "state.measured_position noisy rms=1e-5",
+    ]
+    return [f"{channel}/{fault}" for fault in told]
+
+
+PISTON = {"spindle_encoder": SPINDLE, "learning_controller": ERROR, "electrodynamic_actuator": drive("coarse")}
+CUT = [
+    "cut tool_broken length=1e-3",
+    "cut hard_spot factor=2",
+    "cut.measured_force off",
+    "cut.measured_force stuck",
+    "cut.measured_force wrong scale=0.8",
+    "cut.measured_force noisy rms=10",
+]
+FEED = ["longitudinal/command.command stuck", "longitudinal/state.velocity off"]
 #: scenario, revolution of the fault, and the faults by node
 CASES = {
-    "supervised": (
-        60,
-        {
-            "spindle_encoder": [
-                "encoder.angle off",
-                "encoder.angle stuck",
-                "encoder.angle garbage amplitude=100",
-                "encoder.angle wrong scale=1.001",
-                "encoder.speed wrong scale=1.2",
-                "encoder.angle slow time=0.01",
-                "encoder.angle delayed time=0.005",
-                "encoder.speed intermittent good=0.01 off=0.001",
-                "encoder.angle noisy rms=1e-4",
-                "encoder missed_index",
-                "encoder lost_counts angle=0.01",
-                "encoder reversed",
-            ],
-            "learning_controller": [
-                "tool.measured_error off",
-                "tool.measured_error stuck",
-                "tool.measured_error garbage amplitude=1e-4",
-                "tool.measured_error wrong scale=-1",
-                "tool.measured_error delayed time=0.01",
-                "tool.measured_error noisy rms=2e-6",
-            ],
-            "electrodynamic_actuator": [
-                "coarse/command.position off",
-                "coarse/command.position stuck",
-                "coarse/command.position delayed time=0.002",
-                "coarse/state.position stuck",
-                "coarse/state.measured_position off",
-                "coarse/state.measured_position stuck",
-                "coarse/state.measured_position garbage amplitude=1e-4",
-                "coarse/state.measured_position wrong scale=0.9 offset=1e-5",
-                "coarse/state.measured_position slow time=0.001",
-                "coarse/state.measured_position intermittent good=0.01 off=0.001",
-                "coarse/state.measured_position noisy rms=1e-5",
-            ],
-        },
-    ),
-    "supervised_turning": (
-        200,
-        {
-            "cutting_process": [
-                "cut tool_broken length=1e-3",
-                "cut hard_spot factor=2",
-                "cut.measured_force off",
-                "cut.measured_force stuck",
-                "cut.measured_force wrong scale=0.8",
-                "cut.measured_force noisy rms=10",
-            ],
-            "longitudinal": ["longitudinal/command.command stuck", "longitudinal/state.velocity off"],
-        },
-    ),
+    "supervised": (60, PISTON),
+    "supervised_two_channel": (100, PISTON | {"fine_controller": ERROR, "piezo_actuator": drive("fine")}),
+    "supervised_turning": (200, {"cutting_process": CUT, "longitudinal": FEED}),
 }
 
 
@@ -99,7 +100,8 @@ def noticed(name: str, node: str, fault: str, revolution: int) -> str:
     result = harness.run(scenario.load(CONFIG / f"{name}.yaml", overrides))
     recording = result.recording
     lost = str(sum(result.samples - next(iter(signals.values())).size for signals in recording.dense.values()))
-    begin = recording.sparse[f"/{node}/events"].values["sample_index"][0]
+    events = recording.sparse[f"/{node}/events"].values
+    begin = events["sample_index"][events["action"].index(f"fault {fault}")]
     status = recording.sparse["/safety/status"].values
     found = list(zip(status["sample_index"], status["state"], strict=True)) if status else []
     safe = next((index for index, state in found if state == State.SAFE), None)

@@ -91,6 +91,24 @@ def test_a_command_that_is_retracted_and_given_back_never_jumps():
     assert np.abs(np.diff(out, 2)).max() / STEP**2 <= 50.0 + 2.0 * natural
 
 
+@given(velocity=st.floats(-5.0, 5.0), position=st.floats(-1e-3, 1e-3), goal=st.floats(-1e-3, 1e-3), hold=st.booleans())
+def test_a_takeover_goes_no_further_the_wrong_way_than_it_takes_to_stop(velocity, position, goal, hold):
+    """Noise in a command looks like a velocity; carried on, one such sample took the tool 1 mm into the part."""
+    bounds = Bounds(0.05, 50.0, 1e5)
+    takeover = Takeover(bounds, goal, STEP)
+    takeover.apply(position + velocity * STEP * np.array([-1.0, 0.0]))
+    takeover.change(Mode.HOLD if hold else Mode.RETRACT)
+    out = np.zeros(20_000)
+    takeover.apply(out)
+    stopping = np.abs(motion(0.0, min(abs(velocity), 0.05), None, bounds, STEP)[-1]) + 1e-12
+    low, high = (position, position) if hold else sorted((position, goal))
+    assert low - stopping <= out.min()
+    assert out.max() <= high + stopping
+    assert np.abs(np.diff(out, prepend=position)).max() <= 0.05 * STEP * (1 + 1e-6)
+    if not hold:
+        assert out[-1] == goal
+
+
 def test_a_command_with_steps_is_taken_over_without_its_velocity():
     takeover = Takeover(Bounds(10.0, 1000.0, math.inf), 0.0, STEP, carries=False)
     steps = np.where(np.arange(40_000) % 2 > 0, 0.51, 0.5)

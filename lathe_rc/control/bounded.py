@@ -80,13 +80,16 @@ class Mode(Enum):
 
 
 class Takeover:
-    """A command that is held or retracted, and given back to its controller, without a jump of position or velocity.
+    """A command that is held or retracted, and given back to its controller, without a jump of position.
+
+    Nor is there one of velocity, unless the command is faster than the bounds allow.
 
     Args:
         bounds: of what it does itself.
         retracted: where the command is when retracted [m].
         step: sampling step [s].
-        carries: whether a motion begins with the velocity that the command has; one with steps and noise has none.
+        carries: whether a motion begins with the velocity that the command has, up to that of the bounds; one that is
+            all steps and noise has none.
 
     Attributes:
         mode: who commands; see `change`.
@@ -112,14 +115,26 @@ class Takeover:
         """Take over, or give back, from the next sample on."""
         if mode is self.mode:
             return
-        velocity = (self._given[1] - self._given[0]) / self._step if self._carries else 0.0
+        velocity = self._carried(self._given)
         if mode is Mode.FOLLOW:
-            rest = velocity - (self._wanted[1] - self._wanted[0]) / self._step if self._carries else 0.0
+            rest = velocity - self._carried(self._wanted)
             self._path = motion(self._given[1] - self._wanted[1], rest, 0.0, self._bounds, self._step)
         else:
-            goal = self._goal if mode is Mode.RETRACT else None
-            self._path = motion(self._given[1], velocity, goal, self._bounds, self._step)
+            self._path = self._taken(velocity, to_goal=mode is Mode.RETRACT)
         self.mode, self._place = mode, 0
+
+    def _taken(self, velocity: float, *, to_goal: bool) -> Array:
+        """The way to rest, or out of the part: a single motion that begins into the part would first go far into it."""
+        start, step = float(self._given[1]), self._step
+        if to_goal and velocity * (self._goal - start) >= 0.0:
+            return motion(start, velocity, self._goal, self._bounds, step)
+        stop = motion(start, velocity, None, self._bounds, step)
+        return np.concatenate((stop, motion(float(stop[-1]), 0.0, self._goal, self._bounds, step))) if to_goal else stop
+
+    def _carried(self, command: Array) -> float:
+        """The velocity of the last two samples as far as a motion may have it: what is faster is noise, or a step."""
+        highest = self._bounds.velocity if self._carries else 0.0
+        return float(np.clip((command[1] - command[0]) / self._step, -highest, highest))
 
     def apply(self, command: Array) -> None:
         """Make of what the controller wants what the drive gets; in place, shape (n,) [m]."""
