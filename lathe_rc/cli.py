@@ -142,7 +142,7 @@ def _trouble(event: harness.Event) -> str:
     """What is said of an event in any case; empty if nothing."""
     kind = event["event"]
     if kind == "stuck":
-        return f"{event['node']} did not end{event['place']}; the run is complete, it was killed"
+        return f"{event['node']} did not end{event['place']}; the bag is closed: no longer waited for"
     if kind == "stranger":
         return f"{event['node']} refuses: {event['message']}; publishers: {', '.join(event['publishers'])}"
     if kind == "dead":

@@ -531,7 +531,7 @@ class Processes:
             self._raise_failure(event)
             if self._ended == set(self._children):
                 break
-        if self._lost and not self._complete:
+        if "safe" in self._newest or (self._lost and not self._complete):
             raise LatheError(self._with_the_lost(f"the run did not come to its end{self._tails()}"))
         if not {"block0", "complete", "closed"} <= set(self._newest):
             raise LatheError(f"the nodes ended before the run did{self._tails()}")

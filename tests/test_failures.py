@@ -15,7 +15,7 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from lathe_rc import harness
+from lathe_rc import cli, harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
 from lathe_rc.bag.resim import resimulate
@@ -66,6 +66,23 @@ def test_a_killed_node_is_named_and_the_bag_is_readable(node, tmp_path):
     with next(bag.glob("*.mcap")).open("rb") as stream:
         assert sum(1 for _ in make_reader(stream).iter_messages()) > 100
 
+
+#: Makes the disk full when a bag is closed.
+FULL_AT_THE_END = """
+import errno, os, sys
+
+def close(self):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == "lathe_rc.nodes.recorder_node":
+            sys.meta_path.remove(self)
+            from lathe_rc.bag.writer import BagWriter
+            BagWriter.close = close
+
+sys.meta_path.insert(0, Finder())
+"""
 
 RUN = ["spindle_encoder.revolutions=100.0", "spindle_encoder.safe_time=0.1", "recorder.chunk_size=65536"]
 
@@ -191,7 +208,29 @@ def test_who_crashes_while_leaving_a_complete_run_is_named_and_nothing_is_lost(t
         processes.wait_for_end(told.append)
         thread.join()
     (end,) = [event for event in told if event["event"] == "exit" and event["code"]]
-    assert harness.how_it_ended(end) == "crashed was killed by SIGSEGV"
+    assert cli._trouble(end) == "crashed was killed by SIGSEGV"
+
+
+def test_a_bag_that_is_closed_makes_no_safe_state_a_success(tmp_path):
+    """The spindle is killed when it has declared the safe state, and the bag comes to its end all the same."""
+    cell = harness.with_recorder(load(CONFIG / "supervised.yaml", RUN), tmp_path / "bag", keep=True)
+    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+        processes.wait_for("cycle")
+        os.kill(processes.pids["tool"], signal.SIGKILL)
+        processes.wait_for("safe")
+        os.kill(processes.pids["spindle_encoder"], signal.SIGKILL)
+        processes._newest["closed"] = {"complete": True}
+        with pytest.raises(LatheError, match=r"^tool was killed by SIGKILL; the run did not come to its end"):
+            processes.wait_for_end()
+
+
+@pytest.mark.parametrize("mode", ["composed", "processes"])
+def test_a_bag_that_cannot_be_closed_is_a_failure_in_every_host(mode, tmp_path, monkeypatch):
+    """The recorder's last words, when all others have ended well."""
+    (tmp_path / "sitecustomize.py").write_text(FULL_AT_THE_END, encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ['PYTHONPATH']}")
+    with pytest.raises(LatheError, match=r"bag: cannot be closed \(No space left on device\)"):
+        harness.run(load(PISTON, ["spindle_encoder.revolutions=6.0"]), mode=mode, bag=tmp_path / "bag")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

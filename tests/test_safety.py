@@ -109,6 +109,23 @@ def test_a_takeover_goes_no_further_the_wrong_way_than_it_takes_to_stop(velocity
         assert out[-1] == goal
 
 
+@given(velocity=st.floats(-5.0, 5.0), held=st.floats(-1e-3, 1e-3), wanted=st.floats(-1e-3, 1e-3))
+def test_a_command_that_is_given_back_comes_near_its_own_along_a_bounded_motion(velocity, held, wanted):
+    bounds = Bounds(0.05, 50.0, 1e5)
+    takeover = Takeover(bounds, held, STEP)
+    takeover.apply(np.full(2, held))
+    takeover.change(Mode.RETRACT)
+    takeover.apply(wanted + velocity * STEP * np.array([-1.0, 0.0]))
+    takeover.change(Mode.FOLLOW)
+    out = np.full(20_000, wanted)
+    takeover.apply(out)
+    # Noise that looks like a velocity adds no more than a motion that begins as fast as it may.
+    most = np.abs(motion(abs(held - wanted), 0.05, 0.0, bounds, STEP)).max()
+    assert np.abs(out - wanted).max() <= max(most, abs(held - wanted)) * 1.05 + 1e-12
+    assert np.abs(np.diff(out, prepend=held)).max() <= 0.05 * STEP * (1 + 1e-6)
+    assert out[-1] == wanted
+
+
 def test_a_command_with_steps_is_taken_over_without_its_velocity():
     takeover = Takeover(Bounds(10.0, 1000.0, math.inf), 0.0, STEP, carries=False)
     steps = np.where(np.arange(40_000) % 2 > 0, 0.51, 0.5)

@@ -19,7 +19,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import START_NS
 from lathe_rc.cell.rerun_bridge import PORT, RATE, Kind
 from lathe_rc.cell.wire import Block
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.view.rerun_output import Viewer, end, require, viewer
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def log(recording: "rr.RecordingStream", bag: Path, *, rate: float) -> int:
     try:
         recording.flush()
     except (RuntimeError, ValueError) as error:
-        raise LatheError(f"the view cannot be written ({error})") from None
+        raise LatheError(f"the view cannot be written ({shown(error)})") from None
     return header.samples
 
 

@@ -120,10 +120,10 @@ class Takeover:
             rest = velocity - self._carried(self._wanted)
             self._path = motion(self._given[1] - self._wanted[1], rest, 0.0, self._bounds, self._step)
         else:
-            self._path = self._taken(velocity, to_goal=mode is Mode.RETRACT)
+            self._path = self._way(velocity, to_goal=mode is Mode.RETRACT)
         self.mode, self._place = mode, 0
 
-    def _taken(self, velocity: float, *, to_goal: bool) -> Array:
+    def _way(self, velocity: float, *, to_goal: bool) -> Array:
         """The way to rest, or out of the part: a single motion that begins into the part would first go far into it."""
         start, step = float(self._given[1]), self._step
         if to_goal and velocity * (self._goal - start) >= 0.0:

@@ -47,11 +47,11 @@ def _remove(port: Path) -> bool:
             return False
         # As long as the locks are held, nobody can begin to listen; who had begun before has it in memory.
         free = not _is_mapped(port)
-        if free:
-            port.unlink(missing_ok=True)  # DDS removes some, too
-        # DDS takes a lock file that nobody holds for that of a dead process: none is left that was not there.
-        for lock in locks if free else [alone] if made else []:
-            lock.unlink(missing_ok=True)
+        gone = [port, *locks] if free else []
+        if made and not free:
+            gone = [alone]  # DDS takes a lock file that nobody holds for that of a dead process
+        for file in gone:
+            file.unlink(missing_ok=True)  # DDS removes some, too
         return free
 
 

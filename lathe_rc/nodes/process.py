@@ -101,7 +101,7 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
                     node.tick(now)
             if all(node.done or node.failure for node in nodes):
                 return
-            if any(node.failure and not node.is_missed for node in nodes):
+            if any(node.failure and not node.others_go_on for node in nodes):
                 return
             if now >= look:
                 look = now + _LONGEST_WAIT
@@ -169,6 +169,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
         return error.exit_code
     finally:
         for node in nodes:
+            node.farewell()
             node.finish()
             if node.strangers.senders:
                 reporter("refused", node.get_name(), senders=node.strangers.senders)

@@ -353,6 +353,7 @@ class RecorderNode(CellNode):
             self.fail(LatheError(f"{self._path}: cannot be closed ({error.strerror})"))
         finally:
             self._writer = None
+        complete = complete and not self.failure
         whole = "complete" if complete else "interrupted"
         self.get_logger().info(f"bag {self._path} closed: {self._blocks} blocks, {whole}")
         self.reporter("closed", self.get_name(), bag=str(self._path), blocks=self._blocks, complete=complete)

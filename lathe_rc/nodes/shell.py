@@ -23,7 +23,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.nodes import declare
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
@@ -122,7 +122,7 @@ class CellNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         except Exception as error:  # noqa: BLE001 - rclpy would swallow it, and the cell wait for a node that is not there
             self.get_logger().error(traceback.format_exc())
-            self.fail(LatheError(f"{self.get_name()}: {type(error).__name__}: {error}"))
+            self.fail(LatheError(f"{self.get_name()}: {type(error).__name__}: {shown(error)}"))
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
@@ -173,7 +173,11 @@ class CellNode(LifecycleNode):
     def failed(self, member: Member) -> None:
         """A member has given up; once the cell may be running, the time master says what is to be done."""
         if not self._ready:
-            self.fail(LatheError(f"{member.name} failed: {member.message}"), cause="abandoned")
+            self.abandon(member)
+
+    def abandon(self, member: Member) -> None:
+        """Give up because a member has."""
+        self.fail(LatheError(f"{member.name} failed: {member.message}"), cause="abandoned")
 
     def begin(self, *, joins: bool) -> None:
         """Every input and output is matched; ``joins``: the cell is running already."""
@@ -300,8 +304,8 @@ class CellNode(LifecycleNode):
             self.announce()
 
     @property
-    def is_missed(self) -> bool:
-        """Whether it has given up where others of its process may have to go on, to the cell's safe state."""
+    def others_go_on(self) -> bool:
+        """Whether it has given up where the others, of its process too, may have to go on to the cell's safe state."""
         return bool(self.failure) and self._ready and self.master is not None and self.master.name != self.full_name
 
     # ---- membership ---------------------------------------------------------------------------------
@@ -502,12 +506,20 @@ class CellNode(LifecycleNode):
         if self.master is None or self.master.name == self.full_name:
             self._leave([*acknowledged, self._host["progress"]])
 
-    def _leave(self, acknowledged: list[Publisher]) -> None:
+    def farewell(self) -> None:
+        """Stay until the others have heard why it has given up, if they go on without it."""
+        if self.others_go_on:
+            self._wait_for([self._host["members"]])
+
+    def _wait_for(self, acknowledged: list[Publisher]) -> None:
         from rclpy.duration import Duration
 
         for publisher in acknowledged:
             if not publisher.wait_for_all_acked(Duration(seconds=self.patience)):
                 self.get_logger().warning(f"{publisher.topic}: not everybody has acknowledged the last message")
+
+    def _leave(self, acknowledged: list[Publisher]) -> None:
+        self._wait_for(acknowledged)
         self.done = True
         self.reporter("done", self.get_name(), cpu_s=time.process_time())
 

@@ -3,6 +3,7 @@
 
 import time
 from collections import deque
+from collections.abc import Mapping
 
 from lathe_rc_msgs.msg import CellState, Member, Progress
 from rclpy.qos import QoSProfile
@@ -234,7 +235,7 @@ class SpindleNode(StageNode):
             return
         if not self._running and not self._member_names:
             self._begin()
-        self.release()
+        self.attempt(self.release)
         self.next_tick = min(self.next_tick, now + _LOOK)
 
     # ---- those who stall, and those who die ---------------------------------------------------------
@@ -255,21 +256,19 @@ class SpindleNode(StageNode):
             self._heard = now
             self.reporter("back", self.get_name(), member=name)
         if any(now >= until for until in self._dead.values()):
-            self._lose(set(self._dead), "died")  # who was waited for as well: it could not join any more
+            self._lose(dict.fromkeys(self._dead, "died"))  # who was waited for as well: it could not join any more
         elif not self._dead and (self._unsafe or not self._credit()) and now - self._heard > _STALL:
             self._name_the_silent()
             if self._pace.stall_reaction == "safe" and now - self._heard > self._pace.stall_time:
-                self._lose(self._silent_for(now, self._pace.stall_time) or set(self._stalled), "fell silent")
+                silent = self._silent_for(now, self._pace.stall_time) or self._stalled
+                self._lose(dict.fromkeys(silent, "fell silent"))
 
     def failed(self, member: Member) -> None:
         """See `CellNode`: the others go on without it to their safe state, if they can wait until all know."""
-        if not (self._running and self.table.window):
-            self.fail(LatheError(f"{member.name} failed: {member.message}"), cause="abandoned")
-            return
-        self._dead.pop(member.name, None)
-        if self._dead:
-            self._lose(set(self._dead), "died")  # who is waited for could not join any more
-        self._lose({member.name}, f"failed: {member.message}")
+        if self._running and self.table.window:
+            self._lose(dict.fromkeys(self._dead, "died") | {member.name: f"failed: {member.message}"})
+        else:
+            self.abandon(member)
 
     def _silent_for(self, now: float, seconds: float) -> set[str]:
         """Members that DDS has not heard for so long."""
@@ -290,9 +289,13 @@ class SpindleNode(StageNode):
             self.get_logger().warning(f"{name} has been silent for {_STALL * 1e3:.0f} ms at block {blocks}")
             self.reporter("stall", self.get_name(), member=name, blocks=blocks)
 
-    def _lose(self, names: set[str], what: str) -> None:
-        """Bring the cell to its safe state without some members, from the next sample on: once all others know."""
-        who = f"{', '.join(sorted(names))} {what}"
+    def _lose(self, members: Mapping[str, str]) -> None:
+        """Bring the cell to its safe state without some members, from the next sample on: once all others know.
+
+        Args:
+            members: what became of each.
+        """
+        names, who = members.keys(), ", ".join(f"{name} {what}" for name, what in sorted(members.items()))
         if not self.table.window:
             raise LatheError(f"{who} at sample {self.samples}; a cell with window = 0 cannot go on without it")
         self._why = f"{self._why}; {who}" if self._why else f"{who}: safe state from sample {self.samples} on"

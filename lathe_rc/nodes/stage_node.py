@@ -257,8 +257,8 @@ class StageNode(CellNode):
 
     def _on_schedule(self, request: Any, response: Any) -> Any:
         index = max(self.samples, int(request.not_before))
-        if self._waits:
-            response.message = f"{self.full_name} is not ready yet; ask again"
+        if self._waits or self.failure:
+            response.message = str(self.failure or f"{self.full_name} is not ready yet; ask again")
             return response
         try:
             self.stage.schedule(request.action, index)

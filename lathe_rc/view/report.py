@@ -72,7 +72,7 @@ class FormSection:
     figures: Sequence[Picture]
 
 
-def shown(text: str, longest: int = _LONGEST_TEXT) -> str:
+def printable(text: str, longest: int = _LONGEST_TEXT) -> str:
     """A text from a bag: of bounded length, and of what prints, line ends and tabs."""
     cut = text[:longest] + (f" … ({len(text)} characters)" if len(text) > longest else "")
     return "".join(letter if letter.isprintable() or letter in "\n\t" else "\ufffd" for letter in cut)
@@ -106,9 +106,9 @@ def _metrics(form: Form) -> Grid:
 
 
 def _form(form: Form, cycles: Mapping[str, Envelope]) -> FormSection:
-    refused = shown(form.refused)
+    refused = printable(form.refused)
     if form.first is None:
-        return FormSection(shown(form.tool), refused or "the bag holds no complete revolution", None, ())
+        return FormSection(printable(form.tool), refused or "the bag holds no complete revolution", None, ())
     grouped = f" Each line is the mean of {form.map.group} revolutions." if form.map.group > 1 else ""
     page = "docs/metrology.md"
     pictures = [
@@ -139,7 +139,7 @@ def _form(form: Form, cycles: Mapping[str, Envelope]) -> FormSection:
             f"{page}, docs/learning.md",
         ),
     ]
-    return FormSection(shown(form.tool), refused, _metrics(form), pictures)
+    return FormSection(printable(form.tool), refused, _metrics(form), pictures)
 
 
 def _signals(told: Gathered) -> list[Picture]:
@@ -183,12 +183,12 @@ def _nodes(told: Gathered) -> Grid | None:
     levels = ("ok", "warning", "error", "stale")
     rows = [
         [
-            shown(name),
+            printable(name),
             str(node.reports),
             levels[node.level] if node.level < len(levels) else "?",
-            shown(node.values.get("blocks", "–"), 20),
-            shown(node.values.get("lost blocks", "–"), 20),
-            shown(node.message),
+            printable(node.values.get("blocks", "–"), 20),
+            printable(node.values.get("lost blocks", "–"), 20),
+            printable(node.message),
         ]
         for name, node in host.nodes.items()
     ]
@@ -212,7 +212,7 @@ def _losses(told: Gathered) -> list[str]:
         found.append(f"{host.unreadable} messages of host topics cannot be decoded")
     if host.left_out:
         found.append(f"{host.left_out} lines of host topics beyond those shown")
-    return [shown(text) for text in found]
+    return [printable(text) for text in found]
 
 
 def _topics(told: Gathered) -> Grid:
@@ -225,8 +225,8 @@ def _topics(told: Gathered) -> Grid:
 
     rows = (
         [
-            shown(topic),
-            shown(tally.type.rpartition("/")[2]),
+            printable(topic),
+            printable(tally.type.rpartition("/")[2]),
             str(tally.count),
             str(told.samples) if tally.type in dense else "",
             _number(tally.rate),
@@ -246,7 +246,7 @@ def _events(told: Gathered) -> Grid | None:
     if not told.curves.events:
         return None
     rows: list[Sequence[str]] = [
-        [shown(event.topic), str(event.index), _number(event.index * told.step_ns * 1e-9), shown(event.action)]
+        [printable(event.topic), str(event.index), _number(event.index * told.step_ns * 1e-9), printable(event.action)]
         for event in told.curves.events
     ]
     if told.curves.event_count > len(rows):
@@ -262,7 +262,7 @@ def _versions(told: Gathered) -> Grid | None:
         return None
     if not isinstance(given, dict) or not given:
         return None
-    rows = ([shown(name), shown(str(number))] for name, number in given.items())
+    rows = ([printable(name), printable(str(number))] for name, number in given.items())
     return Grid(("made with", "version"), _cut(rows, len(given)), "", "docs/bags.md", ("made with", "version"))
 
 
@@ -271,7 +271,7 @@ def _about(told: Gathered) -> Grid | None:
     if not given:
         return None
     rows = (
-        [shown(key), f"{len(text)} characters of base64" if key.startswith(FILE) else shown(text)]
+        [printable(key), f"{len(text)} characters of base64" if key.startswith(FILE) else printable(text)]
         for key, text in sorted(given.items())
     )
     caption = "What else the bag says of itself."
@@ -287,7 +287,7 @@ def _facts(told: Gathered) -> list[Fact]:
             facts.append(Fact("RMS, first revolution", f"{_number(form.first.numbers['rms'])} µm"))
             facts.append(Fact("RMS, last revolution", f"{_number(form.last.numbers['rms'])} µm"))
     if told.run_id:
-        facts.append(Fact("run", shown(told.run_id, 16)))
+        facts.append(Fact("run", printable(told.run_id, 16)))
     return facts
 
 
@@ -314,8 +314,8 @@ def render(told: Gathered, name: str, command: str) -> str:
             caption = "What each controller measured in its own cycles."
             signals.append(Picture("Convergence", figures.convergence(None, cycles), caption, "docs/learning.md"))
     text: str = environment.get_template("report.html.j2").render(
-        title=f"Report of {shown(name, 80)}",
-        command=shown(command),
+        title=f"Report of {printable(name, 80)}",
+        command=printable(command),
         version=__version__,
         facts=_facts(told),
         forms=forms,
@@ -323,12 +323,12 @@ def render(told: Gathered, name: str, command: str) -> str:
         timing=timing,
         nodes=_nodes(told),
         losses=_losses(told),
-        states=[shown(state) for state in told.host.states],
+        states=[printable(state) for state in told.host.states],
         topics=_topics(told),
         events=_events(told),
         versions=_versions(told),
         about=_about(told),
-        scenario=shown(told.about.get(SCENARIO, ""), _LONGEST_SCENARIO),
+        scenario=printable(told.about.get(SCENARIO, ""), _LONGEST_SCENARIO),
     )
     return text
 

@@ -15,7 +15,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Block, Decoder
-from lathe_rc.errors import LatheError
+from lathe_rc.errors import LatheError, shown
 from lathe_rc.view.rerun_blueprint import blueprint
 from lathe_rc.view.rerun_heard import Order
 from lathe_rc.view.rerun_pieces import Pieces
@@ -133,7 +133,7 @@ class _Run:
         if not complete:
             self._scene.note(self._end, "the end of the run was not heard")
         self._scene.close()
-        shown = Shown(
+        seen = Shown(
             self._run_id,
             self._file,
             self._pieces.first,
@@ -143,16 +143,16 @@ class _Run:
             complete,
         )
         self._say(
-            f"run {self._name}: {shown.revolutions} revolutions shown, {shown.left_out} pieces left out"
+            f"run {self._name}: {seen.revolutions} revolutions shown, {seen.left_out} pieces left out"
             + ("" if complete else "; its end was not heard")
         )
         try:
             self._recording.flush(timeout_sec=_FLUSH)
         except (RuntimeError, ValueError) as error:
-            raise LatheError(f"the view cannot be written ({error})") from None
+            raise LatheError(f"the view cannot be written ({shown(error)})") from None
         finally:
             self._recording.disconnect()
-        return shown
+        return seen
 
 
 class Live:

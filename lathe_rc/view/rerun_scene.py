@@ -15,7 +15,7 @@ import rerun as rr
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals, full
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.errors import LatheError
+from lathe_rc.errors import LatheError, shown
 from lathe_rc.view import happened
 from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.happened import HAPPENED
@@ -291,4 +291,4 @@ def _written() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        raise LatheError(f"the view cannot be written ({error}); is the disk full?") from None
+        raise LatheError(f"the view cannot be written ({shown(error)}); is the disk full?") from None
