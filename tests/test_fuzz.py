@@ -185,6 +185,16 @@ def test_index_that_would_cost_memory_or_time_is_refused(tmp_path, data, summary
         check(mcap(tmp_path / "bad.mcap", data, summary))
 
 
+@pytest.mark.parametrize("length", [2**33, 2**56])
+def test_header_that_is_longer_than_its_file_is_refused_unread(tmp_path, length):
+    path = mcap(tmp_path / "bad.mcap", b"", SCHEMA + STATISTICS)
+    data = bytearray(path.read_bytes())
+    data[9:17] = struct.pack("<Q", length)
+    path.write_bytes(data)
+    with refused("cut off at byte 8"):
+        check(path)
+
+
 def test_times_of_an_index_are_not_added_up_in_memory(tmp_path):
     """A chunk of 8 million messages comes in batches."""
     message = record(5, struct.pack("<HIQQ", 1, 0, 5, 5))

@@ -137,6 +137,8 @@ def summary_of(path: Path) -> bool:
         footer = read_record(stream, size - len(MCAP0_MAGIC))
         if footer is None or footer[0] != Opcode.FOOTER:
             raise ValueError(f"{path.name}: no footer")
+        stream.seek(len(MCAP0_MAGIC))
+        read_record(stream, size - len(MCAP0_MAGIC))  # the header, which rosbags reads however long it says it is
         start, end = Footer.read(ReadDataStream(BytesIO(footer[1]))).summary_start, size - _FOOTER
         if not start:
             return False
