@@ -75,14 +75,14 @@ def senders(topic, own):
 
 
 @contextlib.contextmanager
-def all_the_time(sends):
+def all_the_time(sends, pause=0.002):
     """Publishes the messages of ``sends``, pairs of publisher and message, again and again."""
     over = threading.Event()
 
     def work():
         for publisher, message in itertools.cycle(sends):
             publisher.publish(message)
-            if over.wait(0.002):
+            if over.wait(pause):
                 return
 
     thread = threading.Thread(target=work)
@@ -133,6 +133,16 @@ def test_a_cell_goes_on_among_strangers(ghost, domain, tmp_path):
     values = {pair.key: pair.value for pair in diagnostics(tmp_path / "bag")["/learning_controller"].values}
     assert "from /nan of run 'test' on /tool" in values["refused"]
     assert "/haunted/ghost" in values["publishers of /tool"]
+
+
+def test_a_cell_begins_in_a_flood_of_announcements(ghost, domain):
+    """It pushes those that belong out of the readers of nodes that are still busy with their start."""
+    sends = [(ghost.create_publisher(Member, "/members", latched_qos(10)), Member(run_id="elsewhere", name="/x"))]
+    cell = scenario(spindle_encoder={"revolutions": 2.0})
+    with all_the_time(sends, pause=0.0005):
+        result = harness.run(cell, mode="processes", groups=[], domain=domain)
+    assert result.digest == harness.run(cell).digest
+    assert result.refused["/x of run 'elsewhere' on /members"] > 256
 
 
 def test_who_speaks_in_the_name_of_a_member_makes_the_cell_safe_and_all_publishers_are_named(ghost, domain, tmp_path):

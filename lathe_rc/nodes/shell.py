@@ -33,6 +33,7 @@ from lathe_rc.nodes.watch import Watch, liveliness, this_host
 
 _TICK = 0.02  # [s] between looks at the graph while members join
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
+_REPEAT_PERIOD = 0.5  # [s] between announcements before the run, and in the safe state
 _LATCHED_DEPTH = 256
 _PATIENCE = 2.0  # [s] for others to acknowledge the last messages
 _GIVEN_UP = 2.0  # [s] of silence after which a time master is lost in a cell that does not wait
@@ -90,6 +91,7 @@ class CellNode(LifecycleNode):
         self._reported_blocks = 0
         self._heard_elsewhere = True  # whether anybody beside the time master reads the progress
         self._diagnostics_due = time.monotonic() + _DIAGNOSTICS_PERIOD
+        self._repeat_due = 0.0
         self._host: dict[str, Publisher] = {}
         self.outlets: dict[str, Publisher] = {}
         self.inlets: dict[str, Subscription] = {}
@@ -530,11 +532,19 @@ class CellNode(LifecycleNode):
             if not self._ready:
                 self.attempt(self._settle)
             self.attempt(self.look_after_others)
+            self._repeat(now)
         if "progress" in self._host:
             self._heard_elsewhere = self._host["progress"].get_subscription_count() > 1
         if self.active and now >= self._diagnostics_due:
             self._diagnostics_due = now + _DIAGNOSTICS_PERIOD
             self._publish_diagnostics()
+
+    def _repeat(self, now: float) -> None:
+        """Announce itself again as long as others wait for that: a flood of strangers may have pushed it out."""
+        of_a_cell = self.master is not None or self.member_names()
+        if of_a_cell and self._cell != CellState.RUNNING and not self.failure and now >= self._repeat_due:
+            self._repeat_due = now + _REPEAT_PERIOD
+            self.announce()
 
     def _level(self) -> bytes:
         if self.failure:
