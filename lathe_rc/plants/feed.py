@@ -358,10 +358,10 @@ class FeedDrive:
             half=backlash / 2.0,
         )
         self.state = np.zeros(2 * held.size + 3)
-        self._limits = _limits(model, limits, command_limit, divisor * step)
+        self._limited, self._limits = limits.any, _limits(model, limits, command_limit, divisor * step)
         self._memory = np.append(rest(), 0.0)
         self.saturated = self.limited = 0
-        self._step, self._sampling = step, (divisor, float(resolution), feedback == "load", limits.any)
+        self._step, self._sampling = step, (divisor, float(resolution), feedback == "load", self._limited)
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
         """Motor over command, as the difference equation has it, at ``frequency`` [rad/s]; limits and divisor apart."""
@@ -394,8 +394,11 @@ class FeedDrive:
             motor: position of the motor, on the slide's scale [m].
             measured: that of the two which the sensor sees, as it reads it [m].
             disturbance: adds to the limited command, in its unit (f of paper 002, eq. 2); none if empty.
-            clipped: filled with 1 where the command that is held is not what it was when it was taken; or empty.
+            clipped: filled with 1 where the command that is held is not what it was when it was taken; needed if there
+                are limits, else it may be empty.
         """
+        wanted = command.size if self._limited or clipped.size else 0
+        assert clipped.size == wanted, "room for what is clipped"
         saturated, limited = _advance(
             self.table,
             self._limits,
