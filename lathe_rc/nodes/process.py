@@ -74,7 +74,17 @@ def _start(nodes: Sequence[CellNode], exchange: Exchange) -> None:
 
 def _due(nodes: Sequence[CellNode], now: float) -> float:
     """When the next tick of a node is due; now if there is none."""
-    return min((node.next_tick for node in nodes if not (node.done or node.failure)), default=now)
+    return min((node.next_tick for node in nodes if not node.done), default=now)
+
+
+def _tick(nodes: Sequence[CellNode], now: float) -> None:
+    """Let nodes do what is due; one that has given up, and stays, has nothing more to write."""
+    for node in nodes:
+        leaves = node.done or (node.failure and not node.others_go_on)
+        if now >= node.next_tick and not leaves:
+            node.tick(now)
+        if node.failure:
+            node.finish()
 
 
 def _work(nodes: Sequence[CellNode], stop: _Stop, until: float) -> None:
@@ -96,10 +106,8 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
     while not stop.signal:
         now = time.monotonic()
         if _due(nodes, now) <= now:
-            for node in nodes:
-                if now >= node.next_tick and not (node.done or node.failure):
-                    node.tick(now)
-            if all(node.done or node.failure for node in nodes):
+            _tick(nodes, now)
+            if all(node.done for node in nodes):
                 return
             if any(node.failure and not node.others_go_on for node in nodes):
                 return
@@ -169,7 +177,6 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
         return error.exit_code
     finally:
         for node in nodes:
-            node.farewell()
             node.finish()
             if node.strangers.senders:
                 reporter("refused", node.get_name(), senders=node.strangers.senders)

@@ -33,7 +33,7 @@ from lathe_rc.nodes.watch import Watch, liveliness, this_host
 
 _TICK = 0.02  # [s] between looks at the graph while members join
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
-_REPEAT_PERIOD = 0.5  # [s] between announcements before the run, and in the safe state
+_REPEAT_PERIOD = 0.5  # [s] between announcements before the run, in the safe state, and after it has given up
 _LATCHED_DEPTH = 256
 _PATIENCE = 2.0  # [s] for others to acknowledge the last messages
 _GIVEN_UP = 2.0  # [s] of silence after which a time master is lost in a cell that does not wait
@@ -52,7 +52,7 @@ class CellNode(LifecycleNode):
     Attributes:
         table: its parameters, once configured.
         over: it has finished its part of the run.
-        done: it may leave: in a cell, all have finished theirs.
+        done: it may leave: in a cell, all have finished theirs, also if it has given up its own.
         failure: why it gave up.
         due: messages have come since it last worked.
         handled: messages received so far.
@@ -143,7 +143,7 @@ class CellNode(LifecycleNode):
             "diagnostics": add(DiagnosticArray, "/diagnostics", QoSProfile(depth=100)),
         }
         self.create_subscription(Member, "members", self.guarded(self._on_member), latched_qos(_LATCHED_DEPTH))
-        self.create_subscription(CellState, "cell_state", self.guarded(self._on_cell_state), latched_qos())
+        self.create_subscription(CellState, "cell_state", self.guarded(self._on_cell_state, always=True), latched_qos())
         self.create_publisher(Empty, f"~/{messages.ALIVE}", liveliness())
         self.watch = Watch(self, lambda: self.attempt(self.look_after_others))
         self.active = True
@@ -200,13 +200,18 @@ class CellNode(LifecycleNode):
         """Fully qualified name of a relative topic after all remapping."""
         return str(self.resolve_topic_name(remapped(self.table, relative)))
 
-    def guarded(self, callback: Callable[[Any], object]) -> Callable[[Any], None]:
-        """A callback that fails the node, by name and in one line, instead of the process with a traceback."""
+    def guarded(self, callback: Callable[[Any], object], *, always: bool = False) -> Callable[[Any], None]:
+        """A callback that fails the node, by name and in one line, instead of the process with a traceback.
+
+        Args:
+            callback: takes a message.
+            always: whether it also hears what comes after the node has given up.
+        """
 
         def call(message: Any) -> None:
             self.handled += 1
             self.due = True
-            if not self.active or self.failure:
+            if not self.active or (self.failure and not always):
                 return
             try:
                 callback(message)
@@ -304,6 +309,11 @@ class CellNode(LifecycleNode):
         self.reporter(cause, self.get_name(), message=str(error), exit_code=error.exit_code)
         if self._host:
             self.announce()
+        self._leave_with_the_cell()
+
+    def _leave_with_the_cell(self) -> None:
+        """Leave, having given up, if nobody goes on any more."""
+        self.done = self.done or self._cell in (CellState.ENDED, CellState.FAILED)
 
     @property
     def others_go_on(self) -> bool:
@@ -413,11 +423,13 @@ class CellNode(LifecycleNode):
                 raise Stranger(self.topic("cell_state"), "", state.run_id, f"expected run {self.table.run_id!r}")
             return
         self._cell = state.state
-        if state.state == CellState.ENDED and self.over and not self.done:
+        if self.failure:
+            self._leave_with_the_cell()
+        elif state.state == CellState.ENDED and self.over and not self.done:
             self._leave([])
-        if state.state == CellState.FAILED:
+        elif state.state == CellState.FAILED:
             self.fail(LatheError(f"the cell failed: {state.message}"), cause="abandoned")
-        if state.state == CellState.SAFE:
+        elif state.state == CellState.SAFE:
             self._go_safe(state)
 
     def _go_safe(self, state: CellState) -> None:
@@ -433,12 +445,14 @@ class CellNode(LifecycleNode):
 
     def look_after_others(self) -> None:
         """Leave if the time master is gone: without it no sample follows."""
-        if self.master is None or self.failure or self.done or not self.master.members:
+        if self.master is None or self.done or not self.master.members:
             return
         name = self.master.name
         silent = time.monotonic() - self.watch.silent.get(name, math.inf)
         if name in self.watch.ended() or (silent > _GIVEN_UP and self._parameter(name, "stall_reaction") == "safe"):
-            if self.over:
+            if self.failure:
+                self.done = True
+            elif self.over:
                 self._leave([])
             else:
                 self.fail(LatheError(f"{name}, the time master, is lost: no sample follows"), cause="abandoned")
@@ -502,26 +516,18 @@ class CellNode(LifecycleNode):
         """The node's part is over. In a cell it stays until all have ended; else until others have its last messages.
 
         A process that leaves while messages are under way may take a lock of the transport with it, and those who
-        send to the same reader wait for ever.
+        send to the same reader wait for ever. So one that has given up stays as well, while the others go on.
         """
         self.over = True
         if self.master is None or self.master.name == self.full_name:
             self._leave([*acknowledged, self._host["progress"]])
 
-    def farewell(self) -> None:
-        """Stay until the others have heard why it has given up, if they go on without it."""
-        if self.others_go_on:
-            self._wait_for([self._host["members"]])
-
-    def _wait_for(self, acknowledged: list[Publisher]) -> None:
+    def _leave(self, acknowledged: list[Publisher]) -> None:
         from rclpy.duration import Duration
 
         for publisher in acknowledged:
             if not publisher.wait_for_all_acked(Duration(seconds=self.patience)):
                 self.get_logger().warning(f"{publisher.topic}: not everybody has acknowledged the last message")
-
-    def _leave(self, acknowledged: list[Publisher]) -> None:
-        self._wait_for(acknowledged)
         self.done = True
         self.reporter("done", self.get_name(), cpu_s=time.process_time())
 
@@ -540,9 +546,9 @@ class CellNode(LifecycleNode):
             self._publish_diagnostics()
 
     def _repeat(self, now: float) -> None:
-        """Announce itself again as long as others wait for that: a flood of strangers may have pushed it out."""
+        """Announce itself again as long as others may wait for that: a flood of strangers may have pushed it out."""
         of_a_cell = self.master is not None or self.member_names()
-        if of_a_cell and self._cell != CellState.RUNNING and not self.failure and now >= self._repeat_due:
+        if of_a_cell and (self._cell != CellState.RUNNING or self.failure) and now >= self._repeat_due:
             self._repeat_due = now + _REPEAT_PERIOD
             self.announce()
 
