@@ -49,6 +49,20 @@ def test_who_has_it_in_memory_is_left_alone(port):
     assert leftovers.sweep(port.parent) == [port.name]
 
 
+def test_sweeps_wait_for_one_another(port, monkeypatch):
+    """One would take a port that the other holds for one at which somebody listens, and leave it in the way."""
+
+    def is_mapped(_):
+        other = os.open(port.parent, os.O_RDONLY)
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.close(other)
+        return False
+
+    monkeypatch.setattr(leftovers, "_is_mapped", is_mapped)
+    assert leftovers.sweep(port.parent) == [port.name]
+
+
 def test_a_machine_without_shared_memory(tmp_path):
     assert leftovers.sweep(tmp_path / "nowhere") == []
 

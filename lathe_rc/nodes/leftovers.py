@@ -9,7 +9,8 @@ one get lost, and its cell stands still before the first block. So what nobody u
 import fcntl
 import os
 import re
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 FOLDER = Path("/dev/shm")  # noqa: S108 - where POSIX shared memory is on Linux
@@ -20,10 +21,24 @@ _LOCKS = ("_el", "_sl")  # of who listens alone, and of those who listen togethe
 def sweep(folder: Path = FOLDER) -> list[str]:
     """Remove the ports that this user's processes have left; their names.
 
-    A port is in use as long as one of its lock files is locked or a process has it in its memory.
+    A port is in use as long as one of its lock files is locked or a process has it in its memory. Sweeps wait for one
+    another: a port that another sweep holds would be taken for one at which somebody listens, and stay.
     """
-    ports = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [port.name for port in ports if _PORT.fullmatch(port.name) and _is_ours(port) and _remove(port)]
+    if not folder.is_dir():
+        return []
+    with _alone(folder):
+        ports = sorted(folder.iterdir())
+        return [port.name for port in ports if _PORT.fullmatch(port.name) and _is_ours(port) and _remove(port)]
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(opened, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(opened)
 
 
 def _is_ours(port: Path) -> bool:
