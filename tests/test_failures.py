@@ -147,7 +147,7 @@ def test_a_member_that_fails_by_an_error_ends_in_the_safe_state(mode, groups, tm
     assert safe["lost"] == ["/learning_controller"]
     (complete,) = [event["monotonic_ns"] for event in events if event["event"] == "complete"]
     left = [event["monotonic_ns"] for event in events if event["event"] == "exit"]
-    assert all(complete < moment for moment in left), "who leaves while messages are under way may take a lock of DDS with it"
+    assert all(complete < moment for moment in left), "who leaves in mid-traffic may take a lock of DDS with it"
     recording = reader.read(bag)
     assert {signals.size for fields in recording.dense.values() for signals in fields.values()} == {safe["end"]}
     assert recording.of_type(messages.STATE)["position"][-1] == pytest.approx(0.3e-3, abs=1e-6)

@@ -23,6 +23,7 @@ from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
 from lathe_rc.commands.report import report
 from lathe_rc.errors import InputError
 from lathe_rc.view import report as reporting
+from lathe_rc.view.report_figures import timing
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_gather import gather
 from lathe_rc.view.report_host import CELL_STATE, DIAGNOSTICS, Host
@@ -273,6 +274,13 @@ class TestHost:
         host.add(DIAGNOSTICS, master(16.0, 3500, "3:x", "9:2900"))  # broken: the one before counts
         assert str(host.latency["/spindle"]) == "9:2900 12:100"
         assert host.lost_blocks == {"/spindle": 2}
+
+    @pytest.mark.parametrize("paces", [(), (1e12,), (1e12, 1e12 + 1e-3), (64000.0, 32000.0, 1e300)])
+    def test_paces_that_are_all_but_the_same_make_a_histogram(self, paces):
+        host = Host()
+        for pace in paces:
+            host.pace.add(pace)
+        assert timing(host, 1.0).startswith("data:image/svg")
 
     def test_failures_are_told_once_and_bounded(self):
         host = Host()

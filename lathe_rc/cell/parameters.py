@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 from lathe_rc.cell.messages import MAX_BLOCK
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, shown
 
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
 
@@ -102,7 +102,7 @@ class Table(BaseModel):
             name = str(first["loc"][0])
             if first["type"] == "extra_forbidden":
                 known = ", ".join(sorted(cls.model_fields))
-                raise InputError(f"{node}.{name}: unknown parameter; allowed: {known}") from None
+                raise InputError(f"{shown(f'{node}.{name}')}: unknown parameter; allowed: {known}") from None
             given = f"{values[name]!r:.200}"
             raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
 

@@ -27,6 +27,7 @@ _TICKS = 8  # font size
 _LONGEST_LABEL = 60  # characters
 _MOST_LENGTH = 1e3  # [m]
 _MOST_VALUE = 1e12  # of other signals
+_ALMOST = 1e-9  # of their size, by which numbers that are told apart differ
 STYLE: Any = {"svg.hashsalt": "lathe_rc", "axes.titlesize": 10, "axes.labelsize": 9, "legend.fontsize": 8}
 STYLE |= {"xtick.labelsize": _TICKS, "ytick.labelsize": _TICKS}
 
@@ -185,6 +186,15 @@ def against_time(told: Gathered, curves: Mapping[str, Envelope], unit: str, scal
     return _svg(figure)
 
 
+def _told_apart(numbers: Samples) -> tuple[float, float] | None:
+    """Range of a histogram; numbers that are all but the same get one that can be cut into bins."""
+    if not numbers.size:
+        return None
+    low, high = float(numbers.min()), float(numbers.max())
+    least = _ALMOST * max(abs(low), abs(high))
+    return (low, high) if high - low > least else (low - 0.5 - least, high + 0.5 + least)
+
+
 def timing(host: Host, step: float) -> str:
     """Histograms of pace, and of lateness and latency of blocks where there are any; ``step`` in s."""
     figure = _figure(2.8)
@@ -198,7 +208,8 @@ def timing(host: Host, step: float) -> str:
     ]
     pace, *others = figure.subplots(1, 1 + len(counted), squeeze=False)[0]
     numbers = np.clip(host.pace.values(), -_MOST_VALUE, _MOST_VALUE) * step
-    pace.hist(numbers, bins=min(30, max(5, numbers.size // 3)), color=_GREY, edgecolor="white", lw=0.5)
+    bins = min(30, max(5, numbers.size // 3))
+    pace.hist(numbers, bins=bins, range=_told_apart(numbers), color=_GREY, edgecolor="white", lw=0.5)
     pace.set(xlabel="simulated by wall time [s/s]", ylabel="reports", title="pace")
     pace.yaxis.get_major_locator().set_params(integer=True)
     for axes, (title, label, counts, colour) in zip(others, counted, strict=True):
