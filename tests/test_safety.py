@@ -322,7 +322,7 @@ def index_fault(angle, pulse, limit):
 
 
 def growth_fault(angle, error, limit, needed, floor):
-    turn, squares, count, before, grown = 0.0, [0.0] * 8, 0, math.nan, 0  # added up in an order that is quick
+    turn, squares, count, before, grown = 0.0, [0.0] * 32, 0, math.nan, 0  # added up in an order that is quick
     for k in range(angle.size):
         now = np.floor(angle[k] / TURN)
         if now != turn:
@@ -330,8 +330,8 @@ def growth_fault(angle, error, limit, needed, floor):
             grown = grown + 1 if rms > limit * before and rms > floor else 0
             if grown >= needed:
                 return k, rms / before
-            turn, squares, count, before = now, [0.0] * 8, 0, rms
-        squares[count % 8] += error[k] * error[k]
+            turn, squares, count, before = now, [0.0] * 32, 0, rms
+        squares[count % 32] += error[k] * error[k]
         count += 1
     return None, None
 

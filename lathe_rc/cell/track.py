@@ -52,11 +52,12 @@ class Track:
         self._late = [self._arrays[name] for name, delay in delays.items() if delay]
         self._base = -self.delay  # sample index of element 0
         self._block, self._views = block, dict[int, Signals]()
+        self._first, self._size, self._newest = 0, 0, Signals()  # what was added last
         self.end = 0  #: index after the newest sample
 
     def __getstate__(self) -> dict[str, Any]:
         """What is worth keeping: views of arrays would be kept as copies."""
-        return {**self.__dict__, "_views": {}}
+        return {**self.__dict__, "_views": {}, "_size": 0, "_newest": {}}
 
     def _at(self, start: int, samples: int) -> Signals:
         """Views of ``samples`` elements from ``start`` on; those of whole blocks are made once."""
@@ -73,12 +74,14 @@ class Track:
             for array in self._late:
                 array[: self.delay] = array[shift : shift + self.delay]
             self._base += shift
-        start = self.end - self._base
+        self._first, self._size, self._newest = self.end, samples, self._at(self.end - self._base, samples)
         self.end += samples
-        return self._at(start, samples)
+        return self._newest
 
     def view(self, first: int, samples: int) -> Signals:
         """Views of the samples ``first`` on, which must have been added and not be older than the longest delay."""
+        if first == self._first and samples == self._size:
+            return self._newest
         start = first - self._base
         assert start >= 0, "samples are too old"
         assert first + samples <= self.end, "samples are not there yet"
@@ -89,3 +92,4 @@ class Track:
         for array in self._arrays.values():
             array[:] = 0
         self._base, self.end = first - self.delay, first
+        self._first, self._size, self._newest = first, 0, {}

@@ -161,10 +161,19 @@ def _beyond(value: float, offset: float, low: float, high: float) -> bool:
 
 @kernel
 def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
-    """0 if a sample is beyond, or -1; the memory: offset, lower and upper limit."""
-    offset, low, high = memory[0], memory[1], memory[2]
+    """0 if so many samples in a row may be beyond here or from the last one on, or -1.
+
+    The memory: offset, lower and upper limit, how many. Where n are needed, every n-th one and the last tell: n in a
+    row cannot pass between them, if the sample before the first was not beyond.
+    """
+    offset, low, high, needed = memory[0], memory[1], memory[2], int(memory[3])
     count = 0
-    if other.size:
+    if needed > 1:
+        for k in range(needed - 1, signal.size, needed):
+            count += _beyond(signal[k] - (other[k] if other.size else 0.0), offset, low, high)
+        for k in range(max(signal.size - 1, 0), signal.size):
+            count += _beyond(signal[k] - (other[k] if other.size else 0.0), offset, low, high)
+    elif other.size:
         for k in range(signal.size):
             count += _beyond(signal[k] - other[k], offset, low, high)
     else:
@@ -212,7 +221,7 @@ class Threshold(Ruled):
         samples: int = 1,
         after: float = 0.0,
     ) -> None:
-        memory = (offset, -limit, limit)
+        memory = (offset, -limit, limit, samples)
         super().__init__(name, subject, limit, reaction, rule=_THRESHOLD, signal=signal, other=other, memory=memory)
         self._samples, self._patience, self._run = samples, Patience(after), 0
 
@@ -258,7 +267,7 @@ class Below(Threshold):
         after: float = 0.0,
     ) -> None:
         super().__init__(name, subject, limit, reaction, signal=signal, samples=samples, after=after)
-        self.memory[:] = 0.0, limit, np.inf
+        self.memory[:3] = 0.0, limit, np.inf
 
     def _told(self, value: float) -> float:
         """See `Threshold`."""
@@ -351,12 +360,13 @@ def _index(angle: Array, pulse: Pulses, memory: Array) -> int:
         if not count:
             continue
         for k in range(angles.size):
-            since = angles[k] - memory[1]
+            since = angles[k] - last
             if _off(since, limit) or (pulses[k] > 0 and since < _TURN - limit):
-                memory[2] = abs(since - _TURN)
+                memory[1], memory[2] = last, abs(since - _TURN)
                 return start + k
             if pulses[k] > 0:
-                memory[1] = angles[k]
+                last = angles[k]
+        memory[1] = last
     return -1
 
 
@@ -379,50 +389,58 @@ class IndexPulses(Ruled):
 
 @inlined
 def _add_squares(sums: Array, count: int, values: Array) -> None:
-    """Add squares to sums of every eighth one of a revolution, the same whatever the blocks; ``count`` came before."""
-    head = min(-count & 7, values.size)
+    """Add squares to sums of every n-th one of a revolution, the same whatever the blocks; ``count`` came before.
+
+    One sum would wait for itself; so many are vectors.
+    """
+    start = count % sums.size
+    head = min(sums.size - start, values.size)
     for k in range(head):
-        sums[count + k & 7] += values[k] * values[k]
-    end = values.size - (values.size - head & 7)
-    # Each has a name: what is in an array waits for the store of the one before.
-    s0, s1, s2, s3, s4, s5, s6, s7 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7]
-    for k in range(head, end, 8):
-        s0 += values[k] * values[k]
-        s1 += values[k + 1] * values[k + 1]
-        s2 += values[k + 2] * values[k + 2]
-        s3 += values[k + 3] * values[k + 3]
-        s4 += values[k + 4] * values[k + 4]
-        s5 += values[k + 5] * values[k + 5]
-        s6 += values[k + 6] * values[k + 6]
-        s7 += values[k + 7] * values[k + 7]
-    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7] = s0, s1, s2, s3, s4, s5, s6, s7
-    for k in range(end, values.size):
-        sums[count + k & 7] += values[k] * values[k]
+        sums[start + k] += values[k] * values[k]
+    for first in range(head, values.size, sums.size):
+        row = values[first : first + sums.size]
+        for k in range(row.size):
+            sums[k] += row[k] * row[k]
 
 
+_SUMS = 32
 _NEAR = 1e-9  # of a revolution: so close to its ends its number is not taken for known
+
+
+@inlined
+def _surely(turn: float) -> tuple[float, float]:
+    """Angles between which the revolution is this one, without a division."""
+    return (turn + _NEAR) * _TURN, (turn + 1.0 - _NEAR) * _TURN
+
+
+@inlined
+def _add(error: Array, memory: Array) -> None:
+    """More errors of the same revolution, see `_growing`."""
+    _add_squares(memory[8:], int(memory[4]), error)
+    memory[4] += error.size
 
 
 @kernel
 def _turning(angle: Array, error: Array, memory: Array) -> int:
     """See `_growing`, for samples among which a revolution may begin."""
     limit, floor, needed, state, sums = memory[0], memory[1], memory[2], memory[3:8], memory[8:]
-    first = 0
+    first, low, high = 0, *_surely(state[0])
     for k in range(angle.size):
+        if low <= angle[k] <= high:
+            continue
         turn = np.floor(angle[k] / _TURN)
         if turn != state[0]:
-            _add_squares(sums, int(state[1]), error[first:k])
-            samples = state[1] + (k - first)
-            rms = np.sqrt(np.sum(sums) / samples) if samples > 0.0 else np.nan
+            _add(error[first:k], memory)
+            rms = np.sqrt(np.sum(sums) / state[1]) if state[1] > 0.0 else np.nan
             grown = rms > limit * state[2] and rms > floor
             state[3] = state[3] + 1.0 if grown else 0.0
             if grown and state[3] >= needed:
                 state[4] = rms / state[2]
                 return k
             state[0], state[1], state[2], first = turn, 0.0, rms, k
+            low, high = _surely(turn)
             sums[:] = 0.0
-    _add_squares(sums, int(state[1]), error[first:])
-    state[1] += angle.size - first
+    _add(error[first:], memory)
     return -1
 
 
@@ -431,25 +449,26 @@ def _growing(angle: Array, error: Array, memory: Array) -> int:
     """First sample at which the RMS error has grown often enough, or -1.
 
     The memory: limit, floor, revolutions needed; revolution, samples, RMS of the one before, how many have grown, by
-    how much; eight sums of squares.
+    how much; sums of squares.
     """
+    begin = 0  # of what is not in the sums
     for start in range(0, angle.size, _STRETCH):
-        angles, errors = angle[start : start + _STRETCH], error[start : start + _STRETCH]
-        low, high = (memory[3] + _NEAR) * _TURN, (memory[3] + 1.0 - _NEAR) * _TURN
+        angles = angle[start : start + _STRETCH]
+        low, high = _surely(memory[3])
         count = 0
         for k in range(angles.size):
             count += _beyond(angles[k], 0.0, low, high)
         if count:
-            found = _turning(angles, errors, memory)
+            _add(error[begin:start], memory)
+            begin = start + angles.size
+            found = _turning(angles, error[start:begin], memory)
             if found >= 0:
                 return start + found
-        else:
-            _add_squares(memory[8:], int(memory[4]), errors)
-            memory[4] += errors.size
+    _add(error[begin:], memory)
     return -1
 
 
-_UNKNOWN = (0.0, 0.0, np.nan, 0.0, np.nan, *[0.0] * 8)  # what is known of the growth at first
+_UNKNOWN = (0.0, 0.0, np.nan, 0.0, np.nan, *[0.0] * _SUMS)  # what is known of the growth at first
 
 
 class Growth(Ruled):
