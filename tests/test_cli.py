@@ -152,7 +152,7 @@ def assert_refused(result, *texts):
         (["tool.profile=csv", "tool.profile_file=."], "cannot be read"),
         (["tool.fed=1"], "tool.fed: unknown parameter"),
         (["fork.feed=1"], "no node 'fork'"),
-        (["feed=1"], "feed is not shared"),
+        (["feed=1"], "'feed' is not shared"),
         (["nonsense"], "--set 'nonsense'"),
         (["tool.feed=fast"], "tool.feed = 'fast'; allowed: a finite number"),
         (["tool.feed=nan"], "tool.feed = nan; allowed: a finite number"),

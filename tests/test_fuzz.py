@@ -367,7 +367,9 @@ def test_run_of_a_bag_writes_to_no_file_that_the_bag_names(tmp_path):
     [
         ({f"{story.FILE}tool.profile_file": "a"}, "is not base64"),
         ({f"{story.FILE}tool.profile_file": "\u00e9"}, "is not base64"),
-        ({f"{story.FILE}a=b.c": ""}, "a is not shared"),
+        ({f"{story.FILE}a=b.c": ""}, "'a' is not shared"),
+        ({f"{story.FILE}a\nb=c.d": ""}, r"'a\\nb' is not shared"),
+        ({f"{story.FILE}tool.a\nb=c: d: e.f": ""}, r"^--set tool\.a:1: not YAML"),
         ({f"{story.FILE}tool.a\nb": ""}, r"^tool\.a: unknown parameter"),
         ({story.SCENARIO: "\ud800"}, "not a text file"),
     ],

@@ -113,8 +113,8 @@ def test_file_without_shared_parameters_takes_them_from_the_command_line(cell):
     [
         ("block_size", "--set 'block_size'; allowed: NODE.PARAM=VALUE, or PARAM=VALUE for a shared parameter"),
         ("", "--set ''; allowed: NODE.PARAM=VALUE"),
-        ("=5", "--set '=5':  is not shared; allowed: sample_rate, block_size"),
-        ("feed=1e-3", "--set 'feed=1e-3': feed is not shared; allowed: sample_rate, block_size"),
+        ("=5", "--set '=5': '' is not shared; allowed: sample_rate, block_size"),
+        ("feed=1e-3", "--set 'feed=1e-3': 'feed' is not shared; allowed: sample_rate, block_size"),
         ("fork.feed=1", "--set 'fork.feed=1': no node 'fork' in the scenario; allowed: spindle_encoder, learning"),
         ("tool.fed=1", "tool.fed: unknown parameter; allowed: allow_faults, autostart"),
         ("tool.=1", "tool.: unknown parameter"),

@@ -15,7 +15,7 @@ from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Value
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stages import STAGES
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, shown
 
 TABLES: dict[str, type[NodeParameters]] = {kind: stage.Parameters for kind, stage in STAGES.items()}
 TABLES[RECORDER] = RecorderParameters
@@ -126,11 +126,11 @@ def _override(text: str, nodes: dict[str, dict[str, Value]]) -> None:
         node, name = _EVERYONE, node
         if name not in SharedParameters.model_fields:
             shared = ", ".join(SharedParameters.model_fields)
-            raise InputError(f"--set {text!r}: {name} is not shared; allowed: {shared}, or NODE.{name}=VALUE")
+            raise InputError(f"--set {text!r}: {name!r} is not shared; allowed: {shared}, or NODE.PARAM=VALUE")
     elif node not in nodes:
         present = ", ".join(name for name in nodes if name != _EVERYONE)
         raise InputError(f"--set {text!r}: no node {node!r} in the scenario; allowed: {present}")
-    parsed = ros_yaml.parse_value(value, f"--set {target}")
+    parsed = ros_yaml.parse_value(value, f"--set {shown(target)}")
     if node == _EVERYONE:
         for values in nodes.values():
             values.pop(name, None)
