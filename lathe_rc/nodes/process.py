@@ -77,11 +77,15 @@ def _due(nodes: Sequence[CellNode], now: float) -> float:
     return min((node.next_tick for node in nodes if not node.done), default=now)
 
 
+def _leaves(node: CellNode) -> bool:
+    """Whether a node has given up where nobody goes on."""
+    return node.failure is not None and not node.others_go_on
+
+
 def _tick(nodes: Sequence[CellNode], now: float) -> None:
     """Let nodes do what is due; one that has given up, and stays, has nothing more to write."""
     for node in nodes:
-        leaves = node.done or (node.failure and not node.others_go_on)
-        if now >= node.next_tick and not leaves:
+        if now >= node.next_tick and not (node.done or _leaves(node)):
             node.tick(now)
         if node.failure:
             node.finish()
@@ -109,7 +113,7 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
             _tick(nodes, now)
             if all(node.done for node in nodes):
                 return
-            if any(node.failure and not node.others_go_on for node in nodes):
+            if any(_leaves(node) for node in nodes):
                 return
             if now >= look:
                 look = now + _LONGEST_WAIT

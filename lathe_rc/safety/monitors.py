@@ -171,8 +171,8 @@ def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
     if needed > 1:
         for k in range(needed - 1, signal.size, needed):
             count += _beyond(signal[k] - (other[k] if other.size else 0.0), offset, low, high)
-        for k in range(max(signal.size - 1, 0), signal.size):
-            count += _beyond(signal[k] - (other[k] if other.size else 0.0), offset, low, high)
+        if signal.size:
+            count += _beyond(signal[-1] - (other[-1] if other.size else 0.0), offset, low, high)
     elif other.size:
         for k in range(signal.size):
             count += _beyond(signal[k] - other[k], offset, low, high)
@@ -183,12 +183,12 @@ def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
 
 
 @kernel
-def _lasting(signal: Array, other: Array, memory: Array, needed: int, run: int) -> tuple[int, int]:
-    """First sample at which ``needed`` in a row were beyond, or -1, and how many were up to it or the last."""
+def _lasting(signal: Array, other: Array, memory: Array, run: int) -> tuple[int, int]:
+    """First sample at which enough in a row were beyond, or -1, and how many were up to it or the last."""
     for k in range(signal.size):
         value = signal[k] - (other[k] if other.size else 0.0)
         run = run + 1 if _beyond(value, memory[0], memory[1], memory[2]) else 0
-        if run >= needed:
+        if run >= memory[3]:
             return k, run
     return -1, run
 
@@ -223,7 +223,7 @@ class Threshold(Ruled):
     ) -> None:
         memory = (offset, -limit, limit, samples)
         super().__init__(name, subject, limit, reaction, rule=_THRESHOLD, signal=signal, other=other, memory=memory)
-        self._samples, self._patience, self._run = samples, Patience(after), 0
+        self._patience, self._run = Patience(after), 0
 
     @property
     def settled(self) -> bool:
@@ -236,7 +236,7 @@ class Threshold(Ruled):
         other = _NOTHING if self.other is None else inputs[self.other[0]][self.other[1]]
         begin = self._patience.left(inputs)
         signal, other = signal[begin:], other[begin:]
-        place, self._run = _lasting(signal, other, self.memory, self._samples, self._run)
+        place, self._run = _lasting(signal, other, self.memory, self._run)
         if place < 0:
             return None
         return Alarm(begin + place, self._told(float(signal[place] - (other[place] if other.size else 0.0))))
@@ -387,23 +387,7 @@ class IndexPulses(Ruled):
         self.memory[1:] = np.nan
 
 
-@inlined
-def _add_squares(sums: Array, count: int, values: Array) -> None:
-    """Add squares to sums of every n-th one of a revolution, the same whatever the blocks; ``count`` came before.
-
-    One sum would wait for itself; so many are vectors.
-    """
-    start = count % sums.size
-    head = min(sums.size - start, values.size)
-    for k in range(head):
-        sums[start + k] += values[k] * values[k]
-    for first in range(head, values.size, sums.size):
-        row = values[first : first + sums.size]
-        for k in range(row.size):
-            sums[k] += row[k] * row[k]
-
-
-_SUMS = 32
+_SUMS = 32  # of squares, each of every 32nd error: one would wait for itself, these are vectors
 _NEAR = 1e-9  # of a revolution: so close to its ends its number is not taken for known
 
 
@@ -415,8 +399,16 @@ def _surely(turn: float) -> tuple[float, float]:
 
 @inlined
 def _add(error: Array, memory: Array) -> None:
-    """More errors of the same revolution, see `_growing`."""
-    _add_squares(memory[8:], int(memory[4]), error)
+    """Add the squares of more errors of the same revolution, see `_growing`; the same whatever the blocks."""
+    sums = memory[8:]
+    start = int(memory[4]) % sums.size
+    head = min(sums.size - start, error.size)
+    for k in range(head):
+        sums[start + k] += error[k] * error[k]
+    for first in range(head, error.size, sums.size):
+        row = error[first : first + sums.size]
+        for k in range(row.size):
+            sums[k] += row[k] * row[k]
     memory[4] += error.size
 
 
