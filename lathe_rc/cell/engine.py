@@ -3,12 +3,14 @@
 
 import gc
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import lcm
 from typing import Protocol
 
 from lathe_rc.cell.messages import MAX_BLOCK, Signals, sample_fields
 from lathe_rc.cell.parameters import remapped
+from lathe_rc.cell.ring import Ring
 from lathe_rc.cell.stage import Sparse, Stage, compile_kernels
-from lathe_rc.cell.track import Track, longest_delays
+from lathe_rc.cell.track import longest_delays
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 
@@ -39,14 +41,14 @@ class Engine:
         self.samples: int = cell.master.samples
         self._cell = cell
         self._chunk = chunk_size(cell, MAX_BLOCK)
-        tracks = {}
-        for topic, source in cell.dense.items():
-            tracks[topic] = Track(source.type, delays(cell, topic, source.type), self._chunk)
-        self._stages = [
-            (stage, Ports(stage, tracks), {topic: remapped(stage.shared, topic) for topic in stage.sparse_topics})
-            for stage in cell.stages.values()
-        ]
+        rings = {
+            topic: Ring(source.type, delays(cell, topic, source.type), self._chunk)
+            for topic, source in cell.dense.items()
+        }
+        self._stages = []
         for stage in cell.stages.values():
+            said = {topic: remapped(stage.shared, topic) for topic in stage.sparse_topics}
+            self._stages.append((stage, Ports(stage, rings, self._chunk), said))
             compile_kernels(stage)
 
     def run(self, sinks: Iterable[Sink]) -> None:
@@ -85,23 +87,34 @@ def delays(cell: Cell, topic: str, msgtype: str) -> dict[str, int]:
 
 
 class Ports:
-    """The tracks that a stage reads and writes.
+    """The rings that a stage reads and writes.
 
     Args:
         stage: the stage.
-        tracks: of all dense topics, by relative name.
+        rings: of all dense topics, by relative name.
+        chunk: length of their chunks [sample].
     """
 
-    def __init__(self, stage: Stage, tracks: Mapping[str, Track]) -> None:
-        self._inputs = [(tracks[remapped(stage.shared, port.topic)], port.delay) for port in stage.inputs]
-        topics = [remapped(stage.shared, port.topic) for port in stage.outputs]
-        self._outputs = [(topic, tracks[topic]) for topic in topics]
+    def __init__(self, stage: Stage, rings: Mapping[str, Ring], chunk: int) -> None:
+        self._inputs = [(rings[remapped(stage.shared, port.topic)], port.delay) for port in stage.inputs]
+        self._outputs = {topic: rings[topic] for topic in (remapped(stage.shared, p.topic) for p in stage.outputs)}
+        self._chunk = chunk
+        self._period = lcm(*(ring.period for ring, _ in self._inputs), *(r.period for r in self._outputs.values()))
+        self._steady = not any(delay % chunk for _, delay in self._inputs)  # only views, and the same ones again
+        self._opened: dict[int, tuple[list[Signals], dict[str, Signals]]] = {}
 
     def open(self, first: int, samples: int, dense: dict[str, Signals]) -> tuple[list[Signals], list[Signals]]:
-        """Inputs and outputs of the samples ``first`` on; the outputs are added to ``dense`` too."""
-        inputs = [track.view(first - delay, samples) for track, delay in self._inputs]
-        outputs = []
-        for topic, track in self._outputs:
-            dense[topic] = track.extend(samples)
-            outputs.append(dense[topic])
-        return inputs, outputs
+        """Inputs and outputs of the chunk that begins at ``first``; the outputs are added to ``dense`` too."""
+        if not self._steady or samples != self._chunk:
+            inputs, outputs = self._views(first, samples)
+        else:
+            phase = first // samples % self._period
+            if phase not in self._opened:
+                self._opened[phase] = self._views(first, samples)
+            inputs, outputs = self._opened[phase]
+        dense.update(outputs)
+        return inputs, list(outputs.values())
+
+    def _views(self, first: int, samples: int) -> tuple[list[Signals], dict[str, Signals]]:
+        inputs = [ring.view(first, samples, delay) for ring, delay in self._inputs]
+        return inputs, {topic: ring.newest(first, samples) for topic, ring in self._outputs.items()}

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from lathe_rc.cell.engine import Ports, chunk_size, delays
 from lathe_rc.cell.messages import MAX_BLOCK, Signals, sample_fields
 from lathe_rc.cell.parameters import remapped
+from lathe_rc.cell.ring import Ring
 from lathe_rc.cell.stages.lanes import LaneStage, lane_stage, same
-from lathe_rc.cell.track import Track
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 
@@ -53,7 +53,7 @@ class Lanes:
             _check(lane, first, cell)
         self._chunk = chunk_size(first, min(MAX_BLOCK, _SAMPLES // len(cells)))
         self._stages: dict[str, LaneStage[Any]] = {}
-        tracks: dict[str, Track] = {}
+        rings: dict[str, Ring] = {}
         shared: set[str] = set()
         for name, stage in first.stages.items():
             topics = [remapped(stage.shared, port.topic) for port in stage.inputs]
@@ -61,11 +61,11 @@ class Lanes:
             for port in stage.outputs:
                 topic, fields = remapped(stage.shared, port.topic), sample_fields(port.type)
                 kept = delays(first, topic, port.type)
-                tracks[topic] = Track(port.type, kept, self._chunk, len(cells), lanes.shared)
+                rings[topic] = Ring(port.type, kept, self._chunk, len(cells), lanes.shared)
                 if set(fields) <= set(lanes.shared):
                     shared.add(topic)
             self._stages[name] = lanes
-        self._ports = {name: Ports(stage, tracks) for name, stage in first.stages.items()}
+        self._ports = {name: Ports(stage, rings, self._chunk) for name, stage in first.stages.items()}
 
     def run(self, sinks: Iterable[LaneSink] = ()) -> None:
         """Run to the end."""

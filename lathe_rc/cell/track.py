@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recent past of a topic, contiguous in memory, so that a delayed view costs no copy."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from math import ceil
 from typing import Any
 
@@ -32,23 +32,16 @@ class Track:
         msgtype: message type of the topic.
         delays: longest delay at which each field is read [sample]; fields that are not named are not kept at all.
         block: longest block that is added [sample].
-        lanes: length of a second axis, for cells that run at once; 0: there is none.
-        shared: fields without it.
 
     Attributes:
         delay: longest of them.
     """
 
-    def __init__(
-        self, msgtype: str, delays: Mapping[str, int], block: int, lanes: int = 0, shared: Collection[str] = ()
-    ) -> None:
+    def __init__(self, msgtype: str, delays: Mapping[str, int], block: int) -> None:
         self.delay = max(delays.values(), default=0)
         self._capacity = self.delay + max(block, ceil(self.delay / _MOVED))
         types = messages.sample_fields(msgtype)
-        alone, together = (self._capacity,), (self._capacity, lanes)
-        self._arrays = {
-            name: np.zeros(together if lanes and name not in shared else alone, types[name]) for name in delays
-        }
+        self._arrays = {name: np.zeros(self._capacity, types[name]) for name in delays}
         self._late = [self._arrays[name] for name, delay in delays.items() if delay]
         self._base = -self.delay  # sample index of element 0
         self._block, self._views = block, dict[int, Signals]()
