@@ -44,6 +44,7 @@ def engines(revolutions: float) -> dict[str, float]:
     running = {side: Engine(Cell(loaded(side, revolutions).nodes)).steps([]) for side in _SIDES}
     spent: dict[str, list[float]] = {side: [] for side in _SIDES}
     gc.collect()
+    gc.freeze()  # as `Engine.run` does
     reached: int | None = 0
     while reached is not None:
         for side, steps in running.items():
@@ -51,6 +52,7 @@ def engines(revolutions: float) -> dict[str, float]:
             reached = next(steps, None)
             if reached is not None and reached > _FROM:
                 spent[side].append(time.thread_time() - start)
+    gc.unfreeze()
     # All chunks but the last are whole.
     return {side: sum(chunks[:-1]) / (len(chunks) - 1) / _CHUNK for side, chunks in spent.items()}
 

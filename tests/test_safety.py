@@ -240,7 +240,7 @@ CASES = {
         lambda: Rate("a", "e", 100.0, Reaction.STOP, signal=(0, "speed"), window=64, step=STEP, before=SPEED), risen
     ),
     "index": (lambda: IndexPulses(1e-2 / 2, Reaction.STOP, encoder=0), jumped),
-    "growth": (lambda: Growth(1.2, Reaction.FREEZE, encoder=0, tool=1, cycles=2, floor=1e-6), lambda: growing(1.5)),
+    "growth": (lambda: Growth(1.2, Reaction.FREEZE, tool=1, cycles=2, floor=1e-6), lambda: growing(1.5)),
     "below": (
         lambda: Below("b", "e", SPEED * 1.1, Reaction.HOLD, signal=(0, "speed"), samples=10, after=1.5), risen
     ),
@@ -321,18 +321,20 @@ def index_fault(angle, pulse, limit):
     return None, None
 
 
-def growth_fault(angle, error, limit, needed, floor):
-    turn, squares, count, before, grown = 0.0, [0.0] * 32, 0, math.nan, 0  # added up in an order that is quick
-    for k in range(angle.size):
-        now = np.floor(angle[k] / TURN)
-        if now != turn:
-            rms = math.sqrt(functools.reduce(operator.add, squares) / count) if count else math.nan
-            grown = grown + 1 if rms > limit * before and rms > floor else 0
-            if grown >= needed:
-                return k, rms / before
-            turn, squares, count, before = now, [0.0] * 32, 0, rms
-        squares[count % 32] += error[k] * error[k]
-        count += 1
+def growth_fault(pulse, error, limit, needed, floor):
+    squares, count, before, grown = [0.0] * 128, None, math.nan, 0  # added up in an order that is quick
+    for k in range(pulse.size):
+        if pulse[k]:
+            if count is not None:
+                rms = math.sqrt(functools.reduce(operator.add, squares) / count)
+                grown = grown + 1 if rms > limit * before and rms > floor else 0
+                if grown >= needed:
+                    return k, rms / before
+                before = rms
+            squares, count = [0.0] * 128, 0
+        if count is not None:
+            squares[count % 128] += error[k] * error[k]
+            count += 1
     return None, None
 
 
@@ -351,7 +353,7 @@ def taken_one_by_one(angle, speed, pulse, error):
     found = [(name, sample, values[sample]) for name, (sample, values) in watched.items() if sample is not None]
     for name, (sample, value) in (
         ("index_pulses", index_fault(angle, pulse, 0.7)),
-        ("error_growth", growth_fault(angle, error, 1.2, 2, 0.1)),
+        ("error_growth", growth_fault(pulse, error, 1.2, 2, 0.1)),
     ):
         if sample is not None:
             found.append((name, sample, value))
@@ -375,7 +377,7 @@ def test_all_monitors_at_once_find_what_their_definitions_say(data, size, seed, 
         Below("low", "e", -2.0, Reaction.STOP, signal=(0, "speed"), samples=2, after=1.5),
         Rate("rate", "e", 5.0, Reaction.STOP, signal=(0, "speed"), window=5, step=1 / 5, before=0.0),
         IndexPulses(0.7, Reaction.STOP, encoder=0),
-        Growth(1.2, Reaction.STOP, encoder=0, tool=1, cycles=2, floor=0.1),
+        Growth(1.2, Reaction.STOP, tool=1, cycles=2, floor=0.1),
     ]
     inputs = [{"angle": angle, "speed": speed, "index_pulse": pulse}, {"measured_error": error}]
     lookout, found = Lookout(monitors), []

@@ -280,7 +280,8 @@ class Stage(ABC):
         if self._triggers or self._scheduled or (self._injection and self._injection.any):
             sparse = self._advance_with_events(first, inputs, outputs)
         else:
-            sparse = self.process(first, inputs[: self.own_inputs], outputs)
+            own = inputs if len(inputs) == self.own_inputs else inputs[: self.own_inputs]
+            sparse = self.process(first, own, outputs)
         for place, joint in self._joints:
             sparse = sparse + self._joint_states(first, joint, outputs[place])
         if len(sparse) > 1:

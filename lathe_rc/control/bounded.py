@@ -138,10 +138,10 @@ class Takeover:
 
     def apply(self, command: Array) -> None:
         """Make of what the controller wants what the drive gets; in place, shape (n,) [m]."""
-        wanted = _last_two(self._wanted, command)
-        if self.mode is Mode.FOLLOW and self._place >= self._path.size and command.size > 1:
-            self._given = self._wanted = wanted
+        if command.size > 1 and self._place >= self._path.size and self.mode is Mode.FOLLOW:
+            self._given = self._wanted = command[-2:].copy()
             return
+        wanted = _last_two(self._wanted, command)
         if self.mode is not Mode.FOLLOW or self._place < self._path.size:
             ahead = self._path[self._place : self._place + command.size]
             self._place += ahead.size

@@ -8,6 +8,7 @@ makes vectors of, and takes them one by one only where there is. A monitor that 
 """
 
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -24,7 +25,7 @@ Pulses = npt.NDArray[np.uint8]
 
 _THRESHOLD, _RATE, _INDEX, _GROWTH = range(4)  # rules of the table
 _TURN = 2.0 * np.pi
-_STRETCH = 128  # samples
+_STRETCH = 256  # samples
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class Ruled(Monitor):
         """See `Monitor`; alone."""
         table = Table([self])
         table.walk(inputs)
-        return self.alarm(inputs, int(table.places[0]))
+        return self.alarm(inputs, table.places[0])
 
     @abstractmethod
     def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
@@ -155,8 +156,9 @@ class Patience:
 
 @inlined
 def _beyond(value: float, offset: float, low: float, high: float) -> bool:
-    """Whether a value is beyond its limits, or not a number."""
-    return not low <= value - offset <= high
+    """Whether a value is beyond its limits, or not a number; most limits are to both sides, which is one comparison."""
+    value -= offset
+    return not abs(value) <= high if low == -high else not low <= value <= high
 
 
 @kernel
@@ -279,6 +281,14 @@ def _differ(after: float, before: float, limit: float) -> bool:
     return not abs(after - before) <= limit
 
 
+@inlined
+def _how_many_differ(after: Array, before: Array, limit: float) -> int:
+    count = 0
+    for k in range(after.size):
+        count += _differ(after[k], before[k], limit)
+    return count
+
+
 @kernel
 def _changing(signal: Array, memory: Array) -> int:
     """First sample that differs by more than the limit from the one a window before, or -1.
@@ -287,12 +297,7 @@ def _changing(signal: Array, memory: Array) -> int:
     """
     limit, past, size = memory[0], memory[2:], signal.size
     window = past.size
-    late, early = signal[window:], signal[: max(size - window, 0)]
-    count = 0
-    for k in range(min(size, window)):
-        count += _differ(signal[k], past[k], limit)
-    for k in range(late.size):
-        count += _differ(late[k], early[k], limit)
+    count = _how_many_differ(signal[:window], past, limit) + _how_many_differ(signal[window:], signal, limit)
     found = -1
     for k in range(size if count else 0):
         before = past[k] if k < window else signal[k - window]
@@ -303,8 +308,7 @@ def _changing(signal: Array, memory: Array) -> int:
     kept = max(window - size, 0)
     for k in range(kept):
         past[k] = past[k + size]
-    for k in range(kept, window):
-        past[k] = signal[size - window + k]
+    past[kept:] = signal[size - window + kept :]
     return found
 
 
@@ -341,32 +345,54 @@ class Rate(Ruled):
 
 
 @inlined
+def _next(pulse: Pulses, begin: int) -> int:
+    """The first index pulse from a sample on; the end if there is none."""
+    for start in range(begin, pulse.size, _STRETCH):
+        piece, some = pulse[start : start + _STRETCH], np.uint8(0)
+        for k in range(piece.size):
+            some |= piece[k]
+        for k in range(piece.size if some else 0):
+            if piece[k]:
+                return start + k
+    return pulse.size
+
+
+@inlined
 def _off(since: float, limit: float) -> bool:
     """Whether no angle since an index pulse can be this, to the limit; nothing is known before the first pulse: NaN."""
     return since > _TURN + limit or since < -limit
 
 
 @kernel
+def _first_off(angle: Array, last: float, limit: float) -> int:
+    """First sample that no angle since an index pulse can be, or -1."""
+    count = 0
+    for k in range(angle.size):
+        count += _off(angle[k] - last, limit)
+    for k in range(angle.size if count else 0):
+        if _off(angle[k] - last, limit):
+            return k
+    return -1
+
+
+@kernel
 def _index(angle: Array, pulse: Pulses, memory: Array) -> int:
     """First sample that does not fit the pulses, or -1; the memory: limit, angle of the last pulse, what was found."""
-    limit = memory[0]
-    for start in range(0, angle.size, _STRETCH):
-        angles, pulses, last = angle[start : start + _STRETCH], pulse[start : start + _STRETCH], memory[1]
-        count = 0
-        for k in range(pulses.size):
-            count += pulses[k] > 0
-        for k in range(angles.size):
-            count += _off(angles[k] - last, limit)
-        if not count:
-            continue
-        for k in range(angles.size):
-            since = angles[k] - last
-            if _off(since, limit) or (pulses[k] > 0 and since < _TURN - limit):
-                memory[1], memory[2] = last, abs(since - _TURN)
-                return start + k
-            if pulses[k] > 0:
-                last = angles[k]
-        memory[1] = last
+    limit, begin = memory[0], 0
+    while begin < angle.size:
+        at = _next(pulse, begin)
+        last = memory[1]
+        found = _first_off(angle[begin : at + 1], last, limit)
+        if found >= 0:
+            found += begin
+        elif at < angle.size and angle[at] - last < _TURN - limit:
+            found = at
+        if found >= 0:
+            memory[2] = abs(angle[found] - last - _TURN)
+            return found
+        if at < angle.size:
+            memory[1] = angle[at]
+        begin = at + 1
     return -1
 
 
@@ -387,21 +413,14 @@ class IndexPulses(Ruled):
         self.memory[1:] = np.nan
 
 
-_SUMS = 32  # of squares, each of every 32nd error: one would wait for itself, these are vectors
-_NEAR = 1e-9  # of a revolution: so close to its ends its number is not taken for known
-
-
-@inlined
-def _surely(turn: float) -> tuple[float, float]:
-    """Angles between which the revolution is this one, without a division."""
-    return (turn + _NEAR) * _TURN, (turn + 1.0 - _NEAR) * _TURN
+_SUMS = 128  # of squares, each of every 128th error: one would wait for itself, these are vectors
 
 
 @inlined
 def _add(error: Array, memory: Array) -> None:
     """Add the squares of more errors of the same revolution, see `_growing`; the same whatever the blocks."""
-    sums = memory[8:]
-    start = int(memory[4]) % sums.size
+    sums = memory[7:]
+    start = int(memory[3]) % sums.size
     head = min(sums.size - start, error.size)
     for k in range(head):
         sums[start + k] += error[k] * error[k]
@@ -409,86 +428,72 @@ def _add(error: Array, memory: Array) -> None:
         row = error[first : first + sums.size]
         for k in range(row.size):
             sums[k] += row[k] * row[k]
-    memory[4] += error.size
+    memory[3] += error.size
+
+
+@inlined
+def _grown(memory: Array) -> bool:
+    """End a revolution, see `_growing`, and begin the next; whether its error has grown once too often."""
+    limit, floor, needed, state, sums = memory[0], memory[1], memory[2], memory[3:7], memory[7:]
+    rms = np.sqrt(np.sum(sums) / state[0])
+    before = state[1]
+    state[2] = state[2] + 1.0 if rms > limit * before and rms > floor else 0.0
+    state[0], state[1] = 0.0, rms
+    sums[:] = 0.0
+    if state[2] < needed:
+        return False
+    state[3] = rms / before
+    return True
 
 
 @kernel
-def _turning(angle: Array, error: Array, memory: Array) -> int:
-    """See `_growing`, for samples among which a revolution may begin."""
-    limit, floor, needed, state, sums = memory[0], memory[1], memory[2], memory[3:8], memory[8:]
-    first, low, high = 0, *_surely(state[0])
-    for k in range(angle.size):
-        if low <= angle[k] <= high:
-            continue
-        turn = np.floor(angle[k] / _TURN)
-        if turn != state[0]:
-            _add(error[first:k], memory)
-            rms = np.sqrt(np.sum(sums) / state[1]) if state[1] > 0.0 else np.nan
-            grown = rms > limit * state[2] and rms > floor
-            state[3] = state[3] + 1.0 if grown else 0.0
-            if grown and state[3] >= needed:
-                state[4] = rms / state[2]
-                return k
-            state[0], state[1], state[2], first = turn, 0.0, rms, k
-            low, high = _surely(turn)
-            sums[:] = 0.0
-    _add(error[first:], memory)
-    return -1
-
-
-@kernel
-def _growing(angle: Array, error: Array, memory: Array) -> int:
+def _growing(pulse: Pulses, error: Array, memory: Array) -> int:
     """First sample at which the RMS error has grown often enough, or -1.
 
-    The memory: limit, floor, revolutions needed; revolution, samples, RMS of the one before, how many have grown, by
-    how much; sums of squares.
+    The memory: limit, floor, revolutions needed; samples of the revolution, below 0 before the first index pulse; RMS
+    of the one before, how many have grown, by how much; sums of squares.
     """
-    begin = 0  # of what is not in the sums
-    for start in range(0, angle.size, _STRETCH):
-        angles = angle[start : start + _STRETCH]
-        low, high = _surely(memory[3])
-        count = 0
-        for k in range(angles.size):
-            count += _beyond(angles[k], 0.0, low, high)
-        if count:
-            _add(error[begin:start], memory)
-            begin = start + angles.size
-            found = _turning(angles, error[start:begin], memory)
-            if found >= 0:
-                return start + found
-    _add(error[begin:], memory)
-    return -1
+    begin, at = 0, _next(pulse, 0)
+    while True:
+        if memory[3] >= 0.0:
+            _add(error[begin:at], memory)
+        if at == pulse.size:
+            return -1
+        if memory[3] < 0.0:
+            memory[3] = 0.0
+        elif _grown(memory):
+            return at
+        begin, at = at, _next(pulse, at + 1)
 
 
-_UNKNOWN = (0.0, 0.0, np.nan, 0.0, np.nan, *[0.0] * _SUMS)  # what is known of the growth at first
+_UNKNOWN = (-1.0, np.nan, 0.0, np.nan, *[0.0] * _SUMS)  # what is known of the growth at first
 
 
 class Growth(Ruled):
-    """The RMS error grows from revolution to revolution.
+    """The RMS error grows from revolution to revolution, which begin at index pulses.
 
     Args:
         limit: factor from one to the next.
         reaction: what it asks for.
-        encoder, tool: places of the inputs.
+        tool: place of the input.
         cycles: so many times in a row.
         floor: RMS error below which it does not count [m].
     """
 
-    def __init__(self, limit: float, reaction: Reaction, *, encoder: int, tool: int, cycles: int, floor: float) -> None:
+    def __init__(self, limit: float, reaction: Reaction, *, tool: int, cycles: int, floor: float) -> None:
         super().__init__(
             "error_growth",
             "tool",
             limit,
             reaction,
             rule=_GROWTH,
-            signal=(encoder, "angle"),
-            other=(tool, "measured_error"),
+            signal=(tool, "measured_error"),
             memory=(limit, floor, cycles, *_UNKNOWN),
         )
 
     def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
         """See `Ruled`."""
-        return Alarm(place, float(self.memory[7])) if place >= 0 else None
+        return Alarm(place, float(self.memory[6])) if place >= 0 else None
 
     def reset(self) -> None:
         """See `Monitor`."""
@@ -527,20 +532,21 @@ class Clearance:
 
 
 @kernel
-def _walk(signals: tuple[Array, ...], pulse: Pulses, rows: Places, memory: Array, places: Places) -> int:
+def _walk(signals: tuple[Array, ...], pulse: Pulses, rows: Places, memory: Array) -> int:
     """Fill in where each rule finds something, or -1, and say how many do.
 
     Args:
-        signals: all that are watched, each shape (n,); the last is empty, for "no other".
+        signals: all that are watched, each shape (n,).
         pulse: index pulses of the encoder, shape (n,).
-        rows: rule, its two signals, begin and end of its memory, shape (rows, 5).
+        rows: rule, its two signals, the second or -1, begin and end of its memory, and the place that is filled in;
+            shape (rows, 6).
         memory: of all of them.
-        places: filled in, shape (rows,).
     """
     found = 0
-    for row in range(places.size):
-        rule, own = rows[row, 0], memory[rows[row, 3] : rows[row, 4]]
-        signal, other = signals[rows[row, 1]], signals[rows[row, 2]]
+    for row in range(rows.shape[0]):
+        rule, own, second = rows[row, 0], memory[rows[row, 3] : rows[row, 4]], rows[row, 2]
+        signal = signals[rows[row, 1]]
+        other = signals[second] if second >= 0 else signal[:0]
         if rule == _THRESHOLD:
             place = _any_beyond(signal, other, own)
         elif rule == _RATE:
@@ -548,8 +554,8 @@ def _walk(signals: tuple[Array, ...], pulse: Pulses, rows: Places, memory: Array
         elif rule == _INDEX:
             place = _index(signal, pulse, own)
         else:
-            place = _growing(signal, other, own)
-        places[row] = place
+            place = _growing(pulse, signal, own)
+        rows[row, 5] = place
         found += place >= 0
     return found
 
@@ -559,9 +565,6 @@ class Table:
 
     Args:
         monitors: their memory becomes part of the table's.
-
-    Attributes:
-        places: what each rule has found in the last block: a sample, or −1.
     """
 
     def __init__(self, monitors: Sequence[Ruled]) -> None:
@@ -569,19 +572,33 @@ class Table:
             dict.fromkeys(place for monitor in monitors for place in (monitor.signal, monitor.other) if place)
         )
         self._memory = np.concatenate([np.empty(0), *(monitor.memory for monitor in monitors)])
-        self._rows = np.zeros((len(monitors), 5), np.int64)
-        self.places = np.zeros(len(monitors), np.int64)
+        self._rows = np.zeros((len(monitors), 6), np.int64)
+        self._known = deque[tuple[Sequence[Signals], tuple[tuple[Array, ...], Pulses]]](maxlen=4)
         end = 0
         for row, monitor in zip(self._rows, monitors, strict=True):
             begin, end = end, end + monitor.memory.size
-            other = self._signals.index(monitor.other) if monitor.other else len(self._signals)
-            row[:] = monitor.rule, self._signals.index(monitor.signal), other, begin, end
+            other = self._signals.index(monitor.other) if monitor.other else -1
+            row[:] = monitor.rule, self._signals.index(monitor.signal), other, begin, end, -1
             monitor.memory = self._memory[begin:end]
+
+    @property
+    def places(self) -> list[int]:
+        """What each rule has found in the last block: a sample, or −1."""
+        found: list[int] = self._rows[:, 5].tolist()
+        return found
 
     def walk(self, inputs: Sequence[Signals]) -> int:
         """How many rules find something in the next samples."""
-        signals = (*[inputs[place][name] for place, name in self._signals], _NOTHING)
-        return _walk(signals, inputs[0]["index_pulse"], self._rows, self._memory, self.places)
+        return _walk(*self._gathered(inputs), self._rows, self._memory)
+
+    def _gathered(self, inputs: Sequence[Signals]) -> tuple[tuple[Array, ...], Pulses]:
+        """What is watched; the offline host hands out the same few inputs again and again, so they are kept."""
+        for known, gathered in self._known:
+            if known is inputs:
+                return gathered
+        gathered = tuple([inputs[place][name] for place, name in self._signals]), inputs[0]["index_pulse"]
+        self._known.append((inputs, gathered))
+        return gathered
 
 
 class Lookout:
@@ -602,7 +619,7 @@ class Lookout:
         """Alarms of the next samples, by sample."""
         if not self._table.walk(inputs) and self._settled and not self._free:
             return []
-        places = dict(zip(map(id, self._ruled), self._table.places.tolist(), strict=True))
+        places = dict(zip(map(id, self._ruled), self._table.places, strict=True))
         found = []
         for monitor in self._monitors:
             if not isinstance(monitor, Ruled):

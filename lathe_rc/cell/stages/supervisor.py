@@ -194,7 +194,6 @@ class Supervisor(Stage):
                 Growth(
                     table.growth_limit,
                     reaction,
-                    encoder=0,
                     tool=tool,
                     cycles=table.growth_cycles,
                     floor=table.growth_floor,
