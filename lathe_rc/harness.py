@@ -69,7 +69,7 @@ class Result:
         samples: length of the run.
         wall_s: from block 0 to the last block computed and recorded by every member [s].
         bag: where it is recorded; None if it was not to be kept, or in snapshots alone.
-        snapshots: bags of parts of the run, see `lathe_rc.bag.snapshot`.
+        snapshots: bags of parts of the run, see `lathe_rc.bag.snapshots`.
         recording: all signals.
         refused: messages of strangers that the nodes refused, by sender.
     """

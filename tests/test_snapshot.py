@@ -24,7 +24,8 @@ from lathe_rc import harness
 from lathe_rc.bag.check import check
 from lathe_rc.bag.order import Merger
 from lathe_rc.bag.resim import resimulate
-from lathe_rc.bag.snapshot import SNAPSHOT, Snapshots, first_sample
+from lathe_rc.bag.snapshot import SNAPSHOT, first_sample
+from lathe_rc.bag.snapshots import Snapshots
 from lathe_rc.bag.writer import offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.cell.framing import Framer

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from lathe_rc.bag import story
+from lathe_rc.bag.both import Both
 from lathe_rc.bag.order import Merger
-from lathe_rc.bag.snapshot import Both, Snapshots
+from lathe_rc.bag.snapshots import Snapshots
 from lathe_rc.bag.writer import BagWriter, Output, offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.cell.framing import Framer

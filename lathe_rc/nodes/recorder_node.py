@@ -14,7 +14,8 @@ from std_srvs.srv import Trigger
 from lathe_rc.bag import story
 from lathe_rc.bag.order import Merger
 from lathe_rc.bag.record import bag_of, signal_depth
-from lathe_rc.bag.snapshot import Snapshot, Snapshots
+from lathe_rc.bag.snapshot import Snapshot
+from lathe_rc.bag.snapshots import Snapshots
 from lathe_rc.bag.writer import FLUSH_PERIOD, Output, offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.cell.recorder import RecorderParameters
