@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
@@ -38,6 +39,12 @@ class Announced:
     definition: str
     digest: str
     qos: tuple[Qos, ...]
+
+
+@lru_cache(maxsize=8)
+def _profiles(text: str) -> tuple[Qos, ...]:
+    """QoS as YAML has it; most topics of a bag have the same, and to read it takes longer than a chunk of messages."""
+    return tuple(parse_qos(text))
 
 
 @dataclass
@@ -194,7 +201,7 @@ class Salvage:
         trust.check_name(channel.topic)
         trust.check_name(schema.name)
         self._qos.add(channel)
-        qos = tuple(parse_qos(channel.metadata.get("offered_qos_profiles", "") or "[]"))
+        qos = _profiles(channel.metadata.get("offered_qos_profiles", "") or "[]")
         digest = channel.metadata.get("topic_type_hash", "")
         self.topics[channel.topic] = Announced(schema.name, schema.data.decode(), digest, qos)
         channels[channel.id] = channel.topic
@@ -233,5 +240,5 @@ class Salvage:
             definition = defined.get(kind, "")
             self._describe(len(definition) + len(text))
             names[number] = name
-            self.topics[name] = Announced(kind, definition, "", tuple(parse_qos(text)))
+            self.topics[name] = Announced(kind, definition, "", _profiles(text))
         return names
