@@ -23,6 +23,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from random import Random
 from statistics import median
@@ -198,9 +199,14 @@ def stop(scale: int, random: Random) -> Mapping[str, Any]:
 
     long = iter([(number + 1) % 20 == 0 for number in range(count)])
 
+    def go_on(pid: int) -> None:
+        # Stopped twice, it went on at the first of two signals, and may have ended.
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGCONT)
+
     def pause(pid: int) -> None:
         os.kill(pid, signal.SIGSTOP)
-        threading.Timer(_AWAY if next(long) else random.random() * _STOPPED, os.kill, (pid, signal.SIGCONT)).start()
+        threading.Timer(_AWAY if next(long) else random.random() * _STOPPED, go_on, (pid,)).start()
 
     watch = At(moments, pause)
     result = harness.run(scenario, mode="processes", watch=watch)
