@@ -147,9 +147,10 @@ def test_cutting_into_blocks_leaves_no_trace(text, lengths):
     ("text", "said"),
     [
         ("coarse/state.measured_position broken", "KIND one of off, stuck"),
-        ("coarse/state.measured_position noisy", "no rms; allowed: each once: rms= a finite number from 0"),
+        ("coarse/state.measured_position noisy", "no rms; allowed: each once: rms= a number from 0 up to 1e+100"),
         ("coarse/state.measured_position noisy rms=-1", "rms=-1; allowed"),
         ("coarse/state.measured_position noisy rms=nan", "rms=nan; allowed"),
+        ("coarse/state.measured_position garbage amplitude=1e308", "amplitude=1e308; allowed"),
         ("coarse/state.measured_position noisy rms=1 rms=2", "rms=2; allowed: each once"),
         ("coarse/state.measured_position stuck at=3", "at=3; allowed: no values"),
         ("coarse/state.nothing stuck", "no such target for it; allowed: coarse/command.position, coarse/state.effort"),
@@ -215,7 +216,33 @@ def test_a_fault_holds_from_its_first_sample_to_its_last_and_is_recorded():
                        good.recording.of_type(messages.STATE)["position"][:6400])  # fmt: skip
     told = bad.recording.sparse["/electrodynamic_actuator/events"].values
     assert told["sample_index"] == [5000, 6000]
-    assert told["action"] == ["fault coarse/state.measured_position off", "repair coarse/state.measured_position"]
+    assert told["action"] == ["fault coarse/state.measured_position off", "repair coarse/state.measured_position off"]
+
+
+def test_the_end_of_a_fault_is_not_the_end_of_another_of_the_same_target():
+    field = "coarse/state.measured_position"
+    good = measured(run(ALLOWED))
+    both = [f"sample 1000 to 2000: {field} noisy rms=1e-6", f"sample 1500 to 4000: {field} off"]
+    result = run(ALLOWED, electrodynamic_actuator={"faults": both})
+    assert not measured(result)[1500:4000].any()
+    assert_array_equal(measured(result)[4000:4600], good[4000:4600], "before the controller has read any of it")
+    all_at_once = {"faults": [text.partition(" to")[0] + ":" + text.partition(":")[2] for text in both],
+                   "events": [f"sample 3000: repair {field}"]}  # fmt: skip
+    result = run(ALLOWED, electrodynamic_actuator=all_at_once)
+    assert not measured(result)[1500:3000].any()
+    assert_array_equal(measured(result)[3000:4600], good[3000:4600])
+
+
+def test_what_is_repaired_at_the_cut_is_what_was_broken():
+    def force(*faults):
+        changes = ["allow_faults=true", "spindle_encoder.revolutions=16", f"cutting_process.faults={list(faults)!r}"]
+        recording = harness.run(scenarios.load(scenarios_path("interrupted_cut"), changes)).recording
+        turned = recording.of_type(messages.ENCODER)["angle_true"] / (2 * np.pi)
+        return recording.of_type(messages.CUT)["depth_of_cut"][turned > 14.0]
+
+    broken, spot = "revolution 10: cut tool_broken length=1.0", "revolution 11 to 12: cut hard_spot factor=2"
+    assert not force(broken, spot).any()
+    assert force(broken.replace("10:", "10 to 13:"), spot.replace(" to 12", "")).any()
 
 
 def test_a_fault_may_begin_at_an_angle_also_where_the_stage_does_not_read_it():

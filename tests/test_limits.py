@@ -116,6 +116,7 @@ def test_clipped_samples_are_counted_and_told():
     counts = [int(action.split()[1]) for action, _ in told if action.startswith("free")]
     ended = [index for action, index in told if action.startswith("free")]
     assert sum(counts) == clipped[: ended[-1] + 1].sum()
+    assert not [action for action, _ in told if action.startswith("limited:")], "never for so long"
     for index in ended:
         assert not clipped[index - 639 : index + 1].any()
         assert clipped[index - 640]
@@ -125,9 +126,20 @@ def test_a_feed_drive_tells_of_what_its_command_limit_alone_cuts_off():
     recording = harness.run(scenarios.load(CONFIG / "periodic.yaml", ["feed_drive.command_limit=0.2"])).recording
     wanted, held = recording.of_type(messages.SERVO)["command"], recording.of_type(messages.STATE)["effort"]
     assert np.abs(wanted).max() > 0.2 == np.abs(held).max()
-    actions = recording.sparse["/feed_drive/events"].values["action"]
+    told = recording.sparse["/feed_drive/events"].values
+    actions = told["action"]
     assert actions[0] == "limited"
-    assert all(action == "limited" or action.startswith("free: ") for action in actions)
+    assert all(action == "limited" or action.startswith(("limited: ", "free: ")) for action in actions)
+
+
+def test_a_command_that_is_clipped_to_the_end_of_the_run_is_counted_all_the_time():
+    result = run({"block_size": 50}, electrodynamic_actuator={"command_stroke": 0.05e-3})
+    limiter = CommandLimits(0.05e-3, np.inf, np.inf, np.inf)
+    _, clipped = limited(command(result), limiter)
+    told = [(int(action.split()[1]), index) for action, index in events(result) if "were clipped" in action]
+    assert clipped.sum() > 1000
+    assert sum(count for count, _ in told) == clipped[: told[-1][1] + 1].sum()
+    assert clipped.size - told[-1][1] <= 6400, "said every 0.1 s"
 
 
 @pytest.mark.parametrize("mode", ["composed"])

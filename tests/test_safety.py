@@ -22,6 +22,8 @@ from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
 from lathe_rc.cell.stages.learning_controller import LearningController
+from lathe_rc.cell.stages.supervisor import MEMBERS_LOST
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion
 from lathe_rc.errors import InputError
 from lathe_rc.safety import state_machine
@@ -312,12 +314,12 @@ def lasting(beyond, needed, begin=0):
 
 
 def index_fault(angle, pulse, limit):
-    last = math.nan
+    last, known = angle[0], False  # a pulse may come early after the first angle, but not late
     for k in range(angle.size):
         since = angle[k] - last
-        if since > TURN + limit or since < -limit or (pulse[k] and since < TURN - limit):
+        if since > TURN + limit or since < -limit or (known and pulse[k] and since < TURN - limit):
             return k, abs(since - TURN)
-        last = angle[k] if pulse[k] else last
+        last, known = (angle[k], True) if pulse[k] else (last, known)
     return None, None
 
 
@@ -461,6 +463,51 @@ def test_a_stop_is_not_reset():
     stop = "spindle_encoder.faults=['revolution 10 to 10.1: encoder.speed wrong scale=1.5']"
     result = harness.run(supervised(stop, "supervisor.events=['revolution 15: reset']"))
     assert result.recording.of_type(messages.SAFETY)["reaction"][-1] == Reaction.STOP
+
+
+def test_a_reset_while_the_tool_is_on_its_way_out_is_refused():
+    broken = "spindle_encoder.faults=['revolution 20: encoder.speed wrong scale=1.5']"
+    (stopped, *_) = status(harness.run(supervised(broken)))
+    result = harness.run(supervised(broken, f"supervisor.events=['sample {stopped[3] + 1}: reset']"))
+    told = status(result)
+    assert ("reset refused", State.RETRACTING, Reaction.STOP, stopped[3] + 1) in told
+    assert told[-1][:2] == (RETRACTED, State.SAFE)
+
+
+@pytest.mark.parametrize(
+    ("fault", "begins"),
+    [
+        ("sample 0: encoder missed_index", 1),
+        ("revolution 5.5: encoder missed_index", 5),
+        ("sample 7: encoder.index_pulse off", 1),
+    ],
+)
+def test_an_index_track_that_is_dead_is_noticed_also_from_the_start(fault, begins):
+    result = harness.run(supervised(f"spindle_encoder.faults=['{fault}']"))
+    (first, *_) = status(result)
+    assert first[0] == "index_pulses"
+    angle = result.recording.of_type(messages.ENCODER)["angle_true"][first[3]]
+    assert_allclose(angle / TURN, begins if begins == 1 else begins + 1, atol=2e-3)
+
+
+def test_an_index_track_that_is_still_dead_is_noticed_again_after_a_reset():
+    result = harness.run(supervised("spindle_encoder.faults=['revolution 5: encoder missed_index']",
+                                    "supervisor.events=['revolution 12: reset']"))  # fmt: skip
+    told = [each[0] for each in status(result)]
+    assert told.index("index_pulses") < told.index(RESET) < told.index("index_pulses", told.index(RESET))
+
+
+def test_a_supervisor_without_drives_is_safe_at_once_when_members_are_lost():
+    loaded = scenarios.load(CONFIG / "supervised_turning.yaml", [])
+    stage = Cell(loaded.nodes).stages["supervisor"]
+    stage.lose(0)
+    inputs = [
+        {name: np.zeros(64, messages.sample_fields(port.type)[name]) for name in port.fields} for port in stage.inputs
+    ]
+    outputs = [messages.allocate(port.type, 64) for port in stage.outputs]
+    told = stage.advance(0, inputs, outputs)
+    assert outputs[0]["state"].tolist() == [State.SAFE] * 64
+    assert next(each for each in told if each.type == messages.SAFETY_STATUS).values["monitor"] == MEMBERS_LOST
 
 
 def test_an_angle_that_no_controller_can_use_ends_in_the_safe_state_not_in_an_error():

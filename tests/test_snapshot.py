@@ -31,11 +31,13 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.framing import Framer
 from lathe_rc.cell.messages import START_NS
 from lathe_rc.cell.recorder import RecorderParameters
+from lathe_rc.cell.scenario import load
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError, LatheError
 
+CONFIG = Path(__file__).parents[1] / "config"
 STEP_NS, BLOCK, PRE, POST = 15_625, 64, 3200, 1280
 TIMES = {"pre": PRE / 64_000, "post": POST / 64_000, "triggers": ["*: freeze", "learning_controller: clear"]}
 EVENTS = ["sample 9000: freeze", "sample 13000: learn", "sample 20000: clear"]
@@ -117,6 +119,22 @@ def test_the_commands_read_a_snapshot_as_a_bag(recorded):
         found = check(path)
         assert (found.exit_code, found.first, found.samples) == (0, told(path)["first_sample"], told(path)["samples"])
         assert CliRunner().invoke(main, ["bag", "info", str(path), "--json"]).exit_code == 0
+
+
+def test_an_alarm_is_a_trigger(tmp_path):
+    broken = "electrodynamic_actuator.faults=['revolution 12: coarse/state.measured_position slow time=1e-3']"
+    sets = [
+        "spindle_encoder.revolutions=16",
+        broken,
+        "recorder.mode=snapshot",
+        "recorder.pre=0.01",
+        "recorder.post=0.01",
+    ]
+    loaded = load(CONFIG / "supervised.yaml", [*sets, "recorder.triggers=['supervisor: * tool']"])
+    result = harness.run(loaded, bag=tmp_path / "bag")
+    alarm = result.recording.sparse["/safety/status"].values
+    (path,) = result.snapshots
+    assert told(path)["triggers"] == [[alarm["sample_index"][0], "supervisor: error tool"]]
 
 
 def test_the_first_complete_revolution_of_a_snapshot_has_the_number_that_it_has_in_the_run(tmp_path):

@@ -27,6 +27,7 @@ _CATCH_UP = 4  # messages or rows that go to the disk for each that comes, until
 _SPARE_ROWS = 2  # kept beyond the time before a trigger: a trigger may lie in the row before the newest
 _IN_FLIGHT = 16  # rows more that may be in memory: they come some at once
 _LATCHED = f"{messages.PACKAGE}/msg/CellState"
+_HEARD = (messages.EVENT, messages.SAFETY_STATUS)  # what may be a trigger
 
 
 class _Item(NamedTuple):
@@ -152,13 +153,13 @@ class Snapshots:
         return list(self._topics).index(topic) + 1
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None:
-        """See `Output`; an event may be a trigger.
+        """See `Output`; an event or an alarm may be a trigger.
 
         Raises:
             LatheError: the disk does not take it, or too much is kept.
         """
         self._take(_Item(log_ns, topic, data))
-        if self._table.triggers and self._topics[topic][0] == messages.EVENT:
+        if self._table.triggers and self._topics[topic][0] in _HEARD:
             self._hear(topic, data)
 
     def write_rows(self, plan: RowPlan, first_ns: int, data: bytes) -> None:
@@ -172,13 +173,15 @@ class Snapshots:
             self._take(_Item(first_ns + row * plan.period_ns, plan, whole[start : start + plan.size]))
 
     def _hear(self, topic: str, data: bytes) -> None:
+        msgtype = self._topics[topic][0]
         try:
-            event = messages.decode(messages.EVENT, data)
+            heard = messages.decode(msgtype, data)
         except ValueError as error:
             raise LatheError(f"{topic}: {error}") from None
-        cause = f"{event.source.removeprefix(self._namespace)}: {event.action}"
+        what = heard.action if msgtype == messages.EVENT else f"{heard.monitor} {heard.subject}".strip()
+        cause = f"{heard.source.removeprefix(self._namespace)}: {what}"
         if any(fnmatchcase(cause, pattern) for pattern in self._table.triggers):
-            self.trigger(cause, int(event.sample_index))
+            self.trigger(cause, int(heard.sample_index))
 
     def _take(self, item: _Item) -> None:
         if not isinstance(item.key, str) or self._topics[item.key][0] in messages.signal_types():

@@ -30,7 +30,8 @@ class RecorderParameters(NodeParameters):
     post: Annotated[float, Ge(0), Le(3600)] = parameter(1.0, "simulated time that a snapshot has after a trigger", "s")
     triggers: list[str] = parameter(
         [],
-        "events that trigger a snapshot, as patterns of NODE: ACTION, like '*: fault *' or 'fine_controller: joined'",
+        "events and alarms that trigger a snapshot, as patterns of NODE: ACTION or NODE: MONITOR SUBJECT, like "
+        "'*: fault *', 'fine_controller: joined' or 'supervisor: error tool'",
     )
     memory: Annotated[int, Ge(2**16), Le(2**38)] = parameter(
         2**29, "memory that the time before a trigger may take", "B"

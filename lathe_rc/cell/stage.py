@@ -80,7 +80,7 @@ class Trigger:
 _NOTHING = np.empty(0)
 
 _EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)(?:\s+to\s+([0-9.eE+-]+))?\s*:\s*(\S.*?)\s*")
-_FAULT, _REPAIR = "fault", "repair"  # verbs of the events that all stages know: fault FAULT, repair TARGET
+_FAULT, _REPAIR = "fault", "repair"  # verbs of the events that all stages know: fault FAULT, repair FAULT or TARGET
 SAFE = "safe"  #: and of the one that only a host may ask for: members of the cell are lost
 
 
@@ -180,8 +180,7 @@ class Stage(ABC):
         begin = self._trigger("faults", f"{match[1]} {match[2]}: {_FAULT} {match[4]}")
         if not match[3]:
             return [begin]
-        target = faults.parse(match[4], f"{self.name}.faults").target
-        end = self._trigger("faults", f"{match[1]} {match[3]}: {_REPAIR} {target}")
+        end = self._trigger("faults", f"{match[1]} {match[3]}: {_REPAIR} {match[4]}")
         if end.value <= begin.value:
             raise InputError(f"{self.name}.faults = {text!r} ends before it begins; allowed: an end after {match[2]}")
         return [begin, end]
@@ -198,7 +197,9 @@ class Stage(ABC):
             return
         if verb == _REPAIR:
             self._check_allowed(action)
-            if rest not in self.devices:
+            if " " in rest:
+                self._check_fault(faults.parse(rest, self.name))
+            elif rest not in self.devices:
                 assert self._injection is not None, "there is one if faults are allowed"
                 self._injection.check_target(rest)
             return
@@ -327,9 +328,10 @@ class Stage(ABC):
                 self._injection.begin(fault, index)
         elif verb == _REPAIR:
             assert self._injection is not None, "the event has been checked"
-            self._injection.end(rest, index)
-            if rest in self.devices:
-                self.mend()
+            target, one = rest.partition(" ")[0], faults.parse(rest, self.name) if " " in rest else None
+            self._injection.end(target, index, one)
+            if target in self.devices:
+                self.mend(one)
         else:
             self.perform(action)
 
@@ -343,9 +345,9 @@ class Stage(ABC):
         """
         raise NotImplementedError(fault.text)
 
-    def mend(self) -> None:
-        """Be as before all of them; stages with ``devices`` have their own, see `damage`."""
-        raise NotImplementedError
+    def mend(self, fault: Fault | None) -> None:
+        """Be as before a fault, or before all; stages with ``devices`` have their own, see `damage`."""
+        raise NotImplementedError(fault)
 
     def _joint_states(self, first: int, joint: Joint, signals: Signals) -> list[Sparse]:
         period = self.shared.joint_state_period

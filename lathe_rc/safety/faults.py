@@ -24,6 +24,7 @@ from lathe_rc.errors import InputError
 Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
+_LARGEST = 1e100  # any unit's number is far smaller, and its products are finite
 _LONGEST = 200  # characters of a fault: an event holds it
 _VALUE = re.compile(r"(\w+)=(\S+)")
 
@@ -50,7 +51,7 @@ class Value:
 
     def takes(self, value: float) -> bool:
         """Whether it is allowed."""
-        return math.isfinite(value) and (value > self.low if self.above else value >= self.low) and value < self.below
+        return abs(value) <= _LARGEST and (value > self.low if self.above else value >= self.low) and value < self.below
 
 
 @dataclass(frozen=True)
@@ -170,9 +171,13 @@ def _allowed(kind: Kind) -> str:
     """The values of a kind in words."""
     words = []
     for name, value in kind.values.items():
-        limit = "" if value.low == -math.inf else f" {'above' if value.above else 'from'} {value.low:g}"
-        limit += "" if value.below == math.inf else f" below {value.below:.4g}"
-        words.append(f"{name}= a finite number{limit}{f' [{value.unit}]' if value.unit not in ('', '1') else ''}")
+        low = "" if value.low == -math.inf else f" {'above' if value.above else 'from'} {value.low:g}"
+        high = (
+            f" up to {_LARGEST:g}{'' if low else ' in size'}"
+            if value.below == math.inf
+            else f" below {value.below:.4g}"
+        )
+        words.append(f"{name}= a number{low}{high}{f' [{value.unit}]' if value.unit not in ('', '1') else ''}")
     return "each once: " + ", ".join(words) if words else "no values"
 
 

@@ -114,10 +114,10 @@ class Injection:
             made = DISTURBANCES[fault.kind](fault, seed=self._seed, step=self._step, whose=self._node)
             self._injected.append(_Injected(fault, port, made, index))
 
-    def end(self, target: str, index: int) -> None:
-        """Let all faults of a target end before sample ``index``."""
+    def end(self, target: str, index: int, fault: Fault | None = None) -> None:
+        """Let a fault of a target, or all of them, end before sample ``index``."""
         for injected in self._injected:
-            if injected.fault.target == target and injected.end > index:
+            if injected.fault.target == target and fault in (None, injected.fault) and injected.end > index:
                 injected.end = index
 
     @property

@@ -359,7 +359,7 @@ def _next(pulse: Pulses, begin: int) -> int:
 
 @inlined
 def _off(since: float, limit: float) -> bool:
-    """Whether no angle since an index pulse can be this, to the limit; nothing is known before the first pulse: NaN."""
+    """Whether no angle since an index pulse can be this, to the limit."""
     return since > _TURN + limit or since < -limit
 
 
@@ -377,21 +377,27 @@ def _first_off(angle: Array, last: float, limit: float) -> int:
 
 @kernel
 def _index(angle: Array, pulse: Pulses, memory: Array) -> int:
-    """First sample that does not fit the pulses, or -1; the memory: limit, angle of the last pulse, what was found."""
+    """First sample that does not fit the pulses, or -1.
+
+    The memory: limit, angle of the last pulse, what was found, whether there was a pulse: before, the first angle
+    stands for one that may come early.
+    """
     limit, begin = memory[0], 0
+    if angle.size and np.isnan(memory[1]):
+        memory[1] = angle[0]
     while begin < angle.size:
         at = _next(pulse, begin)
         last = memory[1]
         found = _first_off(angle[begin : at + 1], last, limit)
         if found >= 0:
             found += begin
-        elif at < angle.size and angle[at] - last < _TURN - limit:
+        elif at < angle.size and memory[3] > 0.0 and angle[at] - last < _TURN - limit:
             found = at
         if found >= 0:
             memory[2] = abs(angle[found] - last - _TURN)
             return found
         if at < angle.size:
-            memory[1] = angle[at]
+            memory[1], memory[3] = angle[at], 1.0
         begin = at + 1
     return -1
 
@@ -400,7 +406,7 @@ class IndexPulses(Ruled):
     """One revolution of the measured angle from index pulse to index pulse, and never backwards."""
 
     def __init__(self, limit: float, reaction: Reaction, *, encoder: int) -> None:
-        signal, memory = (encoder, "angle"), (limit, np.nan, np.nan)
+        signal, memory = (encoder, "angle"), (limit, np.nan, np.nan, 0.0)
         super().__init__("index_pulses", "encoder", limit, reaction, rule=_INDEX, signal=signal, memory=memory)
 
     def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
@@ -410,7 +416,7 @@ class IndexPulses(Ruled):
     def reset(self) -> None:
         """See `Monitor`."""
         super().reset()
-        self.memory[1:] = np.nan
+        self.memory[1:] = np.nan, np.nan, 0.0
 
 
 _SUMS = 128  # of squares, each of every 128th error: one would wait for itself, these are vectors

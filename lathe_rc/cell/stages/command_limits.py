@@ -13,6 +13,7 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.control.limits import CommandLimiter, CommandLimits
 
 LIMITED, FREE = "limited", "free"  #: events: a sample is clipped; none has been for a while
+_TELL = 0.1  # [s] after which a command that goes on being clipped says how often
 _QUIET = 10e-3  # [s] without a clipped sample until a command is free again
 
 
@@ -71,11 +72,26 @@ class Clipping:
         self._which = f" {which}" if which else ""
         self._begins = f"{LIMITED}:{self._which}" if which else LIMITED
         self._quiet = round(_QUIET * parameters.sample_rate)
+        self._tell = max(round(_TELL * parameters.sample_rate), 1)
         # Clipped samples so far, and when it was last free; samples until it is free again.
         self._clipped, self._before, self._left = 0, 0, 0
 
     def told(self, first: int, clipped: Samples) -> list[Sparse]:
         """The events of samples ``first`` on, of which some are ``clipped``, shape (n,)."""
+        found: list[Sparse] = []
+        start = 0
+        while start < clipped.size:
+            stop = min(start + self._tell - (first + start) % self._tell, clipped.size)
+            found += self._ends(first + start, clipped[start:stop])
+            if (first + stop) % self._tell == 0 and self._clipped > self._before:
+                action = f"{LIMITED}:{self._which} {self._clipped - self._before} samples were clipped"
+                found.append(Sparse(self._topic, messages.EVENT, first + stop - 1, {"action": action}))
+                self._before = self._clipped
+            start = stop
+        return found
+
+    def _ends(self, first: int, clipped: Samples) -> list[Sparse]:
+        """With which sample it begins, and is free again."""
         found: list[Sparse] = []
         count, place, samples = self._clipped, 0, clipped.size
         self._clipped += int(clipped.sum())

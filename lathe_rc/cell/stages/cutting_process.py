@@ -182,7 +182,7 @@ class CuttingProcessStage(Stage):
             step=parameters.step,
         )
         self._movers = moved
-        self._shorter, self._spots = 0.0, list[HardSpot]()
+        self._damages = list[Fault]()
         self.declare(
             inputs=[Input("encoder", messages.ENCODER, ("angle_true", "speed_true")), *(_READ[name] for name in moved)],
             outputs=[Output("cut", messages.CUT)],
@@ -190,18 +190,22 @@ class CuttingProcessStage(Stage):
 
     def damage(self, fault: Fault) -> None:
         """See `Stage`."""
-        values = fault.values
-        if fault.kind == "tool_broken":
-            self._shorter += values["length"]
-        else:
-            everywhere = values["start"], values["width"], -np.inf, np.inf
-            self._spots.append(HardSpot(*everywhere, values["factor"]))
-        self.cut.damage(shorter=self._shorter, spots=self._spots)
+        self._damages.append(fault)
+        self._suffer()
 
-    def mend(self) -> None:
-        """See `Stage`: a new tool in even material."""
-        self._shorter, self._spots = 0.0, []
-        self.cut.damage()
+    def mend(self, fault: Fault | None) -> None:
+        """See `Stage`: a longer edge, or a spot less; all of them are a new tool in even material."""
+        self._damages = [damage for damage in self._damages if fault not in (None, damage)]
+        self._suffer()
+
+    def _suffer(self) -> None:
+        shorter = sum(fault.values["length"] for fault in self._damages if fault.kind == "tool_broken")
+        spots = [
+            HardSpot(fault.values["start"], fault.values["width"], -np.inf, np.inf, fault.values["factor"])
+            for fault in self._damages
+            if fault.kind == "hard_spot"
+        ]
+        self.cut.damage(shorter=shorter, spots=spots)
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`; the cross feed is positive into the part."""

@@ -18,6 +18,7 @@ from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
 Asked = Literal["warn", "freeze", "fall_back", "hold", "retract", "stop"]
 
 MEMBERS_LOST = "members_lost"  #: stands for a monitor where the host says that members of the cell are lost
+RESET_REFUSED = "reset refused"  #: the same: while the tool is on its way out, or after a stop
 _SENSOR, _COMMAND, _MARGIN = ("measured_position", "effort"), ("position",), ("stability_margin",)
 
 
@@ -262,6 +263,8 @@ class Supervisor(Stage):
             self.state, self.reaction = to, Reaction.NONE
             self._told.append(RESET)
             self._lookout.reset()
+        elif self.state is not State.NOMINAL:
+            self._told.append(RESET_REFUSED)
 
     def go_safe(self) -> None:
         """See `Stage`: an alarm that nothing resets."""
@@ -271,6 +274,8 @@ class Supervisor(Stage):
     def _ask_for(self, reaction: Reaction) -> None:
         to = state_machine.after(self.state, reaction)
         assert to is not None, "every reaction is known in every state"
+        if to is State.RETRACTING and self._out is None:
+            to = State.SAFE  # there is no drive to wait for
         if to is State.RETRACTING and self.state is not to:
             self._clearance.begin()
         self.state, self.reaction = to, max(self.reaction, reaction)
