@@ -134,9 +134,17 @@ def test_bags_of_two_process_runs_and_of_an_offline_run_hold_the_same_messages(t
 
 
 def test_events_by_service_are_recorded_at_the_index_that_was_promised(tmp_path):
-    slow = load(PISTON, ["spindle_encoder.revolutions=40.0", "spindle_encoder.speed_factor=0.3"])
+    slow = load(PISTON, ["spindle_encoder.revolutions=40.0", "spindle_encoder.speed_factor=0.3", "allow_faults=true"])
     cell = harness.with_recorder(slow, tmp_path / "bag", keep=True)
+    asked = [
+        "freeze",
+        "fault tool.measured_error noisy rms=1e-7",
+        "repair tool.measured_error",
+        "jump",
+        "fault tool off",
+    ]
     script = """
+import sys
 import rclpy
 from rclpy.node import Node
 from lathe_rc_msgs.srv import Schedule
@@ -144,7 +152,7 @@ rclpy.init()
 node = Node("operator")
 client = node.create_client(Schedule, "/learning_controller/schedule")
 assert client.wait_for_service(20.0)
-for action in ("freeze", "jump"):
+for action in sys.argv[1:]:
     future = client.call_async(Schedule.Request(action=action, not_before=15000))
     rclpy.spin_until_future_complete(node, future, timeout_sec=20.0)
     print(future.result().accepted, future.result().sample_index, future.result().message)
@@ -157,14 +165,15 @@ for action in ("freeze", "jump"):
             "ROS_LOG_DIR": str(tmp_path),
         }
         lines = subprocess.run(
-            [sys.executable, "-c", script], env=environment, stdout=subprocess.PIPE, text=True, check=True
+            [sys.executable, "-c", script, *asked], env=environment, stdout=subprocess.PIPE, text=True, check=True
         ).stdout.splitlines()
         processes.wait_for_end()
-    accepted, index, *_ = lines[0].split()
-    assert accepted == "True"
-    assert int(index) >= 15000
-    assert lines[1].startswith("False 0 ")
-    assert "allowed: freeze, learn, clear" in lines[1]
+    promised = [int(line.split()[1]) for line in lines[:3]]
+    assert [line.split()[0] for line in lines] == ["True"] * 3 + ["False"] * 2
+    assert min(promised) >= 15000
+    assert lines[3].startswith("False 0 ")
+    assert "allowed: freeze, learn, clear" in lines[3]
+    assert "no such target for it; allowed: " in lines[4]
     events = reader.read(tmp_path / "bag").sparse["/learning_controller/events"]
-    assert events.values["action"] == ["freeze"]
-    assert events.values["sample_index"] == [int(index)]
+    assert events.values["action"] == asked[:3]
+    assert events.values["sample_index"] == promised

@@ -516,6 +516,91 @@ def test_an_angle_that_no_controller_can_use_ends_in_the_safe_state_not_in_an_er
     assert (RETRACTED, State.SAFE) in [told[:2] for told in status(result)]
 
 
+@pytest.mark.parametrize(
+    ("scenario", "monitor", "subject", "watched", "limit", "seconds"),
+    [
+        (
+            "supervised",
+            "following",
+            "coarse",
+            ("coarse/command.position", "coarse/state.measured_position"),
+            30e-6,
+            1e-3,
+        ),
+        ("supervised", "stroke", "coarse", ("coarse/state.measured_position",), 100e-6, 0.0),
+        ("supervised", "effort", "coarse", ("coarse/state.effort",), 0.02, 5e-3),
+        ("supervised_turning", "slide", "longitudinal", ("longitudinal/state.measured_position",), 0.3e-3, 0.0),
+    ],
+)
+def test_a_drive_is_watched_by_the_signals_that_its_monitor_names(scenario, monitor, subject, watched, limit, seconds):
+    sets = [f"supervisor.{monitor}_limit=[{limit}]", f"supervisor.{monitor}_reaction=warn"]
+    result = harness.run(scenarios.load(CONFIG / f"{scenario}.yaml", ["spindle_encoder.revolutions=12", *sets]))
+    recording = result.recording
+    first, *rest = (recording.dense[f"/{topic}"][name] for topic, _, name in (each.rpartition(".") for each in watched))
+    value = np.abs(first - rest[0]) if rest else np.abs(first)
+    told = recording.sparse["/safety/status"].values
+    found = list(zip(told["monitor"], told["subject"], told["sample_index"], told["value"], strict=True))
+    index = lasting(value > limit, max(1, round(seconds / STEP)))
+    assert index is not None
+    assert (monitor, subject, index, value[index]) in found
+
+
+def test_acceleration_is_the_change_of_the_measured_speed_over_its_window():
+    sets = ["supervisor.acceleration_limit=20.0", "supervisor.acceleration_reaction=warn", "supervisor.speed_limit=0.0"]
+    recording = harness.run(supervised(*sets)).recording
+    speed = recording.of_type(messages.ENCODER)["speed"]
+    nominal = 1000.0 * TURN / 60.0
+    change = np.abs(speed - np.concatenate((np.full(640, nominal), speed))[: speed.size]) / (640 * STEP)
+    (told,) = status(harness.run(supervised(*sets)))
+    assert (told[0], told[3]) == ("acceleration", np.flatnonzero(change > 20.0)[0])
+
+
+SLOW = STUCK.replace("revolution 20", "revolution 12")
+
+
+def commanded(reaction, *overrides):
+    """Command, and the sample from which on the reaction is obeyed."""
+    asked = ["supervisor.growth_limit=0.0", "supervisor.following_limit=[]", f"supervisor.error_reaction={reaction}"]
+    result = harness.run(supervised(SLOW, *asked, *overrides))
+    (monitor, *_, index), *more = status(result)
+    assert (monitor, more) == ("error", [])
+    return result, command(result), index + 3200
+
+
+def test_a_warning_changes_nothing_that_moves():
+    _, warned, _ = commanded("warn")
+    assert_array_equal(warned, command(harness.run(supervised(SLOW, "supervisor.error_limit=0.0",
+                       "supervisor.growth_limit=0.0", "supervisor.following_limit=[]"))))  # fmt: skip
+
+
+def test_falling_back_freezes_the_memory_and_if_so_asked_the_lead():
+    result, frozen, obeyed = commanded("fall_back")
+    told = result.recording.sparse["/coarse/learning"].values
+    learning = np.array(told["learning"])[np.array(told["sample_index"]) > obeyed]
+    assert learning.size > 5
+    assert not learning.any()
+    _, constant, _ = commanded("fall_back", "learning_controller.fall_back=constant_lead")
+    assert_array_equal(constant[:obeyed], frozen[:obeyed])
+    assert np.abs(constant - frozen)[obeyed:].max() > 1e-6, "the speed swings by a tenth"
+    _, learned, _ = commanded("warn")
+    assert np.abs(learned - frozen)[obeyed:].max() > 1e-6
+
+
+def test_at_a_steady_speed_a_constant_lead_is_the_lead():
+    steady = ["spindle_encoder.deviation_amplitude=[0.0]"]
+    _, frozen, _ = commanded("fall_back", *steady)
+    _, constant, _ = commanded("fall_back", *steady, "learning_controller.fall_back=constant_lead")
+    assert_allclose(constant, frozen, atol=1e-12)
+
+
+def test_to_hold_is_to_come_to_rest_and_stay():
+    result, held, obeyed = commanded("hold")
+    moves = np.flatnonzero(np.diff(held))
+    assert obeyed < moves[-1] < obeyed + 3200
+    assert np.abs(np.diff(held[obeyed:], 2)).max() <= 50.0 * STEP**2 * 1.001
+    assert result.recording.of_type(messages.SAFETY)["state"][-1] == State.DEGRADED
+
+
 def test_a_broken_tool_stops_the_feed():
     broken = "cutting_process.faults=['revolution 200: cut tool_broken length=1e-3']"
     result = harness.run(scenarios.load(CONFIG / "supervised_turning.yaml", [broken]))

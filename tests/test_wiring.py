@@ -2,6 +2,7 @@
 """The wired cell, and what it refuses before anything moves."""
 
 from math import pi
+from pathlib import Path
 
 import pytest
 from cells import NODES, run, scenario
@@ -13,6 +14,8 @@ from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.stage import Input, Output, Stage
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+
+CONFIG = Path(__file__).parents[1] / "config"
 
 
 class Repeater(Stage):
@@ -163,3 +166,23 @@ def test_spindle_that_turns_back_is_refused():
 
 def test_endless_run_is_refused_offline():
     assert refusal(spindle_encoder={"revolutions": 0.0}).startswith("spindle_encoder.revolutions = 0")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            "learning_controller.retract_position=0.2e-3",
+            r"learning_controller.retract_position = 0.0002 m, but the tool",
+        ),
+        (
+            "learning_controller.retract_position=0.0",
+            r"retract_position = 0 m, but .*clear_position = 0.00028 m; allowed",
+        ),
+        ("electrodynamic_actuator.command_stroke=0.275e-3", r"electrodynamic_actuator.command_stroke = 0.000275 m"),
+    ],
+)
+def test_a_tool_that_is_not_brought_out_of_the_part_is_refused(change, said):
+    loaded = scenarios.load(CONFIG / "supervised.yaml", [change])
+    with pytest.raises(InputError, match=said):
+        Cell(loaded.nodes).check()

@@ -17,6 +17,7 @@ from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.profile import ProfileStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.stages.supervisor import Supervisor
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError
 
@@ -122,8 +123,9 @@ class Cell:
         """Refuse what cannot work, with the figures, before anything moves.
 
         Raises:
-            InputError: a block longer than a feedback delay, a profile that a drive cannot follow, a memory that
-                would be read before it is learned, a learning loop that does not converge.
+            InputError: a block longer than a feedback delay, a profile that a drive cannot follow, a tool that is not
+                brought out of the part, a memory that would be read before it is learned, a learning loop that does
+                not converge.
         """
         low, high = self.master.speed_range()
         if low <= 0.0:
@@ -137,6 +139,8 @@ class Cell:
                     )
             if isinstance(stage, Tool):
                 self._check_profile(stage, high)
+            if isinstance(stage, Supervisor) and stage.parameters.drives:
+                self._check_retraction(stage)
             if isinstance(stage, LearningController):
                 self._check_delay(stage, high)
                 self._check_preview(stage)
@@ -153,6 +157,22 @@ class Cell:
             for topic, response in drive.responses().items()
             if remapped(drive.shared, topic) in commands and any(port.topic == topic for port in drive.inputs)
         ]
+
+    def _check_retraction(self, stage: Supervisor) -> None:
+        """The tool has to get as far out of the part as is asked for before it is safe."""
+        drive, clear = stage.parameters.drives[0], stage.parameters.clear_position
+        for topic, name in ((f"{drive}/command", "retract_position"), (f"{drive}/state", "command_stroke")):
+            outlet = self.dense.get(remapped(stage.shared, topic))
+            if outlet is None:
+                continue  # a series drive passes commands on inside
+            source = self.stages[outlet.node]
+            reached = getattr(source.shared, name, None)
+            counts = reached if name == "command_stroke" else getattr(source.shared, "reaction_delay", 0)
+            if counts and reached is not None and reached <= clear:
+                raise InputError(
+                    f"{source.name}.{name} = {reached:g} m, but the tool is out of the part beyond "
+                    f"{stage.name}.clear_position = {clear:g} m; allowed: above that, or a smaller clear_position"
+                )
 
     def _check_delay(self, stage: LearningController, speed: float) -> None:
         encoder = self.master.parameters
