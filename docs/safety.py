@@ -31,7 +31,9 @@ ERROR = [
     "tool.measured_error stuck",
     "tool.measured_error garbage amplitude=1e-4",
     "tool.measured_error wrong scale=-1",
+    "tool.measured_error slow time=0.001",
     "tool.measured_error delayed time=0.01",
+    "tool.measured_error intermittent good=0.01 off=0.001",
     "tool.measured_error noisy rms=2e-6",
 ]
 
@@ -41,13 +43,19 @@ def drive(channel: str) -> list[str]:
     told = [
         "command.position off",
         "command.position stuck",
+        "command.position garbage amplitude=1e-4",
+        "command.position wrong scale=0.9",
+        "command.position slow time=0.001",
         "command.position delayed time=0.002",
+        "command.position intermittent good=0.01 off=0.001",
+        "command.position noisy rms=1e-5",
         "state.position stuck",
         "state.measured_position off",
         "state.measured_position stuck",
         "state.measured_position garbage amplitude=1e-4",
         "state.measured_position wrong scale=0.9 offset=1e-5",
         "state.measured_position slow time=0.001",
+        "state.measured_position delayed time=0.002",
         "state.measured_position intermittent good=0.01 off=0.001",
         "state.measured_position noisy rms=1e-5",
     ]
@@ -60,15 +68,25 @@ CUT = [
     "cut hard_spot factor=2",
     "cut.measured_force off",
     "cut.measured_force stuck",
+    "cut.measured_force garbage amplitude=300",
     "cut.measured_force wrong scale=0.8",
+    "cut.measured_force slow time=0.1",
+    "cut.measured_force delayed time=0.1",
+    "cut.measured_force intermittent good=0.1 off=0.01",
     "cut.measured_force noisy rms=10",
 ]
-FEED = ["longitudinal/command.command stuck", "longitudinal/state.velocity off"]
+FEED = [
+    "longitudinal/command.command off",
+    "longitudinal/command.command stuck",
+    "longitudinal/command.command noisy rms=0.1",
+    "longitudinal/state.velocity off",
+    "longitudinal/state.measured_position stuck",
+]
 #: scenario, revolution of the fault, and the faults by node
 CASES = {
     "supervised": (60, PISTON),
     "supervised_two_channel": (100, PISTON | {"fine_controller": ERROR, "piezo_actuator": drive("fine")}),
-    "supervised_turning": (200, {"cutting_process": CUT, "longitudinal": FEED}),
+    "supervised_turning": (200, {"spindle_encoder": SPINDLE, "cutting_process": CUT, "longitudinal": FEED}),
 }
 
 
