@@ -56,9 +56,11 @@ def test_window_changes_no_bit(offline, window):
     assert harness.run(piston(f"window={window}"), mode="composed").digest == offline
 
 
-@pytest.mark.parametrize("node", ["tool", "recorder"])
-def test_a_stopped_process_changes_no_bit(offline, node, tmp_path):
-    cell = harness.with_recorder(piston("spindle_encoder.speed_factor=0.5"), tmp_path / "bag", keep=True)
+@pytest.mark.parametrize(("node", "window"), [("tool", 64), ("recorder", 64), ("tool", 4096)])
+def test_a_stopped_process_changes_no_bit(offline, node, window, tmp_path):
+    # The largest window is longer than the run: nobody waits, and still the stopped one is named.
+    stopped = piston("spindle_encoder.speed_factor=0.5", f"window={window}")
+    cell = harness.with_recorder(stopped, tmp_path / "bag", keep=True)
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
         processes.wait_for("cycle")
         os.kill(processes.pids[node], signal.SIGSTOP)

@@ -52,6 +52,7 @@ class SpindleNode(StageNode):
         self._running = False
         self._schedule = 0.0  # monotonic time at which sample 0 would have been, were there no slips
         self._heard = time.monotonic()
+        self._moved = dict.fromkeys(self._member_names, self._heard)  # when each has last completed a block
         self._stalled: frozenset[str] = frozenset()
         self._dead: dict[str, float] = {}  # monotonic time until which a member may be restarted
         self._unsafe: set[str] = set()  # members that have not yet heard that others are lost
@@ -130,6 +131,7 @@ class SpindleNode(StageNode):
         self._say(CellState.RUNNING, 0)
         self.reporter("block0", self.get_name())
         self._schedule = self._heard = time.monotonic()
+        self._moved = dict.fromkeys(self._member_names, self._heard)
         self.release()
 
     # ---- run ----------------------------------------------------------------------------------------
@@ -145,8 +147,9 @@ class SpindleNode(StageNode):
         before = self._least
         self._completed[progress.name] = progress.blocks
         least = self._least
-        self._heard = time.monotonic()
-        self._stalled = frozenset()
+        self._heard = self._moved[progress.name] = time.monotonic()
+        if progress.name in self._stalled:
+            self._stalled = frozenset()
         self._after(before, least)
 
     def _after(self, before: int, least: int) -> None:
@@ -257,11 +260,18 @@ class SpindleNode(StageNode):
             self.reporter("back", self.get_name(), member=name)
         if any(now >= until for until in self._dead.values()):
             self._lose(dict.fromkeys(self._dead, "died"))  # who was waited for as well: it could not join any more
-        elif not self._dead and (self._unsafe or not self._credit()) and now - self._heard > _STALL:
-            self._name_the_silent()
-            if self._pace.stall_reaction == "safe" and now - self._heard > self._pace.stall_time:
-                silent = self._silent_for(now, self._pace.stall_time) or self._stalled
-                self._lose(dict.fromkeys(silent, "fell silent"))
+        elif not self._dead:
+            silent = self.watch.silent.keys() & self._completed.keys()
+            stopped = {name for name in silent if now - self._moved[name] > _STALL}
+            stands = (self._unsafe or not self._credit()) and now - self._heard > _STALL
+            if stands:
+                # Who waits for a silent one is as slow as it is: first those that DDS does not hear any more.
+                self._name_the_silent(frozenset(silent or self._unsafe or {self._slowest}))
+            elif stopped:
+                self._name_the_silent(frozenset(stopped) | self._stalled)
+            if stands and self._pace.stall_reaction == "safe" and now - self._heard > self._pace.stall_time:
+                lost = self._silent_for(now, self._pace.stall_time) or self._stalled
+                self._lose(dict.fromkeys(lost, "fell silent"))
 
     def failed(self, member: Member) -> None:
         """See `CellNode`: the others go on without it to their safe state, if they can wait until all know."""
@@ -277,14 +287,9 @@ class SpindleNode(StageNode):
     def _go_safe(self, state: CellState) -> None:
         """It has said so itself."""
 
-    def _name_the_silent(self) -> None:
-        # Who waits for a silent one is as slow as it is: first those that DDS does not hear any more.
-        silent = self.watch.silent.keys() & self._completed.keys()
-        names = frozenset(silent or self._unsafe or {self._slowest})
-        if names == self._stalled:
-            return
-        self._stalled = names
-        for name in sorted(names):
+    def _name_the_silent(self, names: frozenset[str]) -> None:
+        new, self._stalled = names - self._stalled, names
+        for name in sorted(new):
             blocks = self._completed[name]
             self.get_logger().warning(f"{name} has been silent for {_STALL * 1e3:.0f} ms at block {blocks}")
             self.reporter("stall", self.get_name(), member=name, blocks=blocks)
