@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import rclpy
 from cells import scenario
-from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, ToolBlock
+from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, SafetyStatus, ToolBlock
 from mcap.reader import make_reader
 from rclpy.executors import SingleThreadedExecutor
 from rosbags.highlevel import AnyReader
@@ -177,8 +177,9 @@ def test_a_member_that_goes_wrong_makes_the_cell_safe(ghost, domain, tmp_path, b
         if event["event"] == "cycle" and not sent:
             sent.append(publisher.publish(bad))
 
-    with pytest.raises(LatheError, match=words):
+    with pytest.raises(LatheError, match=words) as caught:
         harness.run(cell, mode="processes", groups=[], domain=domain, bag=tmp_path / "bag", watch=watch)
+    assert "safe state from sample" in str(caught.value)
     with AnyReader([tmp_path / "bag"]) as found:
         assert sum(1 for _ in found.messages()) > 100
 
@@ -227,18 +228,21 @@ def test_a_flood_takes_no_memory(ghost, domain, tmp_path):
 
 
 def test_who_comes_late_learns_the_state_of_the_cell_and_its_members(ghost, domain, tmp_path):
-    slow = scenario(spindle_encoder={"revolutions": 1000.0, "speed_factor": 0.1})
+    watched = {"error_limit": 1e-12, "error_after": 0.0, "error_reaction": "warn"}
+    slow = scenario(spindle_encoder={"revolutions": 1000.0, "speed_factor": 0.1}, supervisor=watched)
     cell = harness.with_recorder(slow, tmp_path / "bag", keep=True)
     heard = {}
     with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
         processes.wait_for("progress")
         ghost.create_subscription(CellState, "/cell_state", lambda told: heard.update(state=told), latched_qos(1))
         ghost.create_subscription(Member, "/members", lambda told: heard.update({told.name: told}), latched_qos(256))
+        ghost.create_subscription(SafetyStatus, "/safety/status", lambda told: heard.update(alarm=told), latched_qos(1))
         executor = SingleThreadedExecutor()
         executor.add_node(ghost)
-        while len(heard) < 1 + len(cell.nodes):
+        while len(heard) < 2 + len(cell.nodes):
             executor.spin_once(timeout_sec=1.0)
         executor.shutdown()
     assert (heard["state"].run_id, heard["state"].state) == ("test", CellState.RUNNING)
-    assert {name for name in heard if name != "state"} == {f"/{name}" for name in cell.nodes}
+    assert (heard["alarm"].source, heard["alarm"].monitor, heard["alarm"].subject) == ("/supervisor", "error", "tool")
+    assert {name for name in heard if name not in ("state", "alarm")} == {f"/{name}" for name in cell.nodes}
     assert all(heard[f"/{name}"].state == Member.READY for name in cell.nodes)
