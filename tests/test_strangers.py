@@ -10,11 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rclpy
+from builtin_interfaces.msg import Time
 from cells import scenario
 from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, SafetyStatus, ToolBlock
 from mcap.reader import make_reader
 from rclpy.executors import SingleThreadedExecutor
 from rosbags.highlevel import AnyReader
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 
 from lathe_rc import harness
 from lathe_rc.bag import reader
@@ -65,6 +68,12 @@ def foreign(msgtype, own):
     ]
 
 
+def joint_state(sample):
+    """One with a time of this run; none is due at the samples that are used here."""
+    sec, nanosec = divmod(messages.START_NS + sample * STEP, 10**9)
+    return JointState(header=Header(stamp=Time(sec=sec, nanosec=nanosec)), position=[1.0])
+
+
 def senders(topic, own):
     """What the refused of `foreign` are called."""
     sources = ["/other", "/step", "/long", "/uneven", "/nan", "/jump"]
@@ -112,6 +121,7 @@ def test_a_cell_goes_on_among_strangers(ghost, domain, tmp_path):
     members = ghost.create_publisher(Member, "/members", latched_qos(10))
     states = ghost.create_publisher(CellState, "/cell_state", latched_qos(10))
     progress = ghost.create_publisher(Progress, "/progress", latched_qos(10))
+    joints = ghost.create_publisher(JointState, "/electrodynamic_actuator/joint_states", latched_qos(10))
     sends += [
         (members, Member(run_id="elsewhere", name="/tool", state=Member.FAILED, message="no")),
         (members, Member(run_id="test", name="/made_up", publishes=["/a"])),
@@ -121,6 +131,7 @@ def test_a_cell_goes_on_among_strangers(ghost, domain, tmp_path):
         (states, CellState(run_id="x", state=CellState.FAILED)),
         (progress, Progress(run_id="x", name="/tool", blocks=2**40)),
         (progress, Progress(run_id="test", name="/made_up", blocks=2**40)),
+        *((joints, joint_state(sample)) for sample in range(100, 120_000, 1000)),
     ]
     with all_the_time(sends):
         result = harness.run(cell, mode="processes", groups=[], domain=domain, bag=tmp_path / "bag")
@@ -128,6 +139,7 @@ def test_a_cell_goes_on_among_strangers(ghost, domain, tmp_path):
     expected = set.union(*(senders(topic, own) for topic, (_, own) in on.items()))
     assert expected <= set(result.refused)
     others = set(result.refused) - expected
+    assert "/electrodynamic_actuator of run 'test' on /electrodynamic_actuator/joint_states" in others
     assert {"/tool of run 'elsewhere' on /members", "/made_up of run 'test' on /members"} <= others
     assert {"an unknown sender of run 'x' on /cell_state", "/tool of run 'x' on /progress"} <= others
     values = {pair.key: pair.value for pair in diagnostics(tmp_path / "bag")["/learning_controller"].values}

@@ -61,6 +61,7 @@ class RecorderNode(CellNode):
         self._queues: dict[str, BlockQueue] = {}
         self._sparse: dict[str, str] = {}  # topic -> source
         self._processes: dict[str, int] = {}  # of the members that another process may go on for
+        self._joints: dict[str, tuple[int, set[int]]] = {}  # period, and samples of those that wait, by topic
         self._newest: dict[str, bytes] = {}  # message of each topic that comes from another process
         self._encoders = _Encoders()
         self._merger: Merger | None = None
@@ -176,6 +177,8 @@ class RecorderNode(CellNode):
         self._open.add_topic(topic, msgtype, offered_qos(self._depth, "transient_local"))
         if sparse:
             self._sparse[topic] = source
+            period = self._parameter(source, "joint_state_period")
+            self._joints[topic] = period if isinstance(period, int) else self.table.joint_state_period, set()
             self.listen(topic, msgtype, partial(self._on_message_at, topic, msgtype), partial(self._on_sparse, topic))
             return
         queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
@@ -267,7 +270,18 @@ class RecorderNode(CellNode):
             return  # from another process that goes on in the place of the first
         if rest or not begin <= sample < end:
             raise Stranger(topic, source, run_id, f"expected a time of samples {begin} to {end - 1}")
+        if msgtype == messages.JOINTS and self._merger is not None:
+            self._expect_joints(topic, sample, begin)
         self._on_sparse(topic, data)
+
+    def _expect_joints(self, topic: str, sample: int, begin: int) -> None:
+        """They name no sender, but there is one for each period, and no more."""
+        period, waiting = self._joints[topic]
+        waiting -= {other for other in waiting if other < begin}
+        if sample % period or sample in waiting:
+            expected = f"expected one at every sample that is a multiple of {period}"
+            raise Stranger(topic, self._sparse[topic], self.table.run_id, expected)
+        waiting.add(sample)
 
     def _on_sparse(self, topic: str, data: bytes) -> None:
         if self.over:
