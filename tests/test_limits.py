@@ -126,8 +126,7 @@ def test_a_feed_drive_tells_of_what_its_command_limit_alone_cuts_off():
     recording = harness.run(scenarios.load(CONFIG / "periodic.yaml", ["feed_drive.command_limit=0.2"])).recording
     wanted, held = recording.of_type(messages.SERVO)["command"], recording.of_type(messages.STATE)["effort"]
     assert np.abs(wanted).max() > 0.2 == np.abs(held).max()
-    told = recording.sparse["/feed_drive/events"].values
-    actions = told["action"]
+    actions = recording.sparse["/feed_drive/events"].values["action"]
     assert actions[0] == "limited"
     assert all(action == "limited" or action.startswith(("limited: ", "free: ")) for action in actions)
 

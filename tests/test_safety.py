@@ -547,11 +547,11 @@ def test_a_drive_is_watched_by_the_signals_that_its_monitor_names(scenario, moni
 
 def test_acceleration_is_the_change_of_the_measured_speed_over_its_window():
     sets = ["supervisor.acceleration_limit=20.0", "supervisor.acceleration_reaction=warn", "supervisor.speed_limit=0.0"]
-    recording = harness.run(supervised(*sets)).recording
-    speed = recording.of_type(messages.ENCODER)["speed"]
+    result = harness.run(supervised(*sets))
+    speed = result.recording.of_type(messages.ENCODER)["speed"]
     nominal = 1000.0 * TURN / 60.0
     change = np.abs(speed - np.concatenate((np.full(640, nominal), speed))[: speed.size]) / (640 * STEP)
-    (told,) = status(harness.run(supervised(*sets)))
+    (told,) = status(result)
     assert (told[0], told[3]) == ("acceleration", np.flatnonzero(change > 20.0)[0])
 
 
