@@ -4,6 +4,7 @@
 import signal
 
 import pytest
+import rclpy
 from hypothesis import HealthCheck, settings
 
 from lathe_rc import harness
@@ -27,3 +28,14 @@ def domain(monkeypatch):
         monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         yield number
+
+
+@pytest.fixture
+def ghost(domain):
+    """A node that belongs to no cell."""
+    rclpy.init()
+    node = rclpy.create_node("ghost", namespace="/haunted")
+    yield node
+    # What is latched would haunt the next test in the same domain.
+    node.destroy_node()
+    rclpy.shutdown()

@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+import rclpy
+from lathe_rc_msgs.srv import Schedule
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness
@@ -135,7 +137,7 @@ def test_bags_of_two_process_runs_and_of_an_offline_run_hold_the_same_messages(t
     assert order == sorted(order)
 
 
-def test_events_by_service_are_recorded_at_the_index_that_was_promised(tmp_path):
+def test_events_by_service_are_recorded_at_the_index_that_was_promised(ghost, domain, tmp_path):
     slow = load(PISTON, ["spindle_encoder.revolutions=40.0", "spindle_encoder.speed_factor=0.3", "allow_faults=true"])
     cell = harness.with_recorder(slow, tmp_path / "bag", keep=True)
     asked = [
@@ -145,37 +147,21 @@ def test_events_by_service_are_recorded_at_the_index_that_was_promised(tmp_path)
         "jump",
         "fault tool off",
     ]
-    script = """
-import sys
-import rclpy
-from rclpy.node import Node
-from lathe_rc_msgs.srv import Schedule
-rclpy.init()
-node = Node("operator")
-client = node.create_client(Schedule, "/learning_controller/schedule")
-assert client.wait_for_service(20.0)
-for action in sys.argv[1:]:
-    future = client.call_async(Schedule.Request(action=action, not_before=15000))
-    rclpy.spin_until_future_complete(node, future, timeout_sec=20.0)
-    print(future.result().accepted, future.result().sample_index, future.result().message)
-"""
-    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+    client, answers = ghost.create_client(Schedule, "/learning_controller/schedule"), []
+    with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
         processes.wait_for("cycle")
-        environment = os.environ | {
-            "ROS_DOMAIN_ID": str(processes.domain),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            "ROS_LOG_DIR": str(tmp_path),
-        }
-        lines = subprocess.run(
-            [sys.executable, "-c", script, *asked], env=environment, stdout=subprocess.PIPE, text=True, check=True
-        ).stdout.splitlines()
+        assert client.wait_for_service(20.0)
+        for action in asked:
+            future = client.call_async(Schedule.Request(action=action, not_before=15000))
+            rclpy.spin_until_future_complete(ghost, future)
+            answers.append(future.result())
         processes.wait_for_end()
-    promised = [int(line.split()[1]) for line in lines[:3]]
-    assert [line.split()[0] for line in lines] == ["True"] * 3 + ["False"] * 2
+    promised = [answer.sample_index for answer in answers[:3]]
+    assert [answer.accepted for answer in answers] == [True] * 3 + [False] * 2
     assert min(promised) >= 15000
-    assert lines[3].startswith("False 0 ")
-    assert "allowed: freeze, learn, clear" in lines[3]
-    assert "no such target for it; allowed: " in lines[4]
+    assert "allowed: freeze, learn, clear" in answers[3].message
+    assert answers[3].sample_index == 0
+    assert "no such target for it; allowed: " in answers[4].message
     events = reader.read(tmp_path / "bag").sparse["/learning_controller/events"]
     assert events.values["action"] == asked[:3]
     assert events.values["sample_index"] == promised

@@ -16,6 +16,8 @@ from cells import scenario
 from lathe_rc import harness
 from lathe_rc.nodes import leftovers
 
+SEGMENT = "fastrtps_0123456789abcdef"
+
 
 @pytest.fixture
 def port(tmp_path):
@@ -25,13 +27,23 @@ def port(tmp_path):
 
 
 def test_what_nobody_uses_is_removed_and_nothing_else(port, tmp_path):
-    for name in ("fastrtps_port7661_el", "sem.fastrtps_port7661_mutex", "fastrtps_0123456789abcdef", "port7661"):
+    others = {"sem.fastrtps_port7661_mutex", "fastrtps_0123456789abcdef0", "fastrtps_without_a_lock", "port7661"}
+    for name in others | {"fastrtps_port7661_el", SEGMENT, f"{SEGMENT}_el"}:
         (tmp_path / name).touch()
-    assert leftovers.sweep(tmp_path) == [port.name]
-    assert not port.exists()
-    assert not list(tmp_path.glob("*_[es]l")), "DDS would take what comes next for a port of a dead process"
-    assert (tmp_path / "fastrtps_0123456789abcdef").exists()
+    assert leftovers.sweep(tmp_path) == [port.name, SEGMENT]
+    # A lock that stays would make DDS take what comes next for a port of a dead process.
+    assert {file.name for file in tmp_path.iterdir()} == others
     assert leftovers.sweep(tmp_path) == []
+
+
+def test_the_segment_of_a_living_process_is_left_alone(tmp_path):
+    segment, lock = tmp_path / SEGMENT, tmp_path / f"{SEGMENT}_el"
+    segment.touch()
+    assert leftovers.sweep(tmp_path) == [], "whose lock is not there yet, or has just been removed"
+    with lock.open("ab") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert leftovers.sweep(tmp_path) == []
+    assert leftovers.sweep(tmp_path) == [SEGMENT]
 
 
 @pytest.mark.parametrize("end", ["_el", "_sl"])
@@ -67,25 +79,25 @@ def test_a_machine_without_shared_memory(tmp_path):
     assert leftovers.sweep(tmp_path / "nowhere") == []
 
 
-def listens_at(pid):
-    """Ports at which a process listens: those whose lock it has open."""
+def locked_by(pid):
+    """Ports at which a process listens, and its segment: those whose lock it has open."""
     links = []
     for link in Path(f"/proc/{pid}/fd").iterdir():
         with contextlib.suppress(FileNotFoundError):  # it has been closed
             links.append(str(link.readlink()))
-    return {found[1] for link in links if (found := re.search(r"/(fastrtps_port\d+)_el$", link))}
+    return {found[1] for link in links if (found := re.search(r"/(fastrtps_(?:port\d+|[0-9a-f]{16}))_el$", link))}
 
 
 def there(names):
     return {name for name in names if (leftovers.FOLDER / name).exists()}
 
 
-def test_ports_of_a_killed_node_are_removed_and_those_of_a_living_one_are_not(domain):
+def test_what_a_killed_node_has_left_is_removed_and_what_a_living_one_has_is_not(domain):
     nodes = ["tool", "learning_controller"]  # without a time master, the one does not mind the death of the other
     with harness.Processes(scenario(), [[name] for name in nodes], domain=domain) as processes:
         for _ in nodes:
             processes.wait_for("active")
-        left, used = (listens_at(processes.pids[name]) for name in nodes)
+        left, used = (locked_by(processes.pids[name]) for name in nodes)
         assert left
         assert used
         dead = os.pidfd_open(processes.pids["tool"])
@@ -96,9 +108,10 @@ def test_ports_of_a_killed_node_are_removed_and_those_of_a_living_one_are_not(do
         # The living one still has those in memory to which it has sent.
         assert there(used) == used
     leftovers.sweep()
-    # Those below are shared by all domains: other tests may use them meanwhile.
-    own = {name for name in left | used if int(name.removeprefix("fastrtps_port")) >= 7400}
-    assert own
+    # Ports below are shared by all domains: other tests may use them meanwhile.
+    own = {name for name in left | used if "port" not in name or int(name.removeprefix("fastrtps_port")) >= 7400}
+    assert len({name for name in own if "port" not in name}) == len(nodes)
+    assert len(own) > len(nodes)
     assert not there(own)
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
 from builtin_interfaces.msg import Time
 from cells import scenario
 from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, SafetyStatus, ToolBlock
@@ -27,17 +26,6 @@ from lathe_rc.errors import LatheError
 from lathe_rc.nodes.ports import latched_qos
 
 STEP = 15_625
-
-
-@pytest.fixture
-def ghost(domain):
-    """A node that belongs to no cell."""
-    rclpy.init()
-    node = rclpy.create_node("ghost", namespace="/haunted")
-    yield node
-    # What is latched would haunt the next test in the same domain.
-    node.destroy_node()
-    rclpy.shutdown()
 
 
 def block(msgtype, first, source, run_id, *, step=STEP, size=64, fill=0.0):

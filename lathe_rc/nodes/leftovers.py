@@ -3,7 +3,9 @@
 
 Fast DDS keeps the queue at which a process listens in /dev/shm/fastrtps_portN; N follows from the ROS domain, and who
 comes next uses the file again. A process that is killed while it uses the queue leaves it broken: messages to the next
-one get lost, and its cell stands still before the first block. So what nobody uses is removed before a node starts.
+one get lost, and its cell stands still before the first block. What a process sends is in its segment,
+/dev/shm/fastrtps_ and 16 digits, 0.5 MB; those of the killed would fill the memory (of a container, often 64 MB). So
+what nobody uses is removed before a node starts.
 """
 
 import fcntl
@@ -15,20 +17,24 @@ from pathlib import Path
 
 FOLDER = Path("/dev/shm")  # noqa: S108 - where POSIX shared memory is on Linux
 _PORT = re.compile(r"fast(rtps|dds)_port\d{1,5}")
+_SEGMENT = re.compile(r"fast(rtps|dds)_[0-9a-f]{16}")
 _LOCKS = ("_el", "_sl")  # of who listens alone, and of those who listen together
 
 
 def sweep(folder: Path = FOLDER) -> list[str]:
-    """Remove the ports that this user's processes have left; their names.
+    """Remove the ports and segments that this user's processes have left; their names.
 
-    A port is in use as long as one of its lock files is locked or a process has it in its memory. Sweeps wait for one
-    another: a port that another sweep holds would be taken for one at which somebody listens, and stay.
+    A port is in use as long as one of its lock files is locked or a process has it in its memory; a segment as long as
+    its lock file is, which its process locks first. Sweeps wait for one another: a port that another sweep holds would
+    be taken for one at which somebody listens, and stay.
     """
     if not folder.is_dir():
         return []
     with _alone(folder):
-        ports = sorted(folder.iterdir())
-        return [port.name for port in ports if _PORT.fullmatch(port.name) and _is_ours(port) and _remove(port)]
+        files = sorted(folder.iterdir())
+        ports = [file.name for file in files if _PORT.fullmatch(file.name) and _is_ours(file) and _remove(file)]
+        segments = [file for file in files if _SEGMENT.fullmatch(file.name) and _is_ours(file)]
+        return ports + [segment.name for segment in segments if _remove_segment(segment)]
 
 
 @contextmanager
@@ -68,6 +74,19 @@ def _remove(port: Path) -> bool:
         for file in gone:
             file.unlink(missing_ok=True)  # DDS removes some, too
         return free
+
+
+def _remove_segment(segment: Path) -> bool:
+    """Remove a segment if its process has ended; whether it has. Who still reads in it has it in memory."""
+    lock = segment.with_name(segment.name + _LOCKS[0])
+    try:
+        with lock.open("rb") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            segment.unlink(missing_ok=True)
+            lock.unlink(missing_ok=True)  # DDS removes both, too
+    except (BlockingIOError, FileNotFoundError):  # it lives, or has just removed them
+        return False
+    return True
 
 
 def _is_mapped(file: Path) -> bool:
