@@ -101,20 +101,22 @@ class Ports:
         self._chunk = chunk
         self._period = lcm(*(ring.period for ring, _ in self._inputs), *(r.period for r in self._outputs.values()))
         self._steady = not any(delay % chunk for _, delay in self._inputs)  # only views, and the same ones again
-        self._opened: dict[int, tuple[list[Signals], dict[str, Signals]]] = {}
+        self._opened: dict[int, tuple[list[Signals], dict[str, Signals], list[Signals]]] = {}
 
     def open(self, first: int, samples: int, dense: dict[str, Signals]) -> tuple[list[Signals], list[Signals]]:
         """Inputs and outputs of the chunk that begins at ``first``; the outputs are added to ``dense`` too."""
-        if not self._steady or samples != self._chunk:
-            inputs, outputs = self._views(first, samples)
-        else:
-            phase = first // samples % self._period
-            if phase not in self._opened:
-                self._opened[phase] = self._views(first, samples)
-            inputs, outputs = self._opened[phase]
-        dense.update(outputs)
-        return inputs, list(outputs.values())
+        phase = first // samples % self._period if self._steady and samples == self._chunk else -1
+        opened = self._opened.get(phase)
+        if opened is None:
+            opened = self._views(first, samples)
+            if phase >= 0:
+                self._opened[phase] = opened
+        inputs, topics, outputs = opened
+        dense.update(topics)
+        return inputs, outputs
 
-    def _views(self, first: int, samples: int) -> tuple[list[Signals], dict[str, Signals]]:
+    def _views(self, first: int, samples: int) -> tuple[list[Signals], dict[str, Signals], list[Signals]]:
+        """Inputs and outputs, these by topic too."""
         inputs = [ring.view(first, samples, delay) for ring, delay in self._inputs]
-        return inputs, {topic: ring.newest(first, samples) for topic, ring in self._outputs.items()}
+        topics = {topic: ring.newest(first, samples) for topic, ring in self._outputs.items()}
+        return inputs, topics, list(topics.values())
