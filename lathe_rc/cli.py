@@ -79,6 +79,7 @@ class _Watch:
         self._step = 0.0
         self._start = time.monotonic()
         self._due = {"progress": 0.0, "cycle": 0.0}
+        self._silent = ""  # who was said to be
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -125,6 +126,7 @@ class _Watch:
             self._start = now
             update(self._task, description="turning")
         elif kind == "progress":
+            self._silent = ""
             simulated = event["samples"] * self._step
             elapsed = max(now - self._start, 1e-9)
             update(self._task, completed=event["samples"], factor=f"{simulated / elapsed:.1f}x real time")
@@ -134,7 +136,8 @@ class _Watch:
                 revolution=f"revolution {event['cycle']:.0f}",
                 error=f"error {event['rms_error'] * 1e6:.3g} µm RMS",
             )
-        elif kind == "stall":
+        elif kind == "stall" and event["member"] != self._silent:
+            self._silent = event["member"]  # every other member tells of a silent time master
             self._bar.console.print(f"{event['member']} is silent at block {event['blocks']}: the cell stands still")
 
 

@@ -58,7 +58,7 @@ def test_window_changes_no_bit(offline, window):
     assert harness.run(piston(f"window={window}"), mode="composed").digest == offline
 
 
-@pytest.mark.parametrize(("node", "window"), [("tool", 64), ("recorder", 64), ("tool", 4096)])
+@pytest.mark.parametrize(("node", "window"), [("tool", 64), ("recorder", 64), ("tool", 4096), ("spindle_encoder", 64)])
 def test_a_stopped_process_changes_no_bit(offline, node, window, tmp_path):
     # The largest window is longer than the run: nobody waits, and still the stopped one is named.
     stopped = piston("spindle_encoder.speed_factor=0.5", f"window={window}")
@@ -66,7 +66,8 @@ def test_a_stopped_process_changes_no_bit(offline, node, window, tmp_path):
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
         processes.wait_for("cycle")
         os.kill(processes.pids[node], signal.SIGSTOP)
-        # The spindle names the silent one, whomever else a busy machine delays; only then does it go on.
+        # The spindle names the silent one, and the others the spindle, whomever else a busy machine delays; only then
+        # does it go on.
         processes.wait_for("stall", member=f"/{node}")
         os.kill(processes.pids[node], signal.SIGCONT)
         processes.wait_for_end()

@@ -36,6 +36,7 @@ _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _REPEAT_PERIOD = 0.5  # [s] between announcements before the run, in the safe state, and after it has given up
 _LATCHED_DEPTH = 256
 _PATIENCE = 2.0  # [s] for others to acknowledge the last messages
+STALL = 0.08  #: [s] in which a node that DDS does not hear has completed nothing, after which it is named
 _GIVEN_UP = 2.0  # [s] of silence after which a time master is lost in a cell that does not wait
 _MOST_MEMBERS = 256  # announced names that are kept
 
@@ -89,6 +90,8 @@ class CellNode(LifecycleNode):
         self._cell: int | None = None  # what the time master has said
         self._progress_step = 1
         self._reported_blocks = 0
+        self._moved = 0.0  # when it has last completed a block, monotonic [s]
+        self._master_stalls = False
         self._heard_elsewhere = True  # whether anybody beside the time master reads the progress
         self._diagnostics_due = time.monotonic() + _DIAGNOSTICS_PERIOD
         self._repeat_due = 0.0
@@ -444,11 +447,12 @@ class CellNode(LifecycleNode):
         self.announce()
 
     def look_after_others(self) -> None:
-        """Leave if the time master is gone: without it no sample follows."""
+        """Name a time master that is silent, and leave if it is gone: without it no sample follows."""
         if self.master is None or self.done or not self.master.members:
             return
-        name = self.master.name
-        silent = time.monotonic() - self.watch.silent.get(name, math.inf)
+        name, now = self.master.name, time.monotonic()
+        self._name_a_silent_master(name, now)
+        silent = now - self.watch.silent.get(name, math.inf)
         if name in self.watch.ended() or (silent > _GIVEN_UP and self._parameter(name, "stall_reaction") == "safe"):
             if self.failure:
                 self.done = True
@@ -456,6 +460,22 @@ class CellNode(LifecycleNode):
                 self._leave([])
             else:
                 self.fail(LatheError(f"{name}, the time master, is lost: no sample follows"), cause="abandoned")
+
+    def _name_a_silent_master(self, name: str, now: float) -> None:
+        """Say once that it stalls: who stands still cannot say so itself."""
+        if self._cell != CellState.RUNNING or name not in self.watch.silent:
+            self._master_stalls = False
+        elif not self._master_stalls and now - self._moved < STALL:
+            self.next_tick = min(self.next_tick, self._moved + STALL)  # what was on its way is still being computed
+        elif not self._master_stalls:
+            self._master_stalls = True
+            self.tell_stall(name, self._reported_blocks)
+
+    def tell_stall(self, name: str, blocks: int) -> None:
+        """Say that a member is silent since it has completed so many blocks."""
+        # In this order: to log for the first time takes some 70 ms.
+        self.reporter("stall", self.get_name(), member=name, blocks=blocks)
+        self.get_logger().warning(f"{name} has been silent for {STALL * 1e3:.0f} ms at block {blocks}")
 
     def _parameter(self, name: str, key: str) -> object:
         """What a member has announced of its parameters; None if it has no such."""
@@ -504,6 +524,7 @@ class CellNode(LifecycleNode):
 
     def progressed(self, blocks: int, samples: int, *, last: bool) -> None:
         """Tell the time master, now and then and at the end."""
+        self._moved = time.monotonic()
         if last or blocks - self._reported_blocks >= self._progress_step:
             self._reported_blocks = blocks
             progress = Progress(run_id=self.table.run_id, name=self.full_name, blocks=blocks, samples=samples)

@@ -15,10 +15,10 @@ from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderP
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes.ports import latched_qos
+from lathe_rc.nodes.shell import STALL
 from lathe_rc.nodes.stage_node import StageNode
 from lathe_rc.nodes.strangers import Stranger
 
-_STALL = 0.08  # [s] of silence after which a member is named
 _GONE = 0.2  # [s] for messages to be acknowledged, if who has died never will
 _LOOK = 0.02  # [s] between looks at the members
 _REPORT_PERIOD = 0.05  # [s] between reports of progress
@@ -52,7 +52,7 @@ class SpindleNode(StageNode):
         self._running = False
         self._schedule = 0.0  # monotonic time at which sample 0 would have been, were there no slips
         self._heard = time.monotonic()
-        self._moved = dict.fromkeys(self._member_names, self._heard)  # when each has last completed a block
+        self._members_moved = dict.fromkeys(self._member_names, self._heard)  # when each has last completed a block
         self._stalled: frozenset[str] = frozenset()
         self._dead: dict[str, float] = {}  # monotonic time until which a member may be restarted
         self._unsafe: set[str] = set()  # members that have not yet heard that others are lost
@@ -131,7 +131,7 @@ class SpindleNode(StageNode):
         self._say(CellState.RUNNING, 0)
         self.reporter("block0", self.get_name())
         self._schedule = self._heard = time.monotonic()
-        self._moved = dict.fromkeys(self._member_names, self._heard)
+        self._members_moved = dict.fromkeys(self._member_names, self._heard)
         self.release()
 
     # ---- run ----------------------------------------------------------------------------------------
@@ -147,7 +147,7 @@ class SpindleNode(StageNode):
         before = self._least
         self._completed[progress.name] = progress.blocks
         least = self._least
-        self._heard = self._moved[progress.name] = time.monotonic()
+        self._heard = self._members_moved[progress.name] = time.monotonic()
         if progress.name in self._stalled:
             self._stalled = frozenset()
         self._after(before, least)
@@ -262,8 +262,8 @@ class SpindleNode(StageNode):
             self._lose(dict.fromkeys(self._dead, "died"))  # who was waited for as well: it could not join any more
         elif not self._dead:
             silent = self.watch.silent.keys() & self._completed.keys()
-            stopped = {name for name in silent if now - self._moved[name] > _STALL}
-            stands = (self._unsafe or not self._credit()) and now - self._heard > _STALL
+            stopped = {name for name in silent if now - self._members_moved[name] > STALL}
+            stands = (self._unsafe or not self._credit()) and now - self._heard > STALL
             if stands:
                 # Who waits for a silent one is as slow as it is: first those that DDS does not hear any more.
                 self._name_the_silent(frozenset(silent or self._unsafe or {self._slowest}))
@@ -290,9 +290,7 @@ class SpindleNode(StageNode):
     def _name_the_silent(self, names: frozenset[str]) -> None:
         new, self._stalled = names - self._stalled, names
         for name in sorted(new):
-            blocks = self._completed[name]
-            self.get_logger().warning(f"{name} has been silent for {_STALL * 1e3:.0f} ms at block {blocks}")
-            self.reporter("stall", self.get_name(), member=name, blocks=blocks)
+            self.tell_stall(name, self._completed[name])
 
     def _lose(self, members: Mapping[str, str]) -> None:
         """Bring the cell to its safe state without some members, from the next sample on: once all others know.
