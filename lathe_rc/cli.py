@@ -108,7 +108,7 @@ class _Watch:
         """Take an event of the run."""
         kind, update = event["event"], self._bar.update
         now = time.monotonic()
-        if text := _trouble(event):
+        if kind in _TROUBLE and (text := _TROUBLE[kind](event)):
             self._bar.console.print(text)
         if self._bar.disable:
             self._log(event, now)
@@ -141,21 +141,21 @@ class _Watch:
             self._bar.console.print(f"{event['member']} is silent at block {event['blocks']}: the cell stands still")
 
 
-def _trouble(event: harness.Event) -> str:
-    """What is said of an event in any case; empty if nothing."""
-    kind = event["event"]
-    if kind == "stuck":
-        return f"{event['node']} did not end{event['place']}; the bag is closed: no longer waited for"
-    if kind == "stranger":
-        return f"{event['node']} refuses: {event['message']}; publishers: {', '.join(event['publishers'])}"
-    if kind == "dead":
-        follows = "another process goes on in its place" if event["restarts"] else "the cell goes to its safe state"
-        return f"{event['member']} has died at block {event['blocks']}: {follows}"
-    if kind == "exit" and event["code"] < 0:
-        return harness.how_it_ended(event)
-    if kind == "safe":
-        return f"{event['why']}; the run ends at sample {event['end']}"
-    return ""
+_TROUBLE: dict[str, Callable[[harness.Event], str]] = {
+    "stuck": lambda event: f"{event['node']} did not end{event['place']}; the bag is closed: no longer waited for",
+    "stranger": lambda event: (
+        f"{event['node']} refuses: {event['message']}; publishers: {', '.join(event['publishers'])}"
+    ),
+    "dead": lambda event: (
+        f"{event['member']} has died at block {event['blocks']}: "
+        + ("another process goes on in its place" if event["restarts"] else "the cell goes to its safe state")
+    ),
+    "exit": lambda event: harness.how_it_ended(event) if event["code"] < 0 else "",
+    "stopped": lambda event: (
+        f"{event['node']} has been stopped ({signal.Signals(event['signal']).name}): the cell waits for it"
+    ),
+    "safe": lambda event: f"{event['why']}; the run ends at sample {event['end']}",
+}  #: what is said of an event in any case
 
 
 def _table(result: harness.Result) -> RichTable:

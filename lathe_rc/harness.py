@@ -55,7 +55,7 @@ _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag c
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
 _MOST_RESTARTS = 8  # of a process
 _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
-_NO_SIGN_OF_LIFE = {"stall", "stranger"}  # events that come while nothing goes on
+_NO_SIGN_OF_LIFE = {"stall", "stranger", "stopped", "continued"}  # events that come while nothing goes on
 _LOOK = 0.05  # [s] between looks at what a process has written
 
 
@@ -417,9 +417,12 @@ class Processes:
         self._children[name] = child
         for node in group:
             self.pids[node] = child.pid
-        thread = threading.Thread(target=self._listen, args=(name, ours, child), daemon=True)
-        thread.start()
-        self._threads.append(thread)
+        for thread in (
+            threading.Thread(target=self._listen, args=(name, ours, child), daemon=True),
+            threading.Thread(target=self._follow, args=(name, child), daemon=True),
+        ):
+            thread.start()
+            self._threads.append(thread)
 
     def _listen(self, name: str, line: socket.socket, child: subprocess.Popen[bytes]) -> None:
         """Turn a process's reports, and its end, into events."""
@@ -429,6 +432,22 @@ class Processes:
                     self._events.put(json.loads(report))
             code = child.wait()
         self._events.put({"event": "exit", "node": name, "code": code, "monotonic_ns": time.monotonic_ns()})
+
+    def _follow(self, name: str, child: subprocess.Popen[bytes]) -> None:
+        """Turn it into events that a process is stopped by a signal, and continued.
+
+        A process that is stopped with a lock of DDS in its hands holds up all who send to it, the time master among
+        them: then nobody else can say so.
+        """
+        changes = os.WSTOPPED | os.WCONTINUED
+        with contextlib.suppress(ChildProcessError):  # it has ended
+            while True:
+                ahead = os.waitid(os.P_PID, child.pid, changes | os.WEXITED | os.WNOWAIT)
+                if ahead is None or ahead.si_code in (os.CLD_EXITED, os.CLD_KILLED, os.CLD_DUMPED):
+                    return  # that is for who waits for its end
+                if change := os.waitid(os.P_PID, child.pid, changes | os.WNOHANG):
+                    kind = "continued" if change.si_code == os.CLD_CONTINUED else "stopped"
+                    self._events.put({"event": kind, "node": name, "signal": change.si_status})
 
     def events(self, silence: float) -> Iterator[Event]:
         """Events as they come.

@@ -68,8 +68,10 @@ def test_a_stopped_process_changes_no_bit(offline, node, window, tmp_path):
         os.kill(processes.pids[node], signal.SIGSTOP)
         # The spindle names the silent one, and the others the spindle, whomever else a busy machine delays; only then
         # does it go on.
+        processes.wait_for("stopped", node=node, signal=signal.SIGSTOP)
         processes.wait_for("stall", member=f"/{node}")
         os.kill(processes.pids[node], signal.SIGCONT)
+        processes.wait_for("continued", node=node)
         processes.wait_for_end()
     assert reader.read(tmp_path / "bag").digests() == offline
 

@@ -211,7 +211,7 @@ def test_who_crashes_while_leaving_a_complete_run_is_named_and_nothing_is_lost(t
         processes.wait_for_end(told.append)
         thread.join()
     (end,) = [event for event in told if event["event"] == "exit" and event["code"]]
-    assert cli._trouble(end) == "crashed was killed by SIGSEGV"
+    assert cli._TROUBLE["exit"](end) == "crashed was killed by SIGSEGV"
 
 
 def test_a_bag_that_is_closed_makes_no_safe_state_a_success(tmp_path):
