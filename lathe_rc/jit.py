@@ -14,7 +14,16 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _PACKAGE = Path(__file__).parent
-_KERNELS = ("*.py", "signals/*.py", "plants/*.py", "control/*.py", "analysis/*.py", "bag/walk.py", "safety/*.py")
+_KERNELS = (
+    "*.py",
+    "signals/*.py",
+    "plants/*.py",
+    "control/*.py",
+    "analysis/*.py",
+    "bag/walk.py",
+    "safety/*.py",
+    "cell/collect.py",
+)
 
 
 def _source_hash() -> str:

@@ -11,6 +11,7 @@ import sys
 import numpy as np
 import pytest
 from cells import SCENARIOS, command, cuts, spans
+from cells import run as cell_run
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -25,7 +26,7 @@ from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.supervisor import MEMBERS_LOST
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety import state_machine
 from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Lookout, Rate, Threshold
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
@@ -126,6 +127,39 @@ def test_a_command_that_is_given_back_comes_near_its_own_along_a_bounded_motion(
     assert np.abs(out - wanted).max() <= max(most, abs(held - wanted)) * 1.05 + 1e-12
     assert np.abs(np.diff(out, prepend=held)).max() <= 0.05 * STEP * (1 + 1e-6)
     assert out[-1] == wanted
+
+
+@given(far=st.floats(-1e300, 1e300), goal=st.floats(-1e-3, 1e-3), mode=st.sampled_from([Mode.HOLD, Mode.RETRACT]))
+def test_a_command_that_has_diverged_is_retracted_and_given_back_in_time_all_the_same(far, goal, mode):
+    """A way of 1e6 m at 0.1 m/s would take memory for months, and the tool would stay where it is."""
+    allowed = Bounds(0.1, 50.0, 1e5, 0.01)
+    takeover = Takeover(allowed, goal, STEP)
+    takeover.apply(np.full(100, far))
+    takeover.change(mode)
+    for wanted in (far, far):
+        out = np.full(1000, wanted)
+        takeover.apply(out)
+        assert out[-1] == (goal if mode is Mode.RETRACT else far)
+        assert np.abs(out - out[-1]).max() <= allowed.reach
+    takeover.change(Mode.FOLLOW)
+    given_back = np.full(1000, far)
+    takeover.apply(given_back)
+    assert given_back[-1] == far
+
+
+def test_a_command_that_is_not_finite_is_not_taken_over():
+    takeover = Takeover(Bounds(0.1, 50.0, 1e5), 0.0, STEP)
+    takeover.apply(np.array([0.0, np.nan]))
+    with pytest.raises(LatheError, match=r"^a command of nan with a rate of nan is taken over; allowed: finite"):
+        takeover.change(Mode.RETRACT)
+
+
+def test_a_takeover_reaches_as_far_as_the_drive():
+    with pytest.raises(InputError, match=r"^electrodynamic_actuator.retract_time = 0.01 s: the bounds allow a way of "):
+        cell_run(electrodynamic_actuator={"retract_time": 0.01})
+    listens = {"reaction_delay": 3200, "retract_time": 0.01}
+    with pytest.raises(InputError, match=r"^learning_controller.retract_time = 0.01 s: .* the stroke needs 0.002 m;"):
+        cell_run(learning_controller=listens, supervisor={})
 
 
 def test_a_command_with_steps_is_taken_over_without_its_velocity():

@@ -1,21 +1,59 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keeping the signals of an offline run in memory."""
+"""Checking the signals of an offline run, and keeping them in memory."""
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from lathe_rc.cell import messages
 from lathe_rc.cell.framing import Framer
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wire import NotFiniteError, check_finite
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import LatheError
+from lathe_rc.jit import kernel
+
+
+class Finite:
+    """Ends a run with numbers that are not finite, as nodes end theirs; a sink of the engine, the first."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._sources = {topic: f"/{source.node}" for topic, source in cell.dense.items()}
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`.
+
+        Raises:
+            LatheError: a sample is NaN or infinite; names the first.
+        """
+        found: list[tuple[int, int, str]] = []
+        for topic, signals in dense.items():
+            for name, array in signals.items():
+                try:
+                    check_finite(self._sources[topic], name, array, first)
+                except NotFiniteError as error:
+                    found.append((error.index, len(found), f"/{topic}: {error}"))
+        if found:
+            raise LatheError(min(found)[2])
+
+
+@kernel
+def _keep(samples: Samples, whole: Samples, first: int) -> int:
+    """Copy samples to their place; how many are not finite."""
+    whole[first : first + samples.size] = samples
+    bad = 0
+    for k in range(samples.size):
+        bad += not abs(samples[k]) < np.inf
+    return bad
 
 
 class Collector:
-    """Collects whole arrays; a sink of the engine."""
+    """Collects whole arrays; a sink of the engine, which ends a run with numbers that are not finite, see `Finite`."""
 
     def __init__(self, cell: Cell, samples: int) -> None:
-        self._cell = cell
+        self._cell, self._finite = cell, Finite(cell)
         self._framer = Framer("", "", cell.master.shared.step_ns)
         self._dense = {topic: messages.allocate(source.type, samples) for topic, source in cell.dense.items()}
         for signals in self._dense.values():
@@ -24,11 +62,17 @@ class Collector:
         self._sparse: dict[str, list[Sparse]] = {topic: [] for topic in cell.sparse}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """See `lathe_rc.cell.engine.Sink` and `Finite.chunk`."""
+        bad = 0
         for topic, signals in dense.items():
             whole = self._dense[topic]
             for name, array in signals.items():
-                whole[name][first : first + samples] = array
+                if array.dtype == np.float64:
+                    bad += _keep(array, whole[name], first)
+                else:
+                    whole[name][first : first + samples] = array
+        if bad:
+            self._finite.chunk(first, samples, dense, sparse)
         for topic, found in sparse.items():
             self._sparse[topic] += found
 

@@ -200,12 +200,38 @@ class Block:
                 self._check(name, array)
 
     def _check(self, name: str, array: Samples) -> None:
-        # 0 times anything finite is 0, and NaN otherwise: one product tells for the whole block.
-        if array.dtype == np.float64 and np.dot(array, _ZEROS[: self.samples]) != 0.0:
-            bad = int(np.flatnonzero(~np.isfinite(array))[0])
-            raise ValueError(
-                f"{self.source} sends {name} = {array[bad]} at sample {self.first_index + bad}; allowed: finite numbers"
-            )
+        check_finite(self.source, name, array, self.first_index)
+
+
+class NotFiniteError(ValueError):
+    """A sample that no reader could use.
+
+    Attributes:
+        index: of the sample.
+    """
+
+    def __init__(self, message: str, index: int) -> None:
+        super().__init__(message)
+        self.index = index
+
+
+def check_finite(source: str, name: str, array: Samples, first: int) -> None:
+    """Refuse samples that no reader could use.
+
+    Args:
+        source: who publishes them.
+        name: of the field.
+        array: shape (n,), any type; n up to `lathe_rc.cell.messages.MAX_BLOCK`.
+        first: index of the first sample.
+
+    Raises:
+        NotFiniteError: a sample is NaN or infinite; the first.
+    """
+    # 0 times anything finite is 0, and NaN otherwise: one product tells for the whole block.
+    if array.dtype == np.float64 and np.dot(array, _ZEROS[: array.size]) != 0.0:
+        bad = int(np.flatnonzero(~np.isfinite(array))[0])
+        index = first + bad
+        raise NotFiniteError(f"{source} sends {name} = {array[bad]} at sample {index}; allowed: finite numbers", index)
 
 
 class Encoder:

@@ -16,6 +16,7 @@ from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.profile import ProfileStage
+from lathe_rc.cell.stages.retraction import check_reach
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.supervisor import Supervisor
 from lathe_rc.cell.stages.tool import Tool
@@ -146,6 +147,7 @@ class Cell:
                 self._check_preview(stage)
                 for response, drive in self._learned(stage):
                     _check_convergence(stage, drive, response, low, high)
+                    self._check_reach(stage, drive)
 
     def _learned(self, stage: LearningController) -> list[tuple[Response, str]]:
         """Responses and names of the drives that a channel commands."""
@@ -173,6 +175,13 @@ class Cell:
                     f"{source.name}.{name} = {reached:g} m, but the tool is out of the part beyond "
                     f"{stage.name}.clear_position = {clear:g} m; allowed: above that, or a smaller clear_position"
                 )
+
+    def _check_reach(self, stage: LearningController, name: str) -> None:
+        """What it takes over, it takes over wherever the drive can be."""
+        drive = self.stages[name]
+        assert isinstance(drive, Drive), "it learns"
+        for limits in drive.limits().values() if stage.parameters.reaction_delay else ():
+            check_reach(stage.parameters, stage.name, stage.parameters.retract_position, limits.stroke)
 
     def _check_delay(self, stage: LearningController, speed: float) -> None:
         encoder = self.master.parameters

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motions that keep within velocity, acceleration and jerk, and a command that is taken over and given back by them."""
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
 import scipy
+
+from lathe_rc.errors import LatheError
 
 Array = npt.NDArray[np.float64]
 
@@ -23,11 +26,19 @@ class Bounds:
         velocity: [m/s].
         acceleration: [m/s²].
         jerk: [m/s³].
+        duration: of the longest way from rest to rest [s], from as far as `reach`.
     """
 
     velocity: float
     acceleration: float
     jerk: float
+    duration: float = 1.0
+
+    @property
+    def reach(self) -> float:
+        """As far as a motion gets [m]: the peaks of its polynomial are 1.875·s/T, 10/√3·s/T² and 60·s/T³."""
+        time, peak = self.duration, 10.0 / math.sqrt(3.0)
+        return min(self.velocity * time / 1.875, self.acceleration * time**2 / peak, self.jerk * time**3 / 60.0)
 
 
 def motion(start: float, velocity: float, end: float | None, bounds: Bounds, step: float) -> Array:
@@ -42,14 +53,19 @@ def motion(start: float, velocity: float, end: float | None, bounds: Bounds, ste
 
     Returns:
         Positions one step after the start and on, up to the end [m], shape (n,), n at least 1.
+
+    Raises:
+        LatheError: start or velocity is NaN or infinite.
     """
+    if not (math.isfinite(start) and math.isfinite(velocity)):
+        raise LatheError(f"a command of {start} with a rate of {velocity} is taken over; allowed: finite numbers")
     highest = max(bounds.velocity, abs(velocity))
     length = abs(velocity) * step if end is None else abs(end - start)
     # The shortest that the peaks of a motion from rest to rest could allow; nothing shorter need be tried.
     duration = max(step, 1.875 * length / highest, (60.0 * length / bounds.jerk) ** (1 / 3) / 2.0)
     while True:
-        goal = start + velocity * duration / 2.0 if end is None else end
-        path = scipy.interpolate.BPoly.from_derivatives([0.0, duration], [[start, velocity, 0.0], [goal, 0.0, 0.0]])
+        way = velocity * duration / 2.0 if end is None else end - start
+        path = scipy.interpolate.BPoly.from_derivatives([0.0, duration], [[0.0, velocity, 0.0], [way, 0.0, 0.0]])
         times = np.linspace(0.0, duration, _LOOKS)
         peaks = [float(np.abs(path(times, order)).max()) for order in (1, 2, 3)]
         limits = (highest, bounds.acceleration, bounds.jerk)
@@ -57,8 +73,8 @@ def motion(start: float, velocity: float, end: float | None, bounds: Bounds, ste
             break
         duration *= _LONGER
     samples = int(np.ceil(duration / step))
-    positions: Array = path(np.minimum(np.arange(1, samples + 1) * step, duration))
-    positions[-1] = goal
+    positions: Array = start + path(np.minimum(np.arange(1, samples + 1) * step, duration))
+    positions[-1] = start + way if end is None else end
     return positions
 
 
@@ -82,7 +98,8 @@ class Mode(Enum):
 class Takeover:
     """A command that is held or retracted, and given back to its controller, without a jump of position.
 
-    Nor is there one of velocity, unless the command is faster than the bounds allow.
+    Nor is there one of velocity, unless the command is faster than the bounds allow. A command that is beyond their
+    reach is where nothing that moves can be: the way begins at the end of their reach.
 
     Args:
         bounds: of what it does itself.
@@ -118,7 +135,8 @@ class Takeover:
         velocity = self._carried(self._given)
         if mode is Mode.FOLLOW:
             rest = velocity - self._carried(self._wanted)
-            self._path = motion(self._given[1] - self._wanted[1], rest, 0.0, self._bounds, self._step)
+            left = self._within_reach(self._given[1] - self._wanted[1], 0.0)
+            self._path = motion(left, rest, 0.0, self._bounds, self._step)
         else:
             self._path = self._way(velocity, to_goal=mode is Mode.RETRACT)
         self.mode, self._place = mode, 0
@@ -126,10 +144,15 @@ class Takeover:
     def _way(self, velocity: float, *, to_goal: bool) -> Array:
         """The way to rest, or out of the part: a single motion that begins into the part would first go far into it."""
         start, step = float(self._given[1]), self._step
+        if to_goal:
+            start = self._within_reach(start, self._goal)
         if to_goal and velocity * (self._goal - start) >= 0.0:
             return motion(start, velocity, self._goal, self._bounds, step)
         stop = motion(start, velocity, None, self._bounds, step)
         return np.concatenate((stop, motion(float(stop[-1]), 0.0, self._goal, self._bounds, step))) if to_goal else stop
+
+    def _within_reach(self, place: float, goal: float) -> float:
+        return float(np.clip(place, goal - self._bounds.reach, goal + self._bounds.reach))
 
     def _carried(self, command: Array) -> float:
         """The velocity of the last two samples as far as a motion may have it: what is faster is noise, or a step."""

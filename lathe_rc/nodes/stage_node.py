@@ -358,15 +358,14 @@ class StageNode(CellNode):
                 self.reporter("cycle", self.get_name(), sample=sparse.index, **values)
         companions = self._framer.companions
         for (topic, encoder), (signals, whole) in zip(self._encoders, memory, strict=True):
+            block = encoder.block(self.samples, signals, whole, last=last, companions=companions)
+            try:
+                block.check()
+            except ValueError as error:
+                raise LatheError(f"{topic}: {error}") from None
             if self._goes_out(topic):
                 self.outlets[topic].publish(encoder.encode(self.samples, signals, last=last, companions=companions)[1])
-            if self.exchange.read(topic):
-                block = encoder.block(self.samples, signals, whole, last=last, companions=companions)
-                try:
-                    block.check()
-                except ValueError as error:
-                    raise LatheError(f"{topic}: {error}") from None
-                self.exchange.hand_over(topic, block)
+            self.exchange.hand_over(topic, block)
         self.blocks += 1
         self.samples += samples
         self.progressed(self.blocks, self.samples, last=last)

@@ -32,6 +32,9 @@ class FeedObedientParameters(ObedientParameters):
         "1/s",
     )  # fmt: skip
     stop_rate_change: Annotated[float, Gt(0)] = parameter(1000.0, "largest change of that rate", "1/s^2")
+    stop_time: Annotated[float, Gt(0)] = parameter(
+        1.0, "longest duration: a command that is farther away begins where the way takes so long", "s"
+    )
 
     def obedience(self, learner: "Learner | None", *, speed: bool, settled: int) -> "Obedience":
         """What obeys for a command of the feed.
@@ -44,7 +47,7 @@ class FeedObedientParameters(ObedientParameters):
             speed: whether the command stands for a speed.
             settled: see `Obedience`.
         """
-        bounds = Bounds(self.stop_rate, self.stop_rate_change, math.inf)
+        bounds = Bounds(self.stop_rate, self.stop_rate_change, math.inf, self.stop_time)
         if self.reaction_delay:
             bounded.prepare()
         rest = Mode.RETRACT if speed else Mode.HOLD
