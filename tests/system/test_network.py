@@ -29,6 +29,7 @@ _TUNSETIFF, _TAP, _NO_PI = 0x400454CA, 0x0002, 0x1000
 GROUPS = [["spindle_encoder"], ["learning_controller"], ["electrodynamic_actuator"], ["tool"], ["recorder"]]
 FAR = ("electrodynamic_actuator", "recorder")
 CELL = scenario(spindle_encoder={"revolutions": 30.0})
+CAUTIOUS = scenario(spindle_encoder={"revolutions": 30.0, "stall_reaction": "safe", "stall_time": 1.0})
 
 
 def ip(*words):
@@ -97,11 +98,11 @@ def wire(request, monkeypatch):
 
 
 @pytest.fixture
-def processes(wire, tmp_path):
+def processes(request, wire, tmp_path):
     """The cell's processes: the spindle here, the drive and the recorder at the far end."""
     here, there = ([*["ip", "netns", "exec"], space] for space in wire.spaces)
     prefix = {name: there if name in FAR else here for (name,) in GROUPS}
-    cell = harness.with_recorder(CELL, tmp_path / "bag", keep=True)
+    cell = harness.with_recorder(getattr(request, "param", CELL), tmp_path / "bag", keep=True)
     with harness.Processes(cell, GROUPS, prefix=prefix) as made:
         yield made
 
@@ -116,7 +117,7 @@ def test_a_cell_over_two_machines_gives_the_same_bits(wire, processes, tmp_path)
 def test_a_cut_wire_that_is_mended_costs_nothing_but_time(wire, processes, tmp_path):
     processes.wait_for("cycle")
     wire.loss = 1.0
-    assert processes.wait_for("stall")["member"].removeprefix("/") in FAR
+    assert processes.wait_for("stall", node="spindle_encoder")["member"].removeprefix("/") in FAR
     wire.loss = 0.0
     processes.wait_for_end()
     assert reader.read(tmp_path / "bag").digests() == harness.run(CELL).digest
@@ -125,8 +126,25 @@ def test_a_cut_wire_that_is_mended_costs_nothing_but_time(wire, processes, tmp_p
 def test_when_the_wire_stays_cut_the_silent_are_named_and_the_bag_is_readable(wire, processes, tmp_path):
     processes.wait_for("cycle")
     wire.loss = 1.0
-    assert processes.wait_for("stall")["member"].removeprefix("/") in FAR
+    assert processes.wait_for("stall", node="spindle_encoder")["member"].removeprefix("/") in FAR
     processes.stop()
     recover.mend(tmp_path / "bag")
+    with AnyReader([tmp_path / "bag"]) as found:
+        assert sum(1 for _ in found.messages()) > 100
+
+
+@pytest.mark.parametrize("processes", [CAUTIOUS], indirect=True)
+def test_when_the_wire_stays_cut_both_sides_stop_if_the_cell_shall_not_wait(wire, processes, tmp_path):
+    processes.wait_for("cycle")
+    wire.loss = 1.0
+    told = []
+    for event in processes.events(60.0):
+        told.append(event)
+        if sum(each["event"] == "exit" for each in told) == len(GROUPS):
+            break
+    (safe,) = [event for event in told if event["event"] == "safe"]
+    assert {name.removeprefix("/") for name in safe["lost"]} == set(FAR)
+    assert "fell silent: safe state from sample" in safe["why"]
+    assert {event["node"] for event in told if event["event"] == "abandoned"} == set(FAR), "their time master is gone"
     with AnyReader([tmp_path / "bag"]) as found:
         assert sum(1 for _ in found.messages()) > 100
