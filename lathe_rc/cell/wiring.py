@@ -16,7 +16,6 @@ from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.profile import ProfileStage
-from lathe_rc.cell.stages.retraction import check_reach
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.supervisor import Supervisor
 from lathe_rc.cell.stages.tool import Tool
@@ -178,10 +177,17 @@ class Cell:
 
     def _check_reach(self, stage: LearningController, name: str) -> None:
         """What it takes over, it takes over wherever the drive can be."""
-        drive = self.stages[name]
+        drive, parameters = self.stages[name], stage.parameters
         assert isinstance(drive, Drive), "it learns"
-        for limits in drive.limits().values() if stage.parameters.reaction_delay else ():
-            check_reach(stage.parameters, stage.name, stage.parameters.retract_position, limits.stroke)
+        reach = parameters.bounds().reach(parameters.retract_time)
+        for limits in drive.limits().values() if parameters.reaction_delay else ():
+            needed = limits.stroke + max(limits.stroke, abs(parameters.retract_position))
+            if reach < needed:
+                raise InputError(
+                    f"{stage.name}.retract_time = {parameters.retract_time:g} s: the bounds allow a way of {reach:.3g} "
+                    f"m in that, and the stroke of {name} needs {needed:.3g} m; allowed: a longer retract_time, or "
+                    "wider bounds"
+                )
 
     def _check_delay(self, stage: LearningController, speed: float) -> None:
         encoder = self.master.parameters

@@ -26,18 +26,18 @@ class Bounds:
         velocity: [m/s].
         acceleration: [m/s²].
         jerk: [m/s³].
-        duration: of the longest way from rest to rest [s], from as far as `reach`.
     """
 
     velocity: float
     acceleration: float
     jerk: float
-    duration: float = 1.0
 
-    @property
-    def reach(self) -> float:
-        """As far as a motion gets [m]: the peaks of its polynomial are 1.875·s/T, 10/√3·s/T² and 60·s/T³."""
-        time, peak = self.duration, 10.0 / math.sqrt(3.0)
+    def reach(self, time: float) -> float:
+        """As far as a motion from rest gets in some time [m].
+
+        The peaks of a way s in the time T are 1.875·s/T, 10/√3·s/T² and 60·s/T³.
+        """
+        peak = 10.0 / math.sqrt(3.0)
         return min(self.velocity * time / 1.875, self.acceleration * time**2 / peak, self.jerk * time**3 / 60.0)
 
 
@@ -98,13 +98,14 @@ class Mode(Enum):
 class Takeover:
     """A command that is held or retracted, and given back to its controller, without a jump of position.
 
-    Nor is there one of velocity, unless the command is faster than the bounds allow. A command that is beyond their
-    reach is where nothing that moves can be: the way begins at the end of their reach.
+    Nor is there one of velocity, unless the command is faster than the bounds allow. A command that is out of reach is
+    where nothing that moves can be: its way begins at the end of the reach.
 
     Args:
         bounds: of what it does itself.
         retracted: where the command is when retracted [m].
         step: sampling step [s].
+        reach: how far from its end a motion begins at most [m].
         carries: whether a motion begins with the velocity that the command has, up to that of the bounds; one that is
             all steps and noise has none.
 
@@ -112,8 +113,10 @@ class Takeover:
         mode: who commands; see `change`.
     """
 
-    def __init__(self, bounds: Bounds, retracted: float, step: float, *, carries: bool = True) -> None:
-        self._bounds, self._goal, self._step, self._carries = bounds, retracted, step, carries
+    def __init__(
+        self, bounds: Bounds, retracted: float, step: float, *, reach: float = math.inf, carries: bool = True
+    ) -> None:
+        self._bounds, self._goal, self._step, self._reach, self._carries = bounds, retracted, step, reach, carries
         self.mode = Mode.FOLLOW
         self._path, self._place = np.zeros(0), 0  # positions to come; of what is added to the command when it follows
         self._given, self._wanted = np.zeros(2), np.zeros(2)  # the last two samples, after and before
@@ -152,7 +155,7 @@ class Takeover:
         return np.concatenate((stop, motion(float(stop[-1]), 0.0, self._goal, self._bounds, step))) if to_goal else stop
 
     def _within_reach(self, place: float, goal: float) -> float:
-        return float(np.clip(place, goal - self._bounds.reach, goal + self._bounds.reach))
+        return float(np.clip(place, goal - self._reach, goal + self._reach))
 
     def _carried(self, command: Array) -> float:
         """The velocity of the last two samples as far as a motion may have it: what is faster is noise, or a step."""

@@ -60,7 +60,7 @@ class ElectrodynamicActuator(Drive):
             step=parameters.step,
             method=parameters.discretisation,
         )
-        self._retraction = OwnRetraction(name, parameters, parameters.stroke)
+        self._retraction = OwnRetraction(parameters, parameters.stroke)
         self._limited = LimitedCommand(name, parameters)
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         self.declare(

@@ -97,7 +97,9 @@ class LearningController(Stage):
         parameters = self.parameters
         settled = round(_SETTLED * parameters.lead_time / parameters.step) + parameters.feedback_delay
         bounded.prepare()
-        takeover = Takeover(parameters.bounds(), parameters.retract_position, parameters.step)
+        bounds = parameters.bounds()
+        reach = bounds.reach(parameters.retract_time)
+        takeover = Takeover(bounds, parameters.retract_position, parameters.step, reach=reach)
         return Obedience(self, takeover, settled=settled)
 
     def may_learn(self, *, on: bool) -> None:

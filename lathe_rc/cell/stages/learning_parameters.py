@@ -84,6 +84,9 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters, Bound
         "frozen", "falling back: the memory frozen, or moreover read with the lead angle of the nominal speed"
     )
     retract_position: float = parameter(0.0, "command when retracted", "m")
+    retract_time: Annotated[float, Gt(0)] = parameter(
+        1.0, "longest takeover: a command that is farther away begins where the way takes so long", "s"
+    )
     memory_file: str = parameter("", "file that the events save and load write and read", path=True)
     allow_unstable: bool = parameter(default=False, doc="start although sup|Q - Z| is not below 1")
     publish_margin: bool = parameter(

@@ -47,11 +47,11 @@ class FeedObedientParameters(ObedientParameters):
             speed: whether the command stands for a speed.
             settled: see `Obedience`.
         """
-        bounds = Bounds(self.stop_rate, self.stop_rate_change, math.inf, self.stop_time)
+        bounds = Bounds(self.stop_rate, self.stop_rate_change, math.inf)
         if self.reaction_delay:
             bounded.prepare()
         rest = Mode.RETRACT if speed else Mode.HOLD
-        takeover = Takeover(bounds, 0.0, self.step, carries=False)
+        takeover = Takeover(bounds, 0.0, self.step, reach=bounds.reach(self.stop_time), carries=False)
         return Obedience(learner, takeover, settled=settled, hold=rest, retract=rest)
 
 

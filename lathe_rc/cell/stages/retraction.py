@@ -8,7 +8,6 @@ from annotated_types import Gt
 from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.control.bounded import Bounds, Mode, Takeover
-from lathe_rc.errors import InputError
 
 
 class BoundedParameters(NodeParameters):
@@ -17,33 +16,10 @@ class BoundedParameters(NodeParameters):
     retract_velocity: Annotated[float, Gt(0)] = parameter(0.1, "largest velocity of a takeover", "m/s")
     retract_acceleration: Annotated[float, Gt(0)] = parameter(50.0, "its largest acceleration", "m/s^2")
     retract_jerk: Annotated[float, Gt(0)] = parameter(1e5, "its largest jerk", "m/s^3")
-    retract_time: Annotated[float, Gt(0)] = parameter(
-        1.0, "its longest duration: a command that is farther away begins where the way takes so long", "s"
-    )
 
     def bounds(self) -> Bounds:
         """The same for a motion."""
-        return Bounds(self.retract_velocity, self.retract_acceleration, self.retract_jerk, self.retract_time)
-
-
-def check_reach(parameters: BoundedParameters, name: str, goal: float, stroke: float) -> None:
-    """Refuse a takeover that jumps where the drive can be.
-
-    Args:
-        parameters: of the node that takes over.
-        name: of the node.
-        goal: where its command goes [m].
-        stroke: of the drive, to each side [m].
-
-    Raises:
-        InputError: it does not reach as far as the stroke.
-    """
-    reach, needed = parameters.bounds().reach, stroke + max(stroke, abs(goal))
-    if reach < needed:
-        raise InputError(
-            f"{name}.retract_time = {parameters.retract_time:g} s: the bounds allow a way of {reach:.3g} m in "
-            f"that, and the stroke needs {needed:.3g} m; allowed: a longer retract_time, or wider bounds"
-        )
+        return Bounds(self.retract_velocity, self.retract_acceleration, self.retract_jerk)
 
 
 class RetractionParameters(BoundedParameters):
@@ -58,17 +34,13 @@ class OwnRetraction:
     """The command of a drive, until the drive goes its own way.
 
     Args:
-        name: of the node.
         parameters: its table.
-        stroke: of the drive, to each side [m].
-
-    Raises:
-        InputError: see `check_reach`.
+        stroke: of the drive, to each side [m]: a command beyond is where the drive cannot be.
     """
 
-    def __init__(self, name: str, parameters: RetractionParameters, stroke: float) -> None:
-        check_reach(parameters, name, parameters.safe_position, stroke)
-        self._takeover = Takeover(parameters.bounds(), parameters.safe_position, parameters.step)
+    def __init__(self, parameters: RetractionParameters, stroke: float) -> None:
+        reach = stroke + abs(parameters.safe_position)
+        self._takeover = Takeover(parameters.bounds(), parameters.safe_position, parameters.step, reach=reach)
 
     def begin(self) -> None:
         """Retract from the next sample on, whatever is commanded."""

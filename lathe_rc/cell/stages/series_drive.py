@@ -114,7 +114,7 @@ class SeriesDriveStage(Drive):
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
         self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
-        self._retraction = OwnRetraction(name, coarse, coarse.stroke)
+        self._retraction = OwnRetraction(coarse, coarse.stroke)
         self._limited = LimitedCommand(name, coarse, "coarse"), LimitedCommand(name, fine, "fine")
         self._set_point = SetPoint(name, fine, inside=(_COARSE,))
         # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
