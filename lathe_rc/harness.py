@@ -34,7 +34,7 @@ from lathe_rc.bag.check import write_digests
 from lathe_rc.bag.record import OfflineRecorder, begin, begin_snapshots, recorder_of
 from lathe_rc.bag.writer import refuse_existing
 from lathe_rc.cell import messages
-from lathe_rc.cell.collect import Collector
+from lathe_rc.cell.collect import Collector, Finite
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.recording import Recording
@@ -276,7 +276,7 @@ class _Watcher:
 def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[Event], None]) -> Result:
     engine = Engine(cell)
     collector = Collector(cell, engine.samples)
-    sinks: list[Sink] = [collector, _Watcher(watch)]
+    sinks: list[Sink] = [Finite(cell), collector, _Watcher(watch)]
     recorder = snapshots = None
     if bag is not None:
         snapshots = begin_snapshots(bag, scenario, cell)
@@ -434,7 +434,7 @@ class Processes:
         self._events.put({"event": "exit", "node": name, "code": code, "monotonic_ns": time.monotonic_ns()})
 
     def _follow(self, name: str, child: subprocess.Popen[bytes]) -> None:
-        """Turn it into events that a process is stopped by a signal, and continued.
+        """Turn into events that a process is stopped by a signal, and continued.
 
         A process that is stopped with a lock of DDS in its hands holds up all who send to it, the time master among
         them: then nobody else can say so.

@@ -36,6 +36,18 @@ def run(shared: Values | None = None, **nodes: Values) -> harness.Result:
     return harness.run(scenario(shared, **nodes))
 
 
+def told_until_all_have_ended(processes: harness.Processes) -> list[harness.Event]:
+    """The events up to the end of the last process, whatever becomes of the run."""
+    told, running = [], set(processes.pids)
+    for event in processes.events(60.0):
+        told.append(event)
+        if event["event"] == "exit":
+            running -= set(event["node"].split("+"))
+        if not running:
+            break
+    return told
+
+
 def encoder(result: harness.Result) -> messages.Signals:
     """The encoder's signals of a run."""
     return result.recording.of_type(messages.ENCODER)

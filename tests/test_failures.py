@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cells import told_until_all_have_ended
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
@@ -170,11 +171,7 @@ def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tm
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
         processes.wait_for("cycle")
         os.kill(processes.pids["spindle_encoder"], signal.SIGKILL)
-        told = []
-        for event in processes.events(60.0):
-            told.append(event)
-            if [each["event"] for each in told].count("exit") == len(cell.nodes):
-                break
+        told = told_until_all_have_ended(processes)
     said = [event["message"] for event in told if event["event"] == "abandoned"]
     assert said
     assert any("/spindle_encoder, the time master, is lost: no sample follows" in line for line in said)

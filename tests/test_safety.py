@@ -136,8 +136,8 @@ def test_a_command_that_has_diverged_is_retracted_and_given_back_in_time_all_the
     takeover = Takeover(Bounds(0.1, 50.0, 1e5), goal, STEP, reach=reach)
     takeover.apply(np.full(100, far))
     takeover.change(mode)
-    for wanted in (far, far):
-        out = np.full(1000, wanted)
+    for _ in range(2):
+        out = np.full(1000, far)
         takeover.apply(out)
         assert out[-1] == (goal if mode is Mode.RETRACT else far)
         assert np.abs(out - out[-1]).max() <= reach

@@ -16,6 +16,15 @@ from lathe_rc.errors import LatheError
 from lathe_rc.jit import kernel
 
 
+@kernel
+def _not_finite(samples: Samples) -> int:
+    """How many samples are NaN or infinite."""
+    count = 0
+    for k in range(samples.size):
+        count += not abs(samples[k]) < np.inf
+    return count
+
+
 class Finite:
     """Ends a run with numbers that are not finite, as nodes end theirs; a sink of the engine, the first."""
 
@@ -28,6 +37,10 @@ class Finite:
         Raises:
             LatheError: a sample is NaN or infinite; names the first.
         """
+        if not any(
+            array.dtype == np.float64 and _not_finite(array) for signals in dense.values() for array in signals.values()
+        ):
+            return
         found: list[tuple[int, int, str]] = []
         for topic, signals in dense.items():
             for name, array in signals.items():
@@ -35,25 +48,14 @@ class Finite:
                     check_finite(self._sources[topic], name, array, first)
                 except NotFiniteError as error:
                     found.append((error.index, len(found), f"/{topic}: {error}"))
-        if found:
-            raise LatheError(min(found)[2])
-
-
-@kernel
-def _keep(samples: Samples, whole: Samples, first: int) -> int:
-    """Copy samples to their place; how many are not finite."""
-    whole[first : first + samples.size] = samples
-    bad = 0
-    for k in range(samples.size):
-        bad += not abs(samples[k]) < np.inf
-    return bad
+        raise LatheError(min(found)[2])
 
 
 class Collector:
-    """Collects whole arrays; a sink of the engine, which ends a run with numbers that are not finite, see `Finite`."""
+    """Collects whole arrays; a sink of the engine."""
 
     def __init__(self, cell: Cell, samples: int) -> None:
-        self._cell, self._finite = cell, Finite(cell)
+        self._cell = cell
         self._framer = Framer("", "", cell.master.shared.step_ns)
         self._dense = {topic: messages.allocate(source.type, samples) for topic, source in cell.dense.items()}
         for signals in self._dense.values():
@@ -62,17 +64,11 @@ class Collector:
         self._sparse: dict[str, list[Sparse]] = {topic: [] for topic in cell.sparse}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink` and `Finite.chunk`."""
-        bad = 0
+        """See `lathe_rc.cell.engine.Sink`."""
         for topic, signals in dense.items():
             whole = self._dense[topic]
             for name, array in signals.items():
-                if array.dtype == np.float64:
-                    bad += _keep(array, whole[name], first)
-                else:
-                    whole[name][first : first + samples] = array
-        if bad:
-            self._finite.chunk(first, samples, dense, sparse)
+                whole[name][first : first + samples] = array
         for topic, found in sparse.items():
             self._sparse[topic] += found
 

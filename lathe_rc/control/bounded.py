@@ -147,12 +147,13 @@ class Takeover:
     def _way(self, velocity: float, *, to_goal: bool) -> Array:
         """The way to rest, or out of the part: a single motion that begins into the part would first go far into it."""
         start, step = float(self._given[1]), self._step
-        if to_goal:
-            start = self._within_reach(start, self._goal)
-        if to_goal and velocity * (self._goal - start) >= 0.0:
+        if not to_goal:
+            return motion(start, velocity, None, self._bounds, step)
+        start = self._within_reach(start, self._goal)
+        if velocity * (self._goal - start) >= 0.0:
             return motion(start, velocity, self._goal, self._bounds, step)
         stop = motion(start, velocity, None, self._bounds, step)
-        return np.concatenate((stop, motion(float(stop[-1]), 0.0, self._goal, self._bounds, step))) if to_goal else stop
+        return np.concatenate((stop, motion(float(stop[-1]), 0.0, self._goal, self._bounds, step)))
 
     def _within_reach(self, place: float, goal: float) -> float:
         return float(np.clip(place, goal - self._reach, goal + self._reach))

@@ -31,10 +31,10 @@ def sweep(folder: Path = FOLDER) -> list[str]:
     if not folder.is_dir():
         return []
     with _alone(folder):
-        files = sorted(folder.iterdir())
-        ports = [file.name for file in files if _PORT.fullmatch(file.name) and _is_ours(file) and _remove(file)]
-        segments = [file for file in files if _SEGMENT.fullmatch(file.name) and _is_ours(file)]
-        return ports + [segment.name for segment in segments if _remove_segment(segment)]
+        ours = [file for file in sorted(folder.iterdir()) if _is_ours(file)]
+        ports = [file for file in ours if _PORT.fullmatch(file.name) and _remove_port(file)]
+        segments = [file for file in ours if _SEGMENT.fullmatch(file.name) and _remove_segment(file)]
+        return [file.name for file in (*ports, *segments)]
 
 
 @contextmanager
@@ -47,14 +47,14 @@ def _alone(folder: Path) -> Iterator[None]:
         os.close(opened)
 
 
-def _is_ours(port: Path) -> bool:
+def _is_ours(file: Path) -> bool:
     try:
-        return port.stat().st_uid == os.geteuid()
+        return file.stat().st_uid == os.geteuid()
     except FileNotFoundError:  # somebody else has removed it
         return False
 
 
-def _remove(port: Path) -> bool:
+def _remove_port(port: Path) -> bool:
     """Remove a port if nobody uses it; whether it has."""
     alone, shared = (port.with_name(port.name + end) for end in _LOCKS)
     made = not alone.exists()

@@ -29,14 +29,13 @@ from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
 from lathe_rc.nodes.report import Reporter
 from lathe_rc.nodes.strangers import Stranger, Strangers
-from lathe_rc.nodes.watch import Watch, liveliness, this_host
+from lathe_rc.nodes.watch import SILENCE, Watch, liveliness, this_host
 
 _TICK = 0.02  # [s] between looks at the graph while members join
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _REPEAT_PERIOD = 0.5  # [s] between announcements before the run, in the safe state, and after it has given up
 _LATCHED_DEPTH = 256
 _PATIENCE = 2.0  # [s] for others to acknowledge the last messages
-STALL = 0.08  #: [s] in which a node that DDS does not hear has completed nothing, after which it is named
 _GIVEN_UP = 2.0  # [s] of silence after which a time master is lost in a cell that does not wait
 _MOST_MEMBERS = 256  # announced names that are kept
 
@@ -463,19 +462,19 @@ class CellNode(LifecycleNode):
 
     def _name_a_silent_master(self, name: str, now: float) -> None:
         """Say once that it stalls: who stands still cannot say so itself."""
-        if self._cell != CellState.RUNNING or name not in self.watch.silent:
-            self._master_stalls = False
-        elif not self._master_stalls and now - self._moved < STALL:
-            self.next_tick = min(self.next_tick, self._moved + STALL)  # what was on its way is still being computed
-        elif not self._master_stalls:
-            self._master_stalls = True
+        silent = self._cell == CellState.RUNNING and name in self.watch.silent
+        if silent and not self._master_stalls:
+            if now - self._moved < SILENCE:  # what was on its way is still being computed
+                self.next_tick = min(self.next_tick, self._moved + SILENCE)
+                return
             self.tell_stall(name, self._reported_blocks)
+        self._master_stalls = silent
 
     def tell_stall(self, name: str, blocks: int) -> None:
         """Say that a member is silent since it has completed so many blocks."""
         # In this order: to log for the first time takes some 70 ms.
         self.reporter("stall", self.get_name(), member=name, blocks=blocks)
-        self.get_logger().warning(f"{name} has been silent for {STALL * 1e3:.0f} ms at block {blocks}")
+        self.get_logger().warning(f"{name} has been silent for {SILENCE * 1e3:.0f} ms at block {blocks}")
 
     def _parameter(self, name: str, key: str) -> object:
         """What a member has announced of its parameters; None if it has no such."""

@@ -15,9 +15,9 @@ from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderP
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes.ports import latched_qos
-from lathe_rc.nodes.shell import STALL
 from lathe_rc.nodes.stage_node import StageNode
 from lathe_rc.nodes.strangers import Stranger
+from lathe_rc.nodes.watch import SILENCE
 
 _GONE = 0.2  # [s] for messages to be acknowledged, if who has died never will
 _LOOK = 0.02  # [s] between looks at the members
@@ -52,7 +52,7 @@ class SpindleNode(StageNode):
         self._running = False
         self._schedule = 0.0  # monotonic time at which sample 0 would have been, were there no slips
         self._heard = time.monotonic()
-        self._members_moved = dict.fromkeys(self._member_names, self._heard)  # when each has last completed a block
+        self._members_moved: dict[str, float] = {}  # monotonic time at which each has last completed a block
         self._stalled: frozenset[str] = frozenset()
         self._dead: dict[str, float] = {}  # monotonic time until which a member may be restarted
         self._unsafe: set[str] = set()  # members that have not yet heard that others are lost
@@ -262,8 +262,8 @@ class SpindleNode(StageNode):
             self._lose(dict.fromkeys(self._dead, "died"))  # who was waited for as well: it could not join any more
         elif not self._dead:
             silent = self.watch.silent.keys() & self._completed.keys()
-            stopped = {name for name in silent if now - self._members_moved[name] > STALL}
-            stands = (self._unsafe or not self._credit()) and now - self._heard > STALL
+            stopped = {name for name in silent if now - self._members_moved[name] > SILENCE}
+            stands = (self._unsafe or not self._credit()) and now - self._heard > SILENCE
             if stands:
                 # Who waits for a silent one is as slow as it is: first those that DDS does not hear any more.
                 self._name_the_silent(frozenset(silent or self._unsafe or {self._slowest}))

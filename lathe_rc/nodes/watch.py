@@ -22,7 +22,7 @@ from std_msgs.msg import Empty
 
 from lathe_rc.cell.messages import ALIVE
 
-LEASE = 0.08  # [s] after which a node that is not heard is silent
+SILENCE = 0.08  #: [s] after which a node is silent that DDS does not hear, and that completes nothing
 
 
 @cache
@@ -34,7 +34,9 @@ def this_host() -> str:
 
 def liveliness() -> QoSProfile:
     """Of the topic `lathe_rc.cell.messages.ALIVE`."""
-    return QoSProfile(depth=1, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=LEASE))
+    return QoSProfile(
+        depth=1, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=SILENCE)
+    )
 
 
 class Watch:

@@ -17,7 +17,7 @@ import time
 
 import numpy as np
 import pytest
-from cells import scenario
+from cells import scenario, told_until_all_have_ended
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness
@@ -137,11 +137,7 @@ def test_when_the_wire_stays_cut_the_silent_are_named_and_the_bag_is_readable(wi
 def test_when_the_wire_stays_cut_both_sides_stop_if_the_cell_shall_not_wait(wire, processes, tmp_path):
     processes.wait_for("cycle")
     wire.loss = 1.0
-    told = []
-    for event in processes.events(60.0):
-        told.append(event)
-        if sum(each["event"] == "exit" for each in told) == len(GROUPS):
-            break
+    told = told_until_all_have_ended(processes)
     (safe,) = [event for event in told if event["event"] == "safe"]
     assert {name.removeprefix("/") for name in safe["lost"]} == set(FAR)
     assert "fell silent: safe state from sample" in safe["why"]
