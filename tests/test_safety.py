@@ -239,11 +239,10 @@ def signals(size=20_000, speed=None, error=None):
 
 def alarms(monitor, inputs, lengths=None):
     """Sample and value of each alarm."""
-    size, found = inputs[ENCODER]["angle"].size, []
+    size, lookout, found = inputs[ENCODER]["angle"].size, Lookout([monitor]), []
     for first, stop in spans(lengths or [size]):
-        alarm = monitor.look([{name: array[first:stop] for name, array in part.items()} for part in inputs])
-        if alarm:
-            found.append((first + alarm.place, alarm.value))
+        told = lookout.look([{name: array[first:stop] for name, array in part.items()} for part in inputs])
+        found += [(first + alarm.place, alarm.value) for _, alarm in told]
     return found
 
 
