@@ -424,6 +424,19 @@ def test_all_monitors_at_once_find_what_their_definitions_say(data, size, seed, 
     assert repr(sorted(found)) == repr([(n, s, float(v)) for n, s, v in taken_one_by_one(angle, speed, pulse, error)])
 
 
+def test_signals_may_lie_anywhere_but_have_to_be_as_long_as_their_block():
+    make, inputs = CASES["speed"]
+    apart = [{name: np.repeat(array, 3)[::3] for name, array in part.items()} for part in inputs()]
+    assert alarms(make(), apart) == alarms(make(), inputs())
+    apart[ENCODER]["speed"] = apart[ENCODER]["speed"][:-1]
+    with pytest.raises(ValueError, match="not as long as the block"):
+        Lookout([make()]).look(apart)
+
+
+def test_without_a_monitor_nothing_is_found():
+    assert Lookout([]).look(signals()) == []
+
+
 def test_the_tool_is_out_when_it_has_been_for_long_enough():
     clearance = Clearance(1.0, 3)
     assert clearance.first(np.array([0.0, 1.0, 2.0])) is None

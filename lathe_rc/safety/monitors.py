@@ -9,7 +9,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from lathe_rc.cell.messages import Signals
-from lathe_rc.safety.rules import GROWTH, INDEX, RATE, SUMS, THRESHOLD, TURN, Array, Pulses, clear, lasting, walk
+from lathe_rc.safety.rules import (
+    GROWTH,
+    INDEX,
+    RATE,
+    SUMS,
+    THRESHOLD,
+    TURN,
+    Array,
+    Places,
+    Pulses,
+    clear,
+    lasting,
+    located,
+    walk,
+)
 from lathe_rc.safety.state_machine import Reaction
 
 
@@ -310,24 +324,25 @@ class Lookout:
             dict.fromkeys(place for monitor in monitors for place in (monitor.signal, monitor.other) if place)
         )
         self._memory = np.concatenate([np.empty(0), *(monitor.memory for monitor in monitors)])
-        self._rows = np.zeros((len(monitors), 6), np.int64)
-        self._known = deque[tuple[Sequence[Signals], tuple[tuple[Array, ...], Pulses]]](maxlen=4)
+        self._plan = np.zeros((len(monitors), 5), np.int64)
+        self._places = np.zeros(len(monitors), np.int64)
+        self._known = deque[tuple[Sequence[Signals], tuple[Array, ...], Pulses, Places]](maxlen=4)
         self._settled = False  # all monitors
         end = 0
-        for row, monitor in zip(self._rows, monitors, strict=True):
+        for row, monitor in zip(self._plan, monitors, strict=True):
             begin, end = end, end + monitor.memory.size
             other = self._signals.index(monitor.other) if monitor.other else -1
-            row[:] = monitor.rule, self._signals.index(monitor.signal), other, begin, end, -1
+            row[:] = monitor.rule, self._signals.index(monitor.signal), other, begin, end
             monitor.memory = self._memory[begin:end]
 
     def look(self, inputs: Sequence[Signals]) -> list[tuple[Monitor, Alarm]]:
         """Alarms of the next samples, by sample."""
         if not self._monitors:
             return []
-        if not walk(*self._gathered(inputs), self._rows, self._memory) and self._settled:
+        if not walk(*self._located(inputs), self._memory, self._places) and self._settled:
             return []
         found = []
-        for monitor, place in zip(self._monitors, self._rows[:, 5].tolist(), strict=True):
+        for monitor, place in zip(self._monitors, self._places.tolist(), strict=True):
             if monitor.raised or (place < 0 and monitor.settled):
                 continue
             alarm = monitor.alarm(inputs, place)
@@ -337,14 +352,16 @@ class Lookout:
         self._settled = all(monitor.raised or monitor.settled for monitor in self._monitors)
         return sorted(found, key=lambda one: one[1].place)
 
-    def _gathered(self, inputs: Sequence[Signals]) -> tuple[tuple[Array, ...], Pulses]:
-        """What is watched; the offline host hands out the same few inputs again and again, so they are kept."""
-        for known, gathered in self._known:
+    def _located(self, inputs: Sequence[Signals]) -> tuple[Pulses, Places]:
+        """Index pulses and plan; the offline host hands out the same few inputs again and again, so they are kept."""
+        for known, _, pulse, plan in self._known:
             if known is inputs:
-                return gathered
-        gathered = tuple([inputs[place][name] for place, name in self._signals]), inputs[0]["index_pulse"]
-        self._known.append((inputs, gathered))
-        return gathered
+                return pulse, plan
+        signals = tuple([np.ascontiguousarray(inputs[place][name]) for place, name in self._signals])
+        pulse, plan = inputs[0]["index_pulse"], self._plan.copy()
+        located(signals, pulse.size, plan)
+        self._known.append((inputs, signals, pulse, plan))
+        return pulse, plan
 
     def reset(self) -> None:
         """Watch as from the first sample."""

@@ -9,7 +9,7 @@ vectors of, and takes them one by one only where there is.
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.jit import inlined, kernel
+from lathe_rc.jit import inlined, kernel, lent
 
 Array = npt.NDArray[np.float64]
 Places = npt.NDArray[np.int64]
@@ -218,21 +218,35 @@ def _growing(error: Array, pulse: Pulses, at: int, memory: Array) -> int:
 
 
 @kernel
-def walk(signals: tuple[Array, ...], pulse: Pulses, rows: Places, memory: Array) -> int:
+def located(signals: tuple[Array, ...], samples: int, plan: Places) -> None:
+    """Replace the signals of a plan, see `walk`, by where they are; they must be contiguous.
+
+    Raises:
+        ValueError: one is not as long as the block.
+    """
+    for signal in signals:
+        if signal.size != samples:
+            raise ValueError("a signal that is watched is not as long as the block")
+    for row in range(plan.shape[0]):
+        plan[row, 1] = signals[plan[row, 1]].ctypes.data
+        plan[row, 2] = signals[plan[row, 2]].ctypes.data if plan[row, 2] >= 0 else 0
+
+
+@kernel
+def walk(pulse: Pulses, plan: Places, memory: Array, places: Places) -> int:
     """Fill in where each rule finds something, or -1, and say how many do.
 
     Args:
-        signals: all that are watched, each shape (n,).
         pulse: index pulses of the encoder, shape (n,).
-        rows: rule, its two signals, the second or -1, begin and end of its memory, and the place that is filled in;
-            shape (rows, 6).
+        plan: rule, where its two signals are, the second or 0, begin and end of its memory; shape (rules, 5).
         memory: of all of them.
+        places: that are filled in, shape (rules,).
     """
     found, first_pulse = 0, _next(pulse, 0)
-    for row in range(rows.shape[0]):
-        rule, own, second = rows[row, 0], memory[rows[row, 3] : rows[row, 4]], rows[row, 2]
-        signal = signals[rows[row, 1]]
-        other = signals[second] if second >= 0 else signal[:0]
+    for row in range(plan.shape[0]):
+        rule, own, second = plan[row, 0], memory[plan[row, 3] : plan[row, 4]], plan[row, 2]
+        signal = lent(plan[row, 1], pulse.size)
+        other = lent(second, pulse.size) if second else signal[:0]
         if rule == THRESHOLD:
             place = _any_beyond(signal, other, own)
         elif rule == RATE:
@@ -241,6 +255,6 @@ def walk(signals: tuple[Array, ...], pulse: Pulses, rows: Places, memory: Array)
             place = _index(signal, pulse, first_pulse, own)
         else:
             place = _growing(signal, pulse, first_pulse, own)
-        rows[row, 5] = place
+        places[row] = place
         found += place >= 0
     return found
