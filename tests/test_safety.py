@@ -21,7 +21,9 @@ from lathe_rc.bag.resim import resimulate
 from lathe_rc.cell import messages
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_rc.cell.stages.feed_drive import FeedDriveParameters, FeedDriveStage
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.supervisor import MEMBERS_LOST
 from lathe_rc.cell.wiring import Cell
@@ -136,6 +138,7 @@ def test_a_command_that_has_diverged_is_retracted_and_given_back_in_time_all_the
     takeover = Takeover(Bounds(0.1, 50.0, 1e5), goal, STEP, reach=reach)
     takeover.apply(np.full(100, far))
     takeover.change(mode)
+    assert (takeover.skipped > 0.0) == (mode is Mode.RETRACT and abs(far - goal) > reach)
     for _ in range(2):
         out = np.full(1000, far)
         takeover.apply(out)
@@ -160,6 +163,39 @@ def test_a_takeover_reaches_as_far_as_the_drive():
         InputError, match=r"^learning_controller.retract_time = 0.01 s: .* the stroke of .* needs 0.002 m;"
     ):
         cell_run(learning_controller=listens, supervisor={})
+
+
+WRONG = "tool.faults=['revolution 15 to 17: tool.measured_error wrong offset=1.0']"
+LATE = ["supervisor.error_limit=0", "supervisor.growth_limit=0"]  # only what the command has become is noticed
+
+
+def test_a_command_that_was_out_of_reach_is_told_of():
+    result = harness.run(supervised(WRONG, *LATE))
+    begin = status(result)[0][3] + 3200
+    wanted = result.recording.dense["/coarse/command"]["position"]
+    events = result.recording.sparse["/learning_controller/events"]
+    reach = Bounds(0.05, 50.0, 1e5).reach(1.0)
+    assert events.values["action"] == [f"out of reach: by {abs(wanted[begin - 1] - 0.3e-3) - reach:g}"]
+    assert events.values["sample_index"] == [begin]
+    assert abs(wanted[begin - 1]) > 0.1
+
+
+def test_a_slide_says_so_too():
+    stage = FeedDriveStage("feed_drive", FeedDriveParameters(command_limit=0.0))
+    inputs, outputs = [{"command": np.full(64, 9.0)}], [messages.allocate(messages.STATE, 64)]
+    stage.process(0, inputs, outputs)
+    stage.go_safe()
+    (told,) = stage.process(64, inputs, outputs)
+    assert (told.topic, told.index) == ("feed_drive/events", 64)
+    assert told.values["action"] == f"out of reach: by {9.0 - 10.0 / 1.875:g}"
+    assert stage.process(128, inputs, outputs) == []
+
+
+@pytest.mark.parametrize("node", ["feed_drive", "force_controller", "position_controller"])
+def test_what_a_slide_may_be_commanded_is_within_reach(node):
+    said = rf"^{node}.stop_time = 1 s: .* of 5.33 in that, .* command_limit .* it is 6; allowed"
+    with pytest.raises(InputError, match=said):
+        STAGES[node](node, STAGES[node].Parameters(command_limit=3.0, reaction_delay=64))
 
 
 def test_a_command_with_steps_is_taken_over_without_its_velocity():

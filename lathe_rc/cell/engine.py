@@ -6,6 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import lcm
 from typing import Protocol
 
+import numpy as np
+
 from lathe_rc.cell.messages import MAX_BLOCK, Signals, sample_fields
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.ring import Ring
@@ -56,8 +58,10 @@ class Engine:
         # What is there now stays: the garbage collector need not walk through it again and again.
         gc.freeze()
         try:
-            for _ in self.steps(list(sinks)):
-                pass
+            # What is not finite is named by a sink, see `lathe_rc.cell.collect.Finite`; NumPy need not warn of it too.
+            with np.errstate(over="ignore", invalid="ignore"):
+                for _ in self.steps(list(sinks)):
+                    pass
         finally:
             gc.unfreeze()
 

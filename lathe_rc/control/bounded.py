@@ -111,13 +111,14 @@ class Takeover:
 
     Attributes:
         mode: who commands; see `change`.
+        skipped: by how much the last motion has begun nearer to its end than the command was [m]; 0 within reach.
     """
 
     def __init__(
         self, bounds: Bounds, retracted: float, step: float, *, reach: float = math.inf, carries: bool = True
     ) -> None:
         self._bounds, self._goal, self._step, self._reach, self._carries = bounds, retracted, step, reach, carries
-        self.mode = Mode.FOLLOW
+        self.mode, self.skipped = Mode.FOLLOW, 0.0
         self._path, self._place = np.zeros(0), 0  # positions to come; of what is added to the command when it follows
         self._given, self._wanted = np.zeros(2), np.zeros(2)  # the last two samples, after and before
 
@@ -133,6 +134,7 @@ class Takeover:
 
     def change(self, mode: Mode) -> None:
         """Take over, or give back, from the next sample on."""
+        self.skipped = 0.0
         if mode is self.mode:
             return
         velocity = self._carried(self._given)
@@ -156,7 +158,9 @@ class Takeover:
         return np.concatenate((stop, motion(float(stop[-1]), 0.0, self._goal, self._bounds, step)))
 
     def _within_reach(self, place: float, goal: float) -> float:
-        return float(np.clip(place, goal - self._reach, goal + self._reach))
+        within = float(np.clip(place, goal - self._reach, goal + self._reach))
+        self.skipped = abs(place - within)
+        return within
 
     def _carried(self, command: Array) -> float:
         """The velocity of the last two samples as far as a motion may have it: what is faster is noise, or a step."""

@@ -11,6 +11,7 @@ import time
 from collections.abc import Sequence
 from types import FrameType
 
+import numpy as np
 import rclpy
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
@@ -157,6 +158,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
     _tune()
     reporter = Reporter()
     dds.settle()
+    np.seterr(over="ignore", invalid="ignore")  # each node names its own numbers that are not finite
     try:
         rclpy.init(args=None if args is None else ["lathe", *args], signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:

@@ -12,7 +12,7 @@ from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedParameters
-from lathe_rc.cell.stages.obedience import FeedObedientParameters, Obedience, listens
+from lathe_rc.cell.stages.obedience import OUT_OF_REACH, FeedObedientParameters, Obedience, listens
 from lathe_rc.errors import InputError
 from lathe_rc.plants import feed
 from lathe_rc.plants.feed import Feedback, FeedDrive
@@ -91,7 +91,7 @@ class FeedDriveStage(Stage):
 
     kind = "feed_drive"
     Parameters = FeedDriveParameters
-    announces = (LIMITED, FREE)
+    announces = (LIMITED, FREE, OUT_OF_REACH)
 
     def __init__(self, name: str, parameters: FeedDriveParameters) -> None:
         super().__init__(name, parameters)
@@ -123,11 +123,12 @@ class FeedDriveStage(Stage):
                 *listens(parameters),
             ],
             outputs=[Output(f"{axis}/state", messages.STATE, Joint("position", "velocity", "effort"))],
-            tells=cuts,
+            tells=True,
         )
 
     def _obeys(self) -> Obedience:
-        return self.parameters.obedience(None, speed=self.drive.integrates, settled=0)
+        limit = self.parameters.command_limit
+        return self.parameters.obedience(self.name, None, speed=self.drive.integrates, limit=limit, settled=0)
 
     def go_safe(self) -> None:
         """See `Stage`; the slide stops, and nobody is listened to any more."""
@@ -142,7 +143,9 @@ class FeedDriveStage(Stage):
         if self._safe or safety:
             command = command.copy()
         listening = safety and not self._safe
+        sparse: list[Sparse] = []
         for start, stop in self._obedience.pieces(safety[0]["reaction"]) if listening else [(0, size)]:
+            sparse += self._obedience.told(first + start)
             self._obedience.apply(command[start:stop])
         motor, seen = self._motor[:size], self._seen[:size]
         load = self._load[: size if self.parameters.disturbance else 0]
@@ -152,4 +155,4 @@ class FeedDriveStage(Stage):
             first, command, state["position"], state["velocity"], state["effort"], motor, seen, load, clipped
         )
         self._sensor.measure(seen, state["measured_position"])
-        return self._clipping.told(first, clipped)
+        return sparse + self._clipping.told(first, clipped)

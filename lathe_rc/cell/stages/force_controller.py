@@ -49,7 +49,7 @@ class ForceController(Stage):
         self.pid = parameters.pid(
             parameters.proportional, parameters.integral, parameters.derivative, parameters.derivative_filter
         )
-        self._obedience = parameters.obeys(self)
+        self._obedience = parameters.obeys(name, self)
         self.declare(
             inputs=[
                 # The angle itself is not used: the spindle's blocks say which samples are due.

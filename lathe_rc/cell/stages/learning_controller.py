@@ -15,7 +15,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import MAX_BLOCK, Samples, Signals
 from lathe_rc.cell.stage import Input, Output, Sparse, Stage, cut
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
-from lathe_rc.cell.stages.obedience import Obedience, listens
+from lathe_rc.cell.stages.obedience import OUT_OF_REACH, Obedience, listens
 from lathe_rc.control import bounded, memory_file
 from lathe_rc.control.bounded import Takeover
 from lathe_rc.control.correction import Correction
@@ -40,7 +40,7 @@ class LearningController(Stage):
     kind = "learning_controller"
     Parameters = LearningControllerParameters
     actions = ("freeze", "learn", "clear", *_FILE_ACTIONS)
-    announces = ("joined", "lost")
+    announces = ("joined", "lost", OUT_OF_REACH)
 
     def __init__(self, name: str, parameters: LearningControllerParameters) -> None:
         self.parameters = parameters
@@ -100,7 +100,7 @@ class LearningController(Stage):
         bounds = parameters.bounds()
         reach = bounds.reach(parameters.retract_time)
         takeover = Takeover(bounds, parameters.retract_position, parameters.step, reach=reach)
-        return Obedience(self, takeover, settled=settled)
+        return Obedience(self.name, self, takeover, settled=settled)
 
     def may_learn(self, *, on: bool) -> None:
         """See `lathe_rc.cell.stages.obedience.Learner`."""
@@ -216,6 +216,7 @@ class LearningController(Stage):
             self._obedience.apply(command)
             return
         for start, stop in self._obedience.pieces(safety["reaction"]):
+            sparse += self._obedience.told(first + start)
             self._control_until_lost(first + start, cut(inputs, start, stop), command[start:stop], sparse)
             self._obedience.apply(command[start:stop])
 

@@ -12,10 +12,13 @@ from annotated_types import Gt
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import ObedientParameters, parameter
-from lathe_rc.cell.stage import Input
+from lathe_rc.cell.stage import Input, Sparse
 from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Bounds, Mode, Takeover
+from lathe_rc.errors import InputError
 from lathe_rc.safety.state_machine import Reaction
+
+OUT_OF_REACH = "out of reach"  #: event of a takeover that could not begin where the command was
 
 
 def listens(parameters: ObedientParameters) -> list[Input]:
@@ -36,23 +39,37 @@ class FeedObedientParameters(ObedientParameters):
         1.0, "longest duration: a command that is farther away begins where the way takes so long", "s"
     )
 
-    def obedience(self, learner: "Learner | None", *, speed: bool, settled: int) -> "Obedience":
+    def obedience(
+        self, name: str, learner: "Learner | None", *, speed: bool, limit: float, settled: int
+    ) -> "Obedience":
         """What obeys for a command of the feed.
 
         A command for a speed goes to 0, one for a position stays: so the slide stands. Nothing is taken out of the
         part along the slide.
 
         Args:
+            name: of the node.
             learner: see `Obedience`.
             speed: whether the command stands for a speed.
+            limit: largest command to each side, in its unit; 0: there is none.
             settled: see `Obedience`.
+
+        Raises:
+            InputError: a command within the limit is out of reach.
         """
         bounds = Bounds(self.stop_rate, self.stop_rate_change, math.inf)
+        reach, needed = bounds.reach(self.stop_time), 2.0 * limit
+        if reach < needed:
+            raise InputError(
+                f"{name}.stop_time = {self.stop_time:g} s: stop_rate and stop_rate_change allow a way of {reach:.3g} "
+                f"in that, and from one end of command_limit to the other it is {needed:.3g}; allowed: a longer "
+                "stop_time, or larger rates"
+            )
         if self.reaction_delay:
             bounded.prepare()
         rest = Mode.RETRACT if speed else Mode.HOLD
-        takeover = Takeover(bounds, 0.0, self.step, reach=bounds.reach(self.stop_time), carries=False)
-        return Obedience(learner, takeover, settled=settled, hold=rest, retract=rest)
+        takeover = Takeover(bounds, 0.0, self.step, reach=reach, carries=False)
+        return Obedience(name, learner, takeover, settled=settled, hold=rest, retract=rest)
 
 
 class Learner(Protocol):
@@ -66,6 +83,7 @@ class Obedience:
     """Stops learning, holds or retracts the command, and gives it back when the reaction is over.
 
     Args:
+        name: of the node.
         learner: that learns at first; None: there is nothing to learn.
         takeover: of the command.
         settled: samples from where a command is given back until errors are worth learning from.
@@ -78,6 +96,7 @@ class Obedience:
 
     def __init__(
         self,
+        name: str,
         learner: Learner | None,
         takeover: Takeover,
         *,
@@ -85,10 +104,11 @@ class Obedience:
         hold: Mode = Mode.HOLD,
         retract: Mode = Mode.RETRACT,
     ) -> None:
-        self._learner, self._takeover, self._settled = learner, takeover, settled
+        self._name, self._learner, self._takeover, self._settled = name, learner, takeover, settled
         self._hold, self._retract = hold, retract
         self.reaction = Reaction.NONE
         self._wants_to_learn = True
+        self._skipped = 0.0  # where the command was out of reach: by how much, in its unit
         self._forbidden = 0.0  # samples until learning is no longer forbidden
 
     @property
@@ -140,11 +160,19 @@ class Obedience:
         self.reaction = reaction
         following = self._hold if reaction == Reaction.HOLD else Mode.FOLLOW
         self._takeover.change(self._retract if reaction >= Reaction.RETRACT else following)
+        self._skipped = self._takeover.skipped
         if reaction >= Reaction.FREEZE:
             self._forbid(math.inf)
         elif self._forbidden:
             # The errors of the way back are nothing to learn from; they come late.
             self._forbid(float(self._takeover.remaining + self._settled))
+
+    def told(self, index: int) -> list[Sparse]:
+        """What is to be said of what has just been obeyed, from sample ``index`` on."""
+        if not self._skipped:
+            return []
+        action, self._skipped = f"{OUT_OF_REACH}: by {self._skipped:g}", 0.0
+        return [Sparse(f"{self._name}/events", messages.EVENT, index, {"action": action})]
 
     def apply(self, command: Samples) -> None:
         """Make of what the controller wants what the drive gets; in place, in its unit."""

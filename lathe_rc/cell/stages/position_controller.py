@@ -104,7 +104,7 @@ class PositionController(Stage):
             inputs.append(Input("longitudinal/state", messages.STATE, ("measured_position",), delay))
         self._offset = np.empty(messages.MAX_BLOCK)
         self._largest, self._held = 0.0, 0.0
-        self._obedience = parameters.obeys(self)
+        self._obedience = parameters.obeys(name, self)
         self.declare(inputs=[*inputs, *listens(parameters)], outputs=[Output(f"{axis}/command", messages.SERVO)])
         if parameters.law == "periodic_hyperstable":
             self.sparse_topics[f"{axis}/periodic"] = messages.PERIODIC

@@ -37,11 +37,16 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
         "speed", "what the command stands for at the drive; to stop the slide a speed goes to 0, and a position stays"
     )
 
-    def obeys(self, learner: Learner) -> Obedience | None:
-        """What obeys the supervisor; None if nobody is listened to."""
+    def obeys(self, name: str, learner: Learner) -> Obedience | None:
+        """What obeys the supervisor for a node; None if nobody is listened to.
+
+        Raises:
+            InputError: see `FeedObedientParameters.obedience`; so no command is ever out of reach.
+        """
         if not self.reaction_delay:
             return None
-        return self.obedience(learner, speed=self.commands == "speed", settled=self.feedback_delay)
+        speed, limit = self.commands == "speed", self.command_limit
+        return self.obedience(name, learner, speed=speed, limit=limit, settled=self.feedback_delay)
 
     def pid(self, proportional: float, integral: float, derivative: float, filter_: float) -> Pid:
         """The PID of a table.
