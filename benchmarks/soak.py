@@ -39,6 +39,7 @@ OWN = "learning_controller"
 _PAGE = os.sysconf("SC_PAGESIZE")
 _GROWTH = 32 * 2**20  # [B] that a process may grow after the first tenth of a run
 _STOPPED = 0.3  # [s] at most that a node is stopped
+_SOON = 0.1  # [s] within which a death or a stall should be noticed
 _AWAY = 25.0  # [s] the long stops; DDS by default forgets who is silent for 20 s
 
 
@@ -105,7 +106,7 @@ class At:
     Attributes:
         seen: events of each kind.
         noticed: times from an act until the time master named somebody dead or silent [s].
-        ended: times from an act until the harness saw a process end [s].
+        witnessed: times from an act until the harness saw a process end or stop [s].
     """
 
     def __init__(self, moments: Sequence[tuple[int, str]], act: Callable[[int], None]) -> None:
@@ -113,7 +114,7 @@ class At:
         self._pids: dict[str, int] = {}
         self._acted = self._hit = 0
         self.noticed: list[float] = []
-        self.ended: list[float] = []
+        self.witnessed: list[float] = []
         self.seen: Counter[str] = Counter()
 
     def __call__(self, event: harness.Event) -> None:
@@ -125,8 +126,8 @@ class At:
             while self._moments and event.get("samples", 0) >= self._moments[0][0]:
                 self._act(self._pids[self._moments.pop(0)[1]])
                 self._acted = self._hit = time.monotonic_ns()
-        if self._hit and event["event"] == "exit":
-            self.ended.append((event["monotonic_ns"] - self._hit) * 1e-9)
+        if self._hit and event["event"] in ("exit", "stopped"):
+            self.witnessed.append((event["monotonic_ns"] - self._hit) * 1e-9)
             self._hit = 0
         if self._acted and event["event"] in ("dead", "stall"):
             self.noticed.append((event["monotonic_ns"] - self._acted) * 1e-9)
@@ -138,7 +139,7 @@ def kill(scale: int, random: Random) -> Mapping[str, Any]:
     told: Counter[str] = Counter()
     failures: list[str] = []
     noticed: list[float] = []
-    ended: list[float] = []
+    witnessed: list[float] = []
     with tempfile.TemporaryDirectory(prefix="lathe-soak-") as name:
         folder = Path(name)
         sets = ["spindle_encoder.revolutions=40.0", f"{OWN}.restart_file={folder}/state", "recorder.chunk_size=65536"]
@@ -151,7 +152,7 @@ def kill(scale: int, random: Random) -> Mapping[str, Any]:
             outcome = _killed(scenario, node, bag, watch, plain.digest)
             told[f"{node}: {outcome}"] += 1
             noticed += watch.noticed
-            ended += watch.ended
+            witnessed += watch.witnessed
             if outcome != {OWN: _SAME, "spindle_encoder": _ENDED}.get(node, _SAFE):
                 failures.append(f"{node} at sample {sample}: {outcome}")
             after = "".join(f", noticed after {seconds * 1e3:.0f} ms" for seconds in watch.noticed)
@@ -159,14 +160,15 @@ def kill(scale: int, random: Random) -> Mapping[str, Any]:
     return {
         "outcomes": dict(sorted(told.items())),
         "noticed_after_ms": _times(noticed),
-        "seen_by_the_harness_after_ms": _times(ended),
+        "seen_by_the_harness_after_ms": _times(witnessed),
         "failures": failures,
         "failed": len(failures),
     }
 
 
 def _times(seconds: Sequence[float]) -> dict[str, float]:
-    return {name: round(of(seconds) * 1e3, 1) for name, of in (("median", median), ("largest", max)) if seconds}
+    found = {name: round(of(seconds) * 1e3, 1) for name, of in (("median", median), ("largest", max)) if seconds}
+    return {**found, "later_than_they_should": sum(time > _SOON for time in seconds), "of": len(seconds)}
 
 
 _SAFE, _SAME, _ENDED = "safe state, bag readable", "goes on, same digest", "ended, bag readable"
@@ -213,6 +215,7 @@ def stop(scale: int, random: Random) -> Mapping[str, Any]:
     return {
         "stops": count,
         "stalls_named": watch.seen["stall"],
+        "seen_by_the_harness_after_ms": _times(watch.witnessed),
         "samples": result.samples,
         "same_digest": result.digest == plain.digest,
         "failed": int(result.digest != plain.digest),

@@ -431,7 +431,11 @@ class Processes:
                 for report in reports:
                     self._events.put(json.loads(report))
             code = child.wait()
-        self._events.put({"event": "exit", "node": name, "code": code, "monotonic_ns": time.monotonic_ns()})
+        self._say("exit", name, code=code)
+
+    def _say(self, event: str, name: str, **values: object) -> None:
+        """An event of the harness's own, as nodes report theirs."""
+        self._events.put({"event": event, "node": name, "monotonic_ns": time.monotonic_ns(), **values})
 
     def _follow(self, name: str, child: subprocess.Popen[bytes]) -> None:
         """Turn into events that a process is stopped by a signal, and continued.
@@ -447,7 +451,7 @@ class Processes:
                     return  # that is for who waits for its end
                 if change := os.waitid(os.P_PID, child.pid, changes | os.WNOHANG):
                     kind = "continued" if change.si_code == os.CLD_CONTINUED else "stopped"
-                    self._events.put({"event": kind, "node": name, "signal": change.si_status})
+                    self._say(kind, name, signal=change.si_status)
 
     def events(self, silence: float) -> Iterator[Event]:
         """Events as they come.
@@ -495,7 +499,7 @@ class Processes:
         if self._restarts[name] > _MOST_RESTARTS:
             return False
         self._start(group)
-        self._events.put({"event": "restarted", "node": name, "pid": self._children[name].pid})
+        self._say("restarted", name, pid=self._children[name].pid)
         return True
 
     def _goes_on(self, name: str) -> bool:
