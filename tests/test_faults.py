@@ -17,6 +17,7 @@ from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
 from lathe_rc.safety.faults import DISTURBANCES, KINDS, parse
+from lathe_rc.safety.injection import Injection, Port
 
 STEP = 1.0 / 64000
 ALLOWED = {"allow_faults": True}
@@ -337,3 +338,26 @@ def test_a_re_simulation_breaks_again_in_the_same_way(tmp_path):
     harness.run(with_every_fault(), bag=tmp_path / "bag")
     found = resimulate(tmp_path / "bag")
     assert (found.changed, found.different, found.missing) == (False, [], [])
+
+
+def test_a_delay_is_as_long_as_memory_allows():
+    with pytest.raises(InputError, match=r"time=1e9"):
+        parse("coarse/state.measured_position delayed time=1e9", "node")
+
+
+@pytest.mark.parametrize("spans", [[(21, 22), (20, 21)], [(20, 23), (21, 22)]])
+def test_equal_faults_that_touch_or_overlap_end_one_by_one(spans):
+    injection = Injection("n", [], [Port("coarse/state", messages.STATE, ("position",), 0, out=True)], seed=1, step=1.0)
+    fault = parse("coarse/state.position off", "n")
+    moments = sorted((at, end) for span in spans for at, end in zip(span, (False, True), strict=True))
+    out, reached = np.ones(30), 0
+    for at, end in moments:
+        injection.outputs(reached, [{"position": out[reached:at]}])
+        reached = at
+        if end:
+            injection.end("coarse/state.position", at, fault)
+        else:
+            injection.begin(fault, at)
+    injection.outputs(reached, [{"position": out[reached:]}])
+    off = sorted({sample for begin, end in spans for sample in range(begin, end)})
+    assert np.flatnonzero(out == 0.0).tolist() == off

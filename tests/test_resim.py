@@ -181,3 +181,22 @@ def test_first_and_last_revolution_are_those_of_the_whole(processes, piece, toge
             # Splines of a piece differ from those of the whole by what the far ends do.
             if key != "largest_upr":
                 assert_allclose(told[name][key], value, rtol=1e-6, atol=1e-9, err_msg=f"{name} {key}")
+
+
+@pytest.mark.parametrize(
+    "asked",
+    ["learning_controller.events=['revolution 5: freeze']", "electrodynamic_actuator.faults=[]"],
+)
+def test_other_events_than_those_of_the_bag_are_refused(processes, asked):
+    with pytest.raises(InputError, match=r"^--set .*: events and faults come from the bag, as they took effect; leave"):
+        resimulate(processes[0], [asked])
+
+
+def test_a_controller_with_events_of_its_own_is_refused(processes, tmp_path):
+    file = tmp_path / "controller.yaml"
+    text = "/learning_controller:\n  ros__parameters:\n    events: ['revolution 5: freeze']\n"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(
+        InputError, match=r"^learning_controller.events = \['revolution 5: freeze'\]: events and faults"
+    ):
+        resimulate(processes[0], controller=file)

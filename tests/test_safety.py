@@ -165,6 +165,21 @@ def test_a_takeover_reaches_as_far_as_the_drive():
         cell_run(learning_controller=listens, supervisor={})
 
 
+def test_a_monitor_that_only_warns_warns_again_after_a_reset():
+    warns = ["supervisor.following_reaction=warn", "supervisor.error_reaction=warn", "supervisor.margin_limit=[]"]
+    fault = (
+        "electrodynamic_actuator.faults=['revolution {0} to {0}.2: coarse/state.measured_position wrong offset=1.3e-4']"
+    )
+    faults = fault.format(12).replace("']", "', ") + fault.format(18).split("[")[1]
+    result = harness.run(supervised("supervisor.events=['revolution 14: reset']", faults, *warns))
+    told = [(monitor, state) for monitor, state, _, _ in status(result)]
+    assert told.count(("following", State.NOMINAL)) == 2
+    assert (RESET, State.NOMINAL) in told
+    reaction = result.recording.dense["/safety"]["reaction"]
+    reset = next(sample for monitor, _, _, sample in status(result) if monitor == RESET)
+    assert (reaction[reset - 1], reaction[reset]) == (Reaction.WARN, Reaction.NONE)
+
+
 WRONG = "tool.faults=['revolution 15 to 17: tool.measured_error wrong offset=1.0']"
 LATE = ["supervisor.error_limit=0", "supervisor.growth_limit=0"]  # only what the command has become is noticed
 
@@ -886,6 +901,10 @@ def test_a_re_simulation_reacts_in_the_same_way(tmp_path):
         (["supervisor.margin_limit=[0.1, 0.1]"], "allowed: one for each of coarse"),
         (["supervisor.slide_limit=[1e-4]"], "allowed: one for each of none"),
         (["learning_controller.reaction_delay=32"], "feedback of safety is delayed by 32 samples, block_size = 64"),
+        (
+            ["supervisor.clear_position=1.5e-3", "learning_controller.retract_position=2e-3"],
+            "the stroke of electrodynamic_actuator ends at 0.001 m; allowed: less than that",
+        ),
         (["supervisor.speed_limit=-1"], "allowed: a finite number from 0"),
     ],
 )

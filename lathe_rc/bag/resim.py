@@ -110,6 +110,11 @@ class _Digests:
         return self._digester.result(self._sparse)
 
 
+_HAPPENED = (
+    "events and faults come from the bag, as they took effect; leave them as they are, or run the scenario with others"
+)
+
+
 def with_controller(scenario: Scenario, file: Path) -> Scenario:
     """Replace the nodes that a parameter file names; what all nodes share stays as it was.
 
@@ -185,10 +190,11 @@ def resimulate(
             chosen = scenarios.load(resources.find(scenario), overrides)
         else:
             assert original is not None, "it is the other source of a scenario"
-            _refuse_spindle(original, overrides)
+            _refuse_overrides(original, overrides)
             chosen = story.scenario_of(source.about, Path(folder), overrides) if overrides else original
         if controller is not None:
             chosen = with_controller(chosen, controller)
+        _refuse_events(chosen, original)
         drives = identify.drives(recorded, chosen) if identified else []
         chosen = identify.with_identified(chosen, drives)
         if parameters is not None:
@@ -248,11 +254,23 @@ def _of_bag(recorded: Recorded, source: Source, folder: Path) -> Scenario:
     return story.scenario_of(source.about, folder)
 
 
-def _refuse_spindle(original: Scenario, overrides: Sequence[str]) -> None:
+def _refuse_overrides(original: Scenario, overrides: Sequence[str]) -> None:
     spindle = original.of_kind(SpindleEncoder.kind)[0]
     for text in overrides:
-        if text.partition(".")[0].strip() == spindle or "." not in text.partition("=")[0]:
+        name = text.partition("=")[0].strip()
+        if name.endswith((".events", ".faults")):
+            raise InputError(f"--set {text!r}: {_HAPPENED}")
+        if name.partition(".")[0] == spindle or "." not in name:
             raise InputError(f"--set {text!r}: the spindle and what all nodes share come from the bag; set others")
+
+
+def _refuse_events(chosen: Scenario, original: Scenario | None) -> None:
+    """Refuse to be asked for others than the bag has; a controller's own that has none gets those of the bag."""
+    for name, table in chosen.nodes.items() if original else ():
+        for what in ("events", "faults"):
+            asked = getattr(table, what)
+            if original and asked and asked != getattr(original.nodes[name], what):
+                raise InputError(f"{name}.{what} = {asked}: {_HAPPENED}")
 
 
 def recorded_digests(path: Path) -> dict[str, str]:

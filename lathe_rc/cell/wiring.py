@@ -141,6 +141,7 @@ class Cell:
                 self._check_profile(stage, high)
             if isinstance(stage, Supervisor) and stage.parameters.drives:
                 self._check_retraction(stage)
+                self._check_clearance(stage)
             if isinstance(stage, LearningController):
                 self._check_delay(stage, high)
                 self._check_preview(stage)
@@ -173,6 +174,20 @@ class Cell:
                 raise InputError(
                     f"{source.name}.{name} = {reached:g} m, but the tool is out of the part beyond "
                     f"{stage.name}.clear_position = {clear:g} m; allowed: above that, or a smaller clear_position"
+                )
+
+    def _check_clearance(self, stage: Supervisor) -> None:
+        """A drive gets no farther than its stroke."""
+        clear = stage.parameters.clear_position
+        outlet = self.dense.get(remapped(stage.shared, f"{stage.parameters.drives[0]}/state"))
+        drive = self.stages[outlet.node] if outlet else None
+        if not isinstance(drive, Drive):
+            return
+        for limits in drive.limits().values():
+            if limits.stroke <= clear:
+                raise InputError(
+                    f"{stage.name}.clear_position = {clear:g} m: the tool is out of the part beyond that, and the "
+                    f"stroke of {drive.name} ends at {limits.stroke:g} m; allowed: less than that"
                 )
 
     def _check_reach(self, stage: LearningController, name: str) -> None:

@@ -72,7 +72,7 @@ class Kind:
     whole: bool = False
 
 
-_TIME = Value("how long", "s", low=0.0, above=True)
+_LATEST = 10.0  # [s] that a signal can be late: all of it is kept meanwhile
 KINDS: Mapping[str, Kind] = {
     "off": Kind("0, as from a device without power", {}, whole=True),
     "stuck": Kind("the first sample stays", {}, whole=True),
@@ -84,7 +84,10 @@ KINDS: Mapping[str, Kind] = {
         {"scale": Value("factor", "1", 1.0), "offset": Value("added", "", 0.0)},
     ),
     "slow": Kind("behind a first-order lag", {"time": Value("its time constant", "s", low=0.0, above=True)}),
-    "delayed": Kind("late; the first sample stays until then", {"time": _TIME}),
+    "delayed": Kind(
+        "late; the first sample stays until then",
+        {"time": Value("how long", "s", low=0.0, above=True, below=_LATEST)},
+    ),
     "intermittent": Kind(
         "0 now and then, at random times, as from a loose contact; good at first",
         {

@@ -115,10 +115,12 @@ class Injection:
             self._injected.append(_Injected(fault, port, made, index))
 
     def end(self, target: str, index: int, fault: Fault | None = None) -> None:
-        """Let a fault of a target, or all of them, end before sample ``index``."""
+        """Let a fault of a target, of equal ones the oldest, or all of them, end before sample ``index``."""
         for injected in self._injected:
             if injected.fault.target == target and fault in (None, injected.fault) and injected.end > index:
                 injected.end = index
+                if fault is not None:
+                    return
 
     @property
     def any(self) -> bool:

@@ -52,7 +52,7 @@ def after(state: State, cause: Reaction | str) -> State | None:
     if cause == RETRACTED:
         return State.SAFE if state is State.RETRACTING else None
     if cause == RESET:
-        return State.NOMINAL if state in (State.DEGRADED, State.SAFE) else None
+        return None if state is State.RETRACTING else State.NOMINAL
     if cause in (Reaction.RETRACT, Reaction.STOP):
         return State.RETRACTING if state in (State.NOMINAL, State.DEGRADED) else state
     if cause in (Reaction.FREEZE, Reaction.FALL_BACK, Reaction.HOLD):

@@ -258,12 +258,14 @@ class Supervisor(Stage):
 
     def perform(self, action: str) -> None:
         """See `Stage`: a reset; what is still wrong raises its alarm again."""
+        if self.reaction is Reaction.NONE:
+            return  # nothing has been found since the start or the last reset
         to = state_machine.after(self.state, action)
         if to is not None and self.reaction is not Reaction.STOP:
             self.state, self.reaction = to, Reaction.NONE
             self._told.append(RESET)
             self._lookout.reset()
-        elif self.state is not State.NOMINAL:
+        else:
             self._told.append(RESET_REFUSED)
 
     def go_safe(self) -> None:
