@@ -38,7 +38,7 @@ _SIDES = {
     "watched": _SUPERVISED,
 }
 _FROM = 12 * 3840  # [sample], about the revolution from which on the engine is measured
-_CHUNK = 3200  # [sample], of both
+_CHUNK = 3200  # [sample], of every side
 _TARGET = 0.95
 
 

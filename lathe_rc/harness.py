@@ -524,7 +524,7 @@ class Processes:
         """
         for name in self._running:
             self._abandoned.add(name)
-            self._events.put({"event": "stuck", "node": name, "place": self._place(name)})
+            self._say("stuck", name, place=self._place(name))
             self._children[name].kill()
 
     def wait_for(self, kind: str, node: str | None = None, **values: object) -> Event:

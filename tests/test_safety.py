@@ -167,11 +167,9 @@ def test_a_takeover_reaches_as_far_as_the_drive():
 
 def test_a_monitor_that_only_warns_warns_again_after_a_reset():
     warns = ["supervisor.following_reaction=warn", "supervisor.error_reaction=warn", "supervisor.margin_limit=[]"]
-    fault = (
-        "electrodynamic_actuator.faults=['revolution {0} to {0}.2: coarse/state.measured_position wrong offset=1.3e-4']"
-    )
-    faults = fault.format(12).replace("']", "', ") + fault.format(18).split("[")[1]
-    result = harness.run(supervised("supervisor.events=['revolution 14: reset']", faults, *warns))
+    faults = [f"revolution {k} to {k}.2: coarse/state.measured_position wrong offset=1.3e-4" for k in (12, 18)]
+    broken = f"electrodynamic_actuator.faults={faults}"
+    result = harness.run(supervised("supervisor.events=['revolution 14: reset']", broken, *warns))
     told = [(monitor, state) for monitor, state, _, _ in status(result)]
     assert told.count(("following", State.NOMINAL)) == 2
     assert (RESET, State.NOMINAL) in told

@@ -110,11 +110,6 @@ class _Digests:
         return self._digester.result(self._sparse)
 
 
-_HAPPENED = (
-    "events and faults come from the bag, as they took effect; leave them as they are, or run the scenario with others"
-)
-
-
 def with_controller(scenario: Scenario, file: Path) -> Scenario:
     """Replace the nodes that a parameter file names; what all nodes share stays as it was.
 
@@ -254,6 +249,11 @@ def _of_bag(recorded: Recorded, source: Source, folder: Path) -> Scenario:
     return story.scenario_of(source.about, folder)
 
 
+_HAPPENED = (
+    "events and faults come from the bag, as they took effect; leave them as they are, or run the scenario with others"
+)
+
+
 def _refuse_overrides(original: Scenario, overrides: Sequence[str]) -> None:
     spindle = original.of_kind(SpindleEncoder.kind)[0]
     for text in overrides:
@@ -266,10 +266,12 @@ def _refuse_overrides(original: Scenario, overrides: Sequence[str]) -> None:
 
 def _refuse_events(chosen: Scenario, original: Scenario | None) -> None:
     """Refuse to be asked for others than the bag has; a controller's own that has none gets those of the bag."""
-    for name, table in chosen.nodes.items() if original else ():
+    if original is None:
+        return
+    for name, table in chosen.nodes.items():
         for what in ("events", "faults"):
             asked = getattr(table, what)
-            if original and asked and asked != getattr(original.nodes[name], what):
+            if asked and asked != getattr(original.nodes[name], what):
                 raise InputError(f"{name}.{what} = {asked}: {_HAPPENED}")
 
 
