@@ -6,7 +6,8 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,11 +18,15 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from lathe_rc import __version__, harness, part
+from lathe_rc.bag.record import recorder_of
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.commands import scenario as options
 from lathe_rc.errors import InputError, LatheError
 
+_MOST_EVENTS = 12  # that are told of a run
+_ALIKE = 4  # of them that follow one another: those in between are left out
+_NO_SNAPSHOTS = "no snapshots: no --bag was given"
 _REFRESH = 0.1  # [s] between updates of the progress line
 _LOG_PERIOD = 2.0  # [s] between lines where there is no terminal
 # in lathe_rc.commands, imported when they are wanted
@@ -66,7 +71,12 @@ class _Group(click.Group):
             ctx.exit(error.exit_code)
 
 
-@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=_Group,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="./lathe of a checkout also has: setup; test (linters and tests; --system: those that need privileges); "
+    "python SCRIPT ... (in its environment).",
+)
 @click.version_option(__version__)
 def main() -> None:
     """Emulate the control cell of a lathe for non-circular turning."""
@@ -152,8 +162,10 @@ _TROUBLE: dict[str, Callable[[harness.Event], str]] = {
     ),
     "exit": lambda event: harness.how_it_ended(event) if event["code"] < 0 else "",
     "stopped": lambda event: (
-        f"{event['node']} has been stopped ({signal.Signals(event['signal']).name}): the cell waits for it"
+        f"{event['node']} has been stopped ({signal.Signals(event['signal']).name}): the cell "
+        + ("waits for it" if event["waits"] else "goes to its safe state, if it does not go on in time")
     ),
+    "not_reached": lambda event: f"{event['node']}: the run ends before {'; '.join(event['events'])}",
     "safe": lambda event: f"{event['why']}; the run ends at sample {event['end']}",
 }  #: what is said of an event in any case
 
@@ -166,6 +178,22 @@ def _table(result: harness.Result) -> RichTable:
     for label, revolution in (("first revolution", 0), ("last revolution", -1)):
         told = part.numbers(result.part, revolution)
         table.add_row(label, *(f"{told[name]:#.4g}" for name in columns))
+    return table
+
+
+def _events(result: harness.Result) -> RichTable:
+    """What happened, as far as there is room; of equal ones that follow one another the first and the last."""
+    table = RichTable(show_edge=False, header_style="bold")
+    for column in ("time [s]", "topic", "what happened"):
+        table.add_column(Text(column), justify="left" if table.columns else "right", overflow="fold")
+    rows: list[tuple[str, str, str]] = []
+    for _, run in groupby(result.happened, lambda found: (found.topic, found.text.partition(":")[0])):
+        alike = [(f"{found.time:.6g}", found.topic, found.text) for found in run]
+        rows += alike if len(alike) < _ALIKE else [alike[0], ("", "", f"{len(alike) - 2} more of the kind"), alike[-1]]
+    if (left := len(rows) - _MOST_EVENTS) > 0:
+        rows[_MOST_EVENTS:] = [("", "", f"and {left} more: see --json, or the bag's report")]
+    for row in rows:
+        table.add_row(*map(Text, row))
     return table
 
 
@@ -189,6 +217,21 @@ def _run(
 ) -> harness.Result:
     with _Watch(Console(stderr=True)) as watch:
         return harness.run(scenario, mode=mode, groups=groups, bag=bag, watch=watch, domain=domain, namespace=namespace)
+
+
+def _show(result: harness.Result, further: Mapping[str, Path], *, told: str = "") -> None:
+    """Print a run: its part, what happened, how it went, and the files that it left."""
+    console = Console()
+    if result.errors.rms.size:
+        console.print(_table(result))
+    if result.happened:
+        console.print(_events(result))
+    for fact in [*_facts(result), *filter(None, [told])]:
+        console.print(fact, highlight=False)
+    files = [("bag", result.bag), *(("snapshot", path) for path in result.snapshots), *further.items()]
+    for name, path in files:
+        if path:
+            console.print(f"{name}: {path}", highlight=False, soft_wrap=True)
 
 
 @main.command()
@@ -236,15 +279,8 @@ def run(
     if as_json:
         click.echo(json.dumps(result.summary()))
         return
-    console = Console()
-    if result.errors.rms.size:
-        console.print(_table(result))
-    for fact in _facts(result):
-        console.print(fact, highlight=False)
-    snapshots = [("snapshot", path) for path in result.snapshots]
-    for name, path in (("bag", result.bag), *snapshots, ("profile", profile)):
-        if path:
-            console.print(f"{name}: {path}", highlight=False, soft_wrap=True)
+    asks_for_snapshots = recorder_of(loaded)[1].mode != "continuous"
+    _show(result, {"profile": profile} if profile else {}, told="" if bag or not asks_for_snapshots else _NO_SNAPSHOTS)
 
 
 _DEMOS = {
@@ -298,7 +334,18 @@ def _parameters(kind: str) -> RichTable:
     return table
 
 
-@main.command(context_settings=_PASS_THROUGH)
+class _PassingThrough(click.Command):
+    """Hands on what it does not know; asks for help are its own where they come first."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """See `click.Command`."""
+        if args[:1] in (["-h"], ["--help"]):
+            click.echo(ctx.get_help())
+            ctx.exit()
+        return super().parse_args(ctx, args)
+
+
+@main.command(cls=_PassingThrough, context_settings=_PASS_THROUGH)
 @click.argument("name", type=click.Choice(list(TABLES)))
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
 def node(name: str, arguments: tuple[str, ...]) -> None:
@@ -310,7 +357,7 @@ def node(name: str, arguments: tuple[str, ...]) -> None:
     sys.exit(_nodes([name, *arguments]))
 
 
-@main.command(context_settings=_PASS_THROUGH)
+@main.command(cls=_PassingThrough, context_settings=_PASS_THROUGH)
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
 def container(arguments: tuple[str, ...]) -> None:
     """Run several nodes in one process: NODE[:STAGE]... [--ros-args ...]."""

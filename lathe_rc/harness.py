@@ -21,7 +21,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -43,6 +43,7 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.happened import Happening, listed
 from lathe_rc.namespace import absolute, checked
 from lathe_rc.nodes import leftovers
 from lathe_rc.nodes.report import THROUGHPUT, VARIABLE
@@ -72,6 +73,7 @@ class Result:
         snapshots: bags of parts of the run, see `lathe_rc.bag.snapshots`.
         recording: all signals.
         refused: messages of strangers that the nodes refused, by sender.
+        not_reached: events that the run was too short for, by node.
     """
 
     scenario: Scenario
@@ -82,6 +84,7 @@ class Result:
     snapshots: tuple[Path, ...]
     recording: Recording = field(repr=False)
     refused: Mapping[str, int] = field(default_factory=dict)
+    not_reached: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @property
     def blocks(self) -> int:
@@ -121,6 +124,11 @@ class Result:
         """Digest of each signal topic."""
         return self.recording.digests()
 
+    @cached_property
+    def happened(self) -> list[Happening]:
+        """Events, alarms and reactions, in order."""
+        return listed(self.recording, self.scenario.shared.step)
+
     def summary(self) -> dict[str, object]:
         """What ``lathe run --json`` prints."""
         errors = self.errors
@@ -138,6 +146,8 @@ class Result:
             "blocks": self.blocks,
             "dropped": self.dropped,
             "refused": dict(self.refused),
+            "events": [asdict(happening) for happening in self.happened],
+            "not_reached": {node: list(events) for node, events in self.not_reached.items()},
             "error_um": {
                 "first": of(0),
                 "last": of(-1),
@@ -243,6 +253,7 @@ def _run(
             snapshots=tuple(_bags_in(folder)),
             recording=reader.read(place),
             refused=processes.refused,
+            not_reached=processes.not_reached,
         )
 
 
@@ -292,7 +303,11 @@ def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[
     wall = time.monotonic() - start
     kept = _whole(scenario, bag)
     found = tuple(_bags_in(snapshots.folder)) if snapshots else ()
-    return Result(scenario, "offline", engine.samples, wall, kept, found, collector.recording())
+    waiting = {name: stage.waiting for name, stage in cell.stages.items() if stage.waiting}
+    for name, events in waiting.items():
+        watch({"event": "not_reached", "node": name, "events": events})
+    recording = collector.recording()
+    return Result(scenario, "offline", engine.samples, wall, kept, found, recording, not_reached=waiting)
 
 
 def with_recorder(scenario: Scenario, bag: Path, *, keep: bool, snapshots: Path | None = None) -> Scenario:
@@ -340,6 +355,7 @@ class Processes:
         pids: process of each node.
         domain: the ROS domain in use.
         refused: messages of strangers that the nodes refused, by sender; known when they have ended.
+        not_reached: events that the run was too short for, by node; the same.
     """
 
     def __init__(
@@ -360,10 +376,11 @@ class Processes:
         self._abandoned: set[str] = set()
         self._ended: set[str] = set()
         self._newest: dict[str, Event] = {}
-        self._lost: list[str] = []  # what became of nodes while the cell goes to its safe state without them
+        self._lost: list[tuple[str, str]] = []  # nodes that the cell goes to its safe state without, and why
         self._restarts: Counter[str] = Counter()
         self.pids: dict[str, int] = {}
         self.refused: Counter[str] = Counter()
+        self.not_reached: dict[str, list[str]] = {}
         self.domain = -1
 
     def __enter__(self) -> "Processes":
@@ -451,7 +468,7 @@ class Processes:
                     return  # that is for who waits for its end
                 if change := os.waitid(os.P_PID, child.pid, changes | os.WNOHANG):
                     kind = "continued" if change.si_code == os.CLD_CONTINUED else "stopped"
-                    self._say(kind, name, signal=change.si_status)
+                    self._say(kind, name, signal=change.si_status, waits=self._waits)
 
     def events(self, silence: float) -> Iterator[Event]:
         """Events as they come.
@@ -479,6 +496,8 @@ class Processes:
                 heard = time.monotonic()
             if event["event"] == "refused":
                 self.refused.update(event["senders"])
+            if event["event"] == "not_reached":
+                self.not_reached[event["node"]] = event["events"]
             if event["event"] == "exit" and not self._restarted(event):
                 self._ended.add(event["node"])
             yield event
@@ -507,6 +526,12 @@ class Processes:
         masters = set(self._scenario.of_kind(SpindleEncoder.kind))
         waits = all(self._scenario.nodes[master].window for master in masters)
         return waits and "block0" in self._newest and not self._complete and not masters & set(name.split("+"))
+
+    @property
+    def _waits(self) -> bool:
+        """Whether the cell waits for who stands still, however long."""
+        masters = (self._scenario.nodes[name] for name in self._scenario.of_kind(SpindleEncoder.kind))
+        return all(getattr(master, "stall_reaction", "") == "wait" for master in masters)
 
     @property
     def _running(self) -> list[str]:
@@ -565,12 +590,16 @@ class Processes:
         node = event["node"]
         if event["event"] == "abandoned":
             self._is_no_cause(node)
+        if event["event"] == "masterless":
+            raise LatheError(self._with_the_lost(event["message"]))
         if event["event"] == "error":
             kinds = {InputError.exit_code: InputError, LossyRunError.exit_code: LossyRunError}
             self._lose(node, event["message"], kinds.get(event["exit_code"], LatheError))
             self._is_no_cause(node)
         if event["event"] == "exit" and event["code"] < 0 and self._complete:
             return  # a library crashed while it left; whoever watches has been told
+        if event["event"] == "exit" and event["code"] > 0 and "safe" in self._newest:
+            return  # all say so whose cell went there
         if event["event"] == "exit" and event["code"] and node in self._ended - self._abandoned:
             self._lose(node, f"{how_it_ended(event)}{self._crash(node) if event['code'] < 0 else self._tail(node)}")
 
@@ -582,11 +611,12 @@ class Processes:
         """Raise why a node or process has ended, or keep it until the time master says how the cell went on."""
         if not self._goes_on(name):
             raise error(self._with_the_lost(why))
-        self._lost.append(why)
+        self._lost.append((name, why))
 
     def _with_the_lost(self, message: str) -> str:
         """A message after what became of nodes, as far as it does not say that itself."""
-        return "; ".join([*(why for why in self._lost if why not in message), message])
+        further = [why for name, why in self._lost if why.removeprefix(f"{name}: ") not in message]
+        return "; ".join([*further, message])
 
     def _log(self, name: str) -> list[str]:
         """The lines that a process has written."""

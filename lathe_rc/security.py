@@ -90,7 +90,7 @@ class _Maker:
         reads = {topic for topic in self._signals if stage is None or stage in self._cell.readers(topic)}
         inside = {topic for topic, source in self._signals.items() if source.node in group}
         services = [*_LIFECYCLE, *_SERVICES.get(kind, ())]
-        if stage and stage.takes_events:
+        if stage:
             services.append("schedule")
         told = {topic.name for topic in HOST_TOPICS if kind in topic.publishers}
         heard = {topic.name for topic in HOST_TOPICS if kind in topic.subscribers}

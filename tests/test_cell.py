@@ -151,6 +151,7 @@ def test_events_by_service_are_recorded_at_the_index_that_was_promised(ghost, do
         "fault tool off",
     ]
     client, answers = ghost.create_client(Schedule, "/learning_controller/schedule"), []
+    of_another = ghost.create_client(Schedule, "/tool/schedule")
     with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
         processes.wait_for("cycle")
         assert client.wait_for_service(20.0)
@@ -158,13 +159,17 @@ def test_events_by_service_are_recorded_at_the_index_that_was_promised(ghost, do
             future = client.call_async(Schedule.Request(action=action, not_before=15000))
             rclpy.spin_until_future_complete(ghost, future)
             answers.append(future.result())
+        assert of_another.wait_for_service(20.0)
+        future = of_another.call_async(Schedule.Request(action="freeze"))
+        rclpy.spin_until_future_complete(ghost, future)
         processes.wait_for_end()
+    assert future.result().message == "tool: event 'freeze'; allowed: none (tool has no events)"
     promised = [answer.sample_index for answer in answers[:3]]
     assert [answer.accepted for answer in answers] == [True] * 3 + [False] * 2
     assert min(promised) >= 15000
     assert "allowed: freeze, learn, clear" in answers[3].message
     assert answers[3].sample_index == 0
-    assert "no such target for it; allowed: " in answers[4].message
+    assert "no such target for it; allowed for off: " in answers[4].message
     events = reader.read(tmp_path / "bag").sparse["/learning_controller/events"]
     assert events.values["action"] == asked[:3]
     assert events.values["sample_index"] == promised

@@ -3,9 +3,11 @@
 
 import json
 import math
+import re
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ CELL = """
 /tool: {ros__parameters: {}}
 """
 KEYS = ["scenario", "mode", "simulated_s", "wall_s", "real_time_factor", "revolutions", "blocks", "dropped"]
-KEYS += ["refused", "error_um", "bag", "snapshots", "digest"]
+KEYS += ["refused", "events", "not_reached", "error_um", "bag", "snapshots", "digest"]
 PER_REVOLUTION = ["per_revolution_rms", "per_revolution_peak_to_valley", "per_revolution_ront"]
 
 
@@ -104,6 +106,34 @@ def test_people_get_a_table():
     assert result.exit_code == 0
     for text in ("first revolution", "last revolution", "RMS [µm]", "180 blocks sent, 0 lost", "x real time"):
         assert text in result.stdout
+
+
+def test_people_are_told_what_happened_and_what_the_run_was_too_short_for():
+    events = "learning_controller.events=['revolution 2: freeze', 'revolution 60: clear']"
+    result = lathe("run", "cell.yaml", "--set", events)
+    assert re.search(r"0\.\d+ │ /learning_controller/events │ freeze", result.stdout)
+    assert "learning_controller: the run ends before revolution 60: clear" in result.stderr
+    summary = told("cell.yaml", "--set", events)
+    assert [(event["topic"], event["text"]) for event in summary["events"]] == [
+        ("/learning_controller/events", "freeze")
+    ]
+    assert summary["not_reached"] == {"learning_controller": ["revolution 60: clear"]}
+
+
+def test_more_events_than_fit_are_counted():
+    events = [f"sample {1000 + k}: {action}" for k in range(20) for action in ("freeze", "learn")]
+    out = lathe("run", "cell.yaml", "--set", f"learning_controller.events={events}").stdout
+    assert out.count("/learning_controller/events") == 12
+    assert "and 28 more" in out
+    alike = [f"sample {1000 + k}: freeze" for k in range(20)]
+    out = lathe("run", "cell.yaml", "--set", f"learning_controller.events={alike}").stdout
+    assert out.count("/learning_controller/events") == 2
+    assert "18 more of the kind" in out
+
+
+def test_snapshots_without_a_bag_are_not_forgotten_in_silence():
+    Path("cell.yaml").write_text(CELL + "/recorder: {ros__parameters: {mode: snapshot}}\n")
+    assert "no snapshots: no --bag was given" in lathe("run", "cell.yaml").stdout
 
 
 def test_people_get_a_short_run_too():
@@ -243,6 +273,14 @@ def test_help_of_a_node_lists_its_parameters(name):
     for row in TABLES[name].rows().values():
         assert row.name in result.stdout
         assert row.unit == "1" or f"[{row.unit}]" in result.stdout
+
+
+@pytest.mark.parametrize("command", ["node", "container"])
+@pytest.mark.parametrize("option", ["-h", "--help"])
+def test_commands_that_hand_options_on_have_help_of_their_own(command, option):
+    result = lathe(command, option)
+    assert result.exit_code == 0
+    assert result.stdout.startswith(f"Usage: main {command}")
 
 
 def test_unknown_node_is_refused_with_the_known_ones():

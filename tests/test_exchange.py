@@ -42,7 +42,7 @@ def test_a_member_that_completes_a_block_at_once_does_not_get_it_twice(spindle):
     seen = []
 
     def complete(delivery):
-        seen.append(delivery.first_index)
+        seen.append(delivery.block.first_index)
         spindle.exchange.master(Progress(name="/eager", blocks=len(seen), samples=64 * len(seen)))
 
     spindle.exchange.listen("/encoder", "/eager", complete)
@@ -58,9 +58,21 @@ def test_what_is_handed_over_is_not_written_to_again(spindle):
     spindle.exchange.listen("/encoder", "/eager", blocks.append)
     spindle.trigger_activate()
     spindle._begin()
-    angle = np.concatenate([block.signals["angle_true"] for block in blocks])
+    angle = np.concatenate([run.block.signals["angle_true"] for run in blocks])
     assert len(blocks) == 3  # the window
     assert np.all(np.diff(angle) > 0.0)
+
+
+def test_blocks_that_may_go_at_once_go_in_one_piece(spindle):
+    """Half of what the window lets go, so that others can begin with it."""
+    runs = []
+    spindle.exchange.listen("/encoder", "/eager", runs.append)
+    spindle.together = 2
+    spindle.trigger_activate()
+    spindle._begin()
+    assert [(run.block.first_index, run.block.samples) for run in runs] == [(0, 128), (128, 64)]
+    assert [len(run.companions) for run in runs] == [2, 1]
+    assert spindle.blocks == 3
 
 
 def test_a_sample_that_is_not_finite_is_refused_where_it_is_made(spindle, monkeypatch):

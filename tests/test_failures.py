@@ -156,6 +156,23 @@ def test_a_member_that_fails_by_an_error_ends_in_the_safe_state(mode, groups, tm
     assert not check(bag).wrong
 
 
+def told_after_the_death_of(node, bag):
+    """The events of a piston's cell that loses a node in the midst and is left to itself."""
+    cell = harness.with_recorder(load(PISTON, RUN), bag, keep=True)
+    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+        processes.wait_for("cycle")
+        os.kill(processes.pids[node], signal.SIGKILL)
+        return told_until_all_have_ended(processes)
+
+
+def test_without_the_harness_every_process_of_a_cell_that_lost_a_member_says_so_by_its_exit_code(tmp_path):
+    told = told_after_the_death_of("tool", tmp_path / "bag")
+    codes = {event["node"]: event["code"] for event in told if event["event"] == "exit"}
+    assert codes.pop("tool") == -signal.SIGKILL
+    assert set(codes.values()) == {LatheError.exit_code}
+    assert check(tmp_path / "bag").exit_code == 3, "what the tool published is held"
+
+
 def test_a_member_that_stalls_is_lost_if_the_cell_shall_not_wait(tmp_path):
     sets = [*RUN, "spindle_encoder.stall_reaction=safe", "spindle_encoder.stall_time=5.0"]
     killer = Killer("tool", signal.SIGSTOP)
@@ -165,13 +182,43 @@ def test_a_member_that_stalls_is_lost_if_the_cell_shall_not_wait(tmp_path):
     assert not alive(killer.pids["tool"])
 
 
-def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tmp_path):
-    """Under ros2 launch or by hand nobody ends them: they see that no sample follows, and the bag is closed."""
-    cell = harness.with_recorder(load(PISTON, RUN), tmp_path / "bag", keep=True)
+def test_a_time_master_that_stalls_is_given_up_by_name_if_the_cell_shall_not_wait(tmp_path):
+    killer = Killer("spindle_encoder", signal.SIGSTOP)
+    with pytest.raises(LatheError, match=r"^/spindle_encoder, the time master, has been silent for 2 s: no sample"):
+        harness.run(
+            load(PISTON, [*RUN, "spindle_encoder.stall_reaction=safe"]),
+            mode="processes",
+            bag=tmp_path / "bag",
+            watch=killer,
+        )
+    assert not check(tmp_path / "bag").wrong
+    assert not alive(killer.pids["spindle_encoder"])
+
+
+def test_a_time_master_that_was_given_up_and_comes_back_says_so_and_computes_no_more(tmp_path):
+    sets = [*RUN, "spindle_encoder.stall_reaction=safe"]
+    cell = harness.with_recorder(load(PISTON, sets), tmp_path / "bag", keep=True)
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
         processes.wait_for("cycle")
-        os.kill(processes.pids["spindle_encoder"], signal.SIGKILL)
-        told = told_until_all_have_ended(processes)
+        os.kill(processes.pids["spindle_encoder"], signal.SIGSTOP)
+        told, given_up = [], 0
+        for event in processes.events(60.0):
+            told.append(event)
+            given_up += event["event"] == "masterless"
+            if event["event"] == "masterless" and given_up == len(cell.nodes) - 1:
+                os.kill(processes.pids["spindle_encoder"], signal.SIGCONT)
+            if sum(event["event"] == "exit" for event in told) == len(cell.nodes):
+                break
+    assert not [event for event in told if event["event"] in ("dead", "safe")]
+    said = [event["message"] for event in told if event["event"] == "error"]
+    assert len(said) == 1
+    assert re.fullmatch(r"/spindle_encoder stood still at sample \d+: the others have given it up", said[0])
+    assert not check(tmp_path / "bag").wrong
+
+
+def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tmp_path):
+    """Under ros2 launch or by hand nobody ends them: they see that no sample follows, and the bag is closed."""
+    told = told_after_the_death_of("spindle_encoder", tmp_path / "bag")
     said = [event["message"] for event in told if event["event"] == "abandoned"]
     assert said
     assert any("/spindle_encoder, the time master, is lost: no sample follows" in line for line in said)

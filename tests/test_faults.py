@@ -15,7 +15,7 @@ from lathe_rc.bag.resim import resimulate
 from lathe_rc.cell import messages
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cli import main
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety.faults import DISTURBANCES, KINDS, parse
 from lathe_rc.safety.injection import Injection, Port
 
@@ -154,15 +154,40 @@ def test_cutting_into_blocks_leaves_no_trace(text, lengths):
         ("coarse/state.measured_position garbage amplitude=1e308", "amplitude=1e308; allowed"),
         ("coarse/state.measured_position noisy rms=1 rms=2", "rms=2; allowed: each once"),
         ("coarse/state.measured_position stuck at=3", "at=3; allowed: no values"),
-        ("coarse/state.nothing stuck", "no such target for it; allowed: coarse/command.position, coarse/state.effort"),
-        ("encoder reversed", "no such target"),
-        ("cut tool_broken length=1e-3", "no such target"),
+        (
+            "coarse/state.nothing stuck",
+            "no such target for it; allowed for stuck: coarse/command.position, coarse/",
+        ),
+        ("encoder reversed", "no such target for it; allowed for reversed: none of this node"),
+        ("cut tool_broken length=1e-3", "no such target for it; allowed for tool_broken: none of this node"),
+        ("coarse/state.measured_position noisy rms=\x1b[31m", "rms=\ufffd[31m; allowed: each once"),
         ("x" * 300, "300 characters; allowed: up to 200"),
     ],
 )
 def test_what_cannot_be_is_refused_before_the_run(text, said):
     with pytest.raises(InputError, match="electrodynamic_actuator") as caught:
         run(ALLOWED, electrodynamic_actuator={"faults": [f"second 0.01: {text}"]})
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("node", "text", "said"),
+    [
+        ("cutting_process", "cut off", "allowed for off: cut.allowance, cut.deflection"),
+        ("cutting_process", "cut off", "; for cut: tool_broken, hard_spot"),
+        (
+            "cutting_process",
+            "cut.force tool_broken length=1",
+            "allowed for tool_broken: cut; for cut.force: off, ",
+        ),
+        ("spindle_encoder", "encoder.index_pulse noisy rms=1", "allowed for noisy: encoder.angle, encoder.speed; for"),
+        ("spindle_encoder", "encoder stuck", "encoder.speed; for encoder: missed_index, lost_counts, reversed"),
+    ],
+)
+def test_a_refusal_names_what_the_kind_is_for_and_what_the_target_can_have(node, text, said):
+    changes = ["allow_faults=true", f"{node}.faults={[f'second 1: {text}']!r}"]
+    with pytest.raises(InputError) as caught:
+        harness.run(scenarios.load(scenarios_path("interrupted_cut"), changes))
     assert said in str(caught.value)
 
 
@@ -188,6 +213,16 @@ def test_times_that_cannot_be_are_refused(text, said):
 def test_what_is_repaired_is_one_of_the_targets():
     with pytest.raises(InputError, match=r"repair 'coarse/state.nothing': there is no such target; allowed: coarse"):
         run(ALLOWED, electrodynamic_actuator={"events": ["second 0.01: repair coarse/state.nothing"]})
+
+
+def test_a_repair_of_one_fault_is_written_like_the_fault():
+    with pytest.raises(InputError, match="repair 'encoder lost_counts': no angle; allowed: each once: angle="):
+        run(ALLOWED, spindle_encoder={"events": ["second 0.01: repair encoder lost_counts"]})
+
+
+def test_a_stage_that_cannot_go_on_is_named():
+    with pytest.raises(LatheError, match=r"^learning_controller: sample \d+: at 0 rad the memory is no longer kept"):
+        run({**ALLOWED, "block_size": 64}, spindle_encoder={"faults": ["second 0.15: encoder.angle off"]})
 
 
 def test_faults_are_refused_unless_they_are_allowed():
@@ -232,6 +267,31 @@ def test_the_end_of_a_fault_is_not_the_end_of_another_of_the_same_target():
     result = run(ALLOWED, electrodynamic_actuator=all_at_once)
     assert not measured(result)[1500:3000].any()
     assert_array_equal(measured(result)[3000:4600], good[3000:4600])
+
+
+@pytest.mark.parametrize("mode", ["offline", "composed"])
+def test_a_repair_of_what_is_not_broken_says_so_and_a_re_simulation_too(mode, tmp_path):
+    field = "coarse/state.measured_position"
+    events = [f"sample 1000: repair {field}", f"sample 3000: repair {field}", f"sample 3000: repair {field}"]
+    nodes = {
+        "electrodynamic_actuator": {"events": events, "faults": [f"sample 2000: {field} off"]},
+        "spindle_encoder": {"events": ["sample 1500: repair encoder"]},
+    }
+    bag = tmp_path / "bag"
+    result = harness.run(scenario(ALLOWED, **nodes), mode=mode, bag=bag)
+    told = result.recording.sparse["/electrodynamic_actuator/events"].values
+    nothing = f"nothing to repair: {field}"
+    assert told["action"] == [events[0][13:], nothing, f"fault {field} off", events[1][13:], events[1][13:], nothing]
+    assert resimulate(bag).different == []
+
+
+def test_what_the_run_was_too_short_for_is_told_but_not_that_a_fault_lasts():
+    field = "coarse/state.measured_position"
+    faults = [f"second 0.01 to 100: {field} off", f"second 100 to 200: {field} stuck"]
+    result = run(ALLOWED, electrodynamic_actuator={"faults": faults})
+    assert result.not_reached == {"electrodynamic_actuator": [f"second 100: fault {field} stuck"]}
+    composed = harness.run(scenario(ALLOWED, electrodynamic_actuator={"faults": faults}), mode="composed")
+    assert composed.not_reached == result.not_reached
 
 
 def test_what_is_repaired_at_the_cut_is_what_was_broken():

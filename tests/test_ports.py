@@ -5,12 +5,17 @@ import collections
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.stages.tool import ToolParameters
+from lathe_rc.cell.track import Track
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import LatheError
+from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import BlockQueue
+from lathe_rc.nodes.stage_node import StageNode
 from lathe_rc.nodes.strangers import Stranger, Strangers
 
 SIZE = 4
@@ -27,6 +32,44 @@ def block(first, *, run_id="run", source="/spindle", step_ns=15_625, angle=None,
     signals = messages.allocate(messages.ENCODER, size)
     signals["angle"][:] = np.arange(first, first + size) if angle is None else angle
     return Encoder(messages.ENCODER, run_id, source, step_ns).encode(first, signals, last=False, companions=0)[1]
+
+
+def run_of(first, count, *, last=False) -> Run:
+    """Blocks in one piece, the last of them shorter if the run ends with it."""
+    samples = count * SIZE - (1 if last else 0)
+    signals = messages.allocate(messages.ENCODER, samples)
+    signals["angle"][:] = np.arange(first, first + samples)
+    made = Encoder(messages.ENCODER, "run", "/spindle", 15_625)
+    return Run(made.block(first, signals, None, last=last, companions=0), [0] * count)
+
+
+def test_blocks_in_one_piece_count_one_by_one_and_are_taken_in_any_pieces():
+    taken = queue()
+    taken.add(block(0))
+    taken.take(run_of(4, 3))
+    taken.take(run_of(16, 2, last=True))
+    assert (taken.received, taken.end, taken.ended) == (6, 23, True)
+    pieces = [StageNode._taken(taken, samples)["angle"] for samples in (8, 4, 11)]
+    assert [piece.tolist() for piece in pieces] == [list(range(8)), list(range(8, 12)), list(range(12, 23))]
+    assert not taken.blocks
+
+
+def test_blocks_in_one_piece_that_do_not_follow_are_refused_as_single_ones_are():
+    taken = queue()
+    with pytest.raises(LatheError, match="goes from sample 0 to 4: 4 samples are missing"):
+        taken.take(run_of(4, 3))
+
+
+@given(st.lists(st.integers(1, 5), min_size=1, max_size=40), st.integers(0, 30))
+def test_a_track_shows_the_same_samples_whatever_the_pieces(sizes, delay):
+    track, reached = Track(messages.ENCODER, {"angle": delay}, 10), 0
+    for size in sizes:
+        track.extend(size)["angle"][:] = np.arange(reached, reached + size)
+        reached += size
+        samples = min(10, reached)
+        first = reached - samples - delay
+        expected = np.maximum(np.arange(first, first + samples), 0)
+        assert track.view(first, samples)["angle"].tolist() == expected.tolist()
 
 
 def test_blocks_in_order_are_taken():

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lathe_rc import harness
+from lathe_rc import happened, harness
 from lathe_rc.bag.resim import resimulate
 from lathe_rc.cell import messages
 from lathe_rc.cell import scenario as scenarios
@@ -32,7 +32,6 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety import state_machine
 from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Lookout, Rate, Threshold
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
-from lathe_rc.view import happened
 
 STEP = 1.0 / 64000
 CONFIG = SCENARIOS[0].parent

@@ -411,6 +411,24 @@ def test_command_gets_the_users_arguments_and_directory(copy, tmp_path):
     result = subprocess.run(command, env=clean, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert result.stdout.splitlines() == [str(tmp_path), "-m", "lathe_rc", "run", "a b", "--json", "yes"]
     assert result.stderr == ""
+    command = [copy / "lathe", "python", "my program.py", "--help"]
+    result = subprocess.run(command, env=clean, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines() == [str(tmp_path), "my program.py", "--help", "yes"]
+
+
+def test_another_python_in_the_path_leaves_what_is_set_up_as_it_is(monkeypatch, tmp_path):
+    venv, other = tmp_path / "venv", tmp_path / "other-python"
+    (venv / "bin").mkdir(parents=True)
+    other.touch()
+    (venv / "bin" / "python").symlink_to(other)
+    for name, path in {"VENV": venv, "PYTHON": venv / "bin" / "python", "PACKAGES_STAMP": venv / "stamp"}.items():
+        monkeypatch.setattr(bootstrap, name, path)
+    assert bootstrap.settled({}) is None, "nothing is set up yet"
+    (venv / "stamp").touch()
+    assert bootstrap.settled({}) == other
+    assert bootstrap.settled({"LATHE_PYTHON": "another"}) is None, "whoever names one gets it"
+    other.unlink()
+    assert bootstrap.settled({}) is None, "it is gone"
 
 
 # --- ./lathe test

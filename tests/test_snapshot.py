@@ -36,6 +36,7 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.view.report_gather import gather
 
 CONFIG = Path(__file__).parents[1] / "config"
 STEP_NS, BLOCK, PRE, POST = 15_625, 64, 3200, 1280
@@ -118,6 +119,7 @@ def test_the_commands_read_a_snapshot_as_a_bag(recorded):
     for path in recorded.snapshots:
         found = check(path)
         assert (found.exit_code, found.first, found.samples) == (0, told(path)["first_sample"], told(path)["samples"])
+        assert gather(path).complete
         assert CliRunner().invoke(main, ["bag", "info", str(path), "--json"]).exit_code == 0
 
 
@@ -325,6 +327,9 @@ def test_a_killed_node_leaves_the_last_seconds(node, tmp_path, whole):
     (path,) = (tmp_path / "bag_snapshots").iterdir()
     found = told(path)
     assert found["whole"] is (node == "tool")
+    assert gather(path).complete is (node == "tool")
+    checked = check(path)
+    assert (f"the snapshot has {checked.samples} samples, and it was never closed" in checked.lost) is (node != "tool")
     assert found["triggers"][0][1] == ("learning_controller: freeze" if node == "recorder" else "cell: lost /tool")
     read(path)
 
@@ -427,6 +432,7 @@ def test_flood_of_events_is_refused_by_name(tmp_path):
         ),
         ({"triggers": ["tol: *"]}, r"recorder.triggers = 'tol: \*': no node 'tol' in the cell; allowed: spindle_enc"),
         ({"triggers": ["freeze"]}, r"triggers = 'freeze'; allowed: a pattern of NODE: ACTION, like '\*: freeze'"),
+        ({"faults": ["second 1: bag off"]}, r"faults = .*: a recorder has none; allowed: none \(see triggers"),
         ({"pre": -1.0}, r"recorder.pre = -1.0; allowed: a finite number from 0 up to 3600 \[s\]"),
     ],
 )
@@ -473,7 +479,17 @@ def test_full_disk_fails_by_name(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "{}", '{"first_sample": -1}', '{"first_sample": 1.5}', '{"first_sample": true}']
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"first_sample": 1}',
+        '{"samples": 1, "first_sample": -1}',
+        '{"samples": 1, "first_sample": 1.5}',
+        '{"samples": 1, "first_sample": true}',
+        '{"samples": -1, "first_sample": 1}',
+    ],
 )
 def test_what_a_bag_says_of_its_first_sample_is_checked(text):
     with pytest.raises(InputError, match="allowed: what a recorder writes, with first_sample"):

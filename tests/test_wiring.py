@@ -179,6 +179,10 @@ def test_endless_run_is_refused_offline():
             "learning_controller.retract_position=0.0",
             r"retract_position = 0 m, but .*clear_position = 0.00028 m; allowed",
         ),
+        (
+            "learning_controller.reaction_delay=0",
+            r"monitor \w+ asks for \w+, but nobody who moves coarse listens; allowed: learning_controller.re",
+        ),
         ("electrodynamic_actuator.command_stroke=0.275e-3", r"electrodynamic_actuator.command_stroke = 0.000275 m"),
     ],
 )

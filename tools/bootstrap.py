@@ -4,16 +4,16 @@
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 
 import preconditions
 from environment import Changes, run_environment
-from recipe import Recipe
+from recipe import PACKAGES_STAMP, Recipe
 from ros import SourcedRos, sourced_ros
 from steps import exclusive
-from workplace import PYTHON, ROOT, RefusalError, StepError, say
+from workplace import PYTHON, ROOT, VENV, RefusalError, StepError, say
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -22,8 +22,8 @@ def main(arguments: Sequence[str]) -> int:
         signal.signal(number, interrupt)
     try:
         ros = sourced_ros(os.environ)
-        if ros:
-            change_to(ros.python())
+        if python := ros.python() if ros else settled(os.environ):
+            change_to(python)
         wanted = set_up(ros)
     except RefusalError as refusal:
         say(str(refusal))
@@ -54,6 +54,8 @@ def command(arguments: Sequence[str]) -> list[str]:
     """Return what the Python of the environment is to run."""
     if arguments[:1] == ["test"]:
         return [str(ROOT / "tools" / "check.py"), *arguments[1:]]
+    if arguments[:1] == ["python"]:
+        return list(arguments[1:])
     return ["-m", "lathe_rc", *arguments]
 
 
@@ -61,6 +63,13 @@ def change_to(python: Path) -> None:
     """Start over in another interpreter, unless it is the one that runs this."""
     if python.resolve() != Path(sys.executable).resolve():
         os.execv(python, [str(python), *sys.argv])
+
+
+def settled(environ: Mapping[str, str]) -> Path | None:
+    """Return the interpreter that is set up already: another python3 in the PATH is no wish to make all anew."""
+    python = PYTHON.resolve()
+    there = PACKAGES_STAMP.exists() and python.exists() and VENV not in python.parents
+    return python if there and "LATHE_PYTHON" not in environ else None
 
 
 def interrupt(_number: int, _frame: FrameType | None) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.bag import story
-from lathe_rc.bag.snapshot import SNAPSHOT, first_sample
+from lathe_rc.bag.snapshot import span_of
 from lathe_rc.bag.source import Source
 from lathe_rc.cell import messages
 from lathe_rc.cell.recording import Digester, SparseTopic
@@ -112,7 +112,8 @@ def check(path: Path) -> Findings:
     sparse: dict[str, SparseTopic] = {}
     with Source(path) as source:
         types = {topic: said.type for topic, said in source.topics.items()}
-        findings.first = first_sample(source.about)
+        part = span_of(source.about)
+        findings.first = part[0] if part else 0
         dense = {t: _Dense(t, k, findings, digester) for t, k in types.items() if k in messages.block_types()}
         sparse = {topic: SparseTopic() for topic, kind in types.items() if kind in messages.sparse_types()}
         counts = dict.fromkeys(types, 0)
@@ -126,7 +127,10 @@ def check(path: Path) -> Findings:
             if said.count != counts[topic]:
                 findings.wrong.append(f"{topic}: {counts[topic]} messages, {said.count} by the metadata")
         findings.messages = sum(counts.values())
-    _ends(dense, findings, part=SNAPSHOT in source.about)
+    _ends(dense, findings, part=part is not None)
+    if part and not 0 < part[1] == findings.samples:
+        why = f"it says that it has {part[1]}" if part[1] else "it was never closed"
+        findings.lost.append(f"the snapshot has {findings.samples} samples, and {why}")
     findings.lost += [
         f"{topic}: from sample {first} on its newest value, held: the node was lost"
         for topic, first in story.held(source.about).items()

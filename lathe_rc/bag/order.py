@@ -100,8 +100,8 @@ class Merger:
             self._needs.append((row, source, block.companions))
         return self._brought(place, row + 1)
 
-    def add_blocks(self, topic: str, first: int, signals: Signals, companions: Samples, *, last: bool) -> None:
-        """Take consecutive blocks whose sparse messages have all been added.
+    def add_blocks(self, topic: str, first: int, signals: Signals, companions: Samples, *, last: bool) -> bool:
+        """Take consecutive blocks whose sparse messages have all been added; returns as `add_block` does.
 
         Args:
             topic: fully qualified.
@@ -127,6 +127,7 @@ class Merger:
             sheet.put_many(place, within, part, numbers, last=last and stop == samples)
             self._brought(place, row + count)
             done = stop
+        return not self._late
 
     def add_sparse(self, topic: str, log_ns: int, data: bytes) -> None:
         """Take a sparse message."""

@@ -41,6 +41,10 @@ class _PlayedSpindle(SpindleEncoder):
             signals["angle_true"] -= self._said.turns
         return []
 
+    def replay(self, action: str, index: int) -> None:
+        """See `Stage`: as it was said."""
+        self._scheduled.append((index, action))
+
     def act(self, action: str, index: int) -> None:
         """What was wrong with it is in the recording."""
 

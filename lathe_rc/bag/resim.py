@@ -198,8 +198,7 @@ def resimulate(
         cell, compared, events = wire(chosen, original, recorded, source)
         for name, stage in cell.stages.items():
             for index, action in events.get(name, []):
-                if action.partition(":")[0] not in stage.announces:
-                    stage.schedule(action, index)
+                stage.replay(action, index)
         digests = _Digests(cell)
         errors = ErrorsByRevolution({f"/{name}": said.type for name, said in cell.dense.items()})
         samples = cell.master.samples

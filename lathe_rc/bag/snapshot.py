@@ -51,8 +51,8 @@ class Snapshot:
         return {SNAPSHOT: json.dumps(told | ({"further_triggers": self.further} if self.further else {}))}
 
 
-def first_sample(about: Mapping[str, str]) -> int:
-    """The first sample of a bag: 0, or where a snapshot begins.
+def span_of(about: Mapping[str, str]) -> tuple[int, int] | None:
+    """First sample and number of samples of a snapshot; no samples if it was never closed. None for a whole run.
 
     Args:
         about: what the bag says of itself.
@@ -62,11 +62,27 @@ def first_sample(about: Mapping[str, str]) -> int:
     """
     text = about.get(SNAPSHOT)
     if text is None:
-        return 0
+        return None
     try:
-        first = json.loads(text)["first_sample"]
+        told = json.loads(text)
+        span = told["first_sample"], told["samples"]
     except (ValueError, KeyError, TypeError, RecursionError):
-        first = None
-    if type(first) is not int or not 0 <= first < 2**48:
-        raise InputError(f"{SNAPSHOT} = {text[:80]!r} in the bag; allowed: what a recorder writes, with first_sample")
-    return first
+        span = None, None
+    if not all(type(number) is int and 0 <= number < 2**48 for number in span):
+        raise InputError(
+            f"{SNAPSHOT} = {text[:80]!r} in the bag; allowed: what a recorder writes, with first_sample and samples"
+        )
+    return span
+
+
+def first_sample(about: Mapping[str, str]) -> int:
+    """The first sample of a bag: 0, or where a snapshot begins.
+
+    Args:
+        about: what the bag says of itself.
+
+    Raises:
+        InputError: what it says of the snapshot is not what a recorder writes.
+    """
+    span = span_of(about)
+    return span[0] if span else 0

@@ -43,6 +43,7 @@ _CHANNELS = 2**16  # numbers that a channel may have
 _AT_ONCE = 2**14  # messages of a batch
 _CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
 _SQLITE = b"SQLite format 3\0"
+_RECOVER = "; lathe bag recover saves the rest"
 
 
 @dataclass(frozen=True)
@@ -179,7 +180,7 @@ def _damage(path: Path) -> str:
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 - mcap raises whatever broken bytes lead to
-            return f"{path.name}: {shown(error)}; lathe bag recover saves the rest"
+            return f"{path.name}: {shown(error)}"
     return ""
 
 
@@ -250,10 +251,10 @@ class Source:
         except (LatheError, MemoryError):
             raise
         except Exception as error:  # noqa: BLE001 - the libraries raise whatever broken bytes lead to
-            why = shown(error)
-            for file in filter(Path.is_file, [path] if path.is_file() else sorted(path.glob("*.mcap"))):
+            why, files = shown(error), [path] if path.is_file() else sorted(path.glob("*.mcap"))
+            for file in filter(Path.is_file, files):
                 why = _damage(file) or why
-            raise InputError(f"{path}: not a readable bag ({why})") from None
+            raise InputError(f"{path}: not a readable bag ({why}){_RECOVER if files else ''}") from None
         try:
             self._read_head()
         except (LatheError, MemoryError):
@@ -401,7 +402,7 @@ class Source:
         except (LatheError, MemoryError):
             raise
         except Exception as error:  # noqa: BLE001 - the libraries raise whatever broken bytes lead to
-            raise InputError(f"{self.path}: broken ({shown(error)}); lathe bag check says more") from None
+            raise InputError(f"{self.path}: broken ({shown(error)}){_RECOVER}") from None
 
     def _unpacked(self, batch: Batch) -> Iterator[Batch]:
         """Messages that are compressed one by one; rosbags would unpack each to whatever size it says."""

@@ -264,10 +264,10 @@ def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536) -> BagHeader:
     with Source(path) as source:
         types = {topic: kind.type for topic, kind in source.topics.items()}
         feeder = Feeder(types, sinks, piece, first_sample(source.about))
-        try:
-            for topic, log_ns, data in source.messages(set(feeder.types)):
+        for topic, log_ns, data in source.messages(set(feeder.types)):
+            try:
                 feeder.add(topic, log_ns, data)
-        except LatheError as error:
-            raise type(error)(f"{path}: {error}") from None
+            except LatheError as error:
+                raise type(error)(f"{path}: {error}") from None
         left = feeder.finish()
         return BagHeader(feeder.types, feeder.first, left, feeder.step_ns, feeder.run_id, dict(source.about))

@@ -69,10 +69,11 @@ class Engine:
         """Run chunk by chunk; the sample index after each."""
         for first in range(0, self.samples, self._chunk):
             samples = min(self._chunk, self.samples - first)
+            last = first + samples == self.samples
             dense: dict[str, Signals] = {}
             sparse: dict[str, list[Sparse]] = {}
             for stage, ports, topics in self._stages:
-                for message in stage.advance(first, *ports.open(first, samples, dense)):
+                for message in stage.advance(first, *ports.open(first, samples, dense), last=last):
                     sparse.setdefault(topics[message.topic], []).append(message)
             for sink in sinks:
                 sink.chunk(first, samples, dense, sparse)

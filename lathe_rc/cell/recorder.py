@@ -38,8 +38,11 @@ class RecorderParameters(NodeParameters):
     )
 
     def model_post_init(self, context: Any, /) -> None:
-        """Refuse a trigger that no event could ever match."""
+        """Refuse a trigger that no event could ever match, and events of its own."""
         super().model_post_init(context)
+        for name in ("events", "faults"):
+            if asked := getattr(self, name):
+                raise InputError(f"{name} = {asked}: a recorder has none; allowed: none (see triggers, mode and pre)")
         for pattern in self.triggers:
             if ": " not in pattern and "*" not in pattern:
                 raise InputError(f"triggers = {pattern!r}; allowed: a pattern of NODE: ACTION, like '*: {pattern}'")

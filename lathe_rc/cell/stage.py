@@ -17,7 +17,7 @@ import numpy as np
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import NodeParameters, remapped
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety import faults
 from lathe_rc.safety.faults import Fault
 from lathe_rc.safety.injection import Injection, Port
@@ -75,6 +75,12 @@ class Trigger:
     kind: str  # revolution, second or sample
     value: float
     action: str
+    ends: bool = False  # a fault that has begun
+
+    @property
+    def text(self) -> str:
+        """How it is written."""
+        return f"{self.kind} {self.value:g}: {self.action}"
 
 
 _NOTHING = np.empty(0)
@@ -82,6 +88,7 @@ _NOTHING = np.empty(0)
 _EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)(?:\s+to\s+([0-9.eE+-]+))?\s*:\s*(\S.*?)\s*")
 _FAULT, _REPAIR = "fault", "repair"  # verbs of the events that all stages know: fault FAULT, repair FAULT or TARGET
 SAFE = "safe"  #: and of the one that only a host may ask for: members of the cell are lost
+NOTHING_TO_REPAIR = "nothing to repair"  #: event of a repair of what is not broken
 
 
 class Stage(ABC):
@@ -116,6 +123,7 @@ class Stage(ABC):
         self._injection: Injection | None = None
         self.own_inputs, self.tells = 0, False
         self._scheduled: list[tuple[int, str]] = []
+        self._remarks: list[str] = []  # events that came of the one that is carried out
 
     def declare(self, *, inputs: Sequence[Input] = (), outputs: Sequence[Output] = (), tells: bool = False) -> None:
         """Set the ports; to be called once, at the end of the constructor.
@@ -145,6 +153,7 @@ class Stage(ABC):
                     Port(remapped(self.shared, p.topic), p.type, tuple(messages.sample_fields(p.type)), 0, out=True)
                     for p in outputs
                 ],
+                devices=self.devices,
                 seed=self.shared.seed,
                 step=self.shared.step,
             )
@@ -156,10 +165,10 @@ class Stage(ABC):
         """Whether there are events for it."""
         return bool(self.actions) or self.shared.allow_faults
 
-    def _trigger(self, what: str, text: str) -> Trigger:
+    def _trigger(self, what: str, text: str, *, ends: bool = False) -> Trigger:
         match = _EVENT.fullmatch(text)
         try:
-            trigger = Trigger(match[1], float(match[2]), match[4]) if match and not match[3] else None
+            trigger = Trigger(match[1], float(match[2]), match[4], ends) if match and not match[3] else None
         except ValueError:
             trigger = None
         if trigger is None or not 0 <= trigger.value < math.inf:
@@ -180,7 +189,7 @@ class Stage(ABC):
         begin = self._trigger("faults", f"{match[1]} {match[2]}: {_FAULT} {match[4]}")
         if not match[3]:
             return [begin]
-        end = self._trigger("faults", f"{match[1]} {match[3]}: {_REPAIR} {match[4]}")
+        end = self._trigger("faults", f"{match[1]} {match[3]}: {_REPAIR} {match[4]}", ends=True)
         if end.value <= begin.value:
             raise InputError(f"{self.name}.faults = {text!r} ends before it begins; allowed: an end after {match[2]}")
         return [begin, end]
@@ -198,8 +207,8 @@ class Stage(ABC):
         if verb == _REPAIR:
             self._check_allowed(action)
             if " " in rest:
-                self._check_fault(faults.parse(rest, self.name))
-            elif rest not in self.devices:
+                self._check_fault(faults.parse(rest, self.name, what=_REPAIR))
+            else:
                 assert self._injection is not None, "there is one if faults are allowed"
                 self._injection.check_target(rest)
             return
@@ -214,11 +223,7 @@ class Stage(ABC):
     def _check_fault(self, fault: Fault) -> None:
         self._check_allowed(f"fault {fault.text}")
         assert self._injection is not None, "there is one if faults are allowed"
-        what = faults.KINDS[fault.kind].what
-        if what not in self.devices:
-            self._injection.check(fault)
-        elif fault.target != what:
-            raise InputError(f"{self.name}: fault {fault.text!r}: no such target for it; allowed: {what}")
+        self._injection.check(fault)
 
     def schedule(self, action: str, index: int) -> None:
         """Let an event take effect at sample ``index``, which the host has not issued yet.
@@ -228,6 +233,17 @@ class Stage(ABC):
         """
         self.check_action(action)
         self._scheduled.append((index, action))
+
+    def replay(self, action: str, index: int) -> None:
+        """Let an event of a recording take effect again, at its sample; what comes about by itself will do so."""
+        if action.partition(":")[0] not in (*self.announces, NOTHING_TO_REPAIR):
+            self.schedule(action, index)
+
+    @property
+    def waiting(self) -> list[str]:
+        """Events that have not taken effect; at the end of a run they never will. That a fault lasts is none."""
+        triggers = [trigger.text for trigger in self._triggers if not trigger.ends]
+        return triggers + [f"sample {index}: {action}" for index, action in self._scheduled]
 
     def lose(self, index: int) -> None:
         """Go to its safe state at sample ``index``, which the host has not issued yet: members of the cell are lost."""
@@ -267,26 +283,44 @@ class Stage(ABC):
         self._scheduled = [event for event in self._scheduled if event[0] >= first + samples]
         return due
 
-    def advance(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    def advance(
+        self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals], *, last: bool = False
+    ) -> list[Sparse]:
         """Compute one block.
 
         Args:
             first: index of its first sample.
             inputs: arrays of shape (n,) by field, in the order of the ports.
             outputs: the same, to be filled.
+            last: whether the run ends with it.
 
         Returns:
             The sparse messages of the block, by sample index.
+
+        Raises:
+            LatheError: it cannot go on; names it.
         """
+        try:
+            sparse = self._advance(first, inputs, outputs, last=last)
+        except LatheError as error:
+            error.args = (f"{self.name}: {error}",)
+            raise
+        if len(sparse) > 1:
+            sparse.sort(key=lambda message: message.index)
+        return sparse
+
+    def _advance(
+        self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals], *, last: bool
+    ) -> list[Sparse]:
         if self._triggers or self._scheduled or (self._injection and self._injection.any):
             sparse = self._advance_with_events(first, inputs, outputs)
         else:
             own = inputs if len(inputs) == self.own_inputs else inputs[: self.own_inputs]
             sparse = self.process(first, own, outputs)
+        if last:
+            sparse = sparse + self.finish(first + next(iter(outputs[0].values())).size - 1)
         for place, joint in self._joints:
             sparse = sparse + self._joint_states(first, joint, outputs[place])
-        if len(sparse) > 1:
-            sparse.sort(key=lambda message: message.index)
         return sparse
 
     def _advance_with_events(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
@@ -299,7 +333,9 @@ class Stage(ABC):
             start = index - first
             self.act(action, index)
             if (topic := f"{self.name}/events") in self.sparse_topics:
-                sparse.append(Sparse(topic, messages.EVENT, index, {"action": action}))
+                said = [action, *self._remarks]
+                sparse += [Sparse(topic, messages.EVENT, index, {"action": text}) for text in said]
+            self._remarks.clear()
         return sparse + self._compute(first, start, samples, inputs, outputs)
 
     def _compute(
@@ -329,9 +365,9 @@ class Stage(ABC):
         elif verb == _REPAIR:
             assert self._injection is not None, "the event has been checked"
             target, one = rest.partition(" ")[0], faults.parse(rest, self.name) if " " in rest else None
-            self._injection.end(target, index, one)
-            if target in self.devices:
-                self.mend(one)
+            mended = self.mend(one) if target in self.devices else self._injection.end(target, index, one)
+            if not mended:
+                self._remarks.append(f"{NOTHING_TO_REPAIR}: {target}")
         else:
             self.perform(action)
 
@@ -345,8 +381,8 @@ class Stage(ABC):
         """
         raise NotImplementedError(fault.text)
 
-    def mend(self, fault: Fault | None) -> None:
-        """Be as before a fault, or before all; stages with ``devices`` have their own, see `damage`."""
+    def mend(self, fault: Fault | None) -> bool:
+        """Be as before a fault, or before all; whether there was one. Stages with ``devices`` have their own."""
         raise NotImplementedError(fault)
 
     def _joint_states(self, first: int, joint: Joint, signals: Signals) -> list[Sparse]:
@@ -377,6 +413,10 @@ class Stage(ABC):
         Stages with ``actions`` have their own; the others' events never get here, see `check_action`.
         """
         raise NotImplementedError(action)
+
+    def finish(self, index: int) -> list[Sparse]:
+        """What is still to be said when the run ends with sample ``index``."""
+        return []
 
     @abstractmethod
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recent past of a topic, contiguous in memory, so that a delayed view costs no copy."""
+"""The recent past of a topic, contiguous in memory, so that a view of several blocks, or a late one, costs no copy."""
 
 from collections.abc import Iterable, Mapping
 from math import ceil
@@ -11,7 +11,8 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.stage import Input
 
-_MOVED = 0.25  # of the delayed samples, at most, are copied once more to keep them contiguous
+_MOVED = 0.25  # of the samples, at most, are copied once more to keep them contiguous
+_VIEWS = 256  # that are made once
 
 
 def longest_delays(ports: Iterable[Input]) -> dict[str, int]:
@@ -24,27 +25,27 @@ def longest_delays(ports: Iterable[Input]) -> dict[str, int]:
 
 
 class Track:
-    """Samples of some fields of a topic: the newest block and, where they are read late, those before it.
+    """Samples of some fields of a topic: the newest ones and, where they are read late, those before them.
 
     Before sample 0 everything is zero. What `extend` and `view` hand out is good until the next block is added.
 
     Args:
         msgtype: message type of the topic.
         delays: longest delay at which each field is read [sample]; fields that are not named are not kept at all.
-        block: longest block that is added [sample].
+        longest: of what is added or viewed at once [sample].
 
     Attributes:
         delay: longest of them.
     """
 
-    def __init__(self, msgtype: str, delays: Mapping[str, int], block: int) -> None:
+    def __init__(self, msgtype: str, delays: Mapping[str, int], longest: int) -> None:
         self.delay = max(delays.values(), default=0)
-        self._capacity = self.delay + max(block, ceil(self.delay / _MOVED))
+        self._kept = self.delay + longest
+        self._capacity = self._kept + max(longest, ceil(self._kept / _MOVED))
         types = messages.sample_fields(msgtype)
         self._arrays = {name: np.zeros(self._capacity, types[name]) for name in delays}
-        self._late = [self._arrays[name] for name, delay in delays.items() if delay]
-        self._base = -self.delay  # sample index of element 0
-        self._block, self._views = block, dict[int, Signals]()
+        self._base = -self._kept  # sample index of element 0
+        self._views = dict[tuple[int, int], Signals]()
         self._first, self._size, self._newest = 0, 0, Signals()  # what was added last
         self.end = 0  #: index after the newest sample
 
@@ -53,26 +54,27 @@ class Track:
         return {**self.__dict__, "_views": {}, "_size": 0, "_newest": {}}
 
     def _at(self, start: int, samples: int) -> Signals:
-        """Views of ``samples`` elements from ``start`` on; those of whole blocks are made once."""
-        if samples != self._block:
-            return {name: array[start : start + samples] for name, array in self._arrays.items()}
-        if start not in self._views:
-            self._views[start] = {name: array[start : start + samples] for name, array in self._arrays.items()}
-        return self._views[start]
+        """Views of ``samples`` elements from ``start`` on; the same ones come again and again."""
+        views = self._views.get((start, samples))
+        if views is None:
+            views = {name: array[start : start + samples] for name, array in self._arrays.items()}
+            if len(self._views) < _VIEWS:
+                self._views[start, samples] = views
+        return views
 
     def extend(self, samples: int) -> Signals:
         """Views of ``samples`` new samples, for the caller to fill."""
         if self.end + samples - self._base > self._capacity:
-            shift = self.end - self.delay - self._base
-            for array in self._late:
-                array[: self.delay] = array[shift : shift + self.delay]
+            shift = self.end - self._kept - self._base
+            for array in self._arrays.values():
+                array[: self._kept] = array[shift : shift + self._kept]
             self._base += shift
         self._first, self._size, self._newest = self.end, samples, self._at(self.end - self._base, samples)
         self.end += samples
         return self._newest
 
     def view(self, first: int, samples: int) -> Signals:
-        """Views of the samples ``first`` on, which must have been added and not be older than the longest delay."""
+        """Views of the samples ``first`` on, which must have been added and not be too old."""
         if first == self._first and samples == self._size:
             return self._newest
         start = first - self._base
@@ -84,5 +86,5 @@ class Track:
         """Begin at sample ``first``, with zeros before it; drops what is there."""
         for array in self._arrays.values():
             array[:] = 0
-        self._base, self.end = first - self.delay, first
+        self._base, self.end = first - self._kept, first
         self._first, self._size, self._newest = first, 0, {}

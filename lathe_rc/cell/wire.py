@@ -21,7 +21,7 @@ from lathe_rc.cell.messages import MAX_BLOCK, START_NS, Samples, Signals
 _BILLION = 1_000_000_000
 _MOST_FIELDS = 16
 _ZEROS = np.zeros(_MOST_FIELDS * (MAX_BLOCK + 1))
-_AT_ONCE = 16  # blocks for which memory is made at once
+_AT_ONCE = 8192  # numbers for which memory is made at once, if that are several pieces
 _SHIFT = 4  # CDR aligns to what follows its first four bytes: with so many before, to memory as well
 # What differs from block to block, but for the samples: the stamp, and what follows the texts of a BlockInfo.
 _STAMP = struct.Struct("<iI")  # sec, nanosec
@@ -149,15 +149,15 @@ class Pool:
         if not self._uniform:
             return {name: np.empty(samples, dtype) for name, dtype in self._fields.items()}, None
         if not self._free or samples != self._samples:
-            self._samples = samples
-            self._free = list(np.empty((_AT_ONCE, len(self._fields), samples)))
+            self._samples, size = samples, samples * len(self._fields)
+            self._free = list(np.empty((max(_AT_ONCE // size, 1), len(self._fields), samples)))
         whole = self._free.pop()
         return dict(zip(self._fields, whole, strict=True)), whole
 
 
 @dataclass(slots=True)
 class Block:
-    """A block as it came; the samples are views of its bytes.
+    """A block as it came, its samples views of its bytes; or several in one piece that were computed in this process.
 
     Attributes:
         run_id, source, first_index, step_ns, last, companions: see BlockInfo.msg.
@@ -177,6 +177,14 @@ class Block:
     log_ns: int
     signals: Signals
     whole: Samples | None = None
+
+    def part(self, start: int, stop: int) -> "Block":
+        """Its samples ``start`` to ``stop``, as views."""
+        first, last = self.first_index + start, self.last and stop == self.samples
+        log_ns = START_NS + (first + stop - start - 1) * self.step_ns
+        signals = {name: array[start:stop] for name, array in self.signals.items()}
+        samples = stop - start
+        return Block(self.run_id, self.source, first, self.step_ns, last, self.companions, samples, log_ns, signals)
 
     def copy_to(self, signals: Signals, *, check: bool = True) -> None:
         """Copy samples into arrays of shape (samples,), by field.

@@ -20,6 +20,7 @@ from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.supervisor import Supervisor
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError
+from lathe_rc.safety.state_machine import Reaction
 
 
 @dataclass(frozen=True)
@@ -140,6 +141,7 @@ class Cell:
             if isinstance(stage, Tool):
                 self._check_profile(stage, high)
             if isinstance(stage, Supervisor) and stage.parameters.drives:
+                self._check_obedience(stage)
                 self._check_retraction(stage)
                 self._check_clearance(stage)
             if isinstance(stage, LearningController):
@@ -159,6 +161,20 @@ class Cell:
             for topic, response in drive.responses().items()
             if remapped(drive.shared, topic) in commands and any(port.topic == topic for port in drive.inputs)
         ]
+
+    def _check_obedience(self, stage: Supervisor) -> None:
+        """Where a retraction can be asked for, somebody takes the tool out."""
+        asks = next((monitor for monitor in stage.monitors if monitor.reaction >= Reaction.RETRACT), None)
+        drive, safety = stage.parameters.drives[0], remapped(stage.shared, "safety")
+        found = [self.dense.get(remapped(stage.shared, f"{drive}/{what}")) for what in ("command", "state")]
+        nodes = [source.node for source in found if source]
+        listening = {reader.name for reader in self.readers(safety)}
+        if asks and nodes and not listening & set(nodes):
+            asked = f"monitor {asks.name} asks for {asks.reaction.name.lower()}"
+            raise InputError(
+                f"{stage.name}: {asked}, but nobody who moves {drive} listens; allowed: {nodes[0]}.reaction_delay of a "
+                "block or more, or a weaker reaction"
+            )
 
     def _check_retraction(self, stage: Supervisor) -> None:
         """The tool has to get as far out of the part as is asked for before it is safe."""

@@ -127,7 +127,7 @@ class DriveIdentifier:
         if determinant > _LEAST_EXCITED * s11 * s22 > 0.0:
             a1 = (s1 * s22 - s2 * s12) / determinant
             a2 = (s2 * s11 - s1 * s12) / determinant
-            if a1 > 0.0 and a2 > 0.0:
+            if a1 > 0.0 and a2 > 0.0 and command > 0.0:
                 unexplained = max(rest - a1 * s1 - a2 * s2, 0.0)
                 frequency = float(1.0 / np.sqrt(a2))
                 found = Identified(frequency, float(a1 * frequency / 2.0), float(np.sqrt(unexplained / command)))

@@ -4,15 +4,39 @@
 Which topics stay inside is settled once, when the nodes of a process have been configured and before any of them is
 activated. Nodes that are configured later, and those in other processes, use DDS. What is handed over is the same:
 the arrays that the publisher computed, which nobody writes to afterwards, or the bytes of a message at a chosen sample.
+Blocks that were computed in one go come in one piece.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 from lathe_rc.cell.wire import Block
 
-Delivery = Block | bytes  #: a block, or an encoded message at a chosen sample
+
+class Run(NamedTuple):
+    """Consecutive blocks in one piece.
+
+    Attributes:
+        block: all of their samples, and the companions of the last; if it is the last, so is the last of them.
+        companions: what each of them says of its companions, see BlockInfo.msg.
+    """
+
+    block: Block
+    companions: Sequence[int]
+
+    def blocks(self, size: int) -> Iterator[Block]:
+        """Each of them, as views; ``size`` is their length, the last of the run may be shorter [sample]."""
+        if len(self.companions) == 1:
+            yield self.block
+            return
+        for k, companions in enumerate(self.companions):
+            block = self.block.part(k * size, min((k + 1) * size, self.block.samples))
+            block.companions = companions
+            yield block
+
+
+Delivery = Run | bytes  #: blocks, or an encoded message at a chosen sample
 
 
 class Exchange:

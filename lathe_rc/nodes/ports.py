@@ -15,6 +15,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.wire import Block, Decoder, NoBlockError
 from lathe_rc.errors import LatheError
+from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.strangers import Stranger
 
 
@@ -67,6 +68,8 @@ class BlockQueue:
             and the first to come if there is none.
         inside: its blocks are handed over in this process.
         received: blocks so far, those that were lost included.
+        end: index after the newest sample.
+        ended: the last block has come.
         lost: blocks that never came; always 0 unless the cell is free-running.
         repeats: blocks may come twice: their source may be another process that goes on in its place.
         held_from: sample from which on its newest sample is held, since its source is lost; None: it is not.
@@ -76,8 +79,8 @@ class BlockQueue:
         self.topic, self.type = topic, msgtype
         self.blocks: deque[Block] = deque()
         self.source = ""
-        self.inside = False
-        self.received = self.lost = 0
+        self.inside = self.ended = False
+        self.received = self.lost = self.end = 0
         self.held_from: int | None = None
         self._decoder = Decoder(msgtype, fields, self._admit)
         self._decoder.prepare()
@@ -93,7 +96,7 @@ class BlockQueue:
         self.source, self._expected = source, first
         self.blocks.clear()
         self.received = self.lost = 0
-        self._newest = None
+        self.end, self.ended, self._newest = first or 0, False, None
 
     @property
     def open(self) -> bool:
@@ -125,20 +128,22 @@ class BlockQueue:
             raise LatheError(f"{self.topic}: {error}") from None
         return self.accept(block)
 
-    def take(self, block: Block) -> Block | None:
-        """Queue a block that was handed over in this process.
+    def take(self, run: Run) -> None:
+        """Queue blocks that were handed over in this process.
 
         Raises:
             LatheError: see `add`.
         """
+        block = run.block
         if block.first_index != self._expected or len(self.blocks) >= self._limit:
-            return self.accept(block)
+            for each in run.blocks(self._size):
+                self.accept(each)
+            return
         # What else is checked cannot differ from block to block of a node in this process.
-        self._expected += block.samples
-        self._newest = block
-        self.received += 1
+        self._expected = self.end = block.first_index + block.samples
+        self._newest, self.ended = block, block.last
+        self.received += len(run.companions)
         self.blocks.append(block)
-        return block
 
     def accept(self, block: Block) -> Block | None:
         """Check a block and queue it; see `add`."""
@@ -163,8 +168,10 @@ class BlockQueue:
 
     def resume(self, source: str, state: tuple[int, int, list[Block], Block | None]) -> None:
         """Go on from the state of another process; what comes from before it is a repeat."""
-        self._expected, self.received, waiting, self._newest = state
+        self.end, self.received, waiting, self._newest = state
+        self._expected = self.end
         self.blocks = deque(waiting)
+        self.ended = self._newest is not None and self._newest.last
         self.source, self.repeats = source, True
 
     def hold(self, end: int, newest: Block | None = None) -> None:
@@ -180,6 +187,8 @@ class BlockQueue:
             block.last = block.first_index + block.samples == end
             self.blocks.append(block)
             self.received += 1
+        self._expected = self.end = max(end, self.held_from)
+        self.ended = True
 
     def _zero(self) -> Block:
         """A block that stands for those before the first."""
@@ -201,8 +210,8 @@ class BlockQueue:
             )
 
     def _append(self, block: Block) -> Block:
-        self._expected = block.first_index + block.samples
-        self._newest = block
+        self._expected = self.end = block.first_index + block.samples
+        self._newest, self.ended = block, block.last
         self.received += 1
         self.blocks.append(block)
         if len(self.blocks) > self._limit:

@@ -151,7 +151,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
         args: command line with ``--ros-args``; default: that of the process.
 
     Returns:
-        The exit code: 0, or that of the first failure.
+        The exit code: 0, or that of the first node that has failed, or whose cell went to its safe state.
     """
     faulthandler.enable()  # a crash of a library leaves where it happened in the log
     faulthandler.register(signal.SIGUSR1)  # and the harness can ask where a silent process is
@@ -175,8 +175,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
         gc.collect()
         gc.freeze()
         _loop(nodes, reporter, stop)
-        failures = [node.failure for node in nodes if node.failure]
-        return failures[0].exit_code if failures else 0
+        return next((node.exit_code for node in nodes if node.exit_code), 0)
     except LatheError as error:
         print(f"lathe: {error}", file=sys.stderr)
         reporter("error", members[0][0], message=str(error), exit_code=error.exit_code)

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from lathe_rc_msgs.msg import CellState
 from rclpy.qos import QoSProfile
@@ -23,6 +24,7 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wire import Block, Decoder, Encoder
 from lathe_rc.errors import LatheError, LossyRunError
+from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import BlockQueue, latched_qos
 from lathe_rc.nodes.shell import CellNode
 from lathe_rc.nodes.strangers import Stranger
@@ -184,7 +186,7 @@ class RecorderNode(CellNode):
         queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
         queue.expect(source, 0 if in_cell else None)
         queue.repeats = in_cell and self.restarts(source)
-        self.listen(topic, msgtype, partial(self._on_message, queue), partial(self._on_block, queue))
+        self.listen(topic, msgtype, partial(self._on_message, queue), partial(self._on_run, queue))
 
     def lose(self, lost: set[str], first: int, end: int) -> None:
         """See `CellNode`; what they published is held, and the bag says from which sample on."""
@@ -307,19 +309,27 @@ class RecorderNode(CellNode):
         elif self._merger.add_block(queue.topic, block, data):
             self._drain()
 
-    def _on_block(self, queue: BlockQueue, block: Block) -> None:
-        """A block of a node in this process."""
+    def _on_run(self, queue: BlockQueue, run: Run) -> None:
+        """Blocks of a node in this process; the messages at chosen samples among them have come before."""
         if self.over:
             return
-        queue.take(block)
+        queue.take(run)
         queue.blocks.clear()
-        if self._merger is None:
-            encoder = self._encoders[queue.type, block.run_id, block.source, block.step_ns]
+        whole = run.block
+        if self._merger is not None:
+            if len(run.companions) == 1:
+                ready = self._merger.add_block(queue.topic, whole)
+            else:
+                numbers = np.array(run.companions)
+                ready = self._merger.add_blocks(queue.topic, whole.first_index, whole.signals, numbers, last=whole.last)
+            if ready:
+                self._drain()
+            return
+        encoder = self._encoders[queue.type, whole.run_id, whole.source, whole.step_ns]
+        for block in run.blocks(self.table.block_size):
             first, last, companions = block.first_index, block.last, block.companions
             _, data = encoder.encode(first, block.signals, last=last, companions=companions)
             self._write_unsorted(queue, block, data)
-        elif self._merger.add_block(queue.topic, block):
-            self._drain()
 
     def _write_unsorted(self, queue: BlockQueue, block: Block, data: bytes) -> None:
         """Free-running, blocks may be missing, so nothing can be waited for: write in the order of arrival."""
@@ -370,6 +380,8 @@ class RecorderNode(CellNode):
             self._writer = None
         complete = complete and not self.failure
         whole = "complete" if complete else "interrupted"
+        if complete and self._safe:
+            whole = "to the end of the safe state; what lost members published is held"
         self.get_logger().info(f"bag {self._path} closed: {self._blocks} blocks, {whole}")
         self.reporter("closed", self.get_name(), bag=str(self._path), blocks=self._blocks, complete=complete)
         if self._lost:

@@ -181,7 +181,7 @@ class CellNode(LifecycleNode):
 
     def abandon(self, member: Member) -> None:
         """Give up because a member has."""
-        self.fail(LatheError(f"{member.name} failed: {member.message}"), cause="abandoned")
+        self.fail(LatheError(f"{member.name} {why_failed(member)}"), cause="abandoned")
 
     def begin(self, *, joins: bool) -> None:
         """Every input and output is matched; ``joins``: the cell is running already."""
@@ -312,6 +312,11 @@ class CellNode(LifecycleNode):
         if self._host:
             self.announce()
         self._leave_with_the_cell()
+
+    @property
+    def exit_code(self) -> int:
+        """Of its process: 0 if it has done its part of a run that came to its end."""
+        return self.failure.exit_code if self.failure else int(self._safe) * LatheError.exit_code
 
     def _leave_with_the_cell(self) -> None:
         """Leave, having given up, if nobody goes on any more."""
@@ -451,14 +456,18 @@ class CellNode(LifecycleNode):
             return
         name, now = self.master.name, time.monotonic()
         self._name_a_silent_master(name, now)
-        silent = now - self.watch.silent.get(name, math.inf)
-        if name in self.watch.ended() or (silent > _GIVEN_UP and self._parameter(name, "stall_reaction") == "safe"):
-            if self.failure:
-                self.done = True
-            elif self.over:
-                self._leave([])
-            else:
-                self.fail(LatheError(f"{name}, the time master, is lost: no sample follows"), cause="abandoned")
+        waits = self._parameter(name, "stall_reaction") != "safe"
+        silent = 0.0 if waits else now - self.watch.silent.get(name, math.inf)
+        ended = name in self.watch.ended()
+        if self.failure:
+            # A master that comes back in between shall hear why there is nobody any more.
+            self.done = self.done or ended or silent > 2.0 * _GIVEN_UP
+        elif (ended or silent > _GIVEN_UP) and self.over:
+            self._leave([])
+        elif ended:
+            self.fail(LatheError(f"{name}, the time master, is lost: no sample follows"), cause="abandoned")
+        elif silent > _GIVEN_UP:
+            self.fail(LatheError(given_up(name)), cause="masterless")
 
     def _name_a_silent_master(self, name: str, now: float) -> None:
         """Say once that it stalls: who stands still cannot say so itself."""
@@ -524,7 +533,8 @@ class CellNode(LifecycleNode):
     def progressed(self, blocks: int, samples: int, *, last: bool) -> None:
         """Tell the time master, now and then and at the end."""
         self._moved = time.monotonic()
-        if last or blocks - self._reported_blocks >= self._progress_step:
+        # At the same blocks whoever tells: the time master waits for the slowest.
+        if last or blocks // self._progress_step > self._reported_blocks // self._progress_step:
             self._reported_blocks = blocks
             progress = Progress(run_id=self.table.run_id, name=self.full_name, blocks=blocks, samples=samples)
             if self.exchange.master:
@@ -590,6 +600,17 @@ class CellNode(LifecycleNode):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._host["diagnostics"].publish(message)
+
+
+def why_failed(member: Member) -> str:
+    """What a member says of its failure; its name, with which that may begin, is said before."""
+    own_name = member.name.rpartition("/")[2]
+    return f"failed: {member.message.removeprefix(f'{own_name}: ')}"
+
+
+def given_up(master: str) -> str:
+    """What members say that do without a silent time master from now on."""
+    return f"{master}, the time master, has been silent for {_GIVEN_UP:g} s: no sample follows"
 
 
 def _names(endpoints: list[Any]) -> set[str]:

@@ -4,6 +4,7 @@
 import time
 from collections import deque
 from collections.abc import Mapping
+from typing import cast
 
 from lathe_rc_msgs.msg import CellState, Member, Progress
 from rclpy.qos import QoSProfile
@@ -15,6 +16,7 @@ from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderP
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes.ports import latched_qos
+from lathe_rc.nodes.shell import given_up, why_failed
 from lathe_rc.nodes.stage_node import StageNode
 from lathe_rc.nodes.strangers import Stranger
 from lathe_rc.nodes.watch import SILENCE
@@ -51,7 +53,7 @@ class SpindleNode(StageNode):
         self._told: deque[Progress] = deque()
         self._running = False
         self._schedule = 0.0  # monotonic time at which sample 0 would have been, were there no slips
-        self._heard = time.monotonic()
+        self._heard = self._looked = time.monotonic()
         self._members_moved: dict[str, float] = {}  # monotonic time at which each has last completed a block
         self._stalled: frozenset[str] = frozenset()
         self._dead: dict[str, float] = {}  # monotonic time until which a member may be restarted
@@ -130,7 +132,7 @@ class SpindleNode(StageNode):
         self.get_logger().info(f"run {self.table.run_id or '(no id)'} begins with {len(self._member_names)} members")
         self._say(CellState.RUNNING, 0)
         self.reporter("block0", self.get_name())
-        self._schedule = self._heard = time.monotonic()
+        self._schedule = self._heard = self._looked = time.monotonic()
         self._members_moved = dict.fromkeys(self._member_names, self._heard)
         self.release()
 
@@ -170,11 +172,11 @@ class SpindleNode(StageNode):
         else:
             self.release()
 
-    def _credit(self) -> bool:
-        """Whether the window lets one more block go."""
+    def _credit(self) -> int:
+        """Blocks that the window lets go."""
         if not self._completed or not self.table.window:
-            return True
-        return self.blocks - self._least < self.table.window
+            return 1
+        return self.table.window - (self.blocks - self._least)
 
     def release(self) -> None:
         """Let go every block that credit and pace allow."""
@@ -200,11 +202,13 @@ class SpindleNode(StageNode):
                     # Less is made up by the next blocks. The schedule slips by more: no long burst to catch up.
                     self._schedule += late
                     self.slipped += late
-            rest = size if self._end is None else self._end - self.samples
-            samples = min(size, rest)
+            samples = size if factor else size * min(self._credit(), self.together)
+            last = self._end is not None and self._end - self.samples <= samples
+            if last:
+                samples = cast("int", self._end) - self.samples
             if self._completed:
-                self._released.append(time.monotonic())
-            self.compute(samples, [], last=samples == rest and self._end is not None)
+                self._released.extend([time.monotonic()] * -(-samples // size))
+            self.compute(samples, [], last=last)
         self.next_tick = time.monotonic()
 
     def advance(self) -> None:
@@ -248,6 +252,8 @@ class SpindleNode(StageNode):
         if not self._running or self.over or self.failure:
             return
         now = time.monotonic()
+        self._forgive(now - self._looked)
+        self._looked = now
         for name in self.watch.ended() & self._completed.keys() - self._dead.keys():
             restarts, self.patience = self.restarts(name) and not self._without, _GONE
             self._dead[name] = now + (self._pace.restart_time if restarts else 0.0)
@@ -273,10 +279,23 @@ class SpindleNode(StageNode):
                 lost = self._silent_for(now, self._pace.stall_time) or self._stalled
                 self._lose(dict.fromkeys(lost, "fell silent"))
 
+    def _forgive(self, passed: float) -> None:
+        """While it stood still itself, for so long [s], it could not hear anybody: that is nobody else's silence."""
+        if passed > SILENCE:
+            self._heard += passed
+            self._members_moved = {name: moved + passed for name, moved in self._members_moved.items()}
+            self.watch.silent = {name: since + passed for name, since in self.watch.silent.items()}
+
     def failed(self, member: Member) -> None:
-        """See `CellNode`: the others go on without it to their safe state, if they can wait until all know."""
+        """See `CellNode`: the others go on without it to their safe state, if they can wait until all know.
+
+        Raises:
+            LatheError: it has itself been silent for so long that the others have given it up.
+        """
+        if member.message == given_up(self.full_name):
+            raise LatheError(f"{self.full_name} stood still at sample {self.samples}: the others have given it up")
         if self._running and self.table.window:
-            self._lose(dict.fromkeys(self._dead, "died") | {member.name: f"failed: {member.message}"})
+            self._lose(dict.fromkeys(self._dead, "died") | {member.name: why_failed(member)})
         else:
             self.abandon(member)
 
@@ -301,6 +320,8 @@ class SpindleNode(StageNode):
         names, who = members.keys(), ", ".join(f"{name} {what}" for name, what in sorted(members.items()))
         if not self.table.window:
             raise LatheError(f"{who} at sample {self.samples}; a cell with window = 0 cannot go on without it")
+        if self._completed.keys() <= names:
+            raise LatheError(f"{f'{self._why}; ' if self._why else ''}{who}: nobody is left at sample {self.samples}")
         self._why = f"{self._why}; {who}" if self._why else f"{who}: safe state from sample {self.samples} on"
         before = self._least
         for name in names:

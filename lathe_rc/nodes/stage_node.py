@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """A stage as a ROS node."""
 
+from bisect import bisect_left
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from lathe_rc_msgs.srv import Schedule
 
 from lathe_rc.bag.record import signal_depth
@@ -19,10 +21,12 @@ from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wire import Block, Encoder, Pool
 from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import BlockQueue, message_class, signal_qos
 from lathe_rc.nodes.shell import CellNode
 
 _EARLY = 4  # times the blocks in flight are kept until it is known where to go on
+_TOGETHER = 2  # parts of the window: so much is computed in one go, and members still work side by side
 _OUTSIDE_PERIOD = 0.1  # [s] between looks at who reads what in other processes
 
 
@@ -33,6 +37,7 @@ class StageNode(CellNode):
         stage: what it runs, once configured.
         blocks: computed so far.
         samples: computed so far.
+        together: blocks that are computed in one go, at most.
     """
 
     stage: Stage
@@ -59,6 +64,8 @@ class StageNode(CellNode):
         ]
         for _, encoder in self._encoders:
             encoder.prepare(self.table.block_size)
+        most = min(self.table.window // _TOGETHER, messages.MAX_BLOCK // self.table.block_size)
+        self.together, self._size = max(most, 1), self.table.block_size
         self._pools = [Pool(port.type) for port in self.stage.outputs]
         self._sparse_topics = {topic: self.topic(topic) for topic in self.stage.sparse_topics}
         self._queues: dict[str, BlockQueue] = {}
@@ -67,7 +74,7 @@ class StageNode(CellNode):
         for topic, port in ports:
             delays = longest_delays(p for other, p in ports if other == topic)
             self._queues[topic] = BlockQueue(topic, port.type, self.table, sorted(delays))
-            self._tracks[topic] = Track(port.type, delays, self.table.block_size)
+            self._tracks[topic] = Track(port.type, delays, self.together * self.table.block_size)
         self._wire()
 
     def _ports(self) -> list[tuple[str, Input]]:
@@ -96,8 +103,7 @@ class StageNode(CellNode):
         self._early: deque[tuple[BlockQueue, bytes]] = deque(
             maxlen=_EARLY * signal_depth(self.table) * len(self._queues)
         )
-        if self.stage.takes_events:
-            self.create_service(Schedule, "~/schedule", self._on_schedule)
+        self.create_service(Schedule, "~/schedule", self._on_schedule)
 
     def tick(self, now: float) -> None:
         """See `CellNode`."""
@@ -246,12 +252,12 @@ class StageNode(CellNode):
         pace.expect(self.master.name, first)
         pace.repeats = True
 
-        def come(block: Block | None) -> None:
+        def come(take: Callable[[Any], object], delivery: Any) -> None:
+            take(delivery)
             pace.blocks.clear()
-            if block is not None:
-                self._reach = block.first_index + block.samples
+            self._reach = max(first, pace.end)
 
-        self.listen(topic, messages.ENCODER, lambda data: come(pace.add(data)), lambda block: come(pace.take(block)))
+        self.listen(topic, messages.ENCODER, partial(come, pace.add), partial(come, pace.take))
 
     # ---- events -------------------------------------------------------------------------------------
 
@@ -278,8 +284,8 @@ class StageNode(CellNode):
             self.attempt(self.advance)
 
     @staticmethod
-    def _load(queue: BlockQueue, track: Track, until: int) -> bool:
-        """Move queued blocks into the topic's track until it reaches sample ``until``; False if they do not."""
+    def _load(queue: BlockQueue, track: Track, until: int) -> None:
+        """Move queued blocks into the topic's track until it reaches sample ``until``, as far as they have come."""
         while track.end < until and queue.blocks:
             block = queue.blocks.popleft()
             try:
@@ -287,32 +293,66 @@ class StageNode(CellNode):
                 block.copy_to(track.extend(block.samples), check=not queue.inside)
             except ValueError as error:
                 raise LatheError(f"{queue.topic}: {error}") from None
-        return track.end >= until
+
+    @staticmethod
+    def _taken(queue: BlockQueue, samples: int) -> Signals:
+        """The next samples of blocks that were computed in this process; without a copy if they are one piece."""
+        if queue.blocks[0].samples == samples:
+            return queue.blocks.popleft().signals
+        pieces: list[Signals] = []
+        while samples:
+            block = queue.blocks.popleft()
+            if block.samples > samples:
+                queue.blocks.appendleft(block.part(samples, block.samples))
+                block = block.part(0, samples)
+            pieces.append(block.signals)
+            samples -= block.samples
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
     def _next(self) -> tuple[int, bool] | None:
-        """Length of the next block and whether it is the last; None while an input is missing."""
-        for queue in self._forward:
-            if not queue.blocks:
-                return None
-        head = self._forward[0].blocks[0]
-        if self._reach is not None and head.first_index + head.samples > self._reach:
-            return None
+        """Samples to compute in one go, and whether the run ends with them; None while an input is missing."""
         if not self._started:
+            if not all(queue.blocks for queue in self._forward):
+                return None
             # Alone, a node may join a stream that is under way; in a cell it begins at 0.
-            self._join(head.first_index)
+            self._join(self._forward[0].blocks[0].first_index)
+            self._check_cut([queue.blocks[0].first_index for queue in self._forward], "begin")
+        end, ended = self.samples + self.together * self._size, False
         for queue in self._forward:
-            if queue.blocks[0].first_index != self.samples or queue.blocks[0].samples != head.samples:
-                heads = [queue.blocks[0] for queue in self._forward]
-                spans = ", ".join(f"{b.source} {b.first_index}+{b.samples}" for b in heads)
-                raise LatheError(f"inputs are not cut into the same blocks at sample {self.samples}: {spans}")
+            end = min(end, queue.end)
+            ended = ended or queue.ended
+        if end <= self.samples:
+            return None
         for queue in self._feedback:
             # It may not be needed for a long time yet, but what piles up unread DDS gives up some day.
             if queue.received + self.table.window < self.blocks and self.master is not None and self.table.window:
                 return None
+        if self._reach is not None:
+            end = min(end, self._reach)
         for queue, track, delay in self._delayed:
-            if not self._load(queue, track, self.samples + head.samples - delay):
-                return None
-        return head.samples, head.last
+            self._load(queue, track, end - delay)
+            end = min(end, track.end + delay)
+        last = ended and self._ends_with(end)
+        samples = end - self.samples
+        if not last:
+            samples -= samples % self._size
+        return (samples, last) if samples > 0 else None
+
+    def _ends_with(self, end: int) -> bool:
+        """Whether the run ends before sample ``end``.
+
+        Raises:
+            LatheError: it ends with another sample for another input.
+        """
+        ends = [queue.end for queue in self._forward]
+        if max(ends) > min(queue.end for queue in self._forward if queue.ended):
+            self._check_cut(ends, "end")
+        return all(queue.ended and queue.end == end for queue in self._forward)
+
+    def _check_cut(self, places: Sequence[int], what: str) -> None:
+        if len(set(places)) > 1:
+            where = ", ".join(f"{queue.topic} {place}" for queue, place in zip(self._forward, places, strict=True))
+            raise LatheError(f"inputs do not {what} with the same sample: {where}")
 
     def _join(self, first: int) -> None:
         self._started = True
@@ -322,22 +362,20 @@ class StageNode(CellNode):
 
     def advance(self) -> None:
         """Compute every block whose inputs are there."""
-        shared = self._shared
         while not self.over and not self.failure:
             ready = self._next()
             if ready is None:
                 return
             samples, last = ready
+            taken = {queue.topic: self._taken(queue, samples) for queue in self._shared}
             inputs: list[Signals] = []
             for queue, track, delay in self._inputs:
-                if queue in shared:
-                    inputs.append(queue.blocks[0].signals)
+                if queue.topic in taken:
+                    inputs.append(taken[queue.topic])
                     continue
                 if not delay:
                     self._load(queue, track, self.samples + samples)
                 inputs.append(track.view(self.samples - delay, samples))
-            for queue in shared:
-                queue.blocks.popleft()
             self.compute(samples, inputs, last=last)
 
     def _goes_out(self, topic: str) -> bool:
@@ -345,9 +383,11 @@ class StageNode(CellNode):
         return topic in self._outside or not self.exchange.read(topic)
 
     def compute(self, samples: int, inputs: Sequence[Signals], *, last: bool) -> None:
-        """Compute and publish one block."""
+        """Compute some blocks in one go, and publish each; the last one of the run may be shorter."""
         memory = [pool.take(samples) for pool in self._pools]
-        for sparse in self.stage.advance(self.samples, inputs, [signals for signals, _ in memory]):
+        before, found = self._framer.companions, []
+        for sparse in self.stage.advance(self.samples, inputs, [signals for signals, _ in memory], last=last):
+            found.append(sparse.index)
             framed = self._framer.sparse(sparse)
             topic, data = self._sparse_topics[sparse.topic], messages.encode(sparse.type, framed)
             if self._goes_out(topic):
@@ -356,17 +396,23 @@ class StageNode(CellNode):
             if sparse.type == messages.LEARNING:
                 values = {key: float(value) for key, value in sparse.values.items()}
                 self.reporter("cycle", self.get_name(), sample=sparse.index, **values)
-        companions = self._framer.companions
+        companions = [before + len(found)]
+        if samples > self._size:
+            ends = range(self.samples + self._size, self.samples + samples, self._size)
+            companions = [*(before + bisect_left(found, end) for end in ends), *companions]
         for (topic, encoder), (signals, whole) in zip(self._encoders, memory, strict=True):
-            block = encoder.block(self.samples, signals, whole, last=last, companions=companions)
+            block = encoder.block(self.samples, signals, whole, last=last, companions=companions[-1])
             try:
                 block.check()
             except ValueError as error:
                 raise LatheError(f"{topic}: {error}") from None
+            run = Run(block, companions)
             if self._goes_out(topic):
-                self.outlets[topic].publish(encoder.encode(self.samples, signals, last=last, companions=companions)[1])
-            self.exchange.hand_over(topic, block)
-        self.blocks += 1
+                for each in run.blocks(self._size):
+                    first, end, count = each.first_index, each.last, each.companions
+                    self.outlets[topic].publish(encoder.encode(first, each.signals, last=end, companions=count)[1])
+            self.exchange.hand_over(topic, run)
+        self.blocks += len(companions)
         self.samples += samples
         self.progressed(self.blocks, self.samples, last=last)
         if last:
@@ -376,6 +422,9 @@ class StageNode(CellNode):
 
     def ended(self) -> None:
         """The last block has been computed."""
+        if waiting := self.stage.waiting:
+            self.get_logger().warning(f"not reached: {'; '.join(waiting)}")
+            self.reporter("not_reached", self.get_name(), events=waiting)
         self.end(list(self.outlets.values()))
         if self.lost:
             self.fail(LossyRunError(f"{self.full_name}: lost {self.lost} blocks of a free-running cell"))

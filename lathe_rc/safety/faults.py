@@ -19,7 +19,7 @@ import numpy.typing as npt
 import scipy
 
 from lathe_rc.cell.messages import Signals
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, shown
 
 Array = npt.NDArray[np.float64]
 
@@ -137,20 +137,25 @@ class Fault:
         return " ".join([self.target, self.kind, *given])
 
 
-def parse(text: str, whose: str) -> Fault:
-    """Read a fault; ``whose`` names the node in messages.
+def parse(text: str, whose: str, *, what: str = "fault") -> Fault:
+    """Read a fault.
+
+    Args:
+        text: as it is written.
+        whose: names the node in messages.
+        what: names in messages what is asked for.
 
     Raises:
         InputError: no such kind or value, one that is missing, twice there or out of its range.
     """
     if len(text) > _LONGEST:
-        raise InputError(f"{whose}: a fault of {len(text)} characters; allowed: up to {_LONGEST}")
+        raise InputError(f"{whose}: a {what} of {len(text)} characters; allowed: up to {_LONGEST}")
     target, _, rest = text.strip().partition(" ")
     name, _, rest = rest.strip().partition(" ")
     kind = KINDS.get(name)
     if kind is None:
         known = ", ".join(KINDS)
-        raise InputError(f"{whose}: fault {text!r}; allowed: TARGET KIND NAME=VALUE ..., KIND one of {known}")
+        raise InputError(f"{whose}: {what} {text!r}; allowed: TARGET KIND NAME=VALUE ..., KIND one of {known}")
     given: dict[str, float] = {}
     for part in rest.split():
         match = _VALUE.fullmatch(part)
@@ -160,11 +165,11 @@ def parse(text: str, whose: str) -> Fault:
         except ValueError:
             number = math.nan
         if key not in kind.values or key in given or not kind.values[key].takes(number):
-            raise InputError(f"{whose}: fault {text!r}: {part}; allowed: {_allowed(kind)}")
+            raise InputError(f"{whose}: {what} {text!r}: {shown(part)}; allowed: {_allowed(kind)}")
         given[key] = number
     missing = [key for key, value in kind.values.items() if value.default is None and key not in given]
     if missing:
-        raise InputError(f"{whose}: fault {text!r}: no {missing[0]}; allowed: {_allowed(kind)}")
+        raise InputError(f"{whose}: {what} {text!r}: no {missing[0]}; allowed: {_allowed(kind)}")
     # In the order of the table, so that equal faults read equal.
     values = {key: given.get(key, value.default or 0.0) for key, value in kind.values.items()}
     return Fault(target, name, values)

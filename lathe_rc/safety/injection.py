@@ -4,12 +4,11 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NoReturn
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
 from lathe_rc.errors import InputError
-from lathe_rc.safety.faults import DISTURBANCES, KINDS, Disturbance, Fault
+from lathe_rc.safety.faults import DISTURBANCES, KINDS, Disturbance, Fault, Kind
 
 _TRUE = "_true"  # fields with this ending are what really happens
 
@@ -32,15 +31,19 @@ class Port:
     delay: int
     out: bool
 
+    def targets(self, kind: Kind) -> set[str]:
+        """What of this port a kind of fault can be of."""
+        if kind.what == "encoder":
+            return {self.topic} if self.out and self.type == messages.ENCODER else set()
+        if kind.what != "field":
+            return set()
+        types = messages.sample_fields(self.type)
+        fields = {name for name in self.fields if not name.endswith(_TRUE) and (kind.whole or types[name].kind == "f")}
+        return {f"{self.topic}.{name}" for name in fields}
+
     def takes(self, fault: Fault) -> bool:
         """Whether the fault is one of this port."""
-        kind = KINDS[fault.kind]
-        if kind.what == "encoder":
-            return self.out and self.type == messages.ENCODER and fault.target == self.topic
-        topic, _, field = fault.target.rpartition(".")
-        if kind.what != "field" or topic != self.topic or field not in self.fields or field.endswith(_TRUE):
-            return False
-        return kind.whole or messages.sample_fields(self.type)[field].kind == "f"
+        return fault.target in self.targets(KINDS[fault.kind])
 
 
 @dataclass
@@ -66,61 +69,87 @@ class _Injected:
 
 
 class Injection:
-    """The faults of a stage's ports.
+    """The faults of a stage's ports, and which its devices can have.
 
     Args:
         node: its name.
         inputs, outputs: its ports, in order.
+        devices: what can break beside them.
         seed: of the cell.
         step: sampling step [s].
     """
 
-    def __init__(self, node: str, inputs: Sequence[Port], outputs: Sequence[Port], *, seed: int, step: float) -> None:
-        self._node, self._inputs, self._outputs = node, list(inputs), list(outputs)
+    def __init__(
+        self,
+        node: str,
+        inputs: Sequence[Port],
+        outputs: Sequence[Port],
+        *,
+        devices: Sequence[str] = (),
+        seed: int,
+        step: float,
+    ) -> None:
+        self._node, self._inputs, self._outputs, self._devices = node, list(inputs), list(outputs), devices
         self._seed, self._step = seed, step
         self._injected: list[_Injected] = []
 
-        ports = [*self._inputs, *self._outputs]
-        self._fields = {f"{port.topic}.{name}" for port in ports for name in port.fields if not name.endswith(_TRUE)}
-        self._encoders = {port.topic for port in self._outputs if port.type == messages.ENCODER}
+    @property
+    def _ports(self) -> list[Port]:
+        return [*self._inputs, *self._outputs]
+
+    def _targets(self, kind: Kind) -> set[str]:
+        """What a kind of fault can be of."""
+        if kind.what in self._devices:
+            return {kind.what}
+        return {target for port in self._ports for target in port.targets(kind)}
 
     def check(self, fault: Fault) -> None:
-        """Refuse a fault that no port can have.
+        """Refuse a fault of what cannot have it.
 
         Raises:
-            InputError: says which ports there are.
+            InputError: says what can.
         """
-        if not any(port.takes(fault) for port in [*self._inputs, *self._outputs]):
-            self._refuse(f"fault {fault.text!r}: no such target for it")
+        allowed = self._targets(KINDS[fault.kind])
+        if fault.target in allowed:
+            return
+        others = [name for name, kind in KINDS.items() if fault.target in self._targets(kind)]
+        raise InputError(
+            f"{self._node}: fault {fault.text!r}: no such target for it; allowed for {fault.kind}: "
+            f"{', '.join(sorted(allowed)) or 'none of this node'}"
+            + (f"; for {fault.target}: {', '.join(others)}" if others else "")
+        )
 
     def check_target(self, target: str) -> None:
-        """Refuse a target that no fault of a port can have.
+        """Refuse a target that no fault can have.
 
         Raises:
             InputError: says which there are.
         """
-        if target not in self._fields | self._encoders:
-            self._refuse(f"repair {target!r}: there is no such target")
-
-    def _refuse(self, why: str) -> NoReturn:
-        raise InputError(
-            f"{self._node}: {why}; allowed: {', '.join(sorted(self._fields))}"
-            + (f"; {', '.join(self._encoders)} for faults of the encoder itself" if self._encoders else "")
-        )
+        allowed = {each for kind in KINDS.values() for each in self._targets(kind)}
+        if target not in allowed:
+            raise InputError(
+                f"{self._node}: repair {target!r}: there is no such target; allowed: {', '.join(sorted(allowed))}"
+            )
 
     def begin(self, fault: Fault, index: int) -> None:
         """Let a fault begin at sample ``index``."""
-        for port in (port for port in [*self._inputs, *self._outputs] if port.takes(fault)):
+        for port in (port for port in self._ports if port.takes(fault)):
             made = DISTURBANCES[fault.kind](fault, seed=self._seed, step=self._step, whose=self._node)
             self._injected.append(_Injected(fault, port, made, index))
 
-    def end(self, target: str, index: int, fault: Fault | None = None) -> None:
-        """Let a fault of a target, of equal ones the oldest, or all of them, end before sample ``index``."""
+    def end(self, target: str, index: int, fault: Fault | None = None) -> bool:
+        """Let a fault of a target, of equal ones the oldest, or all of them, end before sample ``index``.
+
+        Returns:
+            Whether there was one.
+        """
+        found = False
         for injected in self._injected:
             if injected.fault.target == target and fault in (None, injected.fault) and injected.end > index:
-                injected.end = index
+                injected.end, found = index, True
                 if fault is not None:
-                    return
+                    break
+        return found
 
     @property
     def any(self) -> bool:

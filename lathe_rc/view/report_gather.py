@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lathe_rc.bag.snapshot import first_sample
+from lathe_rc import happened
+from lathe_rc.bag.snapshot import first_sample, span_of
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.stream import Feeder
 from lathe_rc.cell import messages
@@ -15,8 +16,7 @@ from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError
-from lathe_rc.view import happened
-from lathe_rc.view.happened import HAPPENED
+from lathe_rc.happened import HAPPENED
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_host import TYPES as HOST_TYPES
 from lathe_rc.view.report_host import Host
@@ -133,9 +133,11 @@ class Gathered:
 
     @property
     def complete(self) -> bool:
-        """Whether the whole bag was read and each dense topic ends with the run."""
+        """Whether the whole bag was read and each dense topic ends with the run, or where a snapshot does."""
         dense = [tally for tally in self.topics.values() if tally.type in messages.block_types()]
-        return bool(dense) and not self.stopped and not any(tally.open_end for tally in dense)
+        snapshot = span_of(self.about)
+        ends = 0 < snapshot[1] == self.samples if snapshot else not any(tally.open_end for tally in dense)
+        return bool(dense) and not self.stopped and ends
 
     @property
     def seconds(self) -> float:
@@ -159,14 +161,15 @@ def gather(path: Path) -> Gathered:
         forms = [Form(encoders[0], tool) for tool in of_type(types, messages.TOOL)] if encoders else []
         curves = Curves(types)
         told = Gathered(source.about, {topic: Tally(kind) for topic, kind in sorted(types.items())}, forms, curves)
-        feeder = Feeder(types, [*forms, curves], _PIECE, first_sample(source.about))
+        first = first_sample(source.about)
+        feeder = Feeder(types, [*forms, curves], _PIECE, first)
         try:
             _read(source, feeder, told)
         except LatheError as error:
             told.stopped = str(error)
         for form in forms:
             form.finish()
-        told.samples, told.step_ns, told.run_id = feeder.first, feeder.step_ns, feeder.run_id
+        told.samples, told.step_ns, told.run_id = feeder.first - first, feeder.step_ns, feeder.run_id
     return told
 
 

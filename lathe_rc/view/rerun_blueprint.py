@@ -6,8 +6,8 @@ from collections.abc import Mapping
 import rerun.blueprint as rrb
 
 from lathe_rc.cell import messages
+from lathe_rc.happened import HAPPENED
 from lathe_rc.view import rerun_part as parts
-from lathe_rc.view.happened import HAPPENED
 from lathe_rc.view.rerun_signals import ERROR, PLOTS, POSITION, curve_path, curves
 
 _LATEST_S, _LATEST_REVOLUTIONS = 0.3, 5  # before the time cursor, in plots of fast signals

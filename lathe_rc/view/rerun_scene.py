@@ -12,13 +12,13 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
+from lathe_rc import happened
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals, full
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import LatheError, shown
-from lathe_rc.view import happened
+from lathe_rc.happened import HAPPENED
 from lathe_rc.view import rerun_part as parts
-from lathe_rc.view.happened import HAPPENED
 from lathe_rc.view.rerun_revolutions import ANGLES, HIGHEST, Revolution, Revolutions
 from lathe_rc.view.rerun_signals import CYCLES, curve_path, curves, envelope
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, full
-from lathe_rc.view.happened import HAPPENED
+from lathe_rc.happened import HAPPENED
 
 
 @dataclass(frozen=True)

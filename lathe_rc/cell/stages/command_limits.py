@@ -57,6 +57,10 @@ class LimitedCommand:
         given = np.empty_like(command)
         return given, self._clipping.told(first, self._limiter.block(command, given))
 
+    def finish(self, index: int) -> list[Sparse]:
+        """See `Clipping.finish`."""
+        return self._clipping.finish(index)
+
 
 class Clipping:
     """Says with which sample a command begins to be clipped, and when it is free again.
@@ -83,12 +87,18 @@ class Clipping:
         while start < clipped.size:
             stop = min(start + self._tell - (first + start) % self._tell, clipped.size)
             found += self._ends(first + start, clipped[start:stop])
-            if (first + stop) % self._tell == 0 and self._clipped > self._before:
-                action = f"{LIMITED}:{self._which} {self._clipped - self._before} samples were clipped"
-                found.append(Sparse(self._topic, messages.EVENT, first + stop - 1, {"action": action}))
-                self._before = self._clipped
+            if (first + stop) % self._tell == 0:
+                found += self.finish(first + stop - 1)
             start = stop
         return found
+
+    def finish(self, index: int) -> list[Sparse]:
+        """What has not been said yet of the samples up to ``index``, if there is anything."""
+        if self._clipped == self._before:
+            return []
+        action = f"{LIMITED}:{self._which} {self._clipped - self._before} samples were clipped"
+        self._before = self._clipped
+        return [Sparse(self._topic, messages.EVENT, index, {"action": action})]
 
     def _ends(self, first: int, clipped: Samples) -> list[Sparse]:
         """With which sample it begins, and is free again."""

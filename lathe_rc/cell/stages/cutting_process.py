@@ -193,10 +193,13 @@ class CuttingProcessStage(Stage):
         self._damages.append(fault)
         self._suffer()
 
-    def mend(self, fault: Fault | None) -> None:
+    def mend(self, fault: Fault | None) -> bool:
         """See `Stage`: a longer edge, or a spot less; all of them are a new tool in even material."""
-        self._damages = [damage for damage in self._damages if fault not in (None, damage)]
+        mended = self._damages[:] if fault is None else [damage for damage in self._damages if damage == fault][:1]
+        for damage in mended:
+            self._damages.remove(damage)
         self._suffer()
+        return bool(mended)
 
     def _suffer(self) -> None:
         shorter = sum(fault.values["length"] for fault in self._damages if fault.kind == "tool_broken")

@@ -82,6 +82,10 @@ class ElectrodynamicActuator(Drive):
         """See `Stage`."""
         self._retraction.begin()
 
+    def finish(self, index: int) -> list[Sparse]:
+        """See `Stage`."""
+        return self._limited.finish(index)
+
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         (command,), (state,) = inputs, outputs

@@ -135,6 +135,10 @@ class FeedDriveStage(Stage):
         self._safe = True
         self._obedience.obey(Reaction.STOP)
 
+    def finish(self, index: int) -> list[Sparse]:
+        """See `Stage`."""
+        return self._clipping.finish(index)
+
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         (servo, *safety), (state,) = inputs, outputs

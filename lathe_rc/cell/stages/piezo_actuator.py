@@ -156,6 +156,10 @@ class PiezoActuator(Drive):
         """See `Drive`."""
         return {"fine/command": self.drive.response}
 
+    def finish(self, index: int) -> list[Sparse]:
+        """See `Stage`."""
+        return self._limited.finish(index)
+
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         (state,) = outputs

@@ -141,6 +141,10 @@ class SeriesDriveStage(Drive):
         """See `Stage`; the carriage takes the tool out."""
         self._retraction.begin()
 
+    def finish(self, index: int) -> list[Sparse]:
+        """See `Stage`."""
+        return [message for limited in self._limited for message in limited.finish(index)]
+
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """See `Stage`."""
         command, *others = inputs

@@ -85,7 +85,7 @@ class SupervisorParameters(NodeParameters):
     )
     slide_reaction: Asked = parameter("hold", "what is asked for then")
 
-    clear_position: float = parameter(
+    clear_position: Annotated[float, Ge(0)] = parameter(
         0.25e-3, "the tool is out of the part where the first drive's measured position is beyond this", "m"
     )
     clear_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
