@@ -141,6 +141,8 @@ def test_when_the_wire_stays_cut_both_sides_stop_if_the_cell_shall_not_wait(wire
     (safe,) = [event for event in told if event["event"] == "safe"]
     assert {name.removeprefix("/") for name in safe["lost"]} == set(FAR)
     assert "fell silent: safe state from sample" in safe["why"]
-    assert {event["node"] for event in told if event["event"] == "abandoned"} == set(FAR), "their time master is gone"
+    # Its process may end, which the two name spaces hide from neither side, before it has been silent for so long.
+    gone = {event["node"] for event in told if event["event"] in ("masterless", "abandoned")}
+    assert gone == set(FAR), "their time master is gone"
     with AnyReader([tmp_path / "bag"]) as found:
         assert sum(1 for _ in found.messages()) > 100
