@@ -6,6 +6,7 @@ import itertools
 import json
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.ports import latched_qos
+from lathe_rc.nodes.stage_node import StageNode
 
 STEP = 15_625
 
@@ -225,6 +227,13 @@ def test_a_flood_takes_no_memory(ghost, domain, tmp_path):
     assert grown < 64e6
     assert sum(processes.refused.values()) > 1000
     assert reader.read(tmp_path / "bag").digests() == harness.run(plain).digest
+
+
+def test_nobody_listens_for_lost_messages():
+    """A flood loses some, and in rmw_fastrtps 8.4 whoever listens for that may stand still for ever."""
+    events = StageNode.subscription_events(SimpleNamespace(), "/encoder")
+    assert events.incompatible_qos is not None
+    assert events.message_lost is None
 
 
 def test_who_comes_late_learns_the_state_of_the_cell_and_its_members(ghost, domain, tmp_path):
