@@ -28,7 +28,7 @@ from lathe_rc.nodes.ports import message_class
 _CLOCK = "/clock"
 _OWN = {"/rosout", "/parameter_events"}  # of ROS itself, this node's among them
 _LOOK = 0.05  # [s] of wall time between looks at the graph and at signals
-_DISCOVERY = 3.0  # [s] of wall time after which publishers that were there before have been discovered
+_LOOKS = 60  # after which publishers that were there before have been discovered: 3 s, unless it is kept from looking
 _SILENCE = 10.0  # [s] without a message after which no one published before is under way any more
 _AT_ONCE = 10_000  # messages of a topic that are taken before the others have their turn
 
@@ -63,10 +63,10 @@ class TopicRecorder:
         self._continuity: dict[str, Continuity] = {}
         self._refused: dict[str, str] = {}  # topic -> why it is not recorded
         self._present: set[str] = set()  # topics that may have begun before the recording
-        self._settled = False
+        self._settled, self._looks = False, 0
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
-        self._began = self._newest = self._flushed = time.monotonic()
+        self._newest = self._flushed = time.monotonic()
         self._taken = 0
         self.written = 0
         self.stopped = threading.Event()  #: set from outside to end it
@@ -93,7 +93,8 @@ class TopicRecorder:
         graph = self._graph()
         if not self._settled:
             self._present |= graph.keys()
-            if time.monotonic() - self._began > _DISCOVERY:
+            self._looks += 1
+            if self._looks > _LOOKS:
                 self._settled = True
                 self._node.get_logger().info("recording; what begins from now on is heard from its first message on")
         if self._parameters.sim_time and _CLOCK not in self._inlets:
