@@ -3,6 +3,7 @@
 
 import shutil
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,16 @@ class Recorded:
 
     result: harness.Result
     path: Path
+
+    @cached_property
+    def messages(self):
+        """See `read_by_mcap`, which takes its time."""
+        return read_by_mcap(self.path)
+
+    @cached_property
+    def chunks(self):
+        """See `chunks_of`."""
+        return chunks_of(self.path)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +113,7 @@ def test_sparse_messages_are_all_there(recorded):
 
 
 def test_messages_stand_in_the_order_of_log_time_and_topic(recorded):
-    order = [(log_time, topic) for topic, log_time, _, _ in read_by_mcap(recorded.path)]
+    order = [(log_time, topic) for topic, log_time, _, _ in recorded.messages]
     assert order == sorted(order)
 
 
@@ -114,7 +125,7 @@ def test_log_time_is_the_simulated_time_of_the_last_sample(recorded):
             assert log_time == 1_000_000_000 + (message.block.first_index + samples - 1) * 15_625
         elif hasattr(message, "sample_index"):
             assert log_time == 1_000_000_000 + message.sample_index * 15_625
-    assert all(log_time == publish_time for _, log_time, publish_time, _ in read_by_mcap(recorded.path))
+    assert all(log_time == publish_time for _, log_time, publish_time, _ in recorded.messages)
 
 
 def test_blocks_follow_each_other_and_the_last_says_so(recorded):
@@ -144,13 +155,13 @@ def test_block_tells_how_many_sparse_messages_came_before_it(recorded):
 
 def test_two_runs_give_the_same_messages(recorded, tmp_path):
     record(tmp_path / "again")
-    assert read_by_mcap(tmp_path / "again") == read_by_mcap(recorded.path)
+    assert read_by_mcap(tmp_path / "again") == recorded.messages
 
 
 @pytest.mark.parametrize("recorder", [{"compression": "none"}, {"chunk_size": 4096}, {"chunk_size": 2**28}])
 def test_compression_and_chunks_change_no_message(recorded, tmp_path, recorder):
     record(tmp_path / "other", **recorder)
-    assert read_by_mcap(tmp_path / "other") == read_by_mcap(recorded.path)
+    assert read_by_mcap(tmp_path / "other") == recorded.messages
 
 
 # --- what is told about it
@@ -160,7 +171,7 @@ def test_bag_says_what_it_is(recorded):
     metadata = yaml.safe_load((recorded.path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert metadata["storage_identifier"] == "mcap"
     assert metadata["custom_data"]["lathe_rc.run_id"] == "test"
-    assert metadata["message_count"] == len(read_by_mcap(recorded.path))
+    assert metadata["message_count"] == len(recorded.messages)
     counts = {part["topic_metadata"]["name"]: part["message_count"] for part in metadata["topics_with_message_count"]}
     assert counts["/tool"] == recorded.result.blocks
 
@@ -249,10 +260,10 @@ def cut(path, folder, length):
 def test_every_complete_chunk_of_a_cut_bag_is_saved(recorded, tmp_path_factory, part):
     result, path = recorded.result, recorded.path
     length = int(part * file_of(path).stat().st_size)
-    expected = max((count for end, count in chunks_of(path) if end <= length), default=0)
+    expected = max((count for end, count in recorded.chunks if end <= length), default=0)
     broken = cut(path, tmp_path_factory.mktemp("cut"), length)
     assert recover.mend(broken).saved == expected
-    assert read_by_mcap(broken) == read_by_mcap(path)[:expected]
+    assert read_by_mcap(broken) == recorded.messages[:expected]
     assert len(read_by_rosbags(broken)) == expected
     saved = reader.read(broken)
     for topic, signals in saved.dense.items():
@@ -269,9 +280,9 @@ def test_cut_bag_with_a_damaged_end_is_saved_up_to_it(recorded, tmp_path, part, 
     broken = cut(recorded.path, tmp_path, length)
     with file_of(broken).open("ab") as stream:
         stream.write(tail)
-    expected = max(count for end, count in chunks_of(recorded.path) if end <= length)
+    expected = max(count for end, count in recorded.chunks if end <= length)
     assert recover.mend(broken).saved == expected
-    assert read_by_mcap(broken) == read_by_mcap(recorded.path)[:expected]
+    assert read_by_mcap(broken) == recorded.messages[:expected]
 
 
 def test_saved_bag_keeps_schemas_and_qos(recorded, tmp_path):

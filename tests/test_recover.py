@@ -9,7 +9,7 @@ import struct
 import numpy as np
 import pytest
 import zstandard
-from cells import scenario
+from cells import files_up_to, scenario
 from click.testing import CliRunner
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
@@ -25,7 +25,7 @@ from lathe_rc.bag.writer import BagWriter, offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cli import main
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 
 MODES = [
     pytest.param(plugin, mode, id=f"{plugin.name}-{mode.name}".lower())
@@ -122,7 +122,7 @@ def chunk_ends(data):
 
 
 def test_a_thousand_cuts_lose_no_more_than_the_cut_chunk(tmp_path):
-    made = scenario(spindle_encoder={"revolutions": 8.0}, recorder={"chunk_size": 32768})
+    made = scenario(spindle_encoder={"revolutions": 3.0}, recorder={"chunk_size": 12288})
     harness.run(made, bag=tmp_path / "bag")
     data = mcap_of(tmp_path / "bag").read_bytes()
     ends = chunk_ends(data)
@@ -202,6 +202,34 @@ def test_each_flaw_is_named(tmp_path, change, code, said):
     found = lathe("bag", "check", tmp_path / "bag")
     assert found.exit_code == code
     assert said in found.stdout
+
+
+@pytest.mark.parametrize("flushed", [True, False])
+def test_what_the_disk_does_not_take_is_told_with_the_chunk_or_flush(tmp_path, flushed):
+    """And the bag says of itself what is in it: all before, nothing after."""
+    writer = BagWriter(tmp_path / "bag", compression="none", chunk_size=4096, about={})
+    writer.add_topic("/said", messages.EVENT, offered_qos(10, "volatile"))
+    told = 0
+
+    def fill():
+        nonlocal told
+        while told < 1000:
+            writer.write("/said", 10**9 + told, bytes(1000))
+            if flushed:
+                writer.flush()
+            told += 1
+
+    why = r"bag: cannot write \(File too large\); what was recorded before is readable"
+    with files_up_to(2**16), pytest.raises(LatheError, match=why):
+        fill()
+    writer.write("/said", 2 * 10**9, bytes(1000))
+    with pytest.raises(LatheError, match=why):
+        writer.close()
+    with AnyReader([tmp_path / "bag"]) as found:
+        stamps = [stamp for _, stamp, _ in found.messages()]
+        assert found.message_count == len(stamps)
+    assert stamps == list(range(10**9, 10**9 + len(stamps)))
+    assert len(stamps) == told if flushed else 0 < told - len(stamps) <= 10
 
 
 # --- what nobody should be trusted with

@@ -4,7 +4,6 @@
 import errno
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -13,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from cells import scenario
+from cells import files_up_to, scenario
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -458,21 +457,14 @@ def test_full_disk_fails_by_name(tmp_path):
     for _ in range(1000):
         feed.row()
     snapshot = feed.snapshots.trigger("test")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     why = rf"{snapshot.path}: cannot write \({os.strerror(errno.EFBIG)}\); what was recorded before is readable"
 
     def fill():
         for _ in range(1000):
             feed.row()
 
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (2**19, before[1]))
-        with pytest.raises(LatheError, match=why):
-            fill()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, handler)
+    with files_up_to(2**19), pytest.raises(LatheError, match=why):
+        fill()
     with pytest.raises(LatheError, match=why):
         feed.snapshots.close()
     assert read(snapshot.path)
