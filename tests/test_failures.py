@@ -168,8 +168,10 @@ def told_after_the_death_of(node, bag):
 def test_without_the_harness_every_process_of_a_cell_that_lost_a_member_says_so_by_its_exit_code(tmp_path):
     told = told_after_the_death_of("tool", tmp_path / "bag")
     codes = {event["node"]: event["code"] for event in told if event["event"] == "exit"}
-    assert codes.pop("tool") == -signal.SIGKILL
-    assert set(codes.values()) == {LatheError.exit_code}
+    # Who is killed may take a lock of DDS with it: whoever that holds up is killed and named.
+    held_up = {event["node"] for event in told if event["event"] == "stuck"}
+    assert {name for name, code in codes.items() if code == -signal.SIGKILL} == {"tool"} | held_up
+    assert {code for code in codes.values() if code != -signal.SIGKILL} == {LatheError.exit_code}
     assert check(tmp_path / "bag").exit_code == 3, "what the tool published is held"
 
 
