@@ -68,7 +68,8 @@ class BlockQueue:
             and the first to come if there is none.
         inside: its blocks are handed over in this process.
         received: blocks so far, those that were lost included.
-        end: index after the newest sample.
+        end: index after the newest sample, with which the next block has to begin unless it is `open`.
+        open: it is not known yet with which sample its blocks begin.
         ended: the last block has come.
         lost: blocks that never came; always 0 unless the cell is free-running.
         repeats: blocks may come twice: their source may be another process that goes on in its place.
@@ -79,7 +80,7 @@ class BlockQueue:
         self.topic, self.type = topic, msgtype
         self.blocks: deque[Block] = deque()
         self.source = ""
-        self.inside = self.ended = False
+        self.open, self.inside, self.ended = True, False, False
         self.received = self.lost = self.end = 0
         self.held_from: int | None = None
         self._decoder = Decoder(msgtype, fields, self._admit)
@@ -88,20 +89,14 @@ class BlockQueue:
         self._free_running = not parameters.window
         self.repeats = False
         self._limit = 8 * signal_depth(parameters)
-        self._expected: int | None = None
         self._newest: Block | None = None
 
     def expect(self, source: str, first: int | None = 0) -> None:
         """Accept blocks of this node alone, from a sample on; None: whichever comes first."""
-        self.source, self._expected = source, first
+        self.source, self.open = source, first is None
         self.blocks.clear()
         self.received = self.lost = 0
         self.end, self.ended, self._newest = first or 0, False, None
-
-    @property
-    def open(self) -> bool:
-        """Whether it is open with which sample its blocks begin."""
-        return self._expected is None
 
     def _admit(self, run_id: str, source: str) -> None:
         """Refuse who does not belong."""
@@ -134,16 +129,12 @@ class BlockQueue:
         Raises:
             LatheError: see `add`.
         """
-        block = run.block
-        if block.first_index != self._expected or len(self.blocks) >= self._limit:
+        if self.open or run.block.first_index != self.end:
             for each in run.blocks(self._size):
                 self.accept(each)
             return
         # What else is checked cannot differ from block to block of a node in this process.
-        self._expected = self.end = block.first_index + block.samples
-        self._newest, self.ended = block, block.last
-        self.received += len(run.companions)
-        self.blocks.append(block)
+        self._append(run.block, len(run.companions))
 
     def accept(self, block: Block) -> Block | None:
         """Check a block and queue it; see `add`."""
@@ -154,23 +145,22 @@ class BlockQueue:
             raise LatheError(
                 f"{self.topic}: {block.source} sends {block.samples} samples in a block; expected {self._size} at most"
             )
-        if self._expected is None:
-            self.source, self._expected = block.source, block.first_index
-        if self.repeats and block.first_index + block.samples <= self._expected:
+        if self.open:
+            self.source, self.end, self.open = block.source, block.first_index, False
+        if self.repeats and block.first_index + block.samples <= self.end:
             return None
-        if block.first_index != self._expected:
-            self._gap(block, self._expected)
+        if block.first_index != self.end:
+            self._gap(block, self.end)
         return self._append(block)
 
     def state(self) -> tuple[int, int, list[Block], Block | None]:
         """What another process needs to go on: next sample, blocks received, those that wait, and the newest."""
-        return self._expected or 0, self.received, list(self.blocks), self._newest
+        return self.end, self.received, list(self.blocks), self._newest
 
     def resume(self, source: str, state: tuple[int, int, list[Block], Block | None]) -> None:
         """Go on from the state of another process; what comes from before it is a repeat."""
         self.end, self.received, waiting, self._newest = state
-        self._expected = self.end
-        self.blocks = deque(waiting)
+        self.open, self.blocks = False, deque(waiting)
         self.ended = self._newest is not None and self._newest.last
         self.source, self.repeats = source, True
 
@@ -182,13 +172,13 @@ class BlockQueue:
             newest: the newest block with all its fields; None: with those that are read.
         """
         newest = newest or self._newest or self._zero()
-        self.held_from = self._expected or 0
+        self.held_from = self.end
         for block in self._held(newest, self.held_from, end):
             block.last = block.first_index + block.samples == end
             self.blocks.append(block)
             self.received += 1
-        self._expected = self.end = max(end, self.held_from)
-        self.ended = True
+        self.end = max(end, self.held_from)
+        self.open, self.ended = False, True
 
     def _zero(self) -> Block:
         """A block that stands for those before the first."""
@@ -209,10 +199,11 @@ class BlockQueue:
                 last=False,
             )
 
-    def _append(self, block: Block) -> Block:
-        self._expected = self.end = block.first_index + block.samples
+    def _append(self, block: Block, count: int = 1) -> Block:
+        """Queue a block, or so many in one piece."""
+        self.end = block.first_index + block.samples
         self._newest, self.ended = block, block.last
-        self.received += 1
+        self.received += count
         self.blocks.append(block)
         if len(self.blocks) > self._limit:
             raise LatheError(f"{self.topic}: {len(self.blocks)} blocks wait; the node cannot keep up")
