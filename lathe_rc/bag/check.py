@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.bag import story
-from lathe_rc.bag.snapshot import span_of
+from lathe_rc.bag.snapshot import first_sample, span_of
 from lathe_rc.bag.source import Source
 from lathe_rc.cell import messages
 from lathe_rc.cell.recording import Digester, SparseTopic
@@ -112,8 +112,7 @@ def check(path: Path) -> Findings:
     sparse: dict[str, SparseTopic] = {}
     with Source(path) as source:
         types = {topic: said.type for topic, said in source.topics.items()}
-        part = span_of(source.about)
-        findings.first = part[0] if part else 0
+        part, findings.first = span_of(source.about), first_sample(source.about)
         dense = {t: _Dense(t, k, findings, digester) for t, k in types.items() if k in messages.block_types()}
         sparse = {topic: SparseTopic() for topic, kind in types.items() if kind in messages.sparse_types()}
         counts = dict.fromkeys(types, 0)

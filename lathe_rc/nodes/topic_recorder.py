@@ -63,7 +63,7 @@ class TopicRecorder:
         self._continuity: dict[str, Continuity] = {}
         self._refused: dict[str, str] = {}  # topic -> why it is not recorded
         self._present: set[str] = set()  # topics that may have begun before the recording
-        self._settled, self._looks = False, 0
+        self._looks = 0
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._newest = self._flushed = time.monotonic()
@@ -91,11 +91,10 @@ class TopicRecorder:
     def _discover(self) -> None:
         """Subscribe to what has appeared; with simulated time, to /clock before anything else."""
         graph = self._graph()
-        if not self._settled:
+        if self._looks <= _LOOKS:
             self._present |= graph.keys()
             self._looks += 1
             if self._looks > _LOOKS:
-                self._settled = True
                 self._node.get_logger().info("recording; what begins from now on is heard from its first message on")
         if self._parameters.sim_time and _CLOCK not in self._inlets:
             if _CLOCK in graph:
