@@ -186,9 +186,9 @@ def _events(result: harness.Result) -> RichTable:
     table = RichTable(show_edge=False, header_style="bold")
     for column in ("time [s]", "topic", "what happened"):
         table.add_column(Text(column), justify="left" if table.columns else "right", overflow="fold")
-    rows: list[tuple[str, str, str]] = []
+    step, rows = result.scenario.shared.step, list[tuple[str, str, str]]()
     for _, run in groupby(result.happened, lambda found: (found.topic, found.text.partition(":")[0])):
-        alike = [(f"{found.time:.6g}", found.topic, found.text) for found in run]
+        alike = [(f"{found.sample * step:.6g}", found.topic, found.text) for found in run]
         rows += alike if len(alike) < _ALIKE else [alike[0], ("", "", f"{len(alike) - 2} more of the kind"), alike[-1]]
     if (left := len(rows) - _MOST_EVENTS) > 0:
         rows[_MOST_EVENTS:] = [("", "", f"and {left} more: see --json, or the bag's report")]

@@ -19,13 +19,11 @@ class Happening:
 
     Attributes:
         sample: from which on.
-        time: of that sample [s].
         topic: on which it was said.
         text: what.
     """
 
     sample: int
-    time: float
     topic: str
     text: str
 
@@ -40,7 +38,7 @@ def listed(recording: Recording, step: float) -> list[Happening]:
         for place, stamp in enumerate(said.stamps):
             values = {name: column[place] for name, column in said.values.items()}
             sample = round((stamp - messages.START_NS) * 1e-9 / step)
-            found.append(Happening(sample, sample * step, topic, text(Sparse(topic, kind, sample, values))))
+            found.append(Happening(sample, topic, text(Sparse(topic, kind, sample, values))))
     return sorted(found, key=lambda happening: happening.sample)
 
 

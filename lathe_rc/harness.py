@@ -21,7 +21,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -131,7 +131,7 @@ class Result:
 
     def summary(self) -> dict[str, object]:
         """What ``lathe run --json`` prints."""
-        errors = self.errors
+        errors, step = self.errors, self.scenario.shared.step
 
         def of(revolution: int) -> dict[str, Any] | None:
             return part.numbers(self.part, revolution) if errors.rms.size else None
@@ -146,7 +146,10 @@ class Result:
             "blocks": self.blocks,
             "dropped": self.dropped,
             "refused": dict(self.refused),
-            "events": [asdict(happening) for happening in self.happened],
+            "events": [
+                {"sample": found.sample, "time": found.sample * step, "topic": found.topic, "text": found.text}
+                for found in self.happened
+            ],
             "not_reached": {node: list(events) for node, events in self.not_reached.items()},
             "error_um": {
                 "first": of(0),

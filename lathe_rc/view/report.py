@@ -246,7 +246,7 @@ def _events(told: Gathered) -> Grid | None:
     if not told.curves.events:
         return None
     rows: list[Sequence[str]] = [
-        [printable(event.topic), str(event.index), _number(event.index * told.step_ns * 1e-9), printable(event.action)]
+        [printable(event.topic), str(event.sample), _number(event.sample * told.step_ns * 1e-9), printable(event.text)]
         for event in told.curves.events
     ]
     if told.curves.event_count > len(rows):

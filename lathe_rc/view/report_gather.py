@@ -16,7 +16,7 @@ from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError
-from lathe_rc.happened import HAPPENED
+from lathe_rc.happened import HAPPENED, Happening
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_host import TYPES as HOST_TYPES
 from lathe_rc.view.report_host import Host
@@ -57,15 +57,6 @@ class Tally:
         return (self.count - 1) / (span * 1e-9) if span > 0 else np.nan
 
 
-@dataclass(frozen=True)
-class Event:
-    """Something that took effect at a sample."""
-
-    topic: str
-    index: int
-    action: str
-
-
 class Curves:
     """Signals and cycles to be drawn; a sink, see `lathe_rc.cell.engine.Sink`.
 
@@ -84,7 +75,7 @@ class Curves:
             for name in names
         }
         self.cycles = {(topic, name): Envelope() for kind, name in _CYCLES.items() for topic in of_type(types, kind)}
-        self.events: list[Event] = []
+        self.events: list[Happening] = []
         self.event_count = 0
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
@@ -97,7 +88,7 @@ class Curves:
             if self._types[topic] in HAPPENED:
                 self.event_count += len(found)
                 room = max(0, _MOST_EVENTS - len(self.events))
-                self.events += [Event(topic, event.index, happened.text(event)) for event in found[:room]]
+                self.events += [Happening(event.index, topic, happened.text(event)) for event in found[:room]]
 
 
 def of_type(types: Mapping[str, str], kind: str) -> list[str]:
