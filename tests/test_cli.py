@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from lathe_rc import harness
 from lathe_rc.cell.scenario import TABLES, load
-from lathe_rc.cli import main
+from lathe_rc.cli import COMMANDS, main
 
 CELL = """
 /spindle_encoder: {ros__parameters: {revolutions: 3.0}}
@@ -295,3 +295,20 @@ def test_summary_of_a_failed_learning_is_json_too():
     error = told("cell.yaml", *forced, "--revolutions", "60")["error_um"]
     assert all(math.isfinite(rms) for rms in error["per_revolution_rms"])
     assert np.max(error["per_revolution_rms"]) > 100
+
+
+# --- what it imports
+
+
+def test_commands_are_listed_without_being_imported():
+    code = "import sys; from lathe_rc.cli import main; main(['--help'], standalone_mode=False); print(*sys.modules)"
+    listed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    *text, modules = listed.splitlines()
+    ours = {module for module in modules.split() if module.partition(".")[0] in ("lathe_rc", "numpy", "numba", "rich")}
+    assert ours == {"lathe_rc", "lathe_rc.cli", "lathe_rc.errors"}
+    assert not [line for line in text if line.endswith("...")]  # each summary fits into its line
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_that_is_listed_exists(name):
+    assert lathe(name, "--help").stdout.startswith(f"Usage: main {name}")

@@ -18,6 +18,7 @@ from lathe_rc.cell import ros_yaml, scenario
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.commands.run import run
 from lathe_rc.errors import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -129,7 +130,7 @@ class TestPages:
     def test_commands_have_options_that_exist(self, page: Path) -> None:
         for line in _RUN.findall(page.read_text(encoding="utf-8")):
             words = [word for word in line.split("|")[0].split("#")[0].split() if word.startswith("--")]
-            known = {option for parameter in cli.run.params for option in parameter.opts}
+            known = {option for parameter in run.params for option in parameter.opts}
             assert set(words) <= known, line
 
 

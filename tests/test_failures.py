@@ -16,12 +16,13 @@ from cells import told_until_all_have_ended
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from lathe_rc import cli, harness
+from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
 from lathe_rc.bag.resim import resimulate
 from lathe_rc.cell import messages
 from lathe_rc.cell.scenario import load
+from lathe_rc.commands.progress import TROUBLE
 from lathe_rc.errors import InputError, LatheError
 
 CONFIG = Path(__file__).parents[1] / "config"
@@ -257,7 +258,7 @@ def test_who_crashes_while_leaving_a_complete_run_is_named_and_nothing_is_lost(t
         processes.wait_for_end(told.append)
         thread.join()
     (end,) = [event for event in told if event["event"] == "exit" and event["code"]]
-    assert cli._TROUBLE["exit"](end) == "crashed was killed by SIGSEGV"
+    assert TROUBLE["exit"](end) == "crashed was killed by SIGSEGV"
 
 
 def test_a_bag_that_is_closed_makes_no_safe_state_a_success(tmp_path):

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run gave, as tables and lines for the terminal."""
+
+from collections.abc import Mapping
+from itertools import groupby
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from lathe_rc import harness, part
+
+_MOST_EVENTS = 12  # that are told of a run
+_ALIKE = 4  # of them that follow one another: those in between are left out
+
+
+def table(result: harness.Result) -> RichTable:
+    """The part in its first and last revolution."""
+    table = RichTable(show_edge=False, header_style="bold", title_justify="left")
+    columns = {"rms": "RMS [µm]", "max": "maximum [µm]", "peak_to_valley": "peak to valley [µm]", "ront": "RONt [µm]"}
+    for column in ("", *columns.values()):
+        table.add_column(column, justify="right" if column else "left")
+    for label, revolution in (("first revolution", 0), ("last revolution", -1)):
+        told = part.numbers(result.part, revolution)
+        table.add_row(label, *(f"{told[name]:#.4g}" for name in columns))
+    return table
+
+
+def _events(result: harness.Result) -> RichTable:
+    """What happened, as far as there is room; of equal ones that follow one another the first and the last."""
+    table = RichTable(show_edge=False, header_style="bold")
+    for column in ("time [s]", "topic", "what happened"):
+        table.add_column(Text(column), justify="left" if table.columns else "right", overflow="fold")
+    step, rows = result.scenario.shared.step, list[tuple[str, str, str]]()
+    for _, run in groupby(result.happened, lambda found: (found.topic, found.text.partition(":")[0])):
+        alike = [(f"{found.sample * step:.6g}", found.topic, found.text) for found in run]
+        rows += alike if len(alike) < _ALIKE else [alike[0], ("", "", f"{len(alike) - 2} more of the kind"), alike[-1]]
+    if (left := len(rows) - _MOST_EVENTS) > 0:
+        rows[_MOST_EVENTS:] = [("", "", f"and {left} more: see --json, or the bag's report")]
+    for row in rows:
+        table.add_row(*map(Text, row))
+    return table
+
+
+def facts(result: harness.Result) -> list[str]:
+    """What was sent and lost, how fast, and who was refused."""
+    refused = [f"{count} messages refused from {sender}" for sender, count in result.refused.items()]
+    return [
+        f"{result.blocks} blocks sent, {result.dropped} lost; {result.errors.rms.size} revolutions",
+        f"{result.simulated_s:.2f} s simulated in {result.wall_s:.2f} s: {result.real_time_factor:.1f}x real time",
+        *refused,
+    ]
+
+
+def show(result: harness.Result, further: Mapping[str, Path], *, told: str = "") -> None:
+    """Print a run: its part, what happened, how it went, and the files that it left."""
+    console = Console()
+    if result.errors.rms.size:
+        console.print(table(result))
+    if result.happened:
+        console.print(_events(result))
+    for fact in [*facts(result), *filter(None, [told])]:
+        console.print(fact, highlight=False)
+    files = [("bag", result.bag), *(("snapshot", path) for path in result.snapshots), *further.items()]
+    for name, path in files:
+        if path:
+            console.print(f"{name}: {path}", highlight=False, soft_wrap=True)

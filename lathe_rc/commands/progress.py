@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The progress of a run, shown while it goes on."""
+
+import signal
+import time
+from collections.abc import Callable
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from lathe_rc import harness
+
+_REFRESH = 0.1  # [s] between updates of the progress line
+_LOG_PERIOD = 2.0  # [s] between lines where there is no terminal
+
+
+class Watch:
+    """Shows a run's progress on the error stream."""
+
+    def __init__(self, console: Console) -> None:
+        self._step = 0.0
+        self._start = time.monotonic()
+        self._due = {"progress": 0.0, "cycle": 0.0}
+        self._silent = ""  # who was said to be
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[revolution]}  {task.fields[error]}  {task.fields[factor]}"),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("starting", total=None, revolution="", error="", factor="")
+
+    def __enter__(self) -> Callable[[harness.Event], None]:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.stop()
+
+    def _log(self, event: harness.Event, now: float) -> None:
+        """Without a terminal, a line now and then."""
+        if event["event"] == "cycle" and now >= self._due["cycle"]:
+            self._due["cycle"] = now + _LOG_PERIOD
+            error = f"error {event['rms_error'] * 1e6:.3g} µm RMS"
+            self._bar.console.print(f"revolution {event['cycle']:.0f}: {error}", highlight=False)
+
+    def __call__(self, event: harness.Event) -> None:
+        """Take an event of the run."""
+        kind, update = event["event"], self._bar.update
+        now = time.monotonic()
+        if kind in TROUBLE and (text := TROUBLE[kind](event)):
+            self._bar.console.print(text)
+        if self._bar.disable:
+            self._log(event, now)
+            return
+        if kind in ("progress", "cycle"):
+            if now < self._due[kind]:
+                return  # nobody reads faster, and drawing would slow an offline run down
+            self._due[kind] = now + _REFRESH
+        if kind == "checked":
+            # Not before: a refusal is one line and nothing else.
+            self._step = event["step"]
+            update(self._task, total=event["samples"])
+            self._bar.start()
+        elif kind == "block0":
+            self._start = now
+            update(self._task, description="turning")
+        elif kind == "progress":
+            self._silent = ""
+            simulated = event["samples"] * self._step
+            elapsed = max(now - self._start, 1e-9)
+            update(self._task, completed=event["samples"], factor=f"{simulated / elapsed:.1f}x real time")
+        elif kind == "cycle":
+            update(
+                self._task,
+                revolution=f"revolution {event['cycle']:.0f}",
+                error=f"error {event['rms_error'] * 1e6:.3g} µm RMS",
+            )
+        elif kind == "stall" and event["member"] != self._silent:
+            self._silent = event["member"]  # every other member tells of a silent time master
+            self._bar.console.print(f"{event['member']} is silent at block {event['blocks']}: the cell stands still")
+
+
+TROUBLE: dict[str, Callable[[harness.Event], str]] = {
+    "stuck": lambda event: f"{event['node']} did not end{event['place']}; the bag is closed: no longer waited for",
+    "stranger": lambda event: (
+        f"{event['node']} refuses: {event['message']}; publishers: {', '.join(event['publishers'])}"
+    ),
+    "dead": lambda event: (
+        f"{event['member']} has died at block {event['blocks']}: "
+        + ("another process goes on in its place" if event["restarts"] else "the cell goes to its safe state")
+    ),
+    "exit": lambda event: harness.how_it_ended(event) if event["code"] < 0 else "",
+    "stopped": lambda event: (
+        f"{event['node']} has been stopped ({signal.Signals(event['signal']).name}): the cell "
+        + ("waits for it" if event["waits"] else "goes to its safe state, if it does not go on in time")
+    ),
+    "not_reached": lambda event: f"{event['node']}: the run ends before {'; '.join(event['events'])}",
+    "safe": lambda event: f"{event['why']}; the run ends at sample {event['end']}",
+}  #: what is said of an event in any case
