@@ -22,12 +22,12 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Literal
 
-from lathe_rc import part
+from lathe_rc import part, starting
 from lathe_rc.analysis.metrology import FormErrors, Measurement, form_errors
 from lathe_rc.bag import reader, recover
 from lathe_rc.bag.check import write_digests
@@ -46,7 +46,8 @@ from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.happened import Happening, listed
 from lathe_rc.namespace import absolute, checked
 from lathe_rc.nodes import leftovers
-from lathe_rc.nodes.report import THROUGHPUT, VARIABLE
+from lathe_rc.nodes.report import THROUGHPUT
+from lathe_rc.starting import Child, Start
 
 Mode = Literal["offline", "composed", "processes"]
 Event = Mapping[str, Any]
@@ -185,6 +186,7 @@ def run(
     watch: Callable[[Event], None] = _ignore,
     domain: int | None = None,
     namespace: str = "/",
+    start: Start = "fork",
 ) -> Result:
     """Run a scenario to its end.
 
@@ -199,19 +201,23 @@ def run(
             run's samples and step [s]: from then on nothing is refused.
         domain: ROS domain; None: a free one.
         namespace: ROS namespace of the cell: two cells with one each can share a domain.
+        start: ``fork``: processes are copies of one that has imported what they need; ``spawn``: interpreters of
+            their own.
 
     Raises:
         InputError: the scenario cannot work, or the bag's folder exists.
         LatheError: a node failed or was killed; the bag, if one was asked for, is readable.
         LossyRunError: a free-running cell lost blocks.
     """
+    if mode != "offline" and start == "fork":
+        starting.server().preload()  # meanwhile the cell is checked
     cell = Cell(scenario.nodes)
     cell.check()
     if cell.master.samples is None:
         raise InputError(f"{cell.master.name}.revolutions = 0; the run needs an end: allowed above 0")
     if bag is not None:
         refuse_existing(bag)
-    result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace))
+    result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace), start)
     if result.bag is not None:
         write_digests(result.bag, result.digest)
     return result
@@ -226,6 +232,7 @@ def _run(
     watch: Callable[[Event], None],
     domain: int | None,
     namespace: str,
+    start: Start,
 ) -> Result:
     assert cell.master.samples is not None
     watch({"event": "checked", "node": cell.master.name, "samples": cell.master.samples, "step": scenario.shared.step})
@@ -239,7 +246,7 @@ def _run(
             place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-"))) / "bag"
         complete = with_recorder(scenario, place, keep=bag is not None, snapshots=folder)
         split = [list(complete.nodes)] if mode == "composed" else complete.processes(groups)
-        processes = stack.enter_context(Processes(complete, split, domain=domain, namespace=namespace))
+        processes = stack.enter_context(Processes(complete, split, domain=domain, namespace=namespace, start=start))
         try:
             events = processes.wait_for_end(watch)
         except BaseException:
@@ -352,7 +359,9 @@ class Processes:
         groups: names of the nodes in each process.
         domain: ROS domain; None: a free one.
         namespace: ROS namespace of all nodes.
-        prefix: words that run a command somewhere else, as those of ``ip netns exec``, by the first node of a process.
+        start: see `run`.
+        prefix: words that run a command somewhere else, as those of ``ip netns exec``, by the first node of a process,
+            which is then an interpreter of its own.
 
     Attributes:
         pids: process of each node.
@@ -368,13 +377,14 @@ class Processes:
         *,
         domain: int | None = None,
         namespace: str = "/",
+        start: Start = "fork",
         prefix: Mapping[str, Sequence[str]] = MappingProxyType({}),
     ) -> None:
         self._scenario, self._groups, self._wanted_domain = scenario, groups, domain
-        self._namespace, self._prefix = namespace, prefix
+        self._namespace, self._fresh, self._prefix = namespace, start == "spawn", prefix
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._stack = contextlib.ExitStack()
-        self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._children: dict[str, Child] = {}
         self._threads: list[threading.Thread] = []
         self._abandoned: set[str] = set()
         self._ended: set[str] = set()
@@ -408,43 +418,39 @@ class Processes:
         self.stop()
 
     def _start(self, group: Sequence[str]) -> None:
-        members = [f"{name}:{self._scenario.kind(name)}" for name in group]
-        ours, theirs = socket.socketpair()
-        environment = os.environ | {
-            VARIABLE: str(theirs.fileno()),
-            "ROS_DOMAIN_ID": str(self.domain),
-            "ROS_LOG_DIR": str(self._folder),
-        }
+        environment = os.environ | {"ROS_DOMAIN_ID": str(self.domain), "ROS_LOG_DIR": str(self._folder)}
         if all(getattr(table, "speed_factor", 0.0) == 0.0 for table in self._scenario.nodes.values()):
             environment[THROUGHPUT] = "1"
         name = "+".join(group)
-        with (self._folder / f"{group[0]}.log").open("ab") as log:
-            child = subprocess.Popen(
-                [
-                    *self._prefix.get(group[0], ()),
-                    *(sys.executable, "-m", "lathe_rc.nodes.container", *members),
-                    *("--ros-args", "--params-file", str(self._file), "-r", f"__ns:={self._namespace}"),
-                    *("--enclave", absolute(self._namespace, group[0])),
-                ],
-                env=environment,
-                pass_fds=(theirs.fileno(),),
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
+        arguments = [
+            *(f"{node}:{self._scenario.kind(node)}" for node in group),
+            *("--ros-args", "--params-file", str(self._file), "-r", f"__ns:={self._namespace}"),
+            *("--enclave", absolute(self._namespace, group[0])),
+        ]
+        ours, theirs = socket.socketpair()
+        with theirs, (self._folder / f"{group[0]}.log").open("ab") as log:
+            child = starting.server().start(
+                arguments,
+                environment=environment,
+                report=theirs,
+                log=log.fileno(),
+                changed=partial(self._changed, name),
+                command=self._command(group[0], arguments),
             )
-        theirs.close()
         self._children[name] = child
         for node in group:
             self.pids[node] = child.pid
-        for thread in (
-            threading.Thread(target=self._listen, args=(name, ours, child), daemon=True),
-            threading.Thread(target=self._follow, args=(name, child), daemon=True),
-        ):
-            thread.start()
-            self._threads.append(thread)
+        listener = threading.Thread(target=self._listen, args=(name, ours, child), daemon=True)
+        listener.start()
+        self._threads.append(listener)
 
-    def _listen(self, name: str, line: socket.socket, child: subprocess.Popen[bytes]) -> None:
+    def _command(self, first: str, arguments: Sequence[str]) -> list[str]:
+        """What starts a process as an interpreter of its own; nothing where it is to be forked."""
+        prefix = self._prefix.get(first, ())
+        words = [*prefix, sys.executable, "-m", "lathe_rc.nodes.container", *arguments]
+        return words if prefix or self._fresh else []
+
+    def _listen(self, name: str, line: socket.socket, child: Child) -> None:
         """Turn a process's reports, and its end, into events."""
         with line, line.makefile("r", encoding="utf-8") as reports:
             with contextlib.suppress(OSError):
@@ -457,21 +463,13 @@ class Processes:
         """An event of the harness's own, as nodes report theirs."""
         self._events.put({"event": event, "node": name, "monotonic_ns": time.monotonic_ns(), **values})
 
-    def _follow(self, name: str, child: subprocess.Popen[bytes]) -> None:
-        """Turn into events that a process is stopped by a signal, and continued.
+    def _changed(self, name: str, state: str, number: int) -> None:
+        """Turn into an event that a process has been stopped by a signal, or continued.
 
         A process that is stopped with a lock of DDS in its hands holds up all who send to it, the time master among
         them: then nobody else can say so.
         """
-        changes = os.WSTOPPED | os.WCONTINUED
-        with contextlib.suppress(ChildProcessError):  # it has ended
-            while True:
-                ahead = os.waitid(os.P_PID, child.pid, changes | os.WEXITED | os.WNOWAIT)
-                if ahead is None or ahead.si_code in (os.CLD_EXITED, os.CLD_KILLED, os.CLD_DUMPED):
-                    return  # that is for who waits for its end
-                if change := os.waitid(os.P_PID, child.pid, changes | os.WNOHANG):
-                    kind = "continued" if change.si_code == os.CLD_CONTINUED else "stopped"
-                    self._say(kind, name, signal=change.si_status, waits=self._waits)
+        self._say(state, name, signal=number, waits=self._waits)
 
     def events(self, silence: float) -> Iterator[Event]:
         """Events as they come.

@@ -29,7 +29,7 @@ from lathe_rc.nodes.shell import CellNode
 from lathe_rc.nodes.spindle_node import SpindleNode
 from lathe_rc.nodes.stage_node import StageNode
 
-_PR_SET_TIMERSLACK = 29  # from <linux/prctl.h>
+_PR_SET_NAME, _PR_SET_TIMERSLACK = 15, 29  # from <linux/prctl.h>
 _LONGEST_BURST = 0.02  # [s] of taking messages until nodes compute
 _LONGEST_WAIT = 0.1  # [s] until signals and the harness are looked at again
 
@@ -134,8 +134,9 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
         _work(nodes, stop, due)
 
 
-def _tune() -> None:
-    """Let the operating system wake this process as a cell needs it; none of it needs privileges."""
+def _tune(name: str) -> None:
+    """Let the operating system call this process by a name, and wake it as a cell needs it; without privileges."""
+    ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
     # Waits end when they should, not up to 50 µs later: the executor's empty looks are waits as well.
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     if THROUGHPUT in os.environ:
@@ -155,7 +156,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
     """
     faulthandler.enable()  # a crash of a library leaves where it happened in the log
     faulthandler.register(signal.SIGUSR1)  # and the harness can ask where a silent process is
-    _tune()
+    _tune(members[0][0])
     reporter = Reporter()
     dds.settle()
     np.seterr(over="ignore", invalid="ignore")  # each node names its own numbers that are not finite

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Starting processes by way of a fork server, see `lathe_rc.nodes.fork_server`; this module imports no ROS."""
+
+import atexit
+import contextlib
+import json
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Literal
+
+from lathe_rc.errors import LatheError
+
+Start = Literal["fork", "spawn"]  #: of a process: as a copy of one that has imported everything, or from nothing
+Change = Callable[[str, int], None]
+
+_MOST = 2**16  # [B] of an answer
+_PATIENCE = 5.0  # [s] for the server to leave
+
+
+class Child:
+    """A process that the fork server has started; its methods are those of `subprocess.Popen`.
+
+    Args:
+        pid: its number.
+        descriptor: its pidfd.
+        changed: called with ``stopped`` or ``continued`` and the number of the signal, from a thread.
+
+    Attributes:
+        returncode: as that of `subprocess.Popen`.
+    """
+
+    def __init__(self, pid: int, descriptor: int, changed: Change) -> None:
+        self.pid = pid
+        self.returncode: int | None = None
+        self._descriptor, self._changed = descriptor, changed
+        self._ended = threading.Event()
+        self._lock = threading.Lock()
+
+    def poll(self) -> int | None:
+        """Its exit code once it has ended."""
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end.
+
+        Raises:
+            subprocess.TimeoutExpired: it has not ended in ``timeout`` seconds.
+        """
+        if not self._ended.wait(timeout):
+            raise subprocess.TimeoutExpired(str(self.pid), timeout or 0.0)
+        assert self.returncode is not None
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal, unless it has ended."""
+        with self._lock, contextlib.suppress(ProcessLookupError):
+            if self.returncode is None:
+                signal.pidfd_send_signal(self._descriptor, number)
+
+    def kill(self) -> None:
+        """Send SIGKILL."""
+        self.send_signal(signal.SIGKILL)
+
+    def note(self, state: str, code: int) -> None:
+        """Take what the server says of it."""
+        if state != "ended":
+            self._changed(state, code)
+            return
+        with self._lock:
+            self.returncode = code
+            os.close(self._descriptor)
+        self._ended.set()
+
+
+class ForkServer:
+    """A fork server of this process; it ends when this process does.
+
+    Attributes:
+        lost: it has ended before.
+    """
+
+    def __init__(self) -> None:
+        self._line, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "lathe_rc.nodes.fork_server", str(theirs.fileno())],
+                pass_fds=(theirs.fileno(),),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        self._children: dict[int, Child] = {}
+        self._started: queue.SimpleQueue[Child | None] = queue.SimpleQueue()
+        self._asking = threading.Lock()
+        self._changed: Change
+        self.lost = False
+        threading.Thread(target=self._listen, daemon=True).start()
+        atexit.register(self.close)
+
+    def preload(self) -> None:
+        """Import what nodes need, while this process does something else."""
+        with self._asking, contextlib.suppress(BrokenPipeError):
+            self._line.send(json.dumps({"preload": True}).encode())
+
+    def start(
+        self,
+        arguments: Sequence[str],
+        *,
+        environment: Mapping[str, str],
+        report: socket.socket,
+        log: int,
+        changed: Change,
+        command: Sequence[str] = (),
+    ) -> Child:
+        """Start a process in a session of its own, in this process's folder.
+
+        Args:
+            arguments: of `lathe_rc.nodes.container`, which it is to be.
+            environment: all of it.
+            report: where its `lathe_rc.nodes.report.Reporter` writes; the caller may close it then.
+            log: descriptor of a file for what it prints.
+            changed: see `Child`.
+            command: what it is to be instead.
+
+        Raises:
+            LatheError: the server has ended.
+        """
+        request = {
+            "arguments": list(arguments),
+            "environment": dict(environment),
+            "folder": str(os.getcwd()),  # noqa: PTH109 - a path that need not exist any more
+            "command": list(command),
+        }
+        with self._asking:
+            self._changed = changed
+            with contextlib.suppress(BrokenPipeError):
+                socket.send_fds(self._line, [json.dumps(request).encode()], [report.fileno(), log])
+            child = self._started.get()
+        if child is None:
+            raise LatheError("the process that starts the nodes has ended: see what it has written")
+        return child
+
+    def _listen(self) -> None:
+        """Hand on what the server says; without it nobody would know how its processes end, so they do."""
+        with contextlib.suppress(OSError):
+            while True:
+                told, descriptors, _, _ = socket.recv_fds(self._line, _MOST, 1)
+                if not told:
+                    break
+                change = json.loads(told)
+                pid, state = change["pid"], change["state"]
+                if state == "started":
+                    self._children[pid] = Child(pid, descriptors[0], self._changed)
+                    self._started.put(self._children[pid])
+                else:
+                    self._children[pid].note(state, change["code"])
+                if state == "ended":
+                    del self._children[pid]
+        self.lost = True
+        for child in self._children.values():
+            child.kill()
+            child.note("ended", -signal.SIGKILL)
+        self._started.put(None)
+
+    def close(self) -> None:
+        """End the server."""
+        with contextlib.suppress(OSError):
+            self._line.shutdown(socket.SHUT_RDWR)
+        self._process.wait(_PATIENCE)
+
+
+@cache
+def _server_of(_pid: int) -> ForkServer:
+    return ForkServer()
+
+
+def server() -> ForkServer:
+    """The fork server of this process, started when it is first needed."""
+    found = _server_of(os.getpid())
+    if found.lost:
+        _server_of.cache_clear()
+        found = _server_of(os.getpid())
+    return found
