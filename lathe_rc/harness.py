@@ -210,7 +210,9 @@ def run(
         LossyRunError: a free-running cell lost blocks.
     """
     if mode != "offline" and start == "fork":
-        starting.server().preload()  # meanwhile the cell is checked
+        starting.server().preload(
+            {name: (scenario.kind(name), table.model_dump()) for name, table in scenario.nodes.items()}
+        )  # meanwhile the cell is checked
     cell = Cell(scenario.nodes)
     cell.check()
     if cell.master.samples is None:

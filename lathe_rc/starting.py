@@ -104,10 +104,14 @@ class ForkServer:
         threading.Thread(target=self._listen, daemon=True).start()
         atexit.register(self.close)
 
-    def preload(self) -> None:
-        """Import what nodes need, while this process does something else."""
+    def preload(self, nodes: Mapping[str, tuple[str, Mapping[str, object]]]) -> None:
+        """Load what nodes need, while this process does something else.
+
+        Args:
+            nodes: kind and parameters of each.
+        """
         with self._asking, contextlib.suppress(BrokenPipeError):
-            self._line.send(json.dumps({"preload": True}).encode())
+            self._line.send(json.dumps({"preload": nodes}).encode())
 
     def start(
         self,

@@ -82,8 +82,8 @@ def serve(line: socket.socket) -> int:
             return 0
         request = json.loads(asked)
         if "preload" in request:
-            with contextlib.suppress(ImportError):  # whoever needs it says so
-                importlib.import_module(_NODES)
+            with contextlib.suppress(ImportError):  # a process that needs it says so
+                importlib.import_module(_NODES).preload(request["preload"])
             gc.collect()
             gc.freeze()  # the collector leaves alone what forked processes share with this one
             continue

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A process with one node or several: start, loop, signals, exit code."""
 
+import contextlib
 import ctypes
 import faulthandler
 import gc
@@ -8,8 +9,9 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import FrameType
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -19,6 +21,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
+from lathe_rc.cell.stage import compile_kernels
+from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import dds
@@ -188,6 +192,18 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
                 reporter("refused", node.get_name(), senders=node.strangers.senders)
         # The nodes are not destroyed: Fast DDS may wait for itself for ever while others are leaving, too.
         rclpy.try_shutdown()
+
+
+def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
+    """Load what nodes load when they are configured, above all their compiled kernels, for forked processes to share.
+
+    Args:
+        nodes: kind and parameters of each.
+    """
+    for name, (kind, values) in nodes.items():
+        with contextlib.suppress(LatheError):  # the node itself says what is wrong with its parameters
+            if kind in STAGES:
+                compile_kernels(STAGES[kind](name, TABLES[kind].read(name, values)))
 
 
 def split(arguments: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:
