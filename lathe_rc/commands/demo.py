@@ -4,11 +4,8 @@
 from pathlib import Path
 
 import click
-from rich.console import Console
 
-from lathe_rc.commands import outcome
-from lathe_rc.commands import scenario as options
-from lathe_rc.commands.run import run_shown
+from lathe_rc import starting
 
 _DEMOS = {
     "piston": (
@@ -31,21 +28,7 @@ def demo(name: str, revolutions: float, folder: Path) -> None:
 
     NAME is piston (one channel, the default) or two_channel (a piezo channel learns what the coarse one leaves).
     """
-    number = 1
-    while (folder / f"demo-{number}").exists():
-        number += 1
-    place = folder / f"demo-{number}"
-    announcement, title = _DEMOS[name]
-    scenario = options.load(name, [f"spindle_encoder.revolutions={revolutions!r}"])
-    console = Console()
-    console.print(announcement, highlight=False)
-    folder.mkdir(parents=True, exist_ok=True)
-    result = run_shown(scenario, mode="processes", groups=None, bag=place)
-    from lathe_rc.view import figure
+    starting.server().preload({})  # it imports while this process does
+    from lathe_rc.commands import running
 
-    picture = place.with_suffix(".png")
-    figure.save(picture, result.recording, result.errors, title)
-    console.print(outcome.table(result))
-    for fact in outcome.facts(result):
-        console.print(fact, highlight=False)
-    console.print(f"bag:    {place}\nfigure: {picture}", highlight=False, soft_wrap=True)
+    running.demo(name, *_DEMOS[name], revolutions, folder)

@@ -6,7 +6,8 @@ from pathlib import Path
 import click
 
 from lathe_rc import security
-from lathe_rc.commands import scenario as options
+from lathe_rc.commands import options
+from lathe_rc.commands import scenario as scenarios
 from lathe_rc.errors import InputError
 from lathe_rc.files import replacing
 
@@ -27,8 +28,8 @@ def policy(
     output: Path | None,
 ) -> None:
     """Make the SROS2 policy of a SCENARIO: an enclave for each process, the least that its nodes need."""
-    loaded = options.load(scenario, overrides)
-    split = options.split(loaded, groups)
+    loaded = scenarios.load(scenario, overrides)
+    split = scenarios.split(loaded, groups)
     made = security.policy(loaded, groups=split, namespace=namespace, beside=beside)
     text = security.to_xml(made, f"the scenario {loaded.name}")
     if output is None:

@@ -1,26 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scenario of a command: its argument and options, and how they are read."""
+"""The scenario of a command: how its argument and options are read."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
-import click
-
 from lathe_rc import resources
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import Scenario
-
-overrides = click.option(
-    "--set", "overrides", multiple=True, metavar="NODE.PARAM=VALUE", help="also PARAM=VALUE if shared"
-)
-
-groups = click.option(
-    "--group",
-    "groups",
-    multiple=True,
-    metavar="NODE+NODE",
-    help="nodes that share a process, instead of those that the scenario names; repeatable; none: one each",
-)
 
 
 def load(name: str, overrides: Sequence[str]) -> Scenario:

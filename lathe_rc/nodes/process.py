@@ -5,19 +5,22 @@ import contextlib
 import ctypes
 import faulthandler
 import gc
+import importlib
+import inspect
 import os
 import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from types import FrameType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import rclpy
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
+from rclpy.type_support import check_for_type_support
 
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
@@ -33,6 +36,10 @@ from lathe_rc.nodes.shell import CellNode
 from lathe_rc.nodes.spindle_node import SpindleNode
 from lathe_rc.nodes.stage_node import StageNode
 
+_MESSAGES = (  # what nodes send and offer, rclpy's own services among it
+    *("lathe_rc_msgs.msg", "lathe_rc_msgs.srv", "rcl_interfaces.msg", "rcl_interfaces.srv", "lifecycle_msgs.msg"),
+    *("lifecycle_msgs.srv", "diagnostic_msgs.msg", "rosgraph_msgs.msg", "type_description_interfaces.srv"),
+)
 _PR_SET_NAME, _PR_SET_TIMERSLACK = 15, 29  # from <linux/prctl.h>
 _LONGEST_BURST = 0.02  # [s] of taking messages until nodes compute
 _LONGEST_WAIT = 0.1  # [s] until signals and the harness are looked at again
@@ -200,6 +207,11 @@ def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
     Args:
         nodes: kind and parameters of each.
     """
+    inspect.getframeinfo(cast("FrameType", inspect.currentframe()))  # rclpy's first log message reads all modules
+    for package in _MESSAGES:
+        for found in vars(importlib.import_module(package)).values():
+            if isinstance(found, type):
+                check_for_type_support(found)
     for name, (kind, values) in nodes.items():
         with contextlib.suppress(LatheError):  # the node itself says what is wrong with its parameters
             if kind in STAGES:

@@ -20,10 +20,10 @@ from lathe_rc.signals.profile import (
     Piston,
     Polygon,
     Profile,
-    ProfileTable,
     deviation_along,
     height_along,
     read_csv,
+    tabulated,
 )
 
 
@@ -99,7 +99,7 @@ class Form:
     """
 
     def __init__(self, node: str, parameters: FormParameters) -> None:
-        self.profile = ProfileTable(parameters.form(node))
+        self.profile = tabulated(parameters.form(node))
         self._parameters = parameters
         self.inputs = [Input("encoder", messages.ENCODER, ("angle", "angle_true"))]
         if parameters.height_from == "slide":

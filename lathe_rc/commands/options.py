@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options that several commands have; to import them takes no more than click."""
+
+import click
+
+overrides = click.option(
+    "--set", "overrides", multiple=True, metavar="NODE.PARAM=VALUE", help="also PARAM=VALUE if shared"
+)
+
+groups = click.option(
+    "--group",
+    "groups",
+    multiple=True,
+    metavar="NODE+NODE",
+    help="nodes that share a process, instead of those that the scenario names; repeatable; none: one each",
+)
+
+start = click.option(
+    "--start",
+    type=click.Choice(["fork", "spawn"]),
+    help="processes are forked from one that has imported everything, or interpreters of their own; default: fork",
+)

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``lathe run`` and ``lathe demo`` do once their arguments are known and all is imported."""
+
+import json
+from pathlib import Path
+
+import click
+from rich.console import Console
+
+from lathe_rc import harness, part
+from lathe_rc.bag.record import recorder_of
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.commands import outcome
+from lathe_rc.commands import scenario as scenarios
+from lathe_rc.commands.progress import Watch
+from lathe_rc.errors import InputError
+from lathe_rc.starting import Start
+
+_NO_SNAPSHOTS = "no snapshots: no --bag was given"
+
+
+def _shown(
+    scenario: Scenario,
+    *,
+    mode: harness.Mode,
+    bag: Path | None,
+    groups: list[list[str]] | None = None,
+    domain: int | None = None,
+    namespace: str = "/",
+    start: Start = "fork",
+) -> harness.Result:
+    """Run a scenario and show its progress; the arguments are those of `lathe_rc.harness.run`."""
+    with Watch(Console(stderr=True)) as watch:
+        return harness.run(
+            scenario, mode=mode, groups=groups, bag=bag, watch=watch, domain=domain, namespace=namespace, start=start
+        )
+
+
+def run(
+    scenario: str,
+    mode: harness.Mode,
+    groups: tuple[str, ...],
+    revolutions: float | None,
+    speed_factor: float | None,
+    bag: Path | None,
+    profile: Path | None,
+    overrides: tuple[str, ...],
+    domain: int | None,
+    namespace: str | None,
+    start: Start | None,
+    *,
+    as_json: bool,
+) -> None:
+    """See `lathe_rc.commands.run`."""
+    loaded = scenarios.load(scenario, overrides)
+    asked = {"revolutions": revolutions, "speed_factor": speed_factor}
+    given = {name: value for name, value in asked.items() if value is not None}
+    changes = [f"{node}.{n}={v!r}" for node in loaded.of_kind(SpindleEncoder.kind) for n, v in given.items()]
+    if changes:
+        loaded = scenarios.load(scenario, [*overrides, *changes])
+    split = scenarios.split(loaded, groups)
+    if groups and mode != "processes":
+        raise InputError(f"--group with --mode {mode}; allowed: --mode processes")
+    for option, value in (("--domain", domain), ("--namespace", namespace), ("--start", start)):
+        if value is not None and mode == "offline":
+            raise InputError(f"{option} {value} with --mode offline; allowed: --mode processes or composed")
+    result = _shown(
+        loaded,
+        mode=mode,
+        groups=split,
+        bag=bag,
+        domain=domain,
+        namespace=namespace or "/",
+        start=start or "fork",
+    )
+    if profile:
+        part.write_profile(profile, result.recording, result.part, [result.errors.rms.size - 1])
+    if as_json:
+        click.echo(json.dumps(result.summary()))
+        return
+    asks_for_snapshots = recorder_of(loaded)[1].mode != "continuous"
+    told = _NO_SNAPSHOTS if asks_for_snapshots and not bag else ""
+    outcome.show(result, {"profile": profile} if profile else {}, told=told)
+
+
+def demo(name: str, announcement: str, title: str, revolutions: float, folder: Path) -> None:
+    """See `lathe_rc.commands.demo`."""
+    number = 1
+    while (folder / f"demo-{number}").exists():
+        number += 1
+    place = folder / f"demo-{number}"
+    scenario = scenarios.load(name, [f"spindle_encoder.revolutions={revolutions!r}"])
+    console = Console()
+    console.print(announcement, highlight=False)
+    folder.mkdir(parents=True, exist_ok=True)
+    result = _shown(scenario, mode="processes", bag=place)
+    from lathe_rc.view import figure
+
+    picture = place.with_suffix(".png")
+    figure.save(picture, result.recording, result.errors, title)
+    console.print(outcome.table(result))
+    for fact in outcome.facts(result):
+        console.print(fact, highlight=False)
+    console.print(f"bag:    {place}\nfigure: {picture}", highlight=False, soft_wrap=True)
