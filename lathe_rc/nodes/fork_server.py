@@ -84,7 +84,6 @@ def serve(line: socket.socket) -> int:
         if "preload" in request:
             with contextlib.suppress(ImportError):  # a process that needs it says so
                 importlib.import_module(_NODES).preload(request["preload"])
-            gc.collect()
             gc.freeze()  # the collector leaves alone what forked processes share with this one
             continue
         if not (pid := os.fork()):
@@ -101,6 +100,7 @@ def serve(line: socket.socket) -> int:
 
 def main() -> None:
     """Serve at the socket whose descriptor is the argument."""
+    gc.disable()  # a process of a cell enables it: to collect while all is being imported takes a tenth longer
     with contextlib.suppress(BrokenPipeError), socket.socket(fileno=int(sys.argv[1])) as line:
         sys.exit(serve(line))
 

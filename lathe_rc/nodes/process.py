@@ -183,9 +183,9 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
         for name, kind in members:
             nodes.append(_make(name, kind, reporter, exchange))
         _start(nodes, exchange)
-        # What is there now stays: the collector need not walk through it again and again between blocks.
         gc.collect()
-        gc.freeze()
+        gc.freeze()  # the collector skips existing objects: it would walk through them again and again between blocks
+        gc.enable()  # a fork server has none
         _loop(nodes, reporter, stop)
         return next((node.exit_code for node in nodes if node.exit_code), 0)
     except LatheError as error:
