@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Processes that a fork server starts: what they are given, what is heard of them, what becomes of them without it."""
+
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from cells import scenario
+
+from lathe_rc import harness, starting
+from lathe_rc.errors import LatheError
+
+PATIENCE = 30.0  # [s]
+
+
+class Shell:
+    """A shell that a server has started.
+
+    Args:
+        server: asked to start it.
+        log: for what it prints.
+        script: to run.
+        environment: all of it.
+    """
+
+    def __init__(self, server, log, script, **environment):
+        self.changes = queue.SimpleQueue()
+        self.line, theirs = socket.socketpair()
+        self.line.settimeout(PATIENCE)
+        with log.open("ab") as file, theirs:
+            self.child = server.start(
+                [],
+                environment=os.environ | environment,
+                report=theirs,
+                log=file.fileno(),
+                changed=lambda *change: self.changes.put(change),
+                command=["/bin/sh", "-c", script],
+            )
+
+
+@pytest.fixture
+def server():
+    made = starting.ForkServer()
+    yield made
+    made.close()
+
+
+def test_a_process_has_the_folder_environment_log_and_line_of_who_asked(server, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    log = tmp_path / "log"
+    shell = Shell(server, log, 'echo "$PWD $GREETING"; eval "echo heard >&$LATHE_REPORT_FD"', GREETING="hello")
+    assert shell.child.wait(PATIENCE) == 0
+    assert log.read_text() == f"{tmp_path} hello\n"
+    assert shell.line.recv(100) == b"heard\n"
+    assert shell.line.recv(100) == b""  # nobody else holds the other end
+
+
+@pytest.mark.parametrize(("script", "code"), [("exit 3", 3), ("kill -SEGV $$", -signal.SIGSEGV)])
+def test_how_a_process_ended_is_known(server, tmp_path, script, code):
+    child = Shell(server, tmp_path / "log", script).child
+    assert child.wait(PATIENCE) == code
+    assert child.poll() == code
+    child.kill()  # which has ended: no other process that has its number now
+
+
+def test_who_is_stopped_and_continued_is_known(server, tmp_path):
+    shell = Shell(server, tmp_path / "log", "echo; exec sleep 1000")
+    assert shell.child.poll() is None
+    with pytest.raises(subprocess.TimeoutExpired):
+        shell.child.wait(0.0)
+    for number, change in ((signal.SIGSTOP, "stopped"), (signal.SIGCONT, "continued")):
+        shell.child.send_signal(number)
+        assert shell.changes.get(timeout=PATIENCE) == (change, number)
+    shell.child.kill()
+    assert shell.child.wait(PATIENCE) == -signal.SIGKILL
+
+
+def test_without_the_server_its_processes_are_killed_and_another_server_starts_others(tmp_path, monkeypatch):
+    starting._server_of.cache_clear()
+    first = starting.server()
+    child = Shell(first, tmp_path / "log", "exec sleep 1000").child
+    first._process.kill()
+    assert child.wait(PATIENCE) == -signal.SIGKILL
+    with pytest.raises(LatheError, match="the process that starts the nodes has ended"):
+        Shell(first, tmp_path / "log", "true")
+    second = starting.server()
+    assert second is not first
+    assert Shell(second, tmp_path / "log", "true").child.wait(PATIENCE) == 0
+
+
+def test_the_server_ends_with_the_process_that_started_it():
+    code = """if True:
+        import os, signal
+        from lathe_rc import starting
+        print(starting.server()._process.pid, flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+    """
+    told = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=False).stdout
+    process = Path("/proc", told.strip(), "cmdline")  # the number may be another's by now
+    while process.exists() and b"fork_server" in process.read_bytes():
+        os.sched_yield()
+
+
+def test_separate_interpreters_give_the_bits_of_forked_processes():
+    cell = scenario()
+    runs = [harness.run(cell, mode="composed", start=start) for start in ("fork", "spawn")]
+    assert runs[0].digest == runs[1].digest
