@@ -107,14 +107,15 @@ def cpu_s(pid: int) -> float:
 @contextlib.contextmanager
 def container(**environment: str) -> Iterator[None]:
     """Processes of cells that are started here run `benchmarks.naive.container`."""
-    start = subprocess.Popen
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
 
-    def popen(command: Sequence[str], *, env: Mapping[str, str], **rest: Any) -> Any:
-        words = ["benchmarks.naive.container" if word == "lathe_rc.nodes.container" else word for word in command]
-        return start(words, env={**env, **environment, "PYTHONPATH": os.pathsep.join(paths)}, **rest)
+    def command(_cell: harness.Processes, _first: str, arguments: Sequence[str]) -> list[str]:
+        return [sys.executable, "-m", "benchmarks.naive.container", *arguments]
 
-    with mock.patch.object(subprocess, "Popen", popen):
+    with (
+        mock.patch.object(harness.Processes, "_command", command),
+        mock.patch.dict(os.environ, {**environment, "PYTHONPATH": os.pathsep.join(paths)}),
+    ):
         yield
 
 

@@ -14,14 +14,16 @@
 python -m benchmarks.start ARGUMENTS is ``lathe ARGUMENTS`` and tells of the moments above.
 """
 
+import importlib
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 from unittest import mock
 
@@ -99,14 +101,12 @@ def measure(*, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
     return found
 
 
-def main() -> None:
-    """The command line, telling of what its runs go through."""
-    from lathe_rc import cli, harness
-
+def _told(harness: ModuleType) -> None:
+    """Have the runs of `lathe_rc.harness` tell of the moments."""
     ordinary = harness.run
 
-    def run(*arguments: Any, watch: Callable[[harness.Event], None], **rest: Any) -> harness.Result:
-        def told(event: harness.Event) -> None:
+    def run(*arguments: Any, watch: Callable[[Mapping[str, Any]], None], **rest: Any) -> object:
+        def told(event: Mapping[str, Any]) -> None:
             if event["event"] in _MOMENTS:
                 moment = event.get("monotonic_ns", time.monotonic_ns()) * 1e-9
                 print(_MARK, event["event"], f"{moment:.6f}", file=sys.stderr, flush=True)
@@ -114,7 +114,23 @@ def main() -> None:
 
         return ordinary(*arguments, watch=told, **rest)
 
-    with mock.patch.object(harness, "run", run):
+    setattr(harness, "run", run)  # noqa: B010 - mypy would not have it assigned
+
+
+def main() -> None:
+    """The command line, telling of what its runs go through; it imports what ``lathe`` does, and when it does."""
+    from lathe_rc import cli, starting
+
+    ordinary = starting.ForkServer.preload
+
+    def preload(server: starting.ForkServer, nodes: Mapping[str, Any]) -> None:
+        ordinary(server, nodes)
+        if not nodes:
+            _told(importlib.import_module("lathe_rc.harness"))
+
+    if "offline" in sys.argv:
+        _told(importlib.import_module("lathe_rc.harness"))
+    with mock.patch.object(starting.ForkServer, "preload", preload):
         cli.main()
 
 
