@@ -280,7 +280,7 @@ def test_a_bag_that_cannot_be_closed_is_a_failure_in_every_host(mode, tmp_path, 
     (tmp_path / "sitecustomize.py").write_text(FULL_AT_THE_END, encoding="utf-8")
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ['PYTHONPATH']}")
     with pytest.raises(LatheError, match=r"bag: cannot be closed \(No space left on device\)"):
-        harness.run(load(PISTON, ["spindle_encoder.revolutions=6.0"]), mode=mode, bag=tmp_path / "bag")
+        harness.run(load(PISTON, ["spindle_encoder.revolutions=6.0"]), mode=mode, bag=tmp_path / "bag", start="spawn")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -377,6 +377,6 @@ def test_a_number_that_is_not_finite_ends_the_run_in_every_host_and_is_named(tmp
     cell = load(PISTON, [*RUN, "allow_faults=true", f"electrodynamic_actuator.faults={times}"])
     named = r"/coarse/state: /electrodynamic_actuator sends effort = inf at sample 14346; allowed: finite numbers"
     with pytest.raises(LatheError, match=named):
-        harness.run(cell, mode=mode, bag=tmp_path / "bag")
+        harness.run(cell, mode=mode, bag=tmp_path / "bag", start="spawn")
     assert not recwarn.list, "the error says it, in one line"
     assert not check(tmp_path / "bag").wrong

@@ -10,7 +10,7 @@ from types import FrameType
 
 import preconditions
 from environment import Changes, run_environment
-from recipe import PACKAGES_STAMP, Recipe
+from recipe import GROUPS, PACKAGES_STAMP, Recipe
 from ros import SourcedRos, sourced_ros
 from steps import exclusive
 from workplace import PYTHON, ROOT, VENV, RefusalError, StepError, say
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str]) -> int:
         ros = sourced_ros(os.environ)
         if python := ros.python() if ros else settled(os.environ):
             change_to(python)
-        wanted = set_up(ros)
+        wanted = set_up(ros, needed(arguments))
     except RefusalError as refusal:
         say(str(refusal))
         return 2
@@ -39,15 +39,29 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def set_up(ros: SourcedRos | None) -> Changes:
+def needed(arguments: Sequence[str]) -> Sequence[str]:
+    """Return the groups of packages that a command needs beside those of all.
+
+    Raises:
+        RefusalError: ``setup`` of a group that there is not.
+    """
+    if arguments[:1] == ["setup"]:
+        for name in arguments[1:]:
+            if name not in GROUPS:
+                raise RefusalError(f"setup {name}; allowed: {', '.join(GROUPS)}, or nothing more")
+        return arguments[1:]
+    return {"test": ["test", "view"], "view": ["view"]}.get(next(iter(arguments), ""), [])
+
+
+def set_up(ros: SourcedRos | None, groups: Sequence[str]) -> Changes:
     """Make whatever is missing or out of date and return what lathe_rc needs in its environment."""
     recipe = Recipe(ros)
-    ready = recipe.ready()
+    ready = recipe.ready(groups)
     if ready:
         return ready
     preconditions.check(ros)
     with exclusive() as lock:
-        return recipe.ready() or recipe.make(lock)
+        return recipe.ready(groups) or recipe.make(lock, groups)
 
 
 def command(arguments: Sequence[str]) -> list[str]:

@@ -2,16 +2,18 @@
 """How the environment is made: the packages, the messages built against them, and lathe_rc itself.
 
 Each of the three has a key, a hash of all that it is made from, and a stamp with that key, which is written
-last and lies inside what it vouches for. So what was interrupted, or deleted, is made anew.
+last and lies inside what it vouches for. So what was interrupted, or deleted, is made anew. Packages that not every
+command needs are installed when one is called that does; each group of them has a stamp of its own.
 """
 
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
+import installer
 from environment import Changes, build_environment, changes, own_environment
 from ros import SourcedRos, mend_cmake_paths
 from steps import Step, clear, write_atomically
@@ -21,6 +23,33 @@ CONSTRAINTS = VENV / "constraints.txt"
 PACKAGES_STAMP = VENV / "packages.stamp"
 MESSAGES_STAMP = INSTALL / "messages.stamp"
 ENVIRONMENT = INSTALL / "environment.json"  # also the stamp of the package, the last thing made
+
+CHECK_NETWORK = "check the network and the free disk space, then call again"
+# The wheels' middleware: one type support of each kind, linked to directly.
+FAST_DDS_ALONE = {
+    "STATIC_ROSIDL_TYPESUPPORT_C": "rosidl_typesupport_fastrtps_c",
+    "STATIC_ROSIDL_TYPESUPPORT_CPP": "rosidl_typesupport_fastrtps_cpp",
+}
+
+
+class Group(NamedTuple):
+    """Packages that some commands need.
+
+    Attributes:
+        list: file in requirements/ that names them.
+        usual: how long they take to install, and how much they take, for the terminal.
+        sourced: whether they go with a ROS 2 that is sourced.
+    """
+
+    list: str
+    usual: str
+    sourced: bool
+
+
+GROUPS = {
+    "test": Group("test.in", "5 s, 200 MB", sourced=True),
+    "view": Group("view.in", "10 s, 400 MB", sourced=False),
+}
 
 LIST_PACKAGES = """
 from importlib.metadata import distributions
@@ -50,25 +79,35 @@ class Recipe:
             [ROOT / "setup.py", ROOT / "setup.cfg", ROOT / "package.xml", tools / "environment.py"],
         )
 
-    def ready(self) -> Changes | None:
-        """Return what lathe_rc needs in its environment if all is made and nothing has changed since."""
-        if not PACKAGES_STAMP.exists() or not ENVIRONMENT.exists():
+    def ready(self, groups: Iterable[str] = ()) -> Changes | None:
+        """Return what lathe_rc needs in its environment if all is made, groups too, and nothing has changed since."""
+        if not PACKAGES_STAMP.exists() or not ENVIRONMENT.exists() or self._missing(groups):
             return None
         kept = json.loads(ENVIRONMENT.read_text(encoding="utf-8"))
         return cast("Changes", kept["changes"]) if kept["key"] == self._package_key else None
 
-    def make(self, lock: int) -> Changes:
+    def _missing(self, groups: Iterable[str]) -> list[str]:
+        """Return those of some groups that have to be installed."""
+        wanted = [name for name in groups if GROUPS[name].sourced or not self._ros]
+        return [name for name in wanted if read(stamp_of(name)) != self._packages_key]
+
+    def make(self, lock: int, groups: Iterable[str] = ()) -> Changes:
         """Make what is missing or out of date.
 
         Raises:
             StepError: a command failed.
         """
-        say(f"setting up in {HOME} (from nothing: a minute or two, and 1.7 GB)")
+        say(f"setting up in {HOME}")
         if read(PACKAGES_STAMP) != self._packages_key:
             clear(INSTALL, BUILD, VENV)
             self._make_virtual_environment(lock)
             self._install_packages(lock)
             write_atomically(PACKAGES_STAMP, self._packages_key)
+        for name in self._missing(groups):
+            self._install_group(name, lock)
+            write_atomically(stamp_of(name), self._packages_key)
+        if (kept := self.ready()) is not None:
+            return kept
         if read(MESSAGES_STAMP) != self._messages_key:
             clear(INSTALL, BUILD)
             self._build_messages(lock)
@@ -80,34 +119,53 @@ class Recipe:
 
     def _make_virtual_environment(self, lock: int) -> None:
         options = ["--system-site-packages"] if self._ros else []
-        with Step("virtual environment", "see the log, then call again", lock) as step:
+        with Step("virtual environment", "5 s", "see the log, then call again", lock) as step:
             step.run(BASE_PYTHON, "-m", "venv", *options, VENV, environ=build_environment(self._ros))
 
     def _install_packages(self, lock: int) -> None:
-        advice = "check the network and the free disk space, then call again"
-        with Step("packages", advice, lock) as step:
-            environ = build_environment(self._ros)
+        with Step("packages", "20 s, 900 MB", CHECK_NETWORK, lock) as step:
             if self._ros:
+                environ = build_environment(self._ros)
                 found = step.run(BASE_PYTHON, "-c", LIST_PACKAGES, environ=environ).splitlines()
                 locked = (REQUIREMENTS / "sourced.lock").read_text(encoding="utf-8").splitlines()
                 CONSTRAINTS.write_text("\n".join(constrain(locked, found)), encoding="utf-8")
-                step.run(*pip("runtime.in", "dev.in"), "--constraint", CONSTRAINTS, environ=environ)
+                self._install(step, "runtime.in", "build.in")
             else:
-                step.run(*pip("ros.lock", "python.lock"), "--no-deps", environ=environ)
+                uv = installer.pip("--constraint", REQUIREMENTS / "python.lock", "uv")
+                step.run(*uv, environ=build_environment(self._ros))
+                self._install(step, "ros.in", "runtime.in", "build.in")
                 mend_cmake_paths()
 
+    def _install_group(self, name: str, lock: int) -> None:
+        with Step(f"packages to {name}", GROUPS[name].usual, CHECK_NETWORK, lock) as step:
+            self._install(step, GROUPS[name].list)
+
+    def _install(self, step: Step, *lists: str) -> None:
+        """Install what files in requirements/ list: beside a sourced ROS 2 with pip, which knows what is there."""
+        environ = build_environment(self._ros)
+        if self._ros:
+            files = [word for name in lists for word in ("-r", REQUIREMENTS / name)]
+            step.run(*installer.pip(*files, "--constraint", CONSTRAINTS), environ=environ)
+        else:
+            settings = step.run(PYTHON, "-m", "pip", "config", "list", environ=environ)
+            locked = installer.uv(lists, ["ros.lock", "python.lock"])
+            step.run(*locked, environ=installer.uv_environment(settings, environ))
+
     def _build_messages(self, lock: int) -> None:
-        with Step("messages", "correct msg_defs/, or remove .lathe/, then call again", lock) as step:
+        advice = "correct msg_defs/, or remove .lathe/, then call again"
+        with Step("messages", "25 s", advice, lock) as step:
             step.run(
                 *colcon("--paths", ROOT / "msg_defs"),
                 *("--cmake-args", "-GNinja", "-DCMAKE_BUILD_TYPE=Release", "-DBUILD_TESTING=OFF"),
+                *("-DCMAKE_UNITY_BUILD=ON", "-DCMAKE_UNITY_BUILD_BATCH_SIZE=0"),
+                *(() if self._ros else ("-DLATHE_RC_MSGS_INTROSPECTION=OFF",)),
                 *(f"-DPython3_EXECUTABLE={PYTHON}", f"-DPYTHON_EXECUTABLE={PYTHON}"),
-                environ=self._colcon_environment(),
+                environ=self._colcon_environment() | ({} if self._ros else FAST_DDS_ALONE),
             )
 
     def _install_lathe_rc(self, lock: int) -> Changes:
         advice = "correct setup.py, or remove .lathe/, then call again"
-        with Step("lathe_rc", advice, lock) as step:
+        with Step("lathe_rc", "3 s", advice, lock) as step:
             step.run(*colcon("--paths", ROOT, "--symlink-install"), environ=self._colcon_environment())
             listing = BUILD / "environment"
             step.run(
@@ -116,7 +174,7 @@ class Recipe:
             )
             return changes(dict(line.split("=", 1) for line in listing.read_text().split("\0") if line))
 
-    def _colcon_environment(self) -> Mapping[str, str]:
+    def _colcon_environment(self) -> dict[str, str]:
         return {
             **build_environment(self._ros),
             "COLCON_HOME": str(HOME / "colcon"),  # the user's own defaults are for the user's own builds
@@ -124,10 +182,9 @@ class Recipe:
         }
 
 
-def pip(*names: str) -> list[str | Path]:
-    """Return a command line that installs what some of the files in requirements/ list."""
-    files = [word for name in names for word in ("-r", REQUIREMENTS / name)]
-    return [PYTHON, "-m", "pip", "install", "--no-input", "--no-warn-script-location", *files]
+def stamp_of(group: str) -> Path:
+    """Return the stamp of a group of packages."""
+    return VENV / f"{group}.stamp"
 
 
 def colcon(*options: str | Path) -> list[str | Path]:

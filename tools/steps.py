@@ -56,12 +56,14 @@ class Step:
 
     Args:
         title: what the step makes, for the terminal.
+        usual: how long it usually takes.
         advice: what to do if it fails.
         lock: descriptor of the lock, for the commands to inherit.
     """
 
-    def __init__(self, title: str, advice: str, lock: int) -> None:
+    def __init__(self, title: str, usual: str, advice: str, lock: int) -> None:
         self.title = title
+        self._usual = usual
         self._advice = advice
         self._lock = lock
         self._log = LOG / f"{title.replace(' ', '-')}.log"
@@ -119,7 +121,7 @@ class Step:
                 process.wait(TICK)
 
     def _show(self, end: str) -> None:
-        line = f"  {self.title:<28}{time.monotonic() - self._start:7.1f} s{end}"
+        line = f"  {self.title:<20} (usually {f'{self._usual})':<14}{time.monotonic() - self._start:7.1f} s{end}"
         print(f"\r\x1b[K{line}" if self._live else line, end="", file=sys.stderr, flush=True)
 
     def _failure(self, program: str | Path, code: int, output: str) -> str:

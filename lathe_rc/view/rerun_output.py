@@ -32,7 +32,7 @@ def require() -> None:
         LatheError: it is not.
     """
     if importlib.util.find_spec("rerun_bindings") is None:
-        raise LatheError("rerun is not installed; install it with: pip install rerun-sdk")
+        raise LatheError("rerun is not installed; install it with: ./lathe setup view (or pip install rerun-sdk)")
     os.environ.setdefault("RUST_LOG", "off")  # what goes wrong is told by the command
 
 
