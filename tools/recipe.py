@@ -25,11 +25,8 @@ MESSAGES_STAMP = INSTALL / "messages.stamp"
 ENVIRONMENT = INSTALL / "environment.json"  # also the stamp of the package, the last thing made
 
 CHECK_NETWORK = "check the network and the free disk space, then call again"
-# The wheels' middleware: one type support of each kind, linked to directly.
-FAST_DDS_ALONE = {
-    "STATIC_ROSIDL_TYPESUPPORT_C": "rosidl_typesupport_fastrtps_c",
-    "STATIC_ROSIDL_TYPESUPPORT_CPP": "rosidl_typesupport_fastrtps_cpp",
-}
+# The wheels' middleware reads the introspection of C alone.
+FAST_DDS_ALONE = {"STATIC_ROSIDL_TYPESUPPORT_CPP": "rosidl_typesupport_fastrtps_cpp"}
 
 
 class Group(NamedTuple):
@@ -158,7 +155,7 @@ class Recipe:
                 *colcon("--paths", ROOT / "msg_defs"),
                 *("--cmake-args", "-GNinja", "-DCMAKE_BUILD_TYPE=Release", "-DBUILD_TESTING=OFF"),
                 *("-DCMAKE_UNITY_BUILD=ON", "-DCMAKE_UNITY_BUILD_BATCH_SIZE=0"),
-                *(() if self._ros else ("-DLATHE_RC_MSGS_INTROSPECTION=OFF",)),
+                *(() if self._ros else ("-DLATHE_RC_MSGS_CPP=OFF",)),
                 *(f"-DPython3_EXECUTABLE={PYTHON}", f"-DPYTHON_EXECUTABLE={PYTHON}"),
                 environ=self._colcon_environment() | ({} if self._ros else FAST_DDS_ALONE),
             )
