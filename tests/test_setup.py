@@ -15,6 +15,7 @@ import pytest
 import bootstrap
 import check
 import environment
+import installer
 import preconditions
 import recipe
 import ros
@@ -221,6 +222,7 @@ def workshop(monkeypatch, tmp_path):
     monkeypatch.setattr(made, "_install_packages", step("packages", venv))
     monkeypatch.setattr(made, "_build_messages", step("messages", install))
     monkeypatch.setattr(made, "_install_lathe_rc", step("lathe_rc", install))
+    monkeypatch.setattr(made, "_install_group", lambda name, lock: step(name, venv)(lock))
     return made
 
 
@@ -262,6 +264,81 @@ def test_deleted_folder_is_made_anew(workshop, deleted, again):
     assert workshop.taken == again
 
 
+def test_a_group_of_packages_is_installed_when_a_command_needs_it_and_once(workshop):
+    workshop.make(0)
+    assert workshop.ready(["view"]) is None
+    workshop.taken.clear()
+    workshop.make(0, ["view"])
+    assert workshop.taken == ["view"]
+    assert workshop.ready(["view"])
+    assert workshop.ready(["view", "test"]) is None
+    workshop.make(0, ["view", "test"])
+    assert workshop.taken == ["view", "test"]
+
+
+def test_an_interrupted_group_is_installed_again_and_no_more(workshop):
+    workshop.make(0)
+    workshop.taken.clear()
+    workshop.broken = "test"
+    with pytest.raises(KeyboardInterrupt):
+        workshop.make(0, ["test"])
+    assert workshop.ready()
+    workshop.broken = None
+    workshop.make(0, ["test"])
+    assert workshop.taken == ["test", "test"]
+
+
+def test_the_viewer_stays_away_from_a_sourced_ros():
+    beside = recipe.Recipe(ros.SourcedRos("jazzy", ("/opt/ros/jazzy",)))
+    assert beside._missing(["view"]) == []
+    assert beside._missing(["test"]) == ["test"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "groups"),
+    [
+        (["test", "-k", "view"], ["test", "view"]),
+        (["view", "bag"], ["view"]),
+        (["setup", "view"], ["view"]),
+        (["run", "view"], []),
+        ([], []),
+    ],
+)
+def test_a_command_says_what_it_needs(arguments, groups):
+    assert bootstrap.needed(arguments) == groups
+
+
+def test_setup_of_an_unknown_group_is_refused(copy):
+    assert_refused(lathe(copy, "setup", "viewer"), copy, "setup viewer; allowed: test, view, or nothing more")
+
+
+def test_what_is_set_for_pip_holds_for_uv_and_the_environment_comes_first():
+    config = """\
+:env:.timeout='180'
+global.find-links='/opt/wheels'
+install.index-url='https://mirror.invalid/simple'
+global.index-url='https://other.invalid/simple'
+global.extra-index-url='\\nhttps://a.invalid\\nhttps://b.invalid'
+"""
+    found = installer.uv_environment(config, {"UV_FIND_LINKS": "/mine", "HOME": "/root"})
+    assert found["UV_DEFAULT_INDEX"] == "https://mirror.invalid/simple"
+    assert found["UV_INDEX"] == "https://a.invalid https://b.invalid"
+    assert found["UV_FIND_LINKS"] == "/mine"
+    assert found["HOME"] == "/root"
+
+
+def test_every_package_of_every_list_is_in_a_lock():
+    locked = {
+        recipe.normal(line)
+        for name in ("ros.lock", "python.lock")
+        for line in (workplace.REQUIREMENTS / name).read_text().splitlines()
+    }
+    lists = ["ros.in", "runtime.in", "build.in", *(group.list for group in recipe.GROUPS.values())]
+    for name in lists:
+        wanted = (workplace.REQUIREMENTS / name).read_text().splitlines()
+        assert {recipe.normal(line) for line in wanted if line and not line.startswith("#")} <= locked, name
+
+
 # --- steps
 
 
@@ -269,7 +346,7 @@ def test_deleted_folder_is_made_anew(workshop, deleted, again):
 def step(monkeypatch, tmp_path):
     monkeypatch.setattr(steps, "LOG", tmp_path / "log")
     with (tmp_path / "lock").open("w") as lock:
-        yield steps.Step("the messages", "look at the sky", lock.fileno())
+        yield steps.Step("the messages", "a minute", "look at the sky", lock.fileno())
 
 
 def test_failed_step_shows_the_end_of_its_log_and_what_to_do(step, tmp_path, capfd):
@@ -326,7 +403,7 @@ def test_interrupted_step_leaves_no_process_behind(step, monkeypatch, tmp_path):
     ],
 )
 def test_failed_set_up_ends_with_a_line_and_a_code(monkeypatch, capsys, raised, code, line):
-    def fail(_ros):
+    def fail(_ros, _groups):
         raise raised
 
     monkeypatch.setattr(bootstrap, "set_up", fail)

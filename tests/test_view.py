@@ -362,7 +362,7 @@ def test_without_rerun_the_command_says_how_to_get_it(turned, tmp_path, monkeypa
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *rest: None if "rerun" in name else known(name, *rest)
     )
-    assert "pip install rerun-sdk" in refused("view", turned[0], "-o", tmp_path / "x.rrd", code=1)
+    assert "./lathe setup view" in refused("view", turned[0], "-o", tmp_path / "x.rrd", code=1)
 
 
 def test_bad_input_is_refused_and_leaves_nothing(turned, tmp_path, monkeypatch):

@@ -17,7 +17,7 @@ _SETTINGS = {
     "proxy": ("ALL_PROXY", " "),
     "trusted-host": ("UV_INSECURE_HOST", " "),
 }
-# pip looks for a package at all indexes that it knows. With hard links, what we mend would be changed in the cache, too.
+# pip looks for a package at all indexes that it knows. What we mend must not be changed in the cache as well: no links.
 _ALIKE = {"UV_INDEX_STRATEGY": "unsafe-best-match", "UV_LINK_MODE": "copy", "UV_PYTHON_DOWNLOADS": "never"}
 
 
