@@ -17,10 +17,12 @@ from hypothesis import strategies as st
 from lathe_rc import harness
 from lathe_rc.cell import messages
 from lathe_rc.cell.scenario import TABLES, Scenario
+from lathe_rc.cell.wire import Encoder
 
 Values = Mapping[str, Any]
 
 SCENARIOS = sorted((Path(__file__).parents[1] / "config").glob("*.yaml"))  #: that come with lathe_rc
+STEP = 15_625  #: [ns] of the smallest whole cell
 NODES = ("spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool")
 
 
@@ -107,3 +109,11 @@ def started(*arguments):
             yield process
         finally:
             process.kill()
+
+
+def block(msgtype, first, source, run_id, *, step=STEP, size=64, fill=0.0):
+    """An encoded block, of anybody."""
+    signals = messages.allocate(msgtype, size)
+    for array in signals.values():
+        array[:] = fill if array.dtype == np.float64 else 0
+    return Encoder(msgtype, run_id, source, step).encode(first, signals, last=False, companions=0)[1]

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What users read is true: the reference page, links, the examples of the README, scenarios, the launch file."""
 
+import ast
 import importlib.util
 import re
 import runpy
@@ -13,7 +14,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from lathe_rc import cli, reference
+from lathe_rc import __version__, cli, reference
 from lathe_rc.cell import ros_yaml, scenario
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
@@ -22,7 +23,7 @@ from lathe_rc.commands.run import run
 from lathe_rc.errors import InputError
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
 SCENARIOS = sorted((ROOT / "config").glob("*.yaml"))
 FIVE = {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder"}
@@ -31,6 +32,7 @@ LAUNCH = ROOT / "launch" / "cell.launch.py"
 _LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
 _BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _RUN = re.compile(r"^\$ \./lathe (run .*)$", re.MULTILINE)
+_TEST = re.compile(r"`(test_[a-z0-9_]+)`")
 _CODE = re.compile(r"```.*?```|`[^`]*`", re.DOTALL)
 
 
@@ -113,6 +115,44 @@ class TestHostTopics:
                 assert outlet.qos_profile.depth == topic.depth
                 assert outlet.qos_profile.reliability.name == "RELIABLE"
                 assert (outlet.qos_profile.durability.name == "TRANSIENT_LOCAL") == topic.latched
+
+
+def names_of_tests() -> set[str]:
+    """Names of all tests."""
+    found = set()
+    for path in Path(__file__).parent.rglob("test_*.py"):
+        tree = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        found |= {node.name for node in tree if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")}
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_every_test_that_a_page_names_exists(page: Path) -> None:
+    lines = enumerate(page.read_text(encoding="utf-8").splitlines(), 1)
+    named = {(number, test) for number, line in lines for test in _TEST.findall(line)}
+    known = names_of_tests()
+    assert [f"{name(page)}:{number}: no test {test}" for number, test in sorted(named) if test not in known] == []
+
+
+@pytest.mark.parametrize("page", ["cell", "safety"])
+def test_every_promise_names_a_test(page: str) -> None:
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    _, _, table = text.partition("## Which test holds what\n")
+    rows = [line for line in table.splitlines() if line.startswith("| ")][2:]
+    assert len(rows) >= 20
+    assert [row for row in rows if not _TEST.search(row) and "cell.md#" not in row] == []
+
+
+def test_one_version_stands_everywhere() -> None:
+    said = {
+        re.search(pattern, (ROOT / path).read_text(encoding="utf-8"))[1]
+        for path, pattern in (
+            ("setup.py", r'version="(.+?)"'),
+            ("package.xml", "<version>(.+?)<"),
+            ("msg_defs/package.xml", "<version>(.+?)<"),
+        )
+    }
+    assert said == {__version__}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)

@@ -3,15 +3,13 @@
 
 import contextlib
 import itertools
-import json
 import threading
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from cells import scenario
+from cells import STEP, block, scenario
 from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, SafetyStatus, ToolBlock
 from mcap.reader import make_reader
 from rclpy.executors import SingleThreadedExecutor
@@ -20,21 +18,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from lathe_rc import harness
-from lathe_rc.bag import reader
 from lathe_rc.cell import messages
-from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.stage_node import StageNode
-
-STEP = 15_625
-
-
-def block(msgtype, first, source, run_id, *, step=STEP, size=64, fill=0.0):
-    signals = messages.allocate(msgtype, size)
-    for array in signals.values():
-        array[:] = fill if array.dtype == np.float64 else 0
-    return Encoder(msgtype, run_id, source, step).encode(first, signals, last=False, companions=0)[1]
 
 
 def uneven(msgtype, source, run_id):
@@ -184,49 +171,6 @@ def test_a_member_that_goes_wrong_makes_the_cell_safe(ghost, domain, tmp_path, b
     assert "safe state from sample" in str(caught.value)
     with AnyReader([tmp_path / "bag"]) as found:
         assert sum(1 for _ in found.messages()) > 100
-
-
-def resident(pid):
-    """Memory of a process [B]."""
-    line = next(line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmRSS"))
-    return int(line.split()[1]) * 1024
-
-
-def test_a_flood_takes_no_memory(ghost, domain, tmp_path):
-    """While the cell goes slowly; nearly all the nodes have to do is what comes then."""
-    plain = scenario(spindle_encoder={"revolutions": 30.0, "speed_factor": 0.05})
-    cell = harness.with_recorder(plain, tmp_path / "bag", keep=True)
-    encoder = ghost.create_publisher(EncoderBlock, "/encoder", latched_qos(500))
-    members = ghost.create_publisher(Member, "/members", latched_qos(500))
-
-    def flood(publisher, make, end):
-        """Half as many at a time as the publisher keeps; ``end`` makes a message of /end that the tool tells of."""
-        for part in range(7):
-            for count in range(250 * part, 250 * (part + 1)):
-                publisher.publish(make(count))
-            publisher.publish(end(f"end of part {part}"))
-            told = f"{publisher.topic_name}: message of run 'end of part {part}' from /end; expected run 'test'"
-            processes.wait_for("stranger", "tool", message=told)
-
-    with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
-        processes.wait_for("cycle")
-        before = resident(processes.pids["tool"])
-        flood(
-            encoder,
-            lambda count: block(messages.ENCODER, count, f"/ghost_{count % 8}", "test", size=2048),
-            lambda run: block(messages.ENCODER, 0, "/end", run),
-        )
-        text = json.dumps({"filler": "x" * 40_000})
-        flood(
-            members,
-            lambda count: Member(run_id="test", name=f"/made_up_{count}", parameters=text),
-            lambda run: Member(run_id=run, name="/end"),
-        )
-        grown = resident(processes.pids["tool"]) - before
-        processes.wait_for_end()
-    assert grown < 64e6
-    assert sum(processes.refused.values()) > 1000
-    assert reader.read(tmp_path / "bag").digests() == harness.run(plain).digest
 
 
 def test_nobody_listens_for_lost_messages():

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""./lathe test: the linters, then the tests, all of them, whatever the others find; --system: those of the machine."""
+"""./lathe test: the linters, then the tests, all of them, whatever the others find.
+
+--lint: the linters alone; --system: the tests that need packages or privileges of the machine.
+"""
 
 import os
 import re
@@ -57,7 +60,7 @@ def locked_numpy() -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Run everything on the whole checkout and return the exit code; with --system, only what needs the machine."""
+    """Run everything on the whole checkout, or what an option names, and return the exit code."""
     os.chdir(ROOT)
     if "--system" in arguments:
         arguments.remove("--system")
@@ -65,11 +68,14 @@ def main(arguments: list[str]) -> int:
             print(f"lathe: {against}", file=sys.stderr)
             return 1
         return int(pytest.main(["-m", "system", "tests/system", *arguments]))
-    linters, verdicts = dict(LINTERS), []
+    linters, verdicts = dict(LINTERS), list[str]()
     if (here := version("numpy")) != (locked := locked_numpy()):
         del linters["mypy"]
         verdicts.append(f"not run: mypy, because its verdict is for the types of NumPy {locked}, not {here}")
     failed = [name for name, command in linters.items() if not lint(name, command)]
+    if "--lint" in arguments:
+        print(*verdicts, sep="\n", end="\n" if verdicts else "")
+        return int(bool(failed))
     verdicts += [f"{name} FAILED: see above" for name in failed]
     verdicts.append("not run: the tests that need system packages or privileges (./lathe test --system)")
     code = pytest.main(["-m", "not system", *AT_ONCE, *arguments], plugins=[Verdicts(verdicts)])
