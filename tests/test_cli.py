@@ -306,7 +306,7 @@ def test_commands_are_listed_without_being_imported():
     *text, modules = listed.splitlines()
     ours = {module for module in modules.split() if module.partition(".")[0] in ("lathe_rc", "numpy", "numba", "rich")}
     assert ours == {"lathe_rc", "lathe_rc.cli", "lathe_rc.errors"}
-    assert not [line for line in text if line.endswith("...")]  # each summary fits into its line
+    assert not [line for line in text[text.index("Commands:") :] if line.endswith("...")]  # each summary fits
 
 
 @pytest.mark.parametrize("name", COMMANDS)

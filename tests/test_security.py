@@ -4,9 +4,12 @@
 import contextlib
 import importlib.util
 import os
+import signal
+import socket
 import subprocess
 import sys
 import time
+import warnings
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -18,7 +21,7 @@ from lathe_rc_msgs.msg import CellState
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import NodeNameNonExistentError
 
-from lathe_rc import cli, harness, security
+from lathe_rc import cli, harness, security, starting
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.replayer import KIND as REPLAYER
 from lathe_rc.cell.rerun_bridge import KIND as RERUN_BRIDGE
@@ -28,6 +31,7 @@ from lathe_rc.nodes.ports import latched_qos
 CONFIG = Path(__file__).parents[1] / "config"
 FILES = sorted((CONFIG / "security").glob("*.policy.xml"))
 PATIENCE = 120.0  # [s] that no wait may last
+GRACE = 20.0  # [s] for a process to end on SIGTERM
 
 
 def named(path):
@@ -238,19 +242,36 @@ def compare(observer, root):
 
 @contextlib.contextmanager
 def running(folder, commands):
-    """Processes with a log each in ``folder``; ended, whatever happens."""
+    """Processes with a log each in ``folder``; ended, whatever happens; one that goes on is killed and named."""
     environment = os.environ | {"ROS_LOG_DIR": str(folder)}
+    started = []
     with contextlib.ExitStack() as stack:
-        started = []
         for number, command in enumerate(commands):
-            log = stack.enter_context((folder / f"{number}.log").open("w"))
-            words = [sys.executable, "-m", *map(str, command)]
-            started.append(stack.enter_context(subprocess.Popen(words, env=environment, stdout=log, stderr=log)))
+            ours, theirs = map(stack.enter_context, socket.socketpair())
+            with theirs, (folder / f"{number}.log").open("ab") as log:
+                child = starting.server().start(
+                    command,
+                    environment=environment,
+                    report=theirs,
+                    log=log.fileno(),
+                    changed=lambda *_: None,
+                    command=[sys.executable, "-m", *command] if command[0].startswith("lathe_rc.") else [],
+                )
+            started.append((child, folder / f"{number}.log", ours))
         try:
             yield
         finally:
-            for process in started:
-                process.terminate()
+            for child, _, _ in started:
+                child.send_signal(signal.SIGTERM)
+            for child, log, _ in started:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    child.wait(GRACE)
+                if child.poll() is None:
+                    child.send_signal(signal.SIGUSR1)
+                    with contextlib.suppress(subprocess.TimeoutExpired):
+                        child.wait(1.0)
+                    child.kill()
+                    warnings.warn(f"did not end on SIGTERM: {log.read_text()[-2000:]}", stacklevel=1)
 
 
 def members(loaded, root, folder):
@@ -262,7 +283,7 @@ def members(loaded, root, folder):
         nodes = [profile.get("node") for profile in enclave.iter("profile") if profile.get("node") in complete.nodes]
         if nodes:
             chosen = [f"{node}:{complete.kind(node)}" for node in nodes]
-            yield ["lathe_rc", "container", *chosen, *ros(enclave, "--params-file", file)]
+            yield [*chosen, *ros(enclave, "--params-file", str(file))]
 
 
 def ros(enclave, *options):

@@ -32,6 +32,13 @@ _MOST = 2**18  # [B] of a request; the environment is the most of it
 _CHANGES = os.WEXITED | os.WSTOPPED | os.WCONTINUED | os.WNOHANG
 
 
+def _load(nodes: dict[str, Any]) -> None:
+    """Import what nodes need, and load what some of them will."""
+    with contextlib.suppress(ImportError):  # a process that needs it says so
+        importlib.import_module(_NODES).preload(nodes)
+    gc.freeze()  # the collector leaves alone what forked processes share with this one
+
+
 def _become(request: dict[str, Any], report: int, log: int) -> int:
     """Turn a process that has just been forked into one of a cell; its exit code."""
     os.setsid()
@@ -82,10 +89,10 @@ def serve(line: socket.socket) -> int:
             return 0
         request = json.loads(asked)
         if "preload" in request:
-            with contextlib.suppress(ImportError):  # a process that needs it says so
-                importlib.import_module(_NODES).preload(request["preload"])
-            gc.freeze()  # the collector leaves alone what forked processes share with this one
+            _load(request["preload"])
             continue
+        if not request["command"] and _NODES not in sys.modules:
+            _load({})
         if not (pid := os.fork()):
             signal.set_wakeup_fd(-1)
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
