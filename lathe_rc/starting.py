@@ -21,7 +21,6 @@ Start = Literal["fork", "spawn"]  #: of a process: as a copy of one that has imp
 Change = Callable[[str, int], None]
 
 _MOST = 2**16  # [B] of an answer
-_PATIENCE = 5.0  # [s] for the server to leave
 
 
 class Child:
@@ -177,7 +176,8 @@ class ForkServer:
         """End the server."""
         with contextlib.suppress(OSError):
             self._line.shutdown(socket.SHUT_RDWR)
-        self._process.wait(_PATIENCE)
+        self._process.terminate()  # it may be busy with compiling what nobody wants any more
+        self._process.wait()
 
 
 @cache
