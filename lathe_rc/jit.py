@@ -20,7 +20,7 @@ R = TypeVar("R")
 
 _PACKAGE = Path(__file__).parent
 _KERNELS = (
-    "*.py",
+    "transfer.py",
     "signals/*.py",
     "plants/*.py",
     "control/*.py",

@@ -263,7 +263,7 @@ class Asker:
 
 
 def test_service_makes_a_snapshot_and_an_interrupted_run_leaves_one(domain, tmp_path):
-    running = cell([], 100.0, 1.0, mode="snapshot")
+    running = cell([], 100.0, 0.5, mode="snapshot")
     expected = read(harness.run(cell([], 100.0), bag=tmp_path / "whole").bag)
     complete = harness.with_recorder(running, tmp_path / "bag", keep=True)
     asker = Asker()
@@ -281,7 +281,8 @@ def test_service_makes_a_snapshot_and_an_interrupted_run_leaves_one(domain, tmp_
             assert (closed["first"], closed["samples"], closed["whole"]) == (first, last - first + 1, True)
             assert read(Path(path)) == span(expected, first, last)
             # Whatever is closed is complete while the run goes on; what follows it is the next snapshot's.
-            processes.wait_for("cycle", cycle=40.0)
+            while processes.wait_for("cycle")["cycle"] < 40.0:
+                pass
     finally:
         asker.close()
     assert not (tmp_path / "bag").exists()
