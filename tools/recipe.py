@@ -164,6 +164,8 @@ class Recipe:
         advice = "correct setup.py, or remove .lathe/, then call again"
         with Step("lathe_rc", "3 s", advice, lock) as step:
             step.run(*colcon("--paths", ROOT, "--symlink-install"), environ=self._colcon_environment())
+            # Some environments forbid Python to write byte code, and each start would compile a hundred modules anew.
+            step.run(PYTHON, "-m", "compileall", "-q", ROOT / "lathe_rc", environ=build_environment(self._ros))
             listing = BUILD / "environment"
             step.run(
                 *("bash", "-c", '. "$0" && env -0 > "$1"', INSTALL / "setup.bash", listing),
