@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Literal
 
 from lathe_rc.errors import LatheError
@@ -138,7 +139,7 @@ class ForkServer:
         request = {
             "arguments": list(arguments),
             "environment": dict(environment),
-            "folder": str(os.getcwd()),  # noqa: PTH109 - a path that need not exist any more
+            "folder": str(Path.cwd()),
             "command": list(command),
         }
         with self._asking:
@@ -147,6 +148,7 @@ class ForkServer:
                 socket.send_fds(self._line, [json.dumps(request).encode()], [report.fileno(), log])
             child = self._started.get()
         if child is None:
+            self._started.put(None)  # for who asks next
             raise LatheError("the process that starts the nodes has ended: see what it has written")
         return child
 
