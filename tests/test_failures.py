@@ -377,6 +377,6 @@ def test_a_number_that_is_not_finite_ends_the_run_in_every_host_and_is_named(tmp
     cell = load(PISTON, [*RUN, "allow_faults=true", f"electrodynamic_actuator.faults={times}"])
     named = r"/coarse/state: /electrodynamic_actuator sends effort = inf at sample 14346; allowed: finite numbers"
     with pytest.raises(LatheError, match=named):
-        harness.run(cell, mode=mode, bag=tmp_path / "bag", start="spawn")
+        harness.run(cell, mode=mode, bag=tmp_path / "bag")
     assert not recwarn.list, "the error says it, in one line"
     assert not check(tmp_path / "bag").wrong

@@ -149,12 +149,12 @@ class TestFullCell:
     def offline(cls):
         return harness.run(load("full_cell", *cls.SHORT))
 
-    def test_grouped_processes_give_its_digests(self):
+    @pytest.mark.parametrize("outside", [[], ["recorder"], ["cutting_process", "longitudinal", "force_controller"]])
+    def test_grouped_processes_give_its_digests(self, outside):
         """Long enough for a recorder beside the spindle to complete a block while the spindle makes another."""
-        loaded = load("full_cell", "spindle_encoder.revolutions=20.0")
-        cutting = ["cutting_process", "longitudinal", "force_controller"]
-        inside = [name for name in loaded.nodes if name not in [*cutting, "recorder"]]
-        grouped = harness.run(loaded, mode="processes", groups=[inside, cutting, ["recorder"]])
+        loaded = load("full_cell", "spindle_encoder.revolutions=40.0")
+        groups = [[name for name in loaded.nodes if name not in outside], outside] if outside else None
+        grouped = harness.run(loaded, mode="processes", groups=groups)
         assert grouped.mode == "grouped"
         assert grouped.digest == harness.run(loaded).digest
 

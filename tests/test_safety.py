@@ -832,9 +832,10 @@ def test_a_frozen_force_controller_keeps_its_integral_and_goes_on():
     assert np.ptp(given[settled]) > 0.0
 
 
-def test_the_feed_reacts_alike_in_every_host(turned):
+@pytest.mark.parametrize("outside", [[], ["supervisor", "cutting_process"]])
+def test_the_feed_reacts_alike_in_every_host(outside, turned):
     """Who watches and what is watched may be processes of their own."""
-    cell, outside = turning(), ["supervisor", "cutting_process"]
+    cell = turning()
     groups = [[name for name in cell.nodes if name not in outside], *([name] for name in outside)]
     assert harness.run(cell, mode="processes", groups=groups).digest == turned.digest
 
