@@ -3,19 +3,28 @@
 
 A stage's output depends on its parameters, its state and its declared inputs alone; the length of the blocks
 changes no bit. Hosts (the offline engine, a ROS node) feed it in order and know nothing of what it does.
+
+Most stages compute by a compiled step, which a program of many stages can call (`lathe_rc.cell.program`):
+
+    reached, reason = step(memory, first, start, inputs, outputs)
+
+It computes the block that begins at sample ``first``, from its sample ``start`` on, until the end of the block
+(`DONE`) or until Python has to do something (any other reason, see `Stage.serve`), and is called again from there.
+Inputs and outputs are tuples of the arrays of all fields of all ports, in their order.
 """
 
 import math
 import re
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from abc import ABC
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety import faults
@@ -83,6 +92,10 @@ class Trigger:
         return f"{self.kind} {self.value:g}: {self.action}"
 
 
+Step = Callable[[Any, int, int, tuple[Samples, ...], tuple[Samples, ...]], tuple[int, int]]
+DONE, PYTHON = 0, -1  #: why a step, or a program of steps, has stopped
+NEVER = np.iinfo(np.int64).max  #: no sample at all
+
 _NOTHING = np.empty(0)
 
 _EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)(?:\s+to\s+([0-9.eE+-]+))?\s*:\s*(\S.*?)\s*")
@@ -103,6 +116,8 @@ class Stage(ABC):
         sparse_topics: relative name and type of every topic that carries `Sparse` messages.
         tells: events come about by themselves that only `process` knows of.
         own_inputs: number of inputs that `process` gets; one more may tell the spindle angle to the events.
+        step: compiled; None: the stage has its own `process`, in Python.
+        memory: what the step works on, a NamedTuple of arrays and constants; may be replaced between two calls.
     """
 
     kind: ClassVar[str]
@@ -113,6 +128,8 @@ class Stage(ABC):
 
     inputs: tuple[Input, ...] = ()
     outputs: tuple[Output, ...] = ()
+    step: Step | None = None
+    memory: tuple[Any, ...] = ()
 
     def __init__(self, name: str, parameters: NodeParameters) -> None:
         self.name = name
@@ -137,7 +154,7 @@ class Stage(ABC):
             InputError: an event or fault that cannot be.
         """
         self.inputs, self.outputs, self.own_inputs = tuple(inputs), tuple(outputs), len(inputs)
-        if inputs and self._angle() is None and any(trigger.kind == "revolution" for trigger in self._triggers):
+        if inputs and self.angle_input is None and any(trigger.kind == "revolution" for trigger in self._triggers):
             self.inputs += (Input("encoder", messages.ENCODER, ("angle",)),)
         self._joints = [(place, output.joint) for place, output in enumerate(self.outputs) if output.joint]
         if self._joints:
@@ -253,27 +270,41 @@ class Stage(ABC):
         """Whether the scenario lists an event with this action."""
         return any(trigger.action == action for trigger in self._triggers)
 
-    def _angle(self) -> tuple[int, str] | None:
-        """Input and field with the measured spindle angle, if the stage reads it."""
+    @property
+    def angle_input(self) -> int | None:
+        """Which input has the measured spindle angle, if the stage reads it."""
         for place, port in enumerate(self.inputs):
             if port.type == messages.ENCODER and port.delay == 0 and "angle" in port.fields:
-                return place, "angle"
+                return place
         return None
+
+    @property
+    def due(self) -> tuple[int, float]:
+        """Sample and spindle angle [rad] from which on a step alone does not do: `compute` takes the block."""
+        if self._injection and self._injection.any:
+            return 0, 0.0
+        samples = [self._sample_of(trigger) for trigger in self._triggers if trigger.kind != "revolution"]
+        turns = [trigger.value * 2 * np.pi for trigger in self._triggers if trigger.kind == "revolution"]
+        samples += [index for index, _ in self._scheduled]
+        return min(samples, default=NEVER), min(turns, default=np.inf)
+
+    def _sample_of(self, trigger: Trigger) -> int:
+        """When an event is due that does not depend on the angle."""
+        if trigger.kind == "sample":
+            return int(np.ceil(trigger.value))
+        # The factor keeps 0.1 s · 64000 from becoming sample 6401.
+        return int(np.ceil(trigger.value * self.shared.sample_rate * (1 - 1e-12)))
 
     def _due(self, first: int, samples: int, inputs: Sequence[Signals]) -> list[tuple[int, str]]:
         """Take the events that fall into a block, by sample index; equal indices keep the order of scheduling."""
         waiting = []
         for trigger in self._triggers:
-            if trigger.kind == "sample":
-                index = int(np.ceil(trigger.value))
-            elif trigger.kind == "second":
-                # The factor keeps 0.1 s · 64000 from becoming sample 6401.
-                index = int(np.ceil(trigger.value * self.shared.sample_rate * (1 - 1e-12)))
+            if trigger.kind != "revolution":
+                index = self._sample_of(trigger)
             else:
-                place = self._angle()
+                place = self.angle_input
                 assert place is not None, "declare() refuses revolutions without an angle"
-                angle = inputs[place[0]][place[1]]
-                index = first + int(np.searchsorted(angle, trigger.value * 2 * np.pi))
+                index = first + int(np.searchsorted(inputs[place]["angle"], trigger.value * 2 * np.pi))
             if index < first + samples:
                 self._scheduled.append((max(index, first), trigger.action))
             else:
@@ -300,45 +331,54 @@ class Stage(ABC):
         Raises:
             LatheError: it cannot go on; names it.
         """
+        with self.named():
+            sparse = self.compute(first, inputs, outputs)
+        return self.conclude(first, sparse, outputs, last=last)
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """Let errors name the node."""
         try:
-            sparse = self._advance(first, inputs, outputs, last=last)
+            yield
         except LatheError as error:
             error.args = (f"{self.name}: {error}",)
             raise
-        if len(sparse) > 1:
-            sparse.sort(key=lambda message: message.index)
-        return sparse
 
-    def _advance(
-        self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals], *, last: bool
-    ) -> list[Sparse]:
+    def compute(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+        """Compute a block, with its events and faults; see `advance`."""
         if self._triggers or self._scheduled or (self._injection and self._injection.any):
-            sparse = self._advance_with_events(first, inputs, outputs)
-        else:
-            own = inputs if len(inputs) == self.own_inputs else inputs[: self.own_inputs]
-            sparse = self.process(first, own, outputs)
+            return self._compute_with_events(first, inputs, outputs)
+        own = inputs if len(inputs) == self.own_inputs else inputs[: self.own_inputs]
+        return self.process(first, own, outputs)
+
+    def conclude(
+        self, first: int, sparse: list[Sparse], outputs: Sequence[Signals], *, last: bool = False
+    ) -> list[Sparse]:
+        """The sparse messages of the samples ``first`` on, by sample: those of `compute` and what follows from all."""
         if last:
             sparse = sparse + self.finish(first + next(iter(outputs[0].values())).size - 1)
         for place, joint in self._joints:
             sparse = sparse + self._joint_states(first, joint, outputs[place])
+        if len(sparse) > 1:
+            sparse.sort(key=lambda message: message.index)
         return sparse
 
-    def _advance_with_events(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    def _compute_with_events(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """Compute a block in pieces, from event to event."""
         samples = next(iter(outputs[0].values())).size
         sparse: list[Sparse] = []
         start = 0
         for index, action in self._due(first, samples, inputs):
-            sparse += self._compute(first, start, index - first, inputs, outputs)
+            sparse += self._piece(first, start, index - first, inputs, outputs)
             start = index - first
             self.act(action, index)
             if (topic := f"{self.name}/events") in self.sparse_topics:
                 said = [action, *self._remarks]
                 sparse += [Sparse(topic, messages.EVENT, index, {"action": text}) for text in said]
             self._remarks.clear()
-        return sparse + self._compute(first, start, samples, inputs, outputs)
+        return sparse + self._piece(first, start, samples, inputs, outputs)
 
-    def _compute(
+    def _piece(
         self, first: int, start: int, stop: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
         if start == stop:
@@ -418,9 +458,43 @@ class Stage(ABC):
         """What is still to be said when the run ends with sample ``index``."""
         return []
 
-    @abstractmethod
+    # ---- the compiled step ----------------------------------------------------------------------------
+
+    def prepare(self, samples: int) -> None:  # noqa: B027 - most stages need nothing
+        """Draw the random numbers that the next ``samples`` samples need; a step cannot."""
+
+    def serve(
+        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
+    ) -> list[Sparse]:
+        """Do what the step has stopped for at sample ``reached`` of the block; it goes on from there.
+
+        Stages whose steps stop have their own.
+
+        Raises:
+            LatheError: the stage cannot go on.
+        """
+        raise NotImplementedError(reason)
+
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """The messages about the samples from ``first`` on and before ``end``, which the step has computed last."""
+        return []
+
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
-        """Compute samples ``first`` on; see `advance`."""
+        """Compute samples ``first`` on without events and faults, by the step; see `advance`."""
+        assert self.step is not None, "a stage without a step has its own"
+        read = tuple([part[name] for port, part in zip(self.inputs, inputs, strict=False) for name in port.fields])
+        written = tuple([array for part in outputs for array in part.values()])
+        samples = written[0].size
+        self.prepare(samples)
+        sparse: list[Sparse] = []
+        told = reached = 0
+        while True:
+            reached, reason = self.step(self.memory, first, reached, read, written)
+            if reason == DONE:
+                return sparse + self.tell(first + told, first + samples)
+            sparse += self.tell(first + told, first + reached)
+            told = reached
+            sparse += self.serve(reason, first, reached, inputs, outputs)
 
 
 def cut(signals: Sequence[Signals], start: int, stop: int) -> list[Signals]:
