@@ -28,6 +28,8 @@ _KERNELS = (
     "bag/walk.py",
     "safety/*.py",
     "cell/collect.py",
+    "cell/program.py",
+    "cell/stages/*.py",
 )
 
 

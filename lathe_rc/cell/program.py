@@ -22,6 +22,7 @@ from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
 from lathe_rc.files import replacing
+from lathe_rc.jit import kernel
 
 _HEAD = '''"""Written by lathe_rc.cell.program; the steps of a cell as one compiled function."""
 
@@ -221,7 +222,7 @@ class Program:
         return said
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def passes(angle: Samples, turn: float) -> bool:
     """Whether an angle of rising samples, shape (n,), reaches ``turn`` [rad]; the search is that of NumPy."""
     if turn == np.inf:

@@ -117,7 +117,6 @@ class Stage(ABC):
         tells: events come about by themselves that only `process` knows of.
         own_inputs: number of inputs that `process` gets; one more may tell the spindle angle to the events.
         step: compiled; None: the stage has its own `process`, in Python.
-        memory: what the step works on, a NamedTuple of arrays and constants; may be replaced between two calls.
     """
 
     kind: ClassVar[str]
@@ -128,8 +127,7 @@ class Stage(ABC):
 
     inputs: tuple[Input, ...] = ()
     outputs: tuple[Output, ...] = ()
-    step: Step | None = None
-    memory: tuple[Any, ...] = ()
+    step: ClassVar[Step | None] = None
 
     def __init__(self, name: str, parameters: NodeParameters) -> None:
         self.name = name
@@ -460,6 +458,11 @@ class Stage(ABC):
 
     # ---- the compiled step ----------------------------------------------------------------------------
 
+    @property
+    def memory(self) -> tuple[Any, ...]:
+        """What the step works on, a NamedTuple of arrays and constants; another one may be given after each stop."""
+        return ()
+
     def prepare(self, samples: int) -> None:  # noqa: B027 - most stages need nothing
         """Draw the random numbers that the next ``samples`` samples need; a step cannot."""
 
@@ -481,10 +484,13 @@ class Stage(ABC):
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """Compute samples ``first`` on without events and faults, by the step; see `advance`."""
+        samples = next(iter(outputs[0].values())).size
+        if samples > messages.MAX_BLOCK:
+            pieces = [(k, min(k + messages.MAX_BLOCK, samples)) for k in range(0, samples, messages.MAX_BLOCK)]
+            return [said for k, m in pieces for said in self.process(first + k, cut(inputs, k, m), cut(outputs, k, m))]
         assert self.step is not None, "a stage without a step has its own"
         read = tuple([part[name] for port, part in zip(self.inputs, inputs, strict=False) for name in port.fields])
         written = tuple([array for part in outputs for array in part.values()])
-        samples = written[0].size
         self.prepare(samples)
         sparse: list[Sparse] = []
         told = reached = 0

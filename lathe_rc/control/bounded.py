@@ -3,15 +3,18 @@
 
 import math
 from dataclasses import dataclass
-from enum import Enum
+from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
 from lathe_rc.errors import LatheError
+from lathe_rc.jit import kernel
 
 Array = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
 
 _LONGER = 1.05  # factor from one try of a duration to the next
 _LOOKS = 129  # points at which a motion is looked at
@@ -83,16 +86,60 @@ def prepare() -> None:
     motion(0.0, 0.0, 0.0, Bounds(1.0, 1.0, 1.0), 1.0)
 
 
-def _last_two(before: Array, samples: Array) -> Array:
-    return samples[-2:].copy() if samples.size > 1 else np.concatenate((before, samples))[-2:]
-
-
-class Mode(Enum):
+class Mode(IntEnum):
     """Who commands."""
 
-    FOLLOW = "the controller"
-    HOLD = "nobody: the command comes to rest"
-    RETRACT = "the command goes to its place out of the part"
+    FOLLOW = 0  #: the controller
+    HOLD = 1  #: nobody: the command comes to rest
+    RETRACT = 2  #: the command goes to its place out of the part
+
+
+_MODE, _PLACE = 0, 1  # places in the state of a takeover: its mode, and how much of its path is behind
+
+
+class TakeoverTable(NamedTuple):
+    """A `Takeover` for kernels.
+
+    Attributes:
+        path: positions to come; of what is added to the command when it follows [m], shape (n,).
+        whole: mode, and how much of the path is behind.
+        given, wanted: the last two samples, after and before the takeover [m].
+    """
+
+    path: Array
+    whole: Integers
+    given: Array
+    wanted: Array
+
+
+@kernel
+def follows(takeover: TakeoverTable) -> bool:
+    """Whether the command is the controller's, and nothing is added to it."""
+    return bool(takeover.whole[_MODE] == Mode.FOLLOW.value and takeover.whole[_PLACE] >= takeover.path.size)
+
+
+@kernel
+def _keep_last(last: Array, samples: Array) -> None:
+    if samples.size > 1:
+        last[0], last[1] = samples[-2], samples[-1]
+    elif samples.size == 1:
+        last[0], last[1] = last[1], samples[0]
+
+
+@kernel
+def take_over(takeover: TakeoverTable, command: Array) -> None:
+    """Make of what the controller wants what the drive gets; in place, shape (n,) [m]."""
+    path, whole = takeover.path, takeover.whole
+    _keep_last(takeover.wanted, command)
+    if not follows(takeover):
+        place, adds = whole[_PLACE], whole[_MODE] == Mode.FOLLOW.value
+        ahead = min(path.size - place, command.size)
+        for k in range(ahead):
+            command[k] = command[k] + path[place + k] if adds else path[place + k]
+        if not adds:
+            command[ahead:] = path[-1]
+        whole[_PLACE] = place + ahead
+    _keep_last(takeover.given, command)
 
 
 class Takeover:
@@ -110,7 +157,7 @@ class Takeover:
             all steps and noise has none.
 
     Attributes:
-        mode: who commands; see `change`.
+        table: for `take_over`.
         skipped: by how much the last motion has begun nearer to its end than the command was [m]; 0 within reach.
     """
 
@@ -118,37 +165,42 @@ class Takeover:
         self, bounds: Bounds, retracted: float, step: float, *, reach: float = math.inf, carries: bool = True
     ) -> None:
         self._bounds, self._goal, self._step, self._reach, self._carries = bounds, retracted, step, reach, carries
-        self.mode, self.skipped = Mode.FOLLOW, 0.0
-        self._path, self._place = np.zeros(0), 0  # positions to come; of what is added to the command when it follows
-        self._given, self._wanted = np.zeros(2), np.zeros(2)  # the last two samples, after and before
+        self.skipped = 0.0
+        self.table = TakeoverTable(np.zeros(0), np.zeros(2, np.int64), np.zeros(2), np.zeros(2))
+
+    @property
+    def mode(self) -> Mode:
+        """Who commands; see `change`."""
+        return Mode(self.table.whole[_MODE])
 
     @property
     def newest(self) -> float:
         """What was given last [m]."""
-        return float(self._given[1])
+        return float(self.table.given[1])
 
     @property
     def remaining(self) -> int:
         """Samples until the motion that is under way ends."""
-        return self._path.size - self._place
+        return self.table.path.size - int(self.table.whole[_PLACE])
 
     def change(self, mode: Mode) -> None:
         """Take over, or give back, from the next sample on."""
         self.skipped = 0.0
         if mode is self.mode:
             return
-        velocity = self._carried(self._given)
+        given, wanted = self.table.given, self.table.wanted
+        velocity = self._carried(given)
         if mode is Mode.FOLLOW:
-            rest = velocity - self._carried(self._wanted)
-            left = self._within_reach(self._given[1] - self._wanted[1], 0.0)
-            self._path = motion(left, rest, 0.0, self._bounds, self._step)
+            left = self._within_reach(given[1] - wanted[1], 0.0)
+            path = motion(left, velocity - self._carried(wanted), 0.0, self._bounds, self._step)
         else:
-            self._path = self._way(velocity, to_goal=mode is Mode.RETRACT)
-        self.mode, self._place = mode, 0
+            path = self._way(velocity, to_goal=mode is Mode.RETRACT)
+        self.table.whole[:] = mode, 0
+        self.table = self.table._replace(path=np.ascontiguousarray(path))
 
     def _way(self, velocity: float, *, to_goal: bool) -> Array:
         """The way to rest, or out of the part: a single motion that begins into the part would first go far into it."""
-        start, step = float(self._given[1]), self._step
+        start, step = self.newest, self._step
         if not to_goal:
             return motion(start, velocity, None, self._bounds, step)
         start = self._within_reach(start, self._goal)
@@ -169,15 +221,4 @@ class Takeover:
 
     def apply(self, command: Array) -> None:
         """Make of what the controller wants what the drive gets; in place, shape (n,) [m]."""
-        if command.size > 1 and self._place >= self._path.size and self.mode is Mode.FOLLOW:
-            self._given = self._wanted = command[-2:].copy()
-            return
-        wanted = _last_two(self._wanted, command)
-        if self.mode is not Mode.FOLLOW or self._place < self._path.size:
-            ahead = self._path[self._place : self._place + command.size]
-            self._place += ahead.size
-            if self.mode is Mode.FOLLOW:
-                command[: ahead.size] += ahead
-            else:
-                command[: ahead.size], command[ahead.size :] = ahead, self._path[-1]
-        self._given, self._wanted = _last_two(self._given, command), wanted
+        take_over(self.table, command)

@@ -11,6 +11,7 @@ commanded are counted.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -200,14 +201,35 @@ def keep_velocity(
     return not free or moving != wanted
 
 
+class LimiterTable(NamedTuple):
+    """A `CommandLimiter` for kernels.
+
+    Attributes:
+        stroke, velocity, acceleration, jerk: see `CommandLimits`.
+        step: sampling step [s].
+        state: for `keep_position`.
+        clipped: whether it was not given as it was commanded, of sample n at n modulo its length.
+    """
+
+    stroke: float
+    velocity: float
+    acceleration: float
+    jerk: float
+    step: float
+    state: Array
+    clipped: npt.NDArray[np.uint8]
+
+
 @kernel
-def _limit(
-    stroke: float, velocity: float, acceleration: float, jerk: float, step: float, state: Array, wanted: Array,
-    given: Array, clipped: npt.NDArray[np.uint8],
-) -> None:  # fmt: skip
+def limit(limiter: LimiterTable, first: int, wanted: Array, given: Array) -> None:
+    """Fill ``given`` from ``wanted``, shape (n,) [m], of the samples ``first`` on."""
+    stroke, velocity, acceleration, jerk = limiter.stroke, limiter.velocity, limiter.acceleration, limiter.jerk
+    mask = limiter.clipped.size - 1
     for k in range(wanted.size):
-        clipped[k] = keep_position(stroke, velocity, acceleration, jerk, step, state, wanted[k])
-        given[k] = state[0]
+        limiter.clipped[(first + k) & mask] = keep_position(
+            stroke, velocity, acceleration, jerk, limiter.step, limiter.state, wanted[k]
+        )
+        given[k] = limiter.state[0]
 
 
 def rest() -> Array:
@@ -215,29 +237,14 @@ def rest() -> Array:
     return np.zeros(5)
 
 
-class CommandLimiter:
-    """Keeps a command within its limits.
+def limiter(limits: CommandLimits, step: float, remembered: int) -> LimiterTable:
+    """What keeps a command within limits; it is at rest at 0 before the first sample.
 
     Args:
-        limits: that it keeps within; the command is at rest at 0 before the first sample.
+        limits: that it keeps within.
         step: sampling step [s].
-
-    Attributes:
-        clipped: samples so far that were not given as they were commanded.
+        remembered: samples for which it is known whether they were clipped, a power of two.
     """
-
-    def __init__(self, limits: CommandLimits, step: float) -> None:
-        self._limits, self._step = limits, step
-        self._state = rest()
-        self.clipped = 0
-
-    def block(self, wanted: Array, given: Array) -> npt.NDArray[np.uint8]:
-        """Fill ``given`` from ``wanted``, shape (n,) [m]; 1 where they differ."""
-        clipped = np.empty(wanted.size, np.uint8)
-        limits = self._limits
-        _limit(
-            limits.stroke, limits.velocity, limits.acceleration, limits.jerk, self._step, self._state, wanted, given,
-            clipped,
-        )  # fmt: skip
-        self.clipped += int(clipped.sum())
-        return clipped
+    return LimiterTable(
+        limits.stroke, limits.velocity, limits.acceleration, limits.jerk, step, rest(), np.zeros(remembered, np.uint8)
+    )

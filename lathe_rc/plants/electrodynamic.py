@@ -7,6 +7,8 @@ Source: papers 000 and 001; parameters identified from the table of 001. The coi
 carriage's acceleration asks for, i = m·x''/k.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -16,37 +18,46 @@ from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, se
 Array = npt.NDArray[np.float64]
 
 
-@kernel
-def _advance(
-    transition: Array,
-    weights: Array,
-    part: float,
-    spring: float,
-    damper: float,
-    force_per_current: float,
-    stroke: float,
-    state: Array,
-    line: Array,
-    command: Array,
-    position: Array,
-    velocity: Array,
-    current: Array,
-) -> int:
-    """Step the drive through a block; returns the number of samples at an end stop.
+class CoarseTable(NamedTuple):
+    """An `ElectrodynamicDrive` for kernels.
 
-    ``line`` holds the commands before this block that are still on their way, the oldest first.
+    Attributes:
+        transition, weights, part: of the plant.
+        spring, damper: of its own loops, by the moving mass [1/s², 1/s].
+        force_per_current: moving mass over force constant [A·s²/m].
+        stroke: [m].
+        state: position and velocity.
+        line: the commands before the next block that are still on their way, the oldest first.
+        stopped: samples at an end stop so far, shape (1,).
     """
+
+    transition: Array
+    weights: Array
+    part: float
+    spring: float
+    damper: float
+    force_per_current: float
+    stroke: float
+    state: Array
+    line: Array
+    stopped: npt.NDArray[np.int64]
+
+
+@kernel
+def advance(drive: CoarseTable, command: Array, position: Array, velocity: Array, current: Array) -> None:
+    """Step the drive through a block, see `ElectrodynamicDrive.block`."""
+    state, line, part, stroke = drive.state, drive.line, drive.part, drive.stroke
+    spring, damper, force_per_current = drive.spring, drive.damper, drive.force_per_current
+    a, w = drive.transition, drive.weights
+    a00, a01, a10, a11 = a[0, 0], a[0, 1], a[1, 0], a[1, 1]
+    w00, w01, w02, w10, w11, w12 = w[0, 0], w[0, 1], w[0, 2], w[1, 0], w[1, 1], w[1, 2]
     x, v = state[0], state[1]
     stopped = 0
     sent = np.concatenate((line, command))
     for k in range(command.size):
         u0, u1, u2 = sent[k + 2], sent[k + 1], sent[k]
-        new_x = (
-            transition[0, 0] * x + transition[0, 1] * v + weights[0, 0] * u0 + weights[0, 1] * u1 + weights[0, 2] * u2
-        )
-        new_v = (
-            transition[1, 0] * x + transition[1, 1] * v + weights[1, 0] * u0 + weights[1, 1] * u1 + weights[1, 2] * u2
-        )
+        new_x = a00 * x + a01 * v + w00 * u0 + w01 * u1 + w02 * u2
+        new_v = a10 * x + a11 * v + w10 * u0 + w11 * u1 + w12 * u2
         x, v = new_x, new_v
         # The end stops are inelastic: the carriage stays there until it is driven back.
         if x > stroke:
@@ -60,7 +71,7 @@ def _advance(
         current[k] = (spring * (delayed - x) - damper * v) * force_per_current
     state[0], state[1] = x, v
     line[:] = sent[command.size :]
-    return stopped
+    drive.stopped[0] += stopped
 
 
 class ElectrodynamicDrive:
@@ -78,7 +89,7 @@ class ElectrodynamicDrive:
 
     Attributes:
         plant: the difference equation.
-        stopped: samples spent at an end stop so far.
+        table: for `advance`.
     """
 
     def __init__(
@@ -95,18 +106,24 @@ class ElectrodynamicDrive:
     ) -> None:
         a, b = second_order(natural_frequency, damping)
         self.plant: DiscretePlant = discretise(a, b, delay, step, method)
-        self.stopped = 0
-        self._spring, self._damper = -a[1, 0], -a[1, 1]
-        self._force_per_current = moving_mass / force_constant
-        self._stroke = stroke
-        self._state = np.zeros(2)
-        self._line = np.zeros(self.plant.delay + 2)
+        self.table = CoarseTable(
+            transition=self.plant.transition,
+            weights=self.plant.weights,
+            part=self.plant.fraction,
+            spring=float(-a[1, 0]),
+            damper=float(-a[1, 1]),
+            force_per_current=moving_mass / force_constant,
+            stroke=stroke,
+            state=np.zeros(2),
+            line=np.zeros(self.plant.delay + 2),
+            stopped=np.zeros(1, np.int64),
+        )
+
+    @property
+    def stopped(self) -> int:
+        """Samples spent at an end stop so far."""
+        return int(self.table.stopped[0])
 
     def block(self, command: Array, position: Array, velocity: Array, current: Array) -> None:
         """Step through a block; arrays of shape (n,) [m, m, m/s, A]. At rest at 0 before the first."""
-        plant = self.plant
-        self.stopped += _advance(
-            plant.transition, plant.weights, plant.fraction, self._spring, self._damper,
-            self._force_per_current, self._stroke, self._state, self._line,
-            command, position, velocity, current,
-        )  # fmt: skip
+        advance(self.table, command, position, velocity, current)

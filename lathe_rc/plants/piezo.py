@@ -193,32 +193,44 @@ class Stack:
         return whole * self._amplifier.response(frequency) if self._amplifier else whole
 
 
+class FineTable(NamedTuple):
+    """A `PiezoDrive` for kernels.
+
+    Attributes:
+        transition, weights: of the resonance.
+        stack: amplifier and ceramics.
+        memory: their state.
+        full_voltage: [V].
+        state: position, velocity, and the last extension [m, m/s, m].
+        saturated: samples so far in which something was cut off, shape (1,).
+    """
+
+    transition: Array
+    weights: Array
+    stack: StackTable
+    memory: Array
+    full_voltage: float
+    state: Array
+    saturated: npt.NDArray[np.int64]
+
+
 @kernel
-def _advance(
-    transition: Array,
-    weights: Array,
-    stack: StackTable,
-    memory: Array,
-    full_voltage: float,
-    state: Array,
-    set_point: Array,
-    position: Array,
-    velocity: Array,
-    voltage: Array,
-) -> int:
-    """Step the drive through a block; returns the number of samples in saturation."""
-    saturated = _extend_along(stack, memory, set_point, velocity, voltage)
+def advance_fine(drive: FineTable, set_point: Array, position: Array, velocity: Array, voltage: Array) -> None:
+    """Step the drive through a block, see `PiezoDrive.block`."""
+    drive.saturated[0] += _extend_along(drive.stack, drive.memory, set_point, velocity, voltage)
+    a, w, state, full_voltage = drive.transition, drive.weights, drive.state, drive.full_voltage
+    a00, a01, a10, a11 = a[0, 0], a[0, 1], a[1, 0], a[1, 1]
+    w00, w01, w10, w11 = w[0, 0], w[0, 1], w[1, 0], w[1, 1]
     x, v, before = state[0], state[1], state[2]
     for k in range(set_point.size):
         extension = velocity[k]
         x, v = (
-            transition[0, 0] * x + transition[0, 1] * v + weights[0, 0] * extension + weights[0, 1] * before,
-            transition[1, 0] * x + transition[1, 1] * v + weights[1, 0] * extension + weights[1, 1] * before,
+            a00 * x + a01 * v + w00 * extension + w01 * before,
+            a10 * x + a11 * v + w10 * extension + w11 * before,
         )
         before = extension
         position[k], velocity[k], voltage[k] = x, v, voltage[k] * full_voltage
     state[0], state[1], state[2] = x, v, before
-    return saturated
 
 
 class PiezoDrive:
@@ -234,7 +246,7 @@ class PiezoDrive:
 
     Attributes:
         plant: the difference equation of the resonance.
-        saturated: samples so far in which the set point or the voltage was cut off.
+        table: for `advance_fine`.
     """
 
     def __init__(
@@ -248,9 +260,21 @@ class PiezoDrive:
         method: Discretisation,
     ) -> None:
         self.plant: DiscretePlant = discretise(*second_order(natural_frequency, damping), 0.0, step, method)
-        self.saturated = 0
-        self._stack, self._full_voltage = stack, full_voltage
-        self._state = np.zeros(3)
+        self._stack = stack
+        self.table = FineTable(
+            transition=self.plant.transition,
+            weights=self.plant.weights,
+            stack=stack.table,
+            memory=stack.state,
+            full_voltage=full_voltage,
+            state=np.zeros(3),
+            saturated=np.zeros(1, np.int64),
+        )
+
+    @property
+    def saturated(self) -> int:
+        """Samples so far in which the set point or the voltage was cut off."""
+        return int(self.table.saturated[0])
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
         """Wpk of paper 001 at ``frequency`` [rad/s]: linearised drive, as its difference equations run."""
@@ -258,7 +282,4 @@ class PiezoDrive:
 
     def block(self, set_point: Array, position: Array, velocity: Array, voltage: Array) -> None:
         """Step through a block; arrays of shape (n,) [m, m, m/s, V]. At rest at 0 before the first."""
-        self.saturated += _advance(
-            self.plant.transition, self.plant.weights, self._stack.table, self._stack.state, self._full_voltage,
-            self._state, set_point, position, velocity, voltage,
-        )  # fmt: skip
+        advance_fine(self.table, set_point, position, velocity, voltage)

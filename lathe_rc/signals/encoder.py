@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spindle encoder: true and measured angle, measured speed, index pulse."""
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -12,23 +14,39 @@ Array = npt.NDArray[np.float64]
 _TURN = 2.0 * np.pi
 
 
+class EncoderTable(NamedTuple):
+    """An `Encoder` for kernels.
+
+    Attributes:
+        step: sampling step [s].
+        nominal, lines, tachogram: of the speed law.
+        counts: per revolution; 0 for an ideal encoder.
+        history: the last angles, shape (speed_window,); sample n stands at n modulo its length.
+        revolution: of the last sample, shape (1,).
+    """
+
+    step: float
+    nominal: float
+    lines: Array
+    tachogram: Array
+    counts: int
+    history: Array
+    revolution: Array
+
+
 @kernel
-def _encode(
+def encode(
+    encoder: EncoderTable,
     first: int,
-    step: float,
-    nominal: float,
-    lines: Array,
-    tachogram: Array,
-    counts: int,
-    history: Array,
-    revolution: Array,
     angle: Array,
     speed: Array,
     index_pulse: npt.NDArray[np.uint8],
     angle_true: Array,
     speed_true: Array,
 ) -> None:
-    evaluate_along(first, step, nominal, lines, tachogram, angle_true, speed_true)
+    """Fill the samples from index ``first`` on, see `Encoder.block`."""
+    step, counts, history, revolution = encoder.step, encoder.counts, encoder.history, encoder.revolution
+    evaluate_along(first, step, encoder.nominal, encoder.lines, encoder.tachogram, angle_true, speed_true)
     before = revolution[0]
     if counts == 0:
         for k in range(angle.size):
@@ -62,14 +80,16 @@ class Encoder:
         counts: counts per revolution after quadrature; 0 for an ideal encoder, whose angle and speed are true.
         speed_window: samples over which the measured speed is a difference of the measured angle; it lags
             by half of them. Before sample 0 the spindle is taken to have turned at its nominal speed.
+
+    Attributes:
+        table: for `encode`.
     """
 
     def __init__(self, law: SpeedLaw, step: float, counts: int, speed_window: int) -> None:
-        self._law, self._step, self._counts = law, step, counts
         before = np.arange(-speed_window, 0, dtype=np.float64)
         # history[n % window] holds the angle of sample n; these are the samples before the first.
-        self._history: Array = before * (law.nominal * step)
-        self._revolution = np.array([-1.0])
+        history: Array = before * (law.nominal * step)
+        self.table = EncoderTable(step, law.nominal, law.lines, law.tachogram, counts, history, np.array([-1.0]))
 
     def block(
         self,
@@ -81,8 +101,4 @@ class Encoder:
         speed_true: Array,
     ) -> None:
         """Fill the samples from index ``first`` on; arrays of shape (n,) [rad, rad/s, 1, rad, rad/s]."""
-        law = self._law
-        _encode(
-            first, self._step, law.nominal, law.lines, law.tachogram, self._counts, self._history,
-            self._revolution, angle, speed, index_pulse, angle_true, speed_true,
-        )  # fmt: skip
+        encode(self.table, first, angle, speed, index_pulse, angle_true, speed_true)

@@ -2,6 +2,7 @@
 """Measurement noise and quantisation of a sensor."""
 
 import zlib
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -9,6 +10,9 @@ import numpy.typing as npt
 from lathe_rc.jit import kernel
 
 Array = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+_DRAWN = 8192  # numbers that a stream draws at a time, at most
 
 
 @kernel
@@ -17,6 +21,74 @@ def quantise(value: float, resolution: float) -> float:
     if resolution > 0.0:
         return float(np.rint(value / resolution) * resolution)
     return value
+
+
+class Drawn(NamedTuple):
+    """Normal numbers for kernels, mean 0 and RMS 1.
+
+    Attributes:
+        values: drawn in advance.
+        used: how many of them have been, shape (1,).
+    """
+
+    values: Array
+    used: Integers
+
+
+class NormalStream:
+    """A stream of normal numbers; the lengths in which it is drawn leave no trace.
+
+    Args:
+        seed: the scenario's seed.
+        name: makes the stream its owner's own.
+        on: without, nothing is ever drawn.
+
+    Attributes:
+        drawn: for kernels, which take the next numbers from it.
+    """
+
+    def __init__(self, seed: int, name: str, *, on: bool = True) -> None:
+        self._random = np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
+        size = _DRAWN if on else 0
+        self.drawn = Drawn(np.empty(size), np.array([size], np.int64))
+
+    def draw(self, numbers: int) -> None:
+        """Have so many numbers in advance, up to 8192."""
+        values, used = self.drawn
+        if values.size and used[0] + numbers > values.size:
+            left = values.size - used[0]
+            values[:left] = values[used[0] :].copy()
+            self._random.standard_normal(out=values[left:])
+            used[0] = 0
+
+
+class SensorTable(NamedTuple):
+    """A `Sensor` for kernels.
+
+    Attributes:
+        noise: for its noise.
+        rms: of the noise, in the unit of the signal.
+        resolution: quantisation step, in the unit of the signal.
+    """
+
+    noise: Drawn
+    rms: float
+    resolution: float
+
+
+@kernel
+def measure(sensor: SensorTable, true: Array, measured: Array) -> None:
+    """Fill ``measured`` from ``true``; both of shape (n,), and as many numbers drawn if there is noise."""
+    if sensor.rms > 0.0:
+        noise, place = sensor.noise.values, sensor.noise.used[0]
+        for k in range(true.size):
+            measured[k] = true[k] + sensor.rms * noise[place + k]
+        sensor.noise.used[0] = place + true.size
+    else:
+        measured[:] = true
+    if sensor.resolution > 0.0:
+        for k in range(true.size):
+            measured[k] = quantise(measured[k], sensor.resolution)
 
 
 class Sensor:
@@ -29,20 +101,20 @@ class Sensor:
         name: who measures; makes the noise of each sensor its own.
 
     Attributes:
-        disturbs: False if it measures what is true.
+        table: for `measure`.
     """
 
     def __init__(self, noise_rms: float, resolution: float, seed: int, name: str) -> None:
-        self._noise_rms, self._resolution = noise_rms, resolution
-        self.disturbs = noise_rms > 0.0 or resolution > 0.0
-        # A stream of normal numbers does not depend on the lengths in which it is drawn.
-        self._random = np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
+        self._stream = NormalStream(seed, name, on=noise_rms > 0.0)
+        self.table = SensorTable(self._stream.drawn, noise_rms, resolution)
+
+    def draw(self, samples: int) -> None:
+        """Draw the noise of the next samples, up to 8192."""
+        self._stream.draw(samples)
 
     def measure(self, true: Array, measured: Array) -> None:
         """Fill ``measured`` from ``true``; both of shape (n,)."""
-        measured[:] = true
-        if self._noise_rms > 0.0:
-            measured += self._noise_rms * self._random.standard_normal(true.size)
-        if self._resolution > 0.0:
-            np.rint(measured / self._resolution, out=measured)
-            measured *= self._resolution
+        for start in range(0, true.size, _DRAWN):
+            piece = slice(start, min(start + _DRAWN, true.size))
+            self.draw(piece.stop - start)
+            measure(self.table, true[piece], measured[piece])

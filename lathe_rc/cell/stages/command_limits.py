@@ -10,7 +10,8 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.control.limits import CommandLimiter, CommandLimits
+from lathe_rc.control.limits import CommandLimits, LimiterTable, limit, limiter
+from lathe_rc.jit import kernel
 
 LIMITED, FREE = "limited", "free"  #: events: a sample is clipped; none has been for a while
 _TELL = 0.1  # [s] after which a command that goes on being clipped says how often
@@ -43,23 +44,39 @@ class LimitedCommand:
 
     Attributes:
         on: whether there is a limit.
+        table: for `limited`.
     """
 
     def __init__(self, node: str, parameters: LimitedParameters, which: str = "") -> None:
         limits = parameters.command_limits()
         self.on = limits.any
-        self._limiter, self._clipping = CommandLimiter(limits, parameters.step), Clipping(node, parameters, which)
+        self.table = limiter(limits, parameters.step, messages.MAX_BLOCK if self.on else 1)
+        self._clipping = Clipping(node, parameters, which)
 
-    def block(self, first: int, command: Samples) -> tuple[Samples, list[Sparse]]:
-        """What the drive gets [m], shape (n,), and the events of samples ``first`` on."""
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """The events of the samples from ``first`` on and before ``end``, which were limited last."""
         if not self.on:
-            return command, []
-        given = np.empty_like(command)
-        return given, self._clipping.told(first, self._limiter.block(command, given))
+            return []
+        return self._clipping.told(first, remembered(self.table.clipped, first, end))
 
     def finish(self, index: int) -> list[Sparse]:
         """See `Clipping.finish`."""
         return self._clipping.finish(index)
+
+
+@kernel
+def limited(limits: LimiterTable, first: int, command: Samples) -> Samples:
+    """What the drive gets [m], shape (n,), of samples ``first`` on; see `LimitedCommand`."""
+    if limits.clipped.size == 1:
+        return command
+    given = np.empty_like(command)
+    limit(limits, first, command, given)
+    return given
+
+
+def remembered(flags: Samples, first: int, end: int) -> Samples:
+    """Flags of the samples from ``first`` on and before ``end``, where that of sample n stands at n modulo the size."""
+    return flags[np.arange(first, end) & (flags.size - 1)]
 
 
 class Clipping:

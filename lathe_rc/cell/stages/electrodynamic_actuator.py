@@ -1,22 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coarse electrodynamic tool drive."""
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, NamedTuple
 
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc.analysis.learning import Response
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import Input, Joint, Output, Sparse
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters
+from lathe_rc.cell.stage import DONE, Input, Joint, Output, Sparse
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
 from lathe_rc.cell.stages.drive import Drive, Limits
-from lathe_rc.cell.stages.retraction import OwnRetraction, RetractionParameters
-from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
+from lathe_rc.cell.stages.retraction import OwnRetraction, RetractionParameters, followed
+from lathe_rc.control.bounded import TakeoverTable
+from lathe_rc.control.limits import LimiterTable
+from lathe_rc.jit import kernel
+from lathe_rc.plants.electrodynamic import CoarseTable, ElectrodynamicDrive, advance
 from lathe_rc.plants.linear import Discretisation
-from lathe_rc.signals.noise import Sensor
+from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
 
 class ElectrodynamicActuatorParameters(LimitedParameters, RetractionParameters):
@@ -35,6 +38,27 @@ class ElectrodynamicActuatorParameters(LimitedParameters, RetractionParameters):
     resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
 
 
+class Memory(NamedTuple):
+    """What the step works on."""
+
+    retraction: TakeoverTable
+    limits: LimiterTable
+    drive: CoarseTable
+    sensor: SensorTable
+
+
+@kernel
+def step(
+    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`."""
+    (command,), (position, velocity, effort, measured_position) = inputs, outputs
+    given = limited(memory.limits, first, followed(memory.retraction, command))
+    advance(memory.drive, given, position, velocity, effort)
+    measure(memory.sensor, position, measured_position)
+    return command.size, DONE
+
+
 class ElectrodynamicActuator(Drive):
     """See `lathe_rc.plants.electrodynamic`.
 
@@ -46,6 +70,7 @@ class ElectrodynamicActuator(Drive):
     kind = "electrodynamic_actuator"
     Parameters = ElectrodynamicActuatorParameters
     announces = (LIMITED, FREE)
+    step = staticmethod(step)
 
     def __init__(self, name: str, parameters: ElectrodynamicActuatorParameters) -> None:
         super().__init__(name, parameters)
@@ -86,10 +111,15 @@ class ElectrodynamicActuator(Drive):
         """See `Stage`."""
         return self._limited.finish(index)
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    @property
+    def memory(self) -> Memory:
         """See `Stage`."""
-        (command,), (state,) = inputs, outputs
-        given, told = self._limited.block(first, self._retraction.block(command["position"]))
-        self.drive.block(given, state["position"], state["velocity"], state["effort"])
-        self._sensor.measure(state["position"], state["measured_position"])
-        return told
+        return Memory(self._retraction.table, self._limited.table, self.drive.table, self._sensor.table)
+
+    def prepare(self, samples: int) -> None:
+        """See `Stage`."""
+        self._sensor.draw(samples)
+
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """See `Stage`."""
+        return self._limited.tell(first, end)

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The desired form of the part as parameters, and what evaluates it under the tool."""
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc import resources
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
 from lathe_rc.plants.tool import equal
 from lathe_rc.signals.profile import (
     Harmonics,
@@ -83,6 +83,52 @@ class FormParameters(NodeParameters):
         return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
 
 
+class FormTable(NamedTuple):
+    """A `Form` for kernels.
+
+    Attributes:
+        heights, table: see `lathe_rc.signals.profile.ProfileTable`.
+        slides: whether the longitudinal slide makes the height.
+        feed, start, part: otherwise, see `lathe_rc.signals.profile.height_along`.
+    """
+
+    heights: Samples
+    table: Samples
+    slides: bool
+    feed: float
+    start: float
+    part: int
+
+
+@kernel
+def _place(form: FormTable, angle: Samples, slide: Samples, height: Samples) -> None:
+    """Fill the height [m] at an angle [rad] or place of the longitudinal slide [m]."""
+    if form.slides:
+        for k in range(height.size):
+            height[k] = form.start + slide[k]
+    else:
+        height_along(form.feed, form.start, form.part, angle, height)
+
+
+@kernel
+def evaluate(
+    form: FormTable, inputs: tuple[Samples, ...], reference: Samples, expected: Samples, height: Samples
+) -> None:
+    """Fill the desired displacement and what a controller can know of it, and the height [m], shape (n,).
+
+    The inputs of the `Form` are the first of ``inputs``.
+    """
+    angle, angle_true = inputs[0], inputs[1]
+    position, measured = (inputs[2], inputs[3]) if form.slides else (angle_true, angle)
+    _place(form, angle_true, position, height)
+    deviation_along(form.heights, form.table, angle_true, height, reference)
+    if equal(angle, angle_true) and equal(position, measured):
+        expected[:] = reference
+    else:
+        _place(form, angle, measured, expected)
+        deviation_along(form.heights, form.table, angle, expected.copy(), expected)
+
+
 class Form:
     """A form, tabulated.
 
@@ -93,6 +139,7 @@ class Form:
     Attributes:
         profile: its table.
         inputs: what it reads.
+        table: for `evaluate`.
 
     Raises:
         InputError: see `FormParameters.form`; or a slide that shall begin anew.
@@ -100,34 +147,17 @@ class Form:
 
     def __init__(self, node: str, parameters: FormParameters) -> None:
         self.profile = tabulated(parameters.form(node))
-        self._parameters = parameters
         self.inputs = [Input("encoder", messages.ENCODER, ("angle", "angle_true"))]
-        if parameters.height_from == "slide":
+        slides = parameters.height_from == "slide"
+        self.table = FormTable(
+            heights=self.profile.heights,
+            table=self.profile.table,
+            slides=slides,
+            feed=parameters.feed,
+            start=parameters.start_height,
+            part=parameters.part_revolutions,
+        )
+        if slides:
             self.inputs.append(Input("longitudinal/state", messages.STATE, ("position", "measured_position")))
             if parameters.part_revolutions:
                 raise InputError(f"{node}.part_revolutions with height_from = slide; allowed: 0, a slide does not jump")
-
-    def block(self, inputs: Sequence[Signals], reference: Samples, expected: Samples, height: Samples) -> None:
-        """Fill the desired displacement and what a controller can know of it, and the height [m], shape (n,)."""
-        encoder = inputs[0]
-        angle, angle_true = encoder["angle"], encoder["angle_true"]
-        slides = inputs[1] if self._parameters.height_from == "slide" else None
-        self._heights(angle_true, slides["position"] if slides else None, height)
-        self._deviation(angle_true, height, reference)
-        known = equal(angle, angle_true)
-        if known and (slides is None or equal(slides["position"], slides["measured_position"])):
-            expected[:] = reference
-        else:
-            self._heights(angle, slides["measured_position"] if slides else None, expected)
-            self._deviation(angle, expected.copy(), expected)
-
-    def _heights(self, angle: Samples, slide: Samples | None, height: Samples) -> None:
-        """Fill the height [m] at an angle [rad] or place of the longitudinal slide [m]."""
-        table = self._parameters
-        if slide is None:
-            height_along(table.feed, table.start_height, table.part_revolutions, angle, height)
-        else:
-            np.add(table.start_height, slide, out=height)
-
-    def _deviation(self, angle: Samples, height: Samples, deviation: Samples) -> None:
-        deviation_along(self.profile.heights, self.profile.table, angle, height, deviation)

@@ -1,21 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fine piezo tool drive."""
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc.analysis.learning import Response
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import Joint, Output, Sparse
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters
+from lathe_rc.cell.stage import DONE, Joint, Output, Sparse
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
 from lathe_rc.cell.stages.drive import Drive
-from lathe_rc.cell.stages.set_point import SetPoint, SetPointParameters
+from lathe_rc.cell.stages.set_point import SetPoint, SetPointParameters, sum_up
+from lathe_rc.control.limits import LimiterTable
 from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
 from lathe_rc.plants.hysteresis import (
     THRESHOLDS,
     WEIGHTS,
@@ -23,8 +25,8 @@ from lathe_rc.plants.hysteresis import (
     PrandtlIshlinskii,
 )
 from lathe_rc.plants.linear import Discretisation
-from lathe_rc.plants.piezo import PiezoDrive, Stack
-from lathe_rc.signals.noise import Sensor
+from lathe_rc.plants.piezo import FineTable, PiezoDrive, Stack, advance_fine
+from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
 
 class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
@@ -119,6 +121,27 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
             raise InputError(f"{node}: {error}") from None
 
 
+class Memory(NamedTuple):
+    """What the step works on."""
+
+    signs: Samples
+    limits: LimiterTable
+    drive: FineTable
+    sensor: SensorTable
+
+
+@kernel
+def step(
+    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`."""
+    position, velocity, effort, measured_position = outputs
+    set_point = sum_up(memory.signs, inputs, 0, position.size)
+    advance_fine(memory.drive, limited(memory.limits, first, set_point), position, velocity, effort)
+    measure(memory.sensor, position, measured_position)
+    return position.size, DONE
+
+
 class PiezoActuator(Drive):
     """See `lathe_rc.plants.piezo`.
 
@@ -131,6 +154,7 @@ class PiezoActuator(Drive):
     kind = "piezo_actuator"
     Parameters = PiezoActuatorParameters
     announces = (LIMITED, FREE)
+    step = staticmethod(step)
 
     def __init__(self, name: str, parameters: PiezoActuatorParameters) -> None:
         super().__init__(name, parameters)
@@ -160,12 +184,15 @@ class PiezoActuator(Drive):
         """See `Stage`."""
         return self._limited.finish(index)
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    @property
+    def memory(self) -> Memory:
         """See `Stage`."""
-        (state,) = outputs
-        set_point = np.empty_like(state["position"])
-        self.set_point.fill(inputs, set_point)
-        given, told = self._limited.block(first, set_point)
-        self.drive.block(given, state["position"], state["velocity"], state["effort"])
-        self._sensor.measure(state["position"], state["measured_position"])
-        return told
+        return Memory(self.set_point.signs, self._limited.table, self.drive.table, self._sensor.table)
+
+    def prepare(self, samples: int) -> None:
+        """See `Stage`."""
+        self._sensor.draw(samples)
+
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """See `Stage`."""
+        return self._limited.tell(first, end)

@@ -1,12 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The desired form under the tool as a node of its own, for drives that need it before the tool computes."""
 
-from collections.abc import Sequence
-
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
-from lathe_rc.cell.stage import Joint, Output, Sparse, Stage
-from lathe_rc.cell.stages.form import Form, FormParameters
+from lathe_rc.cell.messages import Samples
+from lathe_rc.cell.stage import DONE, Joint, Output, Stage
+from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, evaluate
+from lathe_rc.jit import kernel
+
+
+@kernel
+def step(
+    memory: FormTable, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`."""
+    reference, expected, height = outputs
+    evaluate(memory, inputs, reference, expected, height)
+    return height.size, DONE
 
 
 class ProfileStage(Stage):
@@ -19,6 +28,7 @@ class ProfileStage(Stage):
 
     kind = "profile"
     Parameters = FormParameters
+    step = staticmethod(step)
 
     def __init__(self, name: str, parameters: FormParameters) -> None:
         super().__init__(name, parameters)
@@ -29,8 +39,7 @@ class ProfileStage(Stage):
             outputs=[Output("reference", messages.REFERENCE, Joint("reference"))],
         )
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    @property
+    def memory(self) -> FormTable:
         """See `Stage`."""
-        (part,) = outputs
-        self.form.block(inputs, part["reference"], part["expected"], part["height"])
-        return []
+        return self.form.table

@@ -7,7 +7,8 @@ from annotated_types import Gt
 
 from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.control.bounded import Bounds, Mode, Takeover
+from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, follows, take_over
+from lathe_rc.jit import kernel
 
 
 class BoundedParameters(NodeParameters):
@@ -42,12 +43,19 @@ class OwnRetraction:
         reach = stroke + abs(parameters.safe_position)
         self._takeover = Takeover(parameters.bounds(), parameters.safe_position, parameters.step, reach=reach)
 
+    @property
+    def table(self) -> TakeoverTable:
+        """For `followed`."""
+        return self._takeover.table
+
     def begin(self) -> None:
         """Retract from the next sample on, whatever is commanded."""
         self._takeover.change(Mode.RETRACT)
 
-    def block(self, command: Samples) -> Samples:
-        """What the drive follows [m], shape (n,)."""
-        followed = command if self._takeover.mode is Mode.FOLLOW else command.copy()
-        self._takeover.apply(followed)
-        return followed
+
+@kernel
+def followed(takeover: TakeoverTable, command: Samples) -> Samples:
+    """What the drive follows [m], shape (n,)."""
+    own = command if follows(takeover) else command.copy()
+    take_over(takeover, own)
+    return own

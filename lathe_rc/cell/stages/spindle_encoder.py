@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spindle and encoder: where time, angle and the run itself begin and end."""
 
-from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Le
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import Joint, Output, Sparse, Stage, Trigger
+from lathe_rc.cell.stage import DONE, Joint, Output, Stage, Trigger
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
-from lathe_rc.signals.encoder import Encoder
+from lathe_rc.jit import kernel
+from lathe_rc.signals.encoder import Encoder, EncoderTable, encode
 
 
 class SpindleEncoderParameters(SpeedLawParameters):
@@ -46,6 +46,16 @@ class SpindleEncoderParameters(SpeedLawParameters):
     )
 
 
+@kernel
+def step(
+    memory: EncoderTable, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`."""
+    angle, speed, index_pulse, angle_true, speed_true = outputs
+    encode(memory, first, angle, speed, index_pulse, angle_true, speed_true)
+    return angle.size, DONE
+
+
 class SpindleEncoder(Stage):
     """See `lathe_rc.signals.speed` and `lathe_rc.signals.encoder`.
 
@@ -57,6 +67,7 @@ class SpindleEncoder(Stage):
 
     kind = "spindle_encoder"
     Parameters = SpindleEncoderParameters
+    step = staticmethod(step)
 
     def __init__(self, name: str, parameters: SpindleEncoderParameters) -> None:
         super().__init__(name, parameters)
@@ -82,7 +93,7 @@ class SpindleEncoder(Stage):
         """Lowest and highest spindle speed in the run [rad/s]."""
         return self.law.speed_range(np.inf if self.samples is None else self.samples * self.shared.step)
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    @property
+    def memory(self) -> EncoderTable:
         """See `Stage`."""
-        self._encoder.block(first, **outputs[0])
-        return []
+        return self._encoder.table

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tool against the part: desired form, displacement, form error."""
 
-from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
+import numpy as np
 from annotated_types import Ge, Le, MinLen
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
-from lathe_rc.cell.stages.form import Form, FormParameters
+from lathe_rc.cell.stage import DONE, Input, Joint, Output, Stage
+from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, evaluate
 from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
 from lathe_rc.plants.tool import add_drive
 
 
@@ -36,6 +37,52 @@ class ToolParameters(FormParameters):
     )
 
 
+class Memory(NamedTuple):
+    """What the step works on.
+
+    Attributes:
+        form: of the part; without a table if a profile node has it.
+        begin: number of the first input of the drives.
+        drives: how many there are, with a true and a measured position each.
+        cross_slide, deflects: whether these come after the drives.
+    """
+
+    form: FormTable
+    begin: int
+    drives: int
+    cross_slide: bool
+    deflects: bool
+
+
+@kernel
+def step(
+    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`."""
+    reference, displacement, error, known, height = outputs
+    if memory.form.heights.size:
+        evaluate(memory.form, inputs, reference, known, height)
+    else:
+        reference[:], known[:], height[:] = inputs[0], inputs[1], inputs[2]
+    place = memory.begin
+    for drive in range(memory.drives):
+        add_drive(drive == 0, reference, known, inputs[place], inputs[place + 1], displacement, known, error)
+        place += 2
+    if memory.cross_slide:
+        position = inputs[place]
+        for k in range(error.size):
+            error[k] += position[k]
+        place += 1
+    if memory.deflects:
+        deflection = inputs[place]
+        for k in range(error.size):
+            error[k] -= deflection[k]
+    return error.size, DONE
+
+
+_ELSEWHERE = FormTable(np.empty(0), np.empty((0, 0, 0)), slides=False, feed=0.0, start=0.0, part=0)
+
+
 class Tool(Stage):
     """Sums the motions (paper 001, Fig. 1a) and compares with the desired form.
 
@@ -46,6 +93,7 @@ class Tool(Stage):
 
     kind = "tool"
     Parameters = ToolParameters
+    step = staticmethod(step)
 
     def __init__(self, name: str, parameters: ToolParameters) -> None:
         super().__init__(name, parameters)
@@ -56,7 +104,6 @@ class Tool(Stage):
         what = [Input("reference", messages.REFERENCE, ("reference", "expected", "height"))]
         if self.form is not None:
             what = self.form.inputs
-        self._drives = slice(len(what), len(what) + len(parameters.drives))
         inputs = what + [
             Input(f"{drive}/state", messages.STATE, ("position", "measured_position")) for drive in parameters.drives
         ]
@@ -66,22 +113,10 @@ class Tool(Stage):
             inputs.append(Input("cut", messages.CUT, ("deflection",), parameters.deflection_delay))
         self.declare(inputs=inputs, outputs=[Output("tool", messages.TOOL, Joint("displacement"))])
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    @property
+    def memory(self) -> Memory:
         """See `Stage` and `lathe_rc.plants.tool`."""
-        (tool,), states = outputs, inputs[self._drives]
-        reference, known = tool["reference"], tool["measured_error"]
-        if self.form is None:
-            what = inputs[0]
-            reference[:], known[:], tool["height"][:] = what["reference"], what["expected"], what["height"]
-        else:
-            self.form.block(inputs, reference, known, tool["height"])
-        for place, state in enumerate(states):
-            add_drive(
-                place == 0, reference, known, state["position"], state["measured_position"], tool["displacement"],
-                known, tool["error"],
-            )  # fmt: skip
-        if self.parameters.cross_slide:
-            tool["error"] += inputs[self._drives.stop]["position"]
-        if self.parameters.deflects:
-            tool["error"] -= inputs[-1]["deflection"]
-        return []
+        parameters = self.parameters
+        form = self.form.table if self.form else _ELSEWHERE
+        begin = 3 if self.form is None else 2 * len(self.form.inputs)
+        return Memory(form, begin, len(parameters.drives), parameters.cross_slide, parameters.deflects)
