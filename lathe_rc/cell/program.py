@@ -181,7 +181,7 @@ class Program:
             LatheError: a stage cannot go on; names it. What was computed before is on the tapes, see `reached`.
         """
         for stage in self._stages:
-            stage.prepare(end - self.reached)
+            stage.prepare(self.reached, end - self.reached)
         self._load()
         while (reason := self._call(end)) != DONE:
             first, number, reached = self._where.tolist()

@@ -463,8 +463,8 @@ class Stage(ABC):
         """What the step works on, a NamedTuple of arrays and constants; another one may be given after each stop."""
         return ()
 
-    def prepare(self, samples: int) -> None:  # noqa: B027 - most stages need nothing
-        """Draw the random numbers that the next ``samples`` samples need; a step cannot."""
+    def prepare(self, first: int, samples: int) -> None:  # noqa: B027 - most stages need nothing
+        """Have ready what the samples ``first`` on need that a step cannot make, as random numbers."""
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
@@ -491,7 +491,7 @@ class Stage(ABC):
         assert self.step is not None, "a stage without a step has its own"
         read = tuple([part[name] for port, part in zip(self.inputs, inputs, strict=False) for name in port.fields])
         written = tuple([array for part in outputs for array in part.values()])
-        self.prepare(samples)
+        self.prepare(first, samples)
         sparse: list[Sparse] = []
         told = reached = 0
         while True:

@@ -6,6 +6,8 @@ between which samples (`find`), what they learn (`_learn_piece`), and what the d
 the same operations in the same order as one sample after the other would, and most of them for eight at a time.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -22,9 +24,9 @@ PIECE = 512  #: grid points that are learned at a time
 
 # Places in the integer state: next grid point to learn, samples seen, first point of the smoothed chunk, grid point
 # from which errors count, whether a cycle ended in the sample at hand, whether the memory was replaced since the last
-# sample.
-NEXT, SEEN, CHUNK, FROM, ENDED, REPLACED = 0, 1, 2, 3, 4, 5
-INTEGERS = 6
+# sample, whether the channel learns if it has joined, whether it has, cycles in the log, whether to stop after each.
+NEXT, SEEN, CHUNK, FROM, ENDED, REPLACED, LEARNS, JOINED, LOGGED, ASKS = range(10)
+INTEGERS = 10
 # Places in the real state: sum of squares and largest error of the cycle at hand and of the last one, the newest
 # three angles and errors, v and v' of Wk2, its last place and input, the lead-lag term's state and last input.
 SQUARES, LARGEST, CYCLE_SQUARES, CYCLE_LARGEST, ANGLES, ERRORS, INVARIANT, PLACE, INPUT, LAG = (
@@ -33,7 +35,8 @@ SQUARES, LARGEST, CYCLE_SQUARES, CYCLE_LARGEST, ANGLES, ERRORS, INVARIANT, PLACE
 REALS = 15
 NO_CHUNK = -(1 << 62)
 
-DONE, CYCLE_ENDED, AHEAD, JUMPED, SMOOTH, BEHIND = 0, 1, 2, 3, 4, 5  #: why `step` stopped
+DONE, CYCLE_ENDED, AHEAD, JUMPED, SMOOTH, BEHIND = 0, 1, 2, 3, 4, 5  #: why `advance` stopped
+LOG = 64  #: cycles that end until somebody reads of them, at most
 
 _BACK = 8  # grid points by which an angle that trembles may be behind the cycle that is still being read
 ROOM = _BACK + 8  #: grid points that a memory keeps beside a cycle, for what is read around a place
@@ -45,24 +48,61 @@ def soft(u: float) -> float:
     return 1.0 if u >= 1.0 else u * u * (3.0 - 2.0 * u)
 
 
+class AngleMemory(NamedTuple):
+    """A memory of repetitive control with its law, for kernels.
+
+    Attributes:
+        delay: samples until a measured error is visible.
+        grid: memory points per revolution.
+        cycle: memory points in a cycle.
+        gain: learning gain.
+        ramp: grid points over which it rises.
+        join_below: largest error of a cycle with which the channel joins [m].
+        ratio, reach: of an exponential Q; a ratio below 0: another makes the smoothed chunks.
+        law, looks_ahead: of the correction.
+        settings: its numbers.
+        memory: what is learned, a power of two of points.
+        chunk: points of the cycle before, smoothed by Q.
+        scratch: for that.
+        windows: angles and errors of a block behind the newest three before it, shape (2, n + 3) or more.
+        ahead: lead, its rate and bend along a block, shape (3, n) or more.
+        sample, work: of the points that are learned at a time.
+        whole, real: see above.
+        log: of each cycle the sample it ended with, sum of squares, largest error, whether it learned, whether the
+            channel has joined since; shape (LOG, 5).
+    """
+
+    delay: int
+    grid: int
+    cycle: int
+    gain: float
+    ramp: float
+    join_below: float
+    ratio: float
+    reach: int
+    law: int
+    looks_ahead: int
+    settings: Array
+    memory: Array
+    chunk: Array
+    scratch: Array
+    windows: Array
+    ahead: Array
+    sample: Integers
+    work: Array
+    whole: Integers
+    real: Array
+    log: Array
+
+
 @kernel
-def _take(
-    first: int,
-    delay: int,
-    per_radian: float,
-    angle: Array,
-    past_angle: Array,
-    error: Array,
-    whole: Integers,
-    real: Array,
-    angles: Array,
-    errors: Array,
-) -> None:
+def begin(m: AngleMemory, first: int, angle: Array, past_angle: Array, error: Array) -> None:
     """Begin a block: set the errors that arrive in it behind the newest three before it, shape (n + 3,).
 
     Errors are there from sample ``delay`` on; before it, and at it, the angle stands still, so that nothing is learned.
     """
-    n = error.size
+    n, per_radian, delay = error.size, m.grid / _TURN, m.delay
+    whole, real, angles, errors = m.whole, m.real, m.windows[0, : error.size + 3], m.windows[1, : error.size + 3]
     if whole[REPLACED] and n:
         # Errors that are still on their way belong to the memory that was replaced.
         whole[REPLACED] = 0
@@ -193,30 +233,18 @@ def _smooth(base: int, cycle: int, reach: int, ratio: float, memory: Array, scra
 
 @kernel
 def _learn(
+    m: AngleMemory,
     start: int,
     arrives: int,
-    grid: int,
-    cycle: int,
-    looks_ahead: int,
     learning: int,
-    gain: float,
-    ramp: float,
-    ratio: float,
-    reach: int,
     angle: Array,
     lead: Array,
     angles: Array,
     errors: Array,
-    sample: Integers,
-    work: Array,
-    chunk: Array,
-    scratch: Array,
-    memory: Array,
-    whole: Integers,
-    real: Array,
 ) -> tuple[int, int]:
-    """Learn from sample ``start`` of the block until something has to be done outside; see `step`."""
-    per_radian = grid / _TURN
+    """Learn from sample ``start`` of the block until something has to be done outside; see `_step`."""
+    cycle, memory, chunk, whole = m.cycle, m.memory, m.chunk, m.whole
+    per_radian = m.grid / _TURN
     k = max(start, min(arrives, angle.size))
     reason = DONE
     last = whole[NEXT] + memory.size - cycle - ROOM
@@ -225,17 +253,18 @@ def _learn(
         stop = min(point + PIECE, last)
         if learning:
             if not 0 <= point - whole[CHUNK] < chunk.size:
-                if ratio < 0.0:
+                if m.ratio < 0.0:
                     return k, SMOOTH
                 whole[CHUNK] = point // chunk.size * chunk.size
-                _smooth(whole[CHUNK], cycle, reach, ratio, memory, scratch, chunk)
+                _smooth(whole[CHUNK], cycle, m.reach, m.ratio, memory, m.scratch, chunk)
             stop = min(stop, whole[CHUNK] + chunk.size)
         k, count, reason, whole[ENDED] = find(
-            k, point, stop, cycle, per_radian, looks_ahead, whole[ENDED], angles, angle, lead, sample, work[6]
+            k, point, stop, cycle, per_radian, m.looks_ahead, whole[ENDED], angles, angle, lead, m.sample, m.work[6]
         )
         _learn_piece(
-            point, count, cycle, learning, gain, ramp, sample, work[6], angles, errors, work, chunk, memory, whole, real
-        )
+            point, count, cycle, learning, m.gain, m.ramp, m.sample, m.work[6], angles, errors, m.work, chunk, memory,
+            whole, m.real,
+        )  # fmt: skip
         whole[NEXT] += count
         if reason == SMOOTH:
             reason = DONE
@@ -276,81 +305,73 @@ def _command(
 
 
 @kernel
-def _send(
-    start: int,
-    stop: int,
-    law: int,
-    grid: int,
-    cycle: int,
-    settings: Array,
-    memory: Array,
-    real: Array,
-    angle: Array,
-    lead: Array,
-    rate: Array,
-    bend: Array,
-    work: Array,
-    told: Array,
-) -> None:
+def _send(m: AngleMemory, start: int, stop: int, angle: Array, told: Array) -> None:
     """Fill the set points of the drive ``told`` of some samples of the block.
 
     The memory may be ahead of them by a block: it holds more than the cycle that they read.
     """
-    per_radian = grid / _TURN
-    if law == 0:
-        read_along(memory, per_radian, cycle, angle[start:stop], lead[start:stop], work, told[start:stop])
+    per_radian, lead, rate, bend = m.grid / _TURN, m.ahead[0], m.ahead[1], m.ahead[2]
+    if m.law == 0:
+        read_along(m.memory, per_radian, m.cycle, angle[start:stop], lead[start:stop], m.work, told[start:stop])
         return
     for k in range(start, stop):
-        place = (angle[k] + lead[k]) * per_radian - cycle
-        told[k] = _command(law, per_radian, place, rate[k], bend[k], settings, memory, real)
+        place = (angle[k] + lead[k]) * per_radian - m.cycle
+        told[k] = _command(m.law, per_radian, place, rate[k], bend[k], m.settings, m.memory, m.real)
 
 
 @kernel
-def step(
-    first: int,
-    start: int,
-    begins: bool,  # noqa: FBT001 - kernels take their arguments by position
-    delay: int,
-    grid: int,
-    cycle: int,
-    looks_ahead: int,
-    learning: bool,  # noqa: FBT001
-    gain: float,
-    ramp: float,
-    ratio: float,
-    reach: int,
-    law: int,
-    settings: Array,
-    angle: Array,
-    lead: Array,
-    rate: Array,
-    bend: Array,
-    past_angle: Array,
-    error: Array,
-    windows: Array,
-    sample: Integers,
-    work: Array,
-    chunk: Array,
-    scratch: Array,
-    memory: Array,
-    whole: Integers,
-    real: Array,
-    told: Array,
-) -> tuple[int, int]:
+def _step(m: AngleMemory, first: int, start: int, angle: Array, told: Array) -> tuple[int, int]:
     """Step from sample ``start`` of a block, whose first one is sample ``first`` of the run, until it needs help.
 
     Returns the sample that is reached and why: `CYCLE_ENDED` after the sample in which one ended, `SMOOTH` where the
     next chunk of the smoothed cycle is wanted, the errors, and `DONE` at the end of the block or where learning further
-    ahead of what is read would write over it. The block ``begins`` in the first call for it.
+    ahead of what is read would write over it.
     """
-    angles, errors = windows[0, : angle.size + 3], windows[1, : angle.size + 3]
-    if begins:
-        _take(first, delay, grid / _TURN, angle, past_angle, error, whole, real, angles, errors)
+    n, delay = angle.size, m.delay
     # What is read before the first error arrives is not checked, so nothing is learned ahead of it.
-    stop = angle.size if start >= delay - first else min(angle.size, delay - first)
+    stop = n if start >= delay - first else min(n, delay - first)
     reached, reason = _learn(
-        start, delay - first, grid, cycle, looks_ahead, learning, gain, ramp, ratio, reach, angle[:stop], lead, angles,
-        errors, sample, work, chunk, scratch, memory, whole, real,
+        m, start, delay - first, m.whole[LEARNS] * m.whole[JOINED], angle[:stop], m.ahead[0, :n],
+        m.windows[0, : n + 3], m.windows[1, : n + 3],
     )  # fmt: skip
-    _send(start, reached, law, grid, cycle, settings, memory, real, angle, lead, rate, bend, work, told)
+    _send(m, start, reached, angle, told)
     return reached, reason
+
+
+@kernel
+def _end_cycle(m: AngleMemory, sample: int) -> None:
+    """Log a cycle; a channel that waits may join."""
+    whole, real = m.whole, m.real
+    row = m.log[whole[LOGGED]]
+    row[0], row[1], row[2] = sample, real[CYCLE_SQUARES], real[CYCLE_LARGEST]
+    row[3] = whole[LEARNS] * whole[JOINED]
+    if not whole[JOINED] and real[CYCLE_LARGEST] <= m.join_below:
+        whole[JOINED] = 1
+        whole[FROM] = whole[NEXT]
+    row[4] = whole[JOINED]
+    whole[LOGGED] += 1
+
+
+@kernel
+def advance(m: AngleMemory, first: int, start: int, angle: Array, told: Array) -> tuple[int, int]:
+    """Step from sample ``start`` of a block that has begun until its end (`DONE`), or until it needs help.
+
+    Args:
+        m: the memory, with its look ahead along the block.
+        first: index of the block's first sample.
+        start: sample of the block.
+        angle: measured spindle angle [rad], shape (n,).
+        told: filled with the set point of the drive [m], shape (n,).
+
+    Returns:
+        The sample of the block that is reached, and why: see `_step`.
+    """
+    reached, reason = start, DONE
+    while True:
+        reached, reason = _step(m, first, reached, angle, told)
+        if reason == CYCLE_ENDED:
+            _end_cycle(m, first + reached - 1)
+            if m.whole[ASKS] or m.whole[LOGGED] == LOG:
+                return reached, reason
+        elif reason != DONE or reached == angle.size:
+            return reached, reason

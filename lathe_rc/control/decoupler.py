@@ -124,7 +124,10 @@ def decouple(k1: System, state1: Array, k2: System, state2: Array, u1: float, u2
 
 
 @kernel
-def _block(k1: System, state1: Array, k2: System, state2: Array, u1: Array, u2: Array, v1: Array, v2: Array) -> None:
+def decouple_along(
+    k1: System, state1: Array, k2: System, state2: Array, u1: Array, u2: Array, v1: Array, v2: Array
+) -> None:
+    """`decouple` for a block, shape (n,)."""
     for k in range(u1.size):
         v1[k], v2[k] = decouple(k1, state1, k2, state2, u1[k], u2[k])
 
@@ -156,4 +159,4 @@ class Decoupler:
             v1: to the longitudinal feed [1].
             v2: to the cross feed [1].
         """
-        _block(self.k1, self.state1, self.k2, self.state2, u1, u2, v1, v2)
+        decouple_along(self.k1, self.state1, self.k2, self.state2, u1, u2, v1, v2)

@@ -9,6 +9,7 @@ enough for both coefficients; the speed of the spindle may vary.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,21 +22,40 @@ _LOOK_BACK = 2  # samples of the command that a delay with a fraction needs
 _LEAST_EXCITED = 1e-6  # determinant of the normal equations, 1 for independent regressors
 
 
+class IdentifierTable(NamedTuple):
+    """A `DriveIdentifier` for kernels.
+
+    Attributes:
+        delay, part: of the command against the position that is seen: whole samples, and the rest in samples.
+        bandwidth: λ [rad/s].
+        step: sampling step [s].
+        commands: of the past; sample n stands at n modulo their number, a power of two [m].
+        state: of the filters.
+        sums: of the normal equations.
+    """
+
+    delay: int
+    part: float
+    bandwidth: float
+    step: float
+    commands: Array
+    state: Array
+    sums: Array
+
+
 @kernel
-def _accumulate(
-    first: int,
-    start: int,
-    stop: int,
-    delay: int,
-    part: float,
-    bandwidth: float,
-    step: float,
-    commands: Array,
-    position: Array,
-    state: Array,
-    sums: Array,
-) -> None:
-    """Filter and sum the samples ``start`` to ``stop`` of a block; ``delay`` [sample] is that of the command."""
+def command_sent(identifier: IdentifierTable, first: int, start: int, stop: int, command: Array) -> None:
+    """Remember the set points ``start`` to ``stop`` of a block that begins at sample ``first`` [m]."""
+    mask = identifier.commands.size - 1
+    for k in range(start, stop):
+        identifier.commands[(first + k) & mask] = command[k]
+
+
+@kernel
+def accumulate(identifier: IdentifierTable, first: int, start: int, stop: int, position: Array) -> None:
+    """Filter and sum the measured positions ``start`` to ``stop`` of a block that begins at sample ``first`` [m]."""
+    delay, part, bandwidth, step = identifier.delay, identifier.part, identifier.bandwidth, identifier.step
+    commands, state, sums = identifier.commands, identifier.state, identifier.sums
     mask = commands.size - 1
     half = 0.5 * bandwidth * step  # bilinear rule
     keep, take = (1.0 - half) / (1.0 + half), half / (1.0 + half)
@@ -89,6 +109,9 @@ class DriveIdentifier:
         forgetting: weight of a cycle when the next one ends, 0 up to 1.
         step: sampling step [s].
         block: longest block [sample].
+
+    Attributes:
+        table: for `accumulate` and `command_sent`.
     """
 
     def __init__(
@@ -102,25 +125,29 @@ class DriveIdentifier:
         block: int,
     ) -> None:
         whole = int(np.floor(model_delay / step + 1e-9))
-        self._delay, self._part = feedback_delay + whole, max(model_delay / step - whole, 0.0)
-        self._bandwidth, self._forgetting, self._step = bandwidth, forgetting, step
-        self._commands = np.zeros(1 << (self._delay + block + _LOOK_BACK).bit_length())
-        self._state, self._sums = np.zeros(8), np.zeros(7)
+        delay = feedback_delay + whole
+        self._forgetting = forgetting
+        self.table = IdentifierTable(
+            delay=delay,
+            part=max(model_delay / step - whole, 0.0),
+            bandwidth=bandwidth,
+            step=step,
+            commands=np.zeros(1 << (delay + block + _LOOK_BACK).bit_length()),
+            state=np.zeros(8),
+            sums=np.zeros(7),
+        )
 
     def block(self, first: int, start: int, stop: int, position: Array) -> None:
         """Take the measured positions ``start`` to ``stop`` of a block that begins at sample ``first`` [m]."""
-        _accumulate(
-            first, start, stop, self._delay, self._part, self._bandwidth, self._step,
-            self._commands, position, self._state, self._sums,
-        )  # fmt: skip
+        accumulate(self.table, first, start, stop, position)
 
     def commanded(self, first: int, command: Array) -> None:
         """Remember the set points of a block [m], once all of it is known."""
-        self._commands[np.arange(first, first + command.size) & (self._commands.size - 1)] = command
+        command_sent(self.table, first, 0, command.size, command)
 
     def fit(self) -> Identified | None:
         """What the measurements so far say; None while they say nothing. Older ones weigh less from now on."""
-        s11, s12, s22, s1, s2, rest, command = self._sums
+        s11, s12, s22, s1, s2, rest, command = self.table.sums
         found = None
         # Relative to independent regressors: the units of the two differ by orders of magnitude.
         determinant = s11 * s22 - s12 * s12
@@ -131,5 +158,5 @@ class DriveIdentifier:
                 unexplained = max(rest - a1 * s1 - a2 * s2, 0.0)
                 frequency = float(1.0 / np.sqrt(a2))
                 found = Identified(frequency, float(a1 * frequency / 2.0), float(np.sqrt(unexplained / command)))
-        self._sums *= self._forgetting
+        self.table.sums[:] *= self._forgetting
         return found

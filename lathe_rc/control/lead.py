@@ -11,6 +11,7 @@ dψ/dt and d²ψ/dt² as well: to first order in T0 the speed and the accelerati
 """
 
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -30,23 +31,41 @@ class LeadLaw(IntEnum):
     EXACT_PREVIEW = 3
 
 
+class PreviewTable(NamedTuple):
+    """A `Preview` for kernels.
+
+    Attributes:
+        step: sampling step [s].
+        law: see `LeadLaw`.
+        lead_time: T0 [s].
+        constant: lead angle beside that of the law [rad].
+        nominal, lines, tachogram: of the speed law.
+        history: of the measured speed, NaN before it was written [rad/s].
+    """
+
+    step: float
+    law: int
+    lead_time: float
+    constant: float
+    nominal: float
+    lines: Array
+    tachogram: Array
+    history: Array
+
+
 @kernel
-def _look_ahead(
+def look_ahead(
+    preview: PreviewTable,
     first: int,
-    step: float,
-    law: int,
-    lead_time: float,
-    constant: float,
-    nominal: float,
-    lines: Array,
-    tachogram: Array,
-    history: Array,
+    wanted: bool,  # noqa: FBT001 - kernels take their arguments by position
     speed: Array,
     lead: Array,
     rate: Array,
     bend: Array,
 ) -> None:
-    wanted = rate.size > 0
+    """Fill lead, rate and bend, the latter two if they are wanted; see `Preview.block`."""
+    step, law, lead_time, constant = preview.step, preview.law, preview.lead_time, preview.constant
+    nominal, lines, tachogram, history = preview.nominal, preview.lines, preview.tachogram, preview.history
     if law < 2 and not wanted:
         for k in range(speed.size):
             lead[k] = lead_time * (nominal if law == 0 else speed[k]) + constant
@@ -84,14 +103,18 @@ class Preview:
         step: sampling step [s].
         window: samples over which dΩ/dt is a difference of the measured speed; it lags by half of them.
         constant: lead angle [rad] beside that of the law, whatever the speed.
+
+    Attributes:
+        table: for `look_ahead`.
     """
 
     def __init__(
         self, law: LeadLaw, lead_time: float, speed_law: SpeedLaw, step: float, window: int, constant: float = 0.0
     ) -> None:
-        self._law, self._lead_time, self._speed_law, self._step = law, lead_time, speed_law, step
-        self._constant = constant
-        self._history = np.full(window, np.nan)
+        known, history = speed_law, np.full(window, np.nan)
+        self.table = PreviewTable(
+            step, int(law), lead_time, constant, known.nominal, known.lines, known.tachogram, history
+        )
 
     def block(self, first: int, speed: Array, *, rates: bool = True) -> tuple[Array, Array, Array]:
         """Lead [rad], dψ/dt [rad/s] and d²ψ/dt² [rad/s²] for the measured ``speed`` [rad/s], shape (n,) each.
@@ -100,9 +123,5 @@ class Preview:
         """
         lead = np.empty(speed.size)
         rate, bend = (np.empty(speed.size), np.empty(speed.size)) if rates else (np.empty(0), np.empty(0))
-        known = self._speed_law
-        _look_ahead(
-            first, self._step, int(self._law), self._lead_time, self._constant, known.nominal, known.lines,
-            known.tachogram, self._history, speed, lead, rate, bend,
-        )  # fmt: skip
+        look_ahead(self.table, first, rates, speed, lead, rate, bend)
         return lead, rate, bend

@@ -35,8 +35,8 @@ Array = npt.NDArray[np.float64]
 _REACH = 5.0  # of the Gaussian, in standard deviations
 _CHUNK = 128  # samples of the memory that are smoothed at a time, if the period allows
 # Places in the state: I, δ̃, the integral of eq. 15, its lower bound, the least distance of both so far, the largest
-# demand |u|, the largest |sample| stored; whether it is frozen.
-_INTEGRATOR, _SWITCH, _POPOV, _BOUND, _CLEARANCE, _DEMAND, _MEMORY, _FROZEN, _SIZE = range(9)
+# demand |u|, the largest |sample| stored; whether it is frozen; samples in which the command was limited.
+_INTEGRATOR, _SWITCH, _POPOV, _BOUND, _CLEARANCE, _DEMAND, _MEMORY, _FROZEN, _SATURATED, _SIZE = range(10)
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class PeriodicState(NamedTuple):
     """What the law remembers, for kernels.
 
     Attributes:
-        values: scalars, shape (8,).
+        values: scalars, shape (9,).
         reference, output: states of the filters.
         ring: stored samples of u1, shape (samples + reach,); sample n stands at n modulo its length.
         smoothed: what is read in the chunk at hand.
@@ -236,14 +236,35 @@ def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, me
 
 
 @kernel
+def advance_and_count(
+    law: PeriodicLaw, state: PeriodicState, n: int, reference: float, measurement: float
+) -> float:
+    """`advance`, with the samples counted in which the limit was in use."""
+    command, limited = advance(law, state, n, reference, measurement)
+    state.values[_SATURATED] += limited
+    return command
+
+
+@kernel
 def _block(
     law: PeriodicLaw, state: PeriodicState, first: int, reference: Array, measurement: Array, command: Array
-) -> int:
-    saturated = 0
+) -> None:
     for k in range(command.size):
-        command[k], limited = advance(law, state, first + k, reference[k], measurement[k])
-        saturated += limited
-    return saturated
+        command[k] = advance_and_count(law, state, first + k, reference[k], measurement[k])
+
+
+@kernel
+def freeze(state: PeriodicState, on: bool) -> None:  # noqa: FBT001 - kernels take their arguments by position
+    """Let memory and I change no more, or again."""
+    state.values[_FROZEN] = 1.0 if on else 0.0
+
+
+@kernel
+def achieved(state: PeriodicState, row: Array) -> None:
+    """Fill in the largest demand, the largest memory, the saturated samples, the integral, its bound, and clearance."""
+    values = state.values
+    row[0], row[1], row[2] = values[_DEMAND], values[_MEMORY], values[_SATURATED]
+    row[3], row[4], row[5] = values[_POPOV], values[_BOUND], values[_CLEARANCE]
 
 
 def samples_in(period: float, step_s: float) -> int:
@@ -280,7 +301,6 @@ class PeriodicController:
 
     Attributes:
         law, state: for `advance`, where a kernel closes the loop.
-        saturated: samples in which the command was limited so far; a kernel that closes the loop counts them itself.
 
     Raises:
         InputError: a gain, limit or period that cannot be, or a Gaussian wider than the period allows.
@@ -342,11 +362,15 @@ class PeriodicController:
         # What a falling adaptive gain may give: the integral of (h11·I + χ*) over I is never below this.
         self.state.values[_BOUND] = -(gains.reference_gain**2) / (2.0 * gains.h11)
         self.state.values[_CLEARANCE] = -self.state.values[_BOUND]
-        self.saturated = 0
 
     def block(self, first: int, reference: Array, measurement: Array, command: Array) -> None:
         """Step from sample ``first`` on; arrays of shape (n,) [1]; ``command`` is limited and quantised."""
-        self.saturated += _block(self.law, self.state, first, reference, measurement, command)
+        _block(self.law, self.state, first, reference, measurement, command)
+
+    @property
+    def saturated(self) -> int:
+        """Samples so far in which the command was limited; a kernel that closes the loop counts them itself."""
+        return int(self.state.values[_SATURATED])
 
     @property
     def learning(self) -> bool:

@@ -137,7 +137,16 @@ def control(pid: PidTable, state: Array, n: int, set_point: float, measurement: 
 
 
 @kernel
-def _block(pid: PidTable, state: Array, first: int, set_point: Array, measurement: Array, command: Array) -> None:
+def lets_learn(state: Array, learns: bool, waits: bool) -> None:  # noqa: FBT001 - kernels take their arguments by position
+    """Set in the state of a `Pid` whether it integrates, and whether another gives the command."""
+    state[_STANDS], state[_WAITS] = 0.0 if learns else 1.0, 1.0 if waits else 0.0
+
+
+@kernel
+def control_along(
+    pid: PidTable, state: Array, first: int, set_point: Array, measurement: Array, command: Array
+) -> None:
+    """`control` for a block that begins at sample ``first``, shape (n,)."""
     for k in range(command.size):
         command[k] = control(pid, state, first + k, set_point[k], measurement[k])
 
@@ -234,4 +243,4 @@ class Pid:
 
     def block(self, first: int, set_point: Array, measurement: Array, command: Array) -> None:
         """Step from sample ``first`` on; arrays of shape (n,), the last is filled."""
-        _block(self.table, self.state, first, set_point, measurement, command)
+        control_along(self.table, self.state, first, set_point, measurement, command)

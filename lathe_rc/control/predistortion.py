@@ -22,6 +22,7 @@ the profile; neither is printed there.
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -78,14 +79,25 @@ def contraction(compliance: Array, stiffness: float | Array, gain: float) -> flo
     return float(np.abs(1.0 - gain / (1.0 + compliance * stiffness)).max())
 
 
+class PathTable(NamedTuple):
+    """A `Predistortion` for kernels.
+
+    Attributes:
+        heights, offsets: see there.
+        beyond: samples so far beyond the ends, shape (1,).
+    """
+
+    heights: Array
+    offsets: Array
+    beyond: npt.NDArray[np.int64]
+
+
 @kernel
-def _fill(heights: Array, offsets: Array, height: Array, set_point: Array) -> int:
-    """Interpolate linearly; returns the samples beyond the ends."""
-    beyond = 0
+def offset_along(path: PathTable, height: Array, set_point: Array) -> None:
+    """Fill ``set_point`` [m] at each ``height`` [m], see `Predistortion.block`."""
     for k in range(height.size):
-        beyond += height[k] < heights[0] or height[k] > heights[-1]
-        set_point[k] = linear(heights, offsets, height[k])
-    return beyond
+        path.beyond[0] += height[k] < path.heights[0] or height[k] > path.heights[-1]
+        set_point[k] = linear(path.heights, path.offsets, height[k])
 
 
 class Predistortion:
@@ -97,7 +109,7 @@ class Predistortion:
 
     Attributes:
         heights, offsets: as given.
-        beyond: samples so far beyond the ends, where the offset is that of the end.
+        table: for `offset_along`.
 
     Raises:
         InputError: no path: no points, not as many of each, heights that do not rise, a number that is not finite.
@@ -116,11 +128,16 @@ class Predistortion:
             raise InputError(f"predistortion: height {a:g} m is followed by {b:g} m; allowed: rising by {_CLOSEST:g} m")
         self.heights = np.array(heights, dtype=np.float64)
         self.offsets = np.array(offsets, dtype=np.float64)
-        self.beyond = 0
+        self.table = PathTable(self.heights, self.offsets, np.zeros(1, np.int64))
+
+    @property
+    def beyond(self) -> int:
+        """Samples so far beyond the ends, where the offset is that of the end."""
+        return int(self.table.beyond[0])
 
     def block(self, height: Array, set_point: Array) -> None:
         """Fill ``set_point`` [m] at each ``height`` [m], linear between those of the path; both of shape (n,)."""
-        self.beyond += _fill(self.heights, self.offsets, height, set_point)
+        offset_along(self.table, height, set_point)
 
     def corrected(self, heights: Array, error: Array, gain: float = 1.0) -> "Predistortion":
         """The path for the next part.

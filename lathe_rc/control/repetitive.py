@@ -11,21 +11,23 @@ modules of their own.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.control.angle_memory import (
     AHEAD,
+    ASKS,
     BEHIND,
     CHUNK,
     CYCLE_ENDED,
-    CYCLE_LARGEST,
-    CYCLE_SQUARES,
     DONE,
-    FROM,
     INTEGERS,
-    JUMPED,
+    JOINED,
+    LEARNS,
+    LOG,
+    LOGGED,
     NEXT,
     NO_CHUNK,
     PIECE,
@@ -34,16 +36,20 @@ from lathe_rc.control.angle_memory import (
     REPLACED,
     ROOM,
     SMOOTH,
-    step,
+    AngleMemory,
+    advance,
+    begin,
 )
 from lathe_rc.control.correction import Correction, CorrectionLaw
-from lathe_rc.control.lead import Preview
+from lathe_rc.control.lead import Preview, look_ahead
 from lathe_rc.control.q_filter import QFilter
 from lathe_rc.errors import LatheError
 
 Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
+_LONGEST = 8192  # samples of a block
+_ROOM = {"windows": (2, _LONGEST + 3), "ahead": (3, _LONGEST)}  # of the table, for a block
 LEARNING_DELAY = 3  #: samples from a measured error to its place in the memory: cubic interpolation looks ahead
 
 
@@ -57,6 +63,7 @@ class Cycle:
     largest: float  #: magnitude of the measured error [m]
     contraction: float  #: rms over that of the cycle before; NaN in the first
     learning: bool
+    joined: bool = True  #: whether the channel learns from then on
 
 
 class AngleLostError(LatheError):
@@ -88,8 +95,8 @@ class RepetitiveController:
         step: sampling step [s].
 
     Attributes:
-        learning: False holds the memory as it is.
-        joined: False as long as the error before the channel is beyond ``join_below``.
+        table: for `lathe_rc.control.angle_memory.advance`.
+        preview: lead law.
         correction: may be replaced by one of the same law between two blocks or at the end of a cycle.
     """
 
@@ -108,24 +115,67 @@ class RepetitiveController:
         join_below: float,
         step: float,
     ) -> None:
-        self._grid, self._cycle, self._q, self._gain = grid, grid * revolutions, q, gain
-        self._ramp = soft_start * grid
-        self._preview, self._nominal, self._delay, self._step = preview, nominal, delay, step
-        self._memory = np.zeros(memory_size(self._cycle, q))
-        self._chunk = np.empty(q.chunk)
-        self._scratch = np.empty((2, q.chunk + 2 * q.reach))
-        self._windows = np.empty((2, 3))
-        self._sample, self._work = np.empty(PIECE, dtype=np.int64), np.empty((7, PIECE + 1))
-        self._whole = np.zeros(INTEGERS, dtype=np.int64)
-        self._real = np.zeros(REALS)
-        self._real[PLACE] = np.nan
+        self._cycle, self._q, self._nominal, self._step = grid * revolutions, q, nominal, step
+        self.preview = preview
+        whole, real = np.zeros(INTEGERS, dtype=np.int64), np.zeros(REALS)
+        whole[LEARNS], whole[JOINED], real[PLACE] = 1, np.isinf(join_below), np.nan
+        self.table = AngleMemory(
+            delay=delay,
+            grid=grid,
+            cycle=self._cycle,
+            gain=gain,
+            ramp=soft_start * grid,
+            join_below=join_below,
+            ratio=q.ratio,
+            reach=q.reach,
+            law=int(correction.law),
+            looks_ahead=correction.looks_ahead,
+            settings=np.zeros(7),
+            memory=np.zeros(memory_size(self._cycle, q)),
+            chunk=np.empty(q.chunk),
+            scratch=np.empty((2, q.chunk + 2 * q.reach)),
+            **{name: np.empty(shape) for name, shape in _ROOM.items()},
+            sample=np.empty(PIECE, dtype=np.int64),
+            work=np.empty((7, PIECE + 1)),
+            whole=whole,
+            real=real,
+            log=np.empty((LOG, 5)),
+        )
         self._cycles = 0
         self._rms_before = np.nan
-        self.learning, self.joined = True, np.isinf(join_below)
-        self._join_below = join_below
         self.correction = correction
-        self._smooth()  # compiles what the first chunk needs
-        self._whole[CHUNK] = NO_CHUNK
+        if q.ratio < 0.0:
+            self.smooth()  # compiles what the first chunk needs
+        whole[CHUNK] = NO_CHUNK
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is worth keeping between two blocks: room for one is not."""
+        table = self.table._replace(**dict.fromkeys(_ROOM))
+        return {**self.__dict__, "table": table}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """See `__getstate__`."""
+        self.__dict__.update(state)
+        room = {name: np.empty(shape) for name, shape in _ROOM.items()}
+        self.table = self.table._replace(**room)
+
+    @property
+    def learning(self) -> bool:
+        """Whether the memory changes; otherwise it stays as it is."""
+        return bool(self.table.whole[LEARNS])
+
+    @learning.setter
+    def learning(self, on: bool) -> None:
+        self.table.whole[LEARNS] = on
+
+    @property
+    def joined(self) -> bool:
+        """False as long as the error before the channel is beyond ``join_below``."""
+        return bool(self.table.whole[JOINED])
+
+    @joined.setter
+    def joined(self, on: bool) -> None:
+        self.table.whole[JOINED] = on
 
     @property
     def correction(self) -> Correction:
@@ -135,35 +185,36 @@ class RepetitiveController:
     @correction.setter
     def correction(self, correction: Correction) -> None:
         self._correction = correction
-        settings = np.zeros(7)
+        settings = self.table.settings
         settings[:2] = correction.inverse
         settings[2] = self._nominal
         if correction.law is CorrectionLaw.LEAD_LAG:
             decay = np.exp(-self._step / correction.lag)
             rest = (1.0 - decay) * correction.lag / self._step
             settings[3:] = decay, rest - decay, 1.0 - rest, correction.lead / correction.lag
-        self._settings = settings
 
     def clear(self) -> None:
         """Forget everything that was learned; learning begins anew, softly if so asked."""
-        self._memory[:] = 0.0
+        self.table.memory[:] = 0.0
         self._replaced()
 
     def _replaced(self) -> None:
-        self._whole[CHUNK] = NO_CHUNK
-        self._whole[REPLACED] = 1
+        self.table.whole[CHUNK] = NO_CHUNK
+        self.table.whole[REPLACED] = 1
 
     def memory(self) -> Array:
         """The newest value at each grid point of the cycle [m], from angle 0 on, shape (cycle,)."""
-        newest = np.arange(self._whole[NEXT] - self._cycle, self._whole[NEXT])
+        memory, end = self.table.memory, self.table.whole[NEXT]
+        newest = np.arange(end - self._cycle, end)
         points = np.empty(self._cycle)
-        points[newest % self._cycle] = self._memory[newest & (self._memory.size - 1)]
+        points[newest % self._cycle] = memory[newest & (memory.size - 1)]
         return points
 
     def remember(self, points: Array) -> None:
         """Replace what was learned by ``points`` as `memory` gives them; the channel counts as joined."""
-        places = np.arange(self._memory.size) + self._whole[NEXT] - self._memory.size
-        self._memory[places & (self._memory.size - 1)] = points[places % self._cycle]
+        memory = self.table.memory
+        places = np.arange(memory.size) + self.table.whole[NEXT] - memory.size
+        memory[places & (memory.size - 1)] = points[places % self._cycle]
         self._replaced()
         self.joined = True
 
@@ -194,59 +245,61 @@ class RepetitiveController:
             AngleLostError: the spindle turned so fast that the memory would have been read where nothing is
                 learned yet, or so far back that it is no longer kept, or its angle jumped.
         """
-        rates = self._correction.law is not CorrectionLaw.NONE
-        lead, rate, bend = self._preview.block(first, speed, rates=rates)
-        if self._windows.shape[1] < angle.size + 3:
-            self._windows = np.empty((2, angle.size + 3))
-        reached, reason, begins = 0, SMOOTH, True
-        while reason in (CYCLE_ENDED, SMOOTH) or (reason == DONE and reached < angle.size):
-            reached, reason = step(
-                first, reached, begins, self._delay, self._grid, self._cycle, self._correction.looks_ahead,
-                self.learning and self.joined, self._gain, self._ramp, self._q.ratio, self._q.reach,
-                int(self._correction.law), self._settings, angle, lead, rate, bend, past_angle, error, self._windows,
-                self._sample, self._work, self._chunk, self._scratch, self._memory, self._whole, self._real, command,
-            )  # fmt: skip
-            begins = False
+        wanted = self._correction.law is not CorrectionLaw.NONE
+        n = angle.size
+        if n > self.table.ahead.shape[1]:
+            self.table = self.table._replace(windows=np.empty((2, n + 3)), ahead=np.empty((3, n)))
+        table = self.table
+        look_ahead(self.preview.table, first, wanted, speed, *table.ahead[:, :n])
+        begin(table, first, angle, past_angle, error)
+        table.whole[ASKS] = 1
+        reached, reason = 0, SMOOTH
+        while reason in (CYCLE_ENDED, SMOOTH):
+            reached, reason = advance(table, first, reached, angle, command)
             if reason == SMOOTH:
-                self._smooth()
+                self.smooth()
             elif reason == CYCLE_ENDED:
-                yield self._end_cycle(first + reached - 1)
+                yield from self.ended()
+        if reason != DONE:
+            raise self.lost(reason, first, reached, angle, speed, past_angle)
+
+    @staticmethod
+    def lost(reason: int, first: int, reached: int, angle: Array, speed: Array, past_angle: Array) -> AngleLostError:
+        """Why the memory cannot be read at sample ``reached`` of a block; its arrays are those of `block`."""
         if reason == AHEAD:
-            raise AngleLostError(
-                f"sample {first + reached}: the memory is read at {angle[reached]:.6g} rad before it is learned; "
-                f"the spindle turns at {speed[reached]:.5g} rad/s: reduce its speed, the lead or the feedback delay",
-                reached,
+            why = (
+                f"the memory is read at {angle[reached]:.6g} rad before it is learned; the spindle turns at "
+                f"{speed[reached]:.5g} rad/s: reduce its speed, the lead or the feedback delay"
             )
-        if reason == BEHIND:
-            raise AngleLostError(
-                f"sample {first + reached}: at {angle[reached]:.6g} rad the memory is no longer kept; the spindle has "
-                "turned back, or its angle is wrong",
-                reached,
+        elif reason == BEHIND:
+            why = (
+                f"at {angle[reached]:.6g} rad the memory is no longer kept; the spindle has turned back, or its angle "
+                "is wrong"
             )
-        if reason == JUMPED:
-            raise AngleLostError(
-                f"sample {first + reached}: the spindle angle jumps to {past_angle[reached]:.6g} rad", reached
-            )
+        else:
+            why = f"the spindle angle jumps to {past_angle[reached]:.6g} rad"
+        return AngleLostError(f"sample {first + reached}: {why}", reached)
 
-    def _smooth(self) -> None:
+    def smooth(self) -> None:
         """Apply Q to the cycle before, for the chunk of grid points that learning has come to."""
-        size, reach = self._q.chunk, self._q.reach
-        base = int(self._whole[NEXT]) // size * size
+        table, size, reach = self.table, self._q.chunk, self._q.reach
+        base = int(table.whole[NEXT]) // size * size
         before = np.arange(base - self._cycle - reach, base - self._cycle + size + reach)
-        self._q.smooth(self._memory[before & (self._memory.size - 1)], self._chunk)
-        self._whole[CHUNK] = base
+        self._q.smooth(table.memory[before & (table.memory.size - 1)], table.chunk)
+        table.whole[CHUNK] = base
 
-    def _end_cycle(self, sample: int) -> Cycle:
-        rms = float(np.sqrt(self._real[CYCLE_SQUARES] / self._cycle))
-        largest = float(self._real[CYCLE_LARGEST])
+    def ended(self) -> list[Cycle]:
+        """The cycles that have ended since the last call."""
+        logged = self.table.log[: self.table.whole[LOGGED]].tolist()
+        self.table.whole[LOGGED] = 0
+        return [self._cycle_of(*row) for row in logged]
+
+    def _cycle_of(self, sample: float, squares: float, largest: float, learning: float, joined: float) -> Cycle:
+        rms = float(np.sqrt(squares / self._cycle))
         contraction = rms / self._rms_before if self._rms_before > 0.0 else np.nan
         self._cycles += 1
         self._rms_before = rms
-        cycle = Cycle(self._cycles, sample, rms, largest, contraction, self.learning and self.joined)
-        if not self.joined and largest <= self._join_below:
-            self.joined = True
-            self._whole[FROM] = self._whole[NEXT]
-        return cycle
+        return Cycle(self._cycles, int(sample), rms, largest, contraction, bool(learning), bool(joined))
 
 
 def memory_size(cycle: int, q: QFilter) -> int:

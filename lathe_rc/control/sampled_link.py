@@ -220,25 +220,31 @@ def correct(link: LinkTable, state: Array, error: float) -> tuple[float, bool]:
     return command, command != wanted
 
 
+class HeldLink(NamedTuple):
+    """A `SampledLink` for kernels.
+
+    Attributes:
+        link: its constants.
+        state: for `correct`.
+        divisor: samples in a period.
+        held: the command, and how many were cut off so far.
+    """
+
+    link: LinkTable
+    state: Array
+    divisor: int
+    held: Array
+
+
 @kernel
-def _advance(
-    link: LinkTable,
-    state: Array,
-    divisor: int,
-    held: float,
-    first: int,
-    set_point: Array,
-    measurement: Array,
-    command: Array,
-) -> tuple[float, int]:
-    """Step through a block; returns the command that is held and the number of those that were cut off."""
-    saturated = 0
+def correct_along(link: HeldLink, first: int, set_point: Array, measurement: Array, command: Array) -> None:
+    """`correct` for a block that begins at sample ``first``, shape (n,)."""
+    held = link.held
     for k in range(command.size):
-        if (first + k) % divisor == 0:
-            held, cut = correct(link, state, set_point[k] - measurement[k])
-            saturated += cut
-        command[k] = held
-    return held, saturated
+        if (first + k) % link.divisor == 0:
+            held[0], cut = correct(link.link, link.state, set_point[k] - measurement[k])
+            held[1] += cut
+        command[k] = held[0]
 
 
 class SampledLink:
@@ -258,7 +264,7 @@ class SampledLink:
     Attributes:
         drive: what the link is for.
         link: its coefficients.
-        saturated: commands so far that were cut off.
+        table: for `correct_along`.
 
     Raises:
         InputError: a value that is out of range, or a loop that would be unstable.
@@ -287,9 +293,12 @@ class SampledLink:
                 f"sampled link: law {law} with K = {gain:g} 1/s, T1 = {lag:g} s, T = {self.drive.period:g} s is "
                 f"unstable (pole at {largest:.4g}); allowed: K·T below 2, or the law ripple_free"
             )
-        self.saturated = 0
-        self._table, self._state = table(self.link, limit), rest(self.link)
-        self._divisor, self._held = divisor, 0.0
+        self.table = HeldLink(table(self.link, limit), rest(self.link), divisor, np.zeros(2))
+
+    @property
+    def saturated(self) -> int:
+        """Commands so far that were cut off."""
+        return int(self.table.held[1])
 
     def block(self, first: int, set_point: Array, measurement: Array, command: Array) -> None:
         """Step from sample ``first`` on; at rest at 0 before sample 0.
@@ -300,7 +309,4 @@ class SampledLink:
             measurement: position, in the same unit, shape (n,).
             command: filled, in the same unit, shape (n,).
         """
-        self._held, saturated = _advance(
-            self._table, self._state, self._divisor, self._held, first, set_point, measurement, command
-        )
-        self.saturated += saturated
+        correct_along(self.table, first, set_point, measurement, command)

@@ -276,14 +276,28 @@ def _remember(surface: Array, state: Array, place: float, left: float) -> None:
     state[_PLACE], state[_LEFT] = place, left
 
 
+class CutTable(NamedTuple):
+    """A `CuttingProcess` for its kernel.
+
+    Attributes:
+        process: its constants.
+        lag_state, mode_state: of F and w.
+        state: VB, the last angle's place on the grid, what is remembered of it, the next grid point.
+        surface: the remembered surface.
+        counts: see `CuttingProcess.apart` and `CuttingProcess.backwards`.
+    """
+
+    process: Process
+    lag_state: Array
+    mode_state: Array
+    state: Array
+    surface: Array
+    counts: npt.NDArray[np.int64]
+
+
 @kernel
-def _advance(
-    process: Process,
-    lag_state: Array,
-    mode_state: Array,
-    state: Array,
-    surface: Array,
-    counts: npt.NDArray[np.int64],
+def cut_along(
+    cut: CutTable,
     angle: Array,
     speed: Array,
     height: Array,
@@ -297,7 +311,9 @@ def _advance(
     feed: Array,
     wear: Array,
 ) -> tuple[int, int]:
-    """Step through a block; returns the sample at which it stopped and why."""
+    """Step through a block, see `CuttingProcess.block`; returns the sample at which it stopped and why."""
+    process, lag_state, mode_state = cut.process, cut.lag_state, cut.mode_state
+    state, surface, counts = cut.state, cut.surface, cut.counts
     per_radian = process.grid / _TURN
     for k in range(angle.size):
         if not speed[k] > 0.0:
@@ -367,6 +383,7 @@ class CuttingProcess:
         apart: samples so far in which the edge was clear of the part although there was material; before the first
             contact too.
         backwards: samples so far in which the feed went back; no chip has a negative thickness, and 0 was taken.
+        table: for `cut_along`.
 
     Raises:
         InputError: a value that is out of its range.
@@ -399,7 +416,7 @@ class CuttingProcess:
         heights, compliances = part.heights, part.compliances
         if heights is None or compliances is None:
             heights, compliances = np.zeros(1), np.array([elasticity.compliance])
-        self._process = Process(
+        self._whole = Process(
             step=step,
             depth=depth,
             overlap=overlap,
@@ -420,29 +437,33 @@ class CuttingProcess:
             compliances=np.ascontiguousarray(compliances, dtype=np.float64),
             grid=grid,
         )
-        self._whole = self._process
-        self._lag_state, self._mode_state = rest(following), rest(mode)
-        self._state = np.array([wear.initial, np.nan, 0.0, 0.0])
-        # A power of two, so that a mask wraps the index; a sample may be up to a revolution long.
-        self._surface = np.zeros(1 << (2 * grid + 2).bit_length())
-        self._counts = np.zeros(2, dtype=np.int64)
+        self.table = CutTable(
+            process=self._whole,
+            lag_state=rest(following),
+            mode_state=rest(mode),
+            state=np.array([wear.initial, np.nan, 0.0, 0.0]),
+            # A power of two, so that a mask wraps the index; a sample may be up to a revolution long.
+            surface=np.zeros(1 << (2 * grid + 2).bit_length()),
+            counts=np.zeros(2, dtype=np.int64),
+        )
 
     def damage(self, *, shorter: float = 0.0, spots: Sequence[HardSpot] = ()) -> None:
         """Let the edge be shorter [m] than it was made, and the part further hard spots; nothing given: neither."""
         further = np.array([spot.row for spot in spots], dtype=np.float64).reshape(-1, 5)
-        self._process = self._whole._replace(
+        process = self._whole._replace(
             depth=self._whole.depth - shorter, spots=np.concatenate((self._whole.spots, further))
         )
+        self.table = self.table._replace(process=process)
 
     @property
     def apart(self) -> int:
         """See the class."""
-        return int(self._counts[_APART])
+        return int(self.table.counts[_APART])
 
     @property
     def backwards(self) -> int:
         """See the class."""
-        return int(self._counts[_BACKWARDS])
+        return int(self.table.counts[_BACKWARDS])
 
     def block(
         self,
@@ -480,22 +501,26 @@ class CuttingProcess:
             LatheError: the spindle stands, or turns back or jumps under regeneration; or the force draws the edge into
                 the part faster than it can cut.
         """
-        reached, reason = _advance(
-            self._process, self._lag_state, self._mode_state, self._state, self._surface, self._counts,
-            angle, speed, height, cross_position, displacement, feed_velocity, allowance,
-            force, deflection, depth_of_cut, feed, wear,
+        reached, reason = cut_along(
+            self.table, angle, speed, height, cross_position, displacement, feed_velocity, allowance, force, deflection,
+            depth_of_cut, feed, wear,
         )  # fmt: skip
-        if reason == _STANDS:
-            raise LatheError(
-                f"the spindle's speed is {speed[reached]:.6g} rad/s in the cut; allowed: above 0 (reduce its deviation)"
-            )
-        if reason == _TURNS_BACK:
-            raise LatheError(
-                f"the spindle turns back or jumps to {angle[reached]:.6g} rad; regeneration needs an angle that rises "
-                "by less than a revolution a sample"
-            )
-        if reason == _DRAWN_IN:
-            raise LatheError(
-                f"the force draws the edge into the part without end at a feed of {feed[reached]:.4g} m/rev; reduce "
-                "the feed, the compliance or the sampling step"
-            )
+        if reason != _DONE:
+            raise failure(reason, angle[reached], speed[reached], feed[reached])
+
+
+def failure(reason: int, angle: float, speed: float, feed: float) -> LatheError:
+    """Why a cut cannot go on at an angle [rad], a speed [rad/s] and a feed [m/rev]."""
+    if reason == _STANDS:
+        return LatheError(
+            f"the spindle's speed is {speed:.6g} rad/s in the cut; allowed: above 0 (reduce its deviation)"
+        )
+    if reason == _TURNS_BACK:
+        return LatheError(
+            f"the spindle turns back or jumps to {angle:.6g} rad; regeneration needs an angle that rises by less than a "
+            "revolution a sample"
+        )
+    return LatheError(
+        f"the force draws the edge into the part without end at a feed of {feed:.4g} m/rev; reduce the feed, the "
+        "compliance or the sampling step"
+    )

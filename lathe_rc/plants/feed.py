@@ -198,16 +198,34 @@ def hold(table: DriveTable, state: Array, command: float) -> bool:
     return abs(command) > table.command_limit
 
 
+class FeedTable(NamedTuple):
+    """A `FeedDrive` for kernels.
+
+    Attributes:
+        drive, state: its constants and memory.
+        limits, memory: those of its command, which are looked at if it is ``kept``; the memory ends with whether the
+            command that is held is clipped.
+        divisor: the command is taken every so many samples.
+        resolution: of the position sensor [m].
+        from_load: whether that is at the load.
+        kept: see above.
+        counts: commands that were cut off and samples at the greatest speed so far.
+    """
+
+    drive: DriveTable
+    state: Array
+    limits: LimitTable
+    memory: Array
+    divisor: int
+    resolution: float
+    from_load: bool
+    kept: bool
+    counts: npt.NDArray[np.int64]
+
+
 @kernel
-def _advance(
-    table: DriveTable,
-    limits: LimitTable,
-    state: Array,
-    memory: Array,
-    divisor: int,
-    resolution: float,
-    from_load: bool,  # noqa: FBT001 - kernels take everything by position
-    kept: bool,  # noqa: FBT001
+def advance(
+    feed: FeedTable,
     first: int,
     command: Array,
     disturbance: Array,
@@ -217,19 +235,17 @@ def _advance(
     motor: Array,
     measured: Array,
     clipped: npt.NDArray[np.uint8],
-) -> tuple[int, int]:
-    """Step through a block; returns the commands that were cut off and the samples at the greatest speed.
-
-    ``memory`` is that of the limits, which are looked at if it is ``kept``, and whether the command held is clipped.
-    """
+) -> None:
+    """Step through a block, see `FeedDrive.block`."""
+    table, state, memory, divisor = feed.drive, feed.state, feed.memory, feed.divisor
     saturated = limited = 0
     for k in range(command.size):
         before = state[_LOAD]
         limited += move(table, state)
         if (first + k) % divisor == 0:
             wanted, changed = command[k], False
-            if kept:
-                changed = _keep(limits, memory, state, wanted)
+            if feed.kept:
+                changed = _keep(feed.limits, memory, state, wanted)
                 wanted = memory[0]
             cut = hold(table, state, wanted)
             saturated += cut
@@ -240,9 +256,10 @@ def _advance(
         motor[k], position[k], effort[k] = state[0], state[_LOAD], state[_EFFORT]
         # Within the gap the slide stands.
         velocity[k] = state[1] if table.half == 0.0 or state[_LOAD] != before else 0.0
-        seen = state[_LOAD] if from_load else state[0]
-        measured[k] = quantise(seen, resolution)
-    return saturated, limited
+        seen = state[_LOAD] if feed.from_load else state[0]
+        measured[k] = quantise(seen, feed.resolution)
+    feed.counts[0] += saturated
+    feed.counts[1] += limited
 
 
 def _realise(model: TransferFunction) -> tuple[Array, Array]:
@@ -308,9 +325,8 @@ class FeedDrive:
     Attributes:
         table: its constants for `move` and `hold`.
         state: its memory for them.
+        whole: both and all else for `advance`.
         integrates: whether the command stands for a speed.
-        saturated: commands so far that were cut off.
-        limited: samples so far at the greatest speed.
 
     Raises:
         InputError: a model whose speed would jump with the command, a value that is out of range, or limits for a
@@ -358,10 +374,28 @@ class FeedDrive:
             half=backlash / 2.0,
         )
         self.state = np.zeros(2 * held.size + 3)
-        self._limited, self._limits = limits.any, _limits(model, limits, command_limit, divisor * step)
-        self._memory = np.append(rest(), 0.0)
-        self.saturated = self.limited = 0
-        self._step, self._sampling = step, (divisor, float(resolution), feedback == "load", self._limited)
+        self._step = step
+        self.whole = FeedTable(
+            drive=self.table,
+            state=self.state,
+            limits=_limits(model, limits, command_limit, divisor * step),
+            memory=np.append(rest(), 0.0),
+            divisor=divisor,
+            resolution=float(resolution),
+            from_load=feedback == "load",
+            kept=limits.any,
+            counts=np.zeros(2, np.int64),
+        )
+
+    @property
+    def saturated(self) -> int:
+        """Commands so far that were cut off."""
+        return int(self.whole.counts[0])
+
+    @property
+    def limited(self) -> int:
+        """Samples so far at the greatest speed."""
+        return int(self.whole.counts[1])
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
         """Motor over command, as the difference equation has it, at ``frequency`` [rad/s]; limits and divisor apart."""
@@ -397,23 +431,6 @@ class FeedDrive:
             clipped: filled with 1 where the command that is held is not what it was when it was taken; needed if there
                 are limits, else it may be empty.
         """
-        wanted = command.size if self._limited or clipped.size else 0
+        wanted = command.size if self.whole.kept or clipped.size else 0
         assert clipped.size == wanted, "room for what is clipped"
-        saturated, limited = _advance(
-            self.table,
-            self._limits,
-            self.state,
-            self._memory,
-            *self._sampling,
-            first,
-            command,
-            disturbance,
-            position,
-            velocity,
-            effort,
-            motor,
-            measured,
-            clipped,
-        )
-        self.saturated += saturated
-        self.limited += limited
+        advance(self.whole, first, command, disturbance, position, velocity, effort, motor, measured, clipped)

@@ -8,7 +8,6 @@ others are its form. Sources: paper 004, whose disturbance of the force is 4.83 
 that is an allowance of 20.7 µm RMS at 233.3 N/mm.
 """
 
-import zlib
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ import numpy.typing as npt
 
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.signals.noise import DRAWN, Drawn, NormalStream
 
 Array = npt.NDArray[np.float64]
 
@@ -72,12 +72,30 @@ def unbounded(rate: float, step: float) -> Walk:
     return Walk(1.0, rate * float(np.sqrt(step)), 0.0)
 
 
+class AllowanceTable(NamedTuple):
+    """An `Allowance` for kernels.
+
+    Attributes:
+        walk: its constants.
+        run_out: rows n_i, a_i, ψ_i, shape (3, m).
+        normal: what drives the walk.
+        state: w, and whether there was a sample.
+    """
+
+    walk: Walk
+    run_out: Array
+    normal: Drawn
+    state: Array
+
+
 @kernel
-def _advance(walk: Walk, run_out: Array, state: Array, angle: Array, allowance: Array) -> None:
-    """Turn the normal numbers in ``allowance`` into the allowance; ``state`` is w and whether there was a sample."""
+def allow(made: AllowanceTable, angle: Array, allowance: Array) -> None:
+    """Fill ``allowance`` [m] at the true spindle ``angle`` [rad]; both of shape (n,), and as many numbers drawn."""
+    walk, run_out, state, place = made.walk, made.run_out, made.state, made.normal.used[0]
+    made.normal.used[0] += angle.size
     w, begun = state[0], state[1]
     for k in range(angle.size):
-        normal = allowance[k]
+        normal = made.normal.values[place + k]
         w = walk.keep * w + walk.kick * normal if begun else walk.start * normal
         begun = 1.0
         total = w
@@ -98,6 +116,9 @@ class Allowance:
         seed: the scenario's seed.
         name: of the node; makes the walk its own.
 
+    Attributes:
+        table: for `allow`.
+
     Raises:
         InputError: arrays of different lengths, or an order that is no whole number from 1.
     """
@@ -113,12 +134,17 @@ class Allowance:
         wrong = order[(order < 1.0) | (order != np.rint(order))]
         if wrong.size:
             raise InputError(f"run-out: order {wrong[0]:g}; allowed: whole numbers from 1")
-        self._walk, self._run_out = walk, np.stack((order, amplitude, phase)).astype(np.float64)
-        # A stream of normal numbers does not depend on the lengths in which it is drawn.
-        self._random = np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
-        self._state = np.zeros(2)
+        run_out = np.stack((order, amplitude, phase)).astype(np.float64)
+        self._stream = NormalStream(seed, name)
+        self.table = AllowanceTable(walk, run_out, self._stream.drawn, np.zeros(2))
+
+    def draw(self, samples: int) -> None:
+        """Draw the numbers of the next samples, up to 8192."""
+        self._stream.draw(samples)
 
     def block(self, angle: Array, allowance: Array) -> None:
         """Fill ``allowance`` [m] at the true spindle ``angle`` [rad]; both of shape (n,)."""
-        allowance[:] = self._random.standard_normal(angle.size)
-        _advance(self._walk, self._run_out, self._state, angle, allowance)
+        for start in range(0, angle.size, DRAWN):
+            piece = slice(start, min(start + DRAWN, angle.size))
+            self.draw(piece.stop - start)
+            allow(self.table, angle[piece], allowance[piece])

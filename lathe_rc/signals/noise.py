@@ -12,7 +12,7 @@ from lathe_rc.jit import kernel
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-_DRAWN = 8192  # numbers that a stream draws at a time, at most
+DRAWN = 8192  #: numbers that a stream draws at a time, at most
 
 
 @kernel
@@ -49,7 +49,7 @@ class NormalStream:
 
     def __init__(self, seed: int, name: str, *, on: bool = True) -> None:
         self._random = np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
-        size = _DRAWN if on else 0
+        size = DRAWN if on else 0
         self.drawn = Drawn(np.empty(size), np.array([size], np.int64))
 
     def draw(self, numbers: int) -> None:
@@ -114,7 +114,7 @@ class Sensor:
 
     def measure(self, true: Array, measured: Array) -> None:
         """Fill ``measured`` from ``true``; both of shape (n,)."""
-        for start in range(0, true.size, _DRAWN):
-            piece = slice(start, min(start + _DRAWN, true.size))
+        for start in range(0, true.size, DRAWN):
+            piece = slice(start, min(start + DRAWN, true.size))
             self.draw(piece.stop - start)
             measure(self.table, true[piece], measured[piece])

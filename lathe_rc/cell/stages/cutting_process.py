@@ -2,22 +2,35 @@
 """The cut: from tool, feed and part to the force, and the deflection of the edge by it."""
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc.analysis.shaft import STEEL_MODULUS, Shaft, Support
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.cell.stage import Input, Output, Sparse, Stage
+from lathe_rc.cell.stage import DONE, Input, Output, Sparse, Stage
 from lathe_rc.errors import InputError
-from lathe_rc.plants.cutting import PAPER, REALISTIC, RIGID, CuttingProcess, Elasticity, HardSpot, Part, Wear
+from lathe_rc.jit import kernel
+from lathe_rc.plants.cutting import (
+    PAPER,
+    REALISTIC,
+    RIGID,
+    CutTable,
+    CuttingProcess,
+    Elasticity,
+    HardSpot,
+    Part,
+    Wear,
+    cut_along,
+    failure,
+)
 from lathe_rc.plants.cutting_force import SpecificForce
 from lathe_rc.safety.faults import Fault
-from lathe_rc.signals.allowance import Allowance, mean_reverting, unbounded
-from lathe_rc.signals.noise import Sensor
+from lathe_rc.signals.allowance import Allowance, AllowanceTable, allow, mean_reverting, unbounded
+from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
 _ELASTICITIES = {"rigid": RIGID, "paper": PAPER, "realistic": REALISTIC}
 _READ = {
@@ -151,6 +164,58 @@ class CuttingProcessParameters(NodeParameters):
         return _ELASTICITIES["realistic" if self.shaft != "none" and self.elasticity == "rigid" else self.elasticity]
 
 
+class Memory(NamedTuple):
+    """What the step works on.
+
+    Attributes:
+        cut: the machine.
+        allowance: of the blank.
+        sensor: of the force.
+        tool, cross, longitudinal: number of the first input of each that moves the edge; -1: it does not.
+        even: whether the blank has the form that is wanted.
+        feed: unless the longitudinal slide makes it [m/rad].
+    """
+
+    cut: CutTable
+    allowance: AllowanceTable
+    sensor: SensorTable
+    tool: int
+    cross: int
+    longitudinal: int
+    even: bool
+    feed: float
+
+
+@kernel
+def step(
+    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`; the cross feed is positive into the part."""
+    angle, speed = inputs[0], inputs[1]
+    force, measured_force, depth_of_cut, feed, allowance, wear, deflection = outputs
+    still = np.zeros(angle.size)
+    displacement = height = cross_position = still
+    if memory.tool >= 0:
+        displacement, height = inputs[memory.tool], inputs[memory.tool + 2]
+        if memory.even:
+            displacement = displacement - inputs[memory.tool + 1]
+    if memory.cross >= 0:
+        cross_position = -inputs[memory.cross]
+    if memory.longitudinal >= 0:
+        height, feed_velocity = inputs[memory.longitudinal], inputs[memory.longitudinal + 1]
+    else:
+        feed_velocity = speed * memory.feed
+    allow(memory.allowance, angle, allowance)
+    reached, reason = cut_along(
+        memory.cut, angle, speed, height, cross_position, displacement, feed_velocity, allowance, force, deflection,
+        depth_of_cut, feed, wear,
+    )  # fmt: skip
+    if reason != DONE:
+        return reached, reason
+    measure(memory.sensor, force, measured_force)
+    return reached, DONE
+
+
 class CuttingProcessStage(Stage):
     """See `lathe_rc.plants.cutting`.
 
@@ -162,6 +227,7 @@ class CuttingProcessStage(Stage):
     kind = "cutting_process"
     Parameters = CuttingProcessParameters
     devices = ("cut",)
+    step = staticmethod(step)
 
     def __init__(self, name: str, parameters: CuttingProcessParameters) -> None:
         super().__init__(name, parameters)
@@ -210,30 +276,35 @@ class CuttingProcessStage(Stage):
         ]
         self.cut.damage(shorter=shorter, spots=spots)
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
-        """See `Stage`; the cross feed is positive into the part."""
-        (encoder, *others), (cut,) = inputs, outputs
-        given = dict(zip(self._movers, others, strict=True))
-        still = np.zeros(encoder["angle_true"].size)
-        tool, cross, longitudinal = (given.get(name, {}) for name in ("tool", "cross", "longitudinal"))
-        displacement = tool.get("displacement", still)
-        if tool and self.parameters.blank == "form":
-            displacement = displacement - tool["reference"]
-        angle, speed = encoder["angle_true"], encoder["speed_true"]
-        self._allowance.block(angle, cut["allowance"])
-        self.cut.block(
-            angle=angle,
-            speed=speed,
-            height=longitudinal.get("position", tool.get("height", still)),
-            cross_position=-cross["position"] if cross else still,
-            displacement=displacement,
-            feed_velocity=longitudinal.get("velocity", speed * (self.parameters.feed / (2.0 * np.pi))),
-            allowance=cut["allowance"],
-            force=cut["force"],
-            deflection=cut["deflection"],
-            depth_of_cut=cut["depth_of_cut"],
-            feed=cut["feed"],
-            wear=cut["wear"],
+    @property
+    def memory(self) -> Memory:
+        """See `Stage`."""
+        parameters = self.parameters
+        places, place = dict.fromkeys(_READ, -1), 2
+        for name in self._movers:
+            places[name] = place
+            place += len(_READ[name].fields)
+        return Memory(
+            cut=self.cut.table,
+            allowance=self._allowance.table,
+            sensor=self._sensor.table,
+            **places,
+            even=parameters.blank == "form",
+            feed=parameters.feed / (2.0 * np.pi),
         )
-        self._sensor.measure(cut["force"], cut["measured_force"])
-        return []
+
+    def prepare(self, first: int, samples: int) -> None:
+        """See `Stage`."""
+        self._allowance.draw(samples)
+        self._sensor.draw(samples)
+
+    def serve(
+        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
+    ) -> list[Sparse]:
+        """See `Stage`.
+
+        Raises:
+            LatheError: there is no cut.
+        """
+        (encoder, *_), (cut,) = inputs, outputs
+        raise failure(reason, encoder["angle_true"][reached], encoder["speed_true"][reached], cut["feed"][reached])

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decoupler between the force and the position loop (paper 004, Figs 5 and 10)."""
 
-from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from annotated_types import Ge, Gt
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.cell.stage import Input, Output, Sparse, Stage
-from lathe_rc.control.decoupler import LAG, LEAK, PRESETS, Channels, Decoupler, compensators
+from lathe_rc.cell.stage import DONE, Input, Output, Stage
+from lathe_rc.control.decoupler import LAG, LEAK, PRESETS, Channels, Decoupler, compensators, decouple_along
 from lathe_rc.errors import InputError
-from lathe_rc.transfer import TransferFunction
+from lathe_rc.jit import kernel
+from lathe_rc.transfer import System, TransferFunction
 
 _CHANNELS = ("w1", "w2", "w3", "w4")
 
@@ -51,6 +51,27 @@ class DecouplerParameters(NodeParameters):
         return Channels(**made)
 
 
+class Memory(NamedTuple):
+    """What the step works on: K1 and K2 with their states."""
+
+    k1: System
+    state1: Samples
+    k2: System
+    state2: Samples
+
+
+@kernel
+def step(
+    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`; set points and errors go on unchanged."""
+    force, force_set_point, force_error, position, position_set_point, position_error = inputs
+    outputs[1][:], outputs[2][:] = force_set_point, force_error
+    outputs[4][:], outputs[5][:] = position_set_point, position_error
+    decouple_along(memory.k1, memory.state1, memory.k2, memory.state2, force, position, outputs[0], outputs[3])
+    return force.size, DONE
+
+
 class DecouplerStage(Stage):
     """See `lathe_rc.control.decoupler`.
 
@@ -60,6 +81,7 @@ class DecouplerStage(Stage):
 
     kind = "decoupler"
     Parameters = DecouplerParameters
+    step = staticmethod(step)
 
     def __init__(self, name: str, parameters: DecouplerParameters) -> None:
         super().__init__(name, parameters)
@@ -78,10 +100,8 @@ class DecouplerStage(Stage):
             ],
         )
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
-        """See `Stage`; set points and errors go on unchanged."""
-        for demand, command in zip(inputs, outputs, strict=True):
-            command["set_point"][:], command["error"][:] = demand["set_point"], demand["error"]
-        (force, position), (longitudinal, cross) = inputs, outputs
-        self._decoupler.block(force["command"], position["command"], longitudinal["command"], cross["command"])
-        return []
+    @property
+    def memory(self) -> Memory:
+        """See `Stage`."""
+        made = self._decoupler
+        return Memory(made.k1, made.state1, made.k2, made.state2)

@@ -116,7 +116,7 @@ class ElectrodynamicActuator(Drive):
         """See `Stage`."""
         return Memory(self._retraction.table, self._limited.table, self.drive.table, self._sensor.table)
 
-    def prepare(self, samples: int) -> None:
+    def prepare(self, first: int, samples: int) -> None:
         """See `Stage`."""
         self._sensor.draw(samples)
 

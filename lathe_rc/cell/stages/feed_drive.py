@@ -2,23 +2,33 @@
 """Feed drive of a slide: cross or longitudinal."""
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedParameters
-from lathe_rc.cell.stages.obedience import OUT_OF_REACH, FeedObedientParameters, Obedience, listens
+from lathe_rc.cell.stage import DONE, Input, Joint, Output, Sparse, Stage
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedParameters, remembered
+from lathe_rc.cell.stages.obedience import (
+    OBEY,
+    OUT_OF_REACH,
+    FeedObedientParameters,
+    Obedience,
+    ObedienceTable,
+    apply,
+    listens,
+    piece,
+)
 from lathe_rc.errors import InputError
 from lathe_rc.plants import feed
-from lathe_rc.plants.feed import Feedback, FeedDrive
+from lathe_rc.jit import kernel
+from lathe_rc.plants.feed import Feedback, FeedDrive, FeedTable, advance
 from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.example_002 import fill_disturbance
-from lathe_rc.signals.noise import Sensor
+from lathe_rc.signals.noise import Sensor, SensorTable, measure
 from lathe_rc.transfer import TransferFunction
 
 Axis = Literal["cross", "longitudinal"]
@@ -81,6 +91,59 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
         return feed.dc_screw(self.velocity_gain, self.lags or [0.045], self.zero)
 
 
+class Memory(NamedTuple):
+    """What the step works on.
+
+    Attributes:
+        drive: the machine.
+        sensor: of its position.
+        obedience: to the supervisor, if it ``listens``; once it is ``safe``, to nobody.
+        disturbance: amplitude of what adds to the command.
+        period: sampling step [s].
+        clipped: whether the command was not given as it was commanded, of sample n at n modulo its length.
+    """
+
+    drive: FeedTable
+    sensor: SensorTable
+    obedience: ObedienceTable
+    listens: bool
+    safe: bool
+    disturbance: float
+    period: float
+    clipped: Samples
+
+
+@kernel
+def step(
+    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`."""
+    command, (position, velocity, effort, measured_position) = inputs[0], outputs
+    n, mask = command.size, memory.clipped.size - 1
+    while start < n:
+        stop = n
+        if memory.listens:
+            stop = piece(memory.obedience, start, inputs[-1])
+            if stop == start:
+                return start, OBEY
+        given, samples, now = command[start:stop], stop - start, first + start
+        if memory.listens or memory.safe:
+            given = given.copy()
+        apply(memory.obedience, given)
+        load, clipped = np.empty(samples if memory.disturbance else 0), np.empty(samples if mask else 0, np.uint8)
+        fill_disturbance(now, memory.period, memory.disturbance, load)
+        motor, seen = np.empty(samples), np.empty(samples)
+        advance(
+            memory.drive, now, given, load, position[start:stop], velocity[start:stop], effort[start:stop], motor, seen,
+            clipped,
+        )  # fmt: skip
+        measure(memory.sensor, seen, measured_position[start:stop])
+        for k in range(clipped.size):
+            memory.clipped[(now + k) & mask] = clipped[k]
+        start = stop
+    return n, DONE
+
+
 class FeedDriveStage(Stage):
     """See `lathe_rc.plants.feed`.
 
@@ -92,6 +155,7 @@ class FeedDriveStage(Stage):
     kind = "feed_drive"
     Parameters = FeedDriveParameters
     announces = (LIMITED, FREE, OUT_OF_REACH)
+    step = staticmethod(step)
 
     def __init__(self, name: str, parameters: FeedDriveParameters) -> None:
         super().__init__(name, parameters)
@@ -112,9 +176,8 @@ class FeedDriveStage(Stage):
             raise InputError(f"{name}: {error}") from None
         self._clipping = Clipping(name, parameters)
         cuts = limits.any or bool(parameters.command_limit)
-        self._clipped = np.empty(messages.MAX_BLOCK if cuts else 0, np.uint8)
+        self._clipped = np.zeros(messages.MAX_BLOCK if cuts else 1, np.uint8)
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
-        self._motor, self._seen, self._load = (np.empty(messages.MAX_BLOCK) for _ in range(3))
         self._obedience, self._safe = self._obeys(), False
         axis = parameters.axis
         self.declare(
@@ -128,35 +191,45 @@ class FeedDriveStage(Stage):
 
     def _obeys(self) -> Obedience:
         limit = self.parameters.command_limit
-        return self.parameters.obedience(self.name, None, speed=self.drive.integrates, limit=limit, settled=0)
+        return self.parameters.obedience(self.name, speed=self.drive.integrates, limit=limit, settled=0)
 
     def go_safe(self) -> None:
         """See `Stage`; the slide stops, and nobody is listened to any more."""
         self._safe = True
-        self._obedience.obey(Reaction.STOP)
+        # The host asks for this between two blocks, and says it with the sample of the next.
+        self._remarks += [message.values["action"] for message in self._obedience.obey(Reaction.STOP, 0)]
 
     def finish(self, index: int) -> list[Sparse]:
         """See `Stage`."""
         return self._clipping.finish(index)
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    @property
+    def memory(self) -> Memory:
         """See `Stage`."""
-        (servo, *safety), (state,) = inputs, outputs
-        command = servo["command"]
-        size = command.size
-        if self._safe or safety:
-            command = command.copy()
-        listening = safety and not self._safe
-        sparse: list[Sparse] = []
-        for start, stop in self._obedience.pieces(safety[0]["reaction"]) if listening else [(0, size)]:
-            sparse += self._obedience.told(first + start)
-            self._obedience.apply(command[start:stop])
-        motor, seen = self._motor[:size], self._seen[:size]
-        load = self._load[: size if self.parameters.disturbance else 0]
-        fill_disturbance(first, self.parameters.step, self.parameters.disturbance, load)
-        clipped = self._clipped[:size]
-        self.drive.block(
-            first, command, state["position"], state["velocity"], state["effort"], motor, seen, load, clipped
+        parameters = self.parameters
+        return Memory(
+            drive=self.drive.whole,
+            sensor=self._sensor.table,
+            obedience=self._obedience.table,
+            listens=bool(parameters.reaction_delay) and not self._safe,
+            safe=self._safe,
+            disturbance=parameters.disturbance,
+            period=parameters.step,
+            clipped=self._clipped,
         )
-        self._sensor.measure(seen, state["measured_position"])
-        return sparse + self._clipping.told(first, clipped)
+
+    def prepare(self, first: int, samples: int) -> None:
+        """See `Stage`."""
+        self._sensor.draw(samples)
+
+    def serve(
+        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
+    ) -> list[Sparse]:
+        """See `Stage`: obey."""
+        return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)
+
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """See `Stage`."""
+        if self._clipped.size == 1:
+            return []
+        return self._clipping.told(first, remembered(self._clipped, first, end))

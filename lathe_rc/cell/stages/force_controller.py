@@ -2,19 +2,20 @@
 """Force controller: holds the main cutting force by the longitudinal feed (paper 004)."""
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
-import numpy as np
 from annotated_types import Ge, Gt
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Input, Output, Sparse, Stage
 from lathe_rc.cell.stages.obedience import listens
-from lathe_rc.cell.stages.servo import ServoParameters
-from lathe_rc.cell.stages.trajectory import Trajectory
-from lathe_rc.control.pid import FORCE
+from lathe_rc.cell.stages.servo import Listener, ServoParameters, listener, pid_along
+from lathe_rc.cell.stages.trajectory import Course, Trajectory, follow
+from lathe_rc.control.pid import FORCE, PidTable
+from lathe_rc.jit import kernel
+from lathe_rc.safety.state_machine import Reaction
 
 
 class ForceControllerParameters(ServoParameters):
@@ -31,6 +32,28 @@ class ForceControllerParameters(ServoParameters):
     derivative_filter: Annotated[float, Gt(0)] = parameter(FORCE.filter, "N, where the derivative ends", "rad/s")
 
 
+class Memory(NamedTuple):
+    """What the step works on."""
+
+    course: Course
+    pid: PidTable
+    state: Samples
+    who: Listener
+
+
+@kernel
+def step(
+    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`."""
+    force, (command, wanted, error) = inputs[1], outputs
+    if start == 0:
+        follow(memory.course, first, wanted)
+        for k in range(error.size):
+            error[k] = wanted[k] - force[k]
+    return pid_along(memory.pid, memory.state, memory.who, first, start, inputs[-1], wanted, force, command)
+
+
 class ForceController(Stage):
     """See `lathe_rc.control.pid`.
 
@@ -41,6 +64,7 @@ class ForceController(Stage):
 
     kind = "force_controller"
     Parameters = ForceControllerParameters
+    step = staticmethod(step)
 
     def __init__(self, name: str, parameters: ForceControllerParameters) -> None:
         super().__init__(name, parameters)
@@ -49,7 +73,7 @@ class ForceController(Stage):
         self.pid = parameters.pid(
             parameters.proportional, parameters.integral, parameters.derivative, parameters.derivative_filter
         )
-        self._obedience = parameters.obeys(name, self)
+        self._obedience = parameters.obeys(name)
         self.declare(
             inputs=[
                 # The angle itself is not used: the spindle's blocks say which samples are due.
@@ -60,22 +84,18 @@ class ForceController(Stage):
             outputs=[Output("longitudinal/command", messages.SERVO)],
         )
 
-    def may_learn(self, *, on: bool) -> None:
-        """See `lathe_rc.cell.stages.obedience.Learner`."""
-        self.pid.integrates = on
-
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    @property
+    def memory(self) -> Memory:
         """See `Stage`."""
-        (_, cut, *safety), (servo,) = inputs, outputs
-        wanted, force, command = servo["set_point"], cut["measured_force"], servo["command"]
-        self.trajectory.block(first, wanted)
-        np.subtract(wanted, force, out=servo["error"])
-        if self._obedience is None:
-            self.pid.block(first, wanted, force, command)
-            return []
-        for start, stop in self._obedience.pieces(safety[0]["reaction"]):
-            self.pid.waits = self._obedience.held
-            part = slice(start, stop)
-            self.pid.block(first + start, wanted[part], force[part], command[part])
-            self._obedience.apply(command[part])
-        return []
+        return Memory(self.trajectory.course, self.pid.table, self.pid.state, listener(self._obedience))
+
+    def prepare(self, first: int, samples: int) -> None:
+        """See `Stage`."""
+        self.trajectory.prepare(first, samples)
+
+    def serve(
+        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
+    ) -> list[Sparse]:
+        """See `Stage`: obey."""
+        assert self._obedience is not None, "nobody else listens"
+        return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)

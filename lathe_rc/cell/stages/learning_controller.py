@@ -6,28 +6,187 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from lathe_rc.analysis.learning import LearningLoop, Response
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import MAX_BLOCK, Samples, Signals
-from lathe_rc.cell.stage import Input, Output, Sparse, Stage, cut
+from lathe_rc.cell.stage import DONE, Input, Output, Sparse, Stage, Step
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
-from lathe_rc.cell.stages.obedience import OUT_OF_REACH, Obedience, listens
-from lathe_rc.control import bounded, memory_file
+from lathe_rc.cell.stages.obedience import (
+    NOBODY,
+    OBEY,
+    OUT_OF_REACH,
+    Obedience,
+    ObedienceTable,
+    apply,
+    listens,
+    may_learn,
+    obeyed,
+    piece,
+)
+from lathe_rc.control import angle_memory, bounded, memory_file
+from lathe_rc.control.angle_memory import AngleMemory
 from lathe_rc.control.bounded import Takeover
-from lathe_rc.control.correction import Correction
-from lathe_rc.control.identification import DriveIdentifier, Identified
-from lathe_rc.control.repetitive import AngleLostError, Cycle, RepetitiveController, largest_feedback_delay
+from lathe_rc.control.correction import Correction, CorrectionLaw
+from lathe_rc.control.identification import DriveIdentifier, Identified, IdentifierTable, accumulate, command_sent
+from lathe_rc.control.lead import PreviewTable, look_ahead
+from lathe_rc.control.repetitive import Cycle, RepetitiveController, largest_feedback_delay
 from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
 from lathe_rc.plants.linear import discretise, second_order
 from lathe_rc.safety.state_machine import Reaction
 
 _SETTLED = 4.0  # lead times until a drive has followed
 _MOST = 1024  # entries of a table of margins
 _FILE_ACTIONS = ("save", "load")
+
+
+# Places in the state of a step: whether it is inside a piece of a block, where that begins and ends, and whether the
+# angle is lost, and since which sample, if that has not been told yet.
+_INSIDE, _BEGIN, _END, _LOST, _LOST_AT = range(5)
+_UNHEARD = np.empty(0, np.uint8)
+
+
+class Memory(NamedTuple):
+    """What the step works on.
+
+    Attributes:
+        control: the memory of the channel.
+        preview: its lead law.
+        identifier: of its drive, if it ``identifies``.
+        obedience: to the supervisor, if it ``listens``.
+        nominal: speed of the spindle [rad/s].
+        period: sampling step [s].
+        by_time: whether time stands for the angle.
+        falls_back: whether the lead angle is that of the nominal speed where the supervisor asks to fall back.
+        rates: whether the correction needs the rates of the lead.
+        finer: how many finer drives the error has in it.
+        margin: of the newest cycle, shape (1,).
+        state: see above.
+    """
+
+    control: AngleMemory
+    preview: PreviewTable
+    identifier: IdentifierTable
+    obedience: ObedienceTable
+    nominal: float
+    period: float
+    by_time: bool
+    falls_back: bool
+    rates: bool
+    finer: int
+    identifies: bool
+    listens: bool
+    margin: Samples
+    state: npt.NDArray[np.int64]
+
+
+@kernel
+def _angle(memory: Memory, first: int, late: int, measured: Samples) -> Samples:
+    """The angle that the memory goes by [rad], ``late`` samples before the samples ``first`` on."""
+    if not memory.by_time:
+        return measured
+    angle = np.empty(measured.size)
+    for k in range(angle.size):
+        angle[k] = memory.nominal * (memory.period * (first + k))
+    if late:
+        angle -= memory.nominal * (memory.period * late)
+    return angle
+
+
+@kernel
+def _begin(memory: Memory, first: int, start: int, stop: int, inputs: tuple[Samples, ...]) -> None:
+    """Look ahead along a piece of a block, and take its errors."""
+    control, samples = memory.control, stop - start
+    speed, error = inputs[1][start:stop], inputs[3][start:stop]
+    if memory.by_time or (memory.falls_back and obeyed(memory.obedience) >= Reaction.FALL_BACK.value):
+        speed = np.full(samples, memory.nominal)
+    if memory.finer:
+        error = error.copy()
+        for finer in range(memory.finer):
+            error += inputs[4 + finer][start:stop]
+    ahead = control.ahead
+    look_ahead(
+        memory.preview, first + start, memory.rates, speed, ahead[0, :samples], ahead[1, :samples], ahead[2, :samples]
+    )
+    angle = _angle(memory, first + start, 0, inputs[0][start:stop])
+    past_angle = _angle(memory, first + start, control.delay, inputs[2][start:stop])
+    angle_memory.begin(control, first + start, angle, past_angle, error)
+
+
+@kernel
+def _lose(memory: Memory, start: int, stop: int, command: Samples) -> None:
+    """Without an angle the command stays, from sample ``start`` of a block on."""
+    command[start:stop] = command[start - 1] if start > memory.state[_BEGIN] else memory.obedience.takeover.given[1]
+
+
+@kernel
+def _control(
+    memory: Memory,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    reaction: Samples,
+    outputs: tuple[Samples, ...],
+) -> tuple[int, int]:
+    """The step, with the reactions that are asked for, if there are any."""
+    control, state, command = memory.control, memory.state, outputs[0]
+    n = command.size
+    while start < n:
+        if not state[_INSIDE]:
+            stop = n
+            if memory.listens:
+                stop = piece(memory.obedience, start, reaction)
+                if stop == start:
+                    return start, OBEY
+                control.whole[angle_memory.LEARNS] = may_learn(memory.obedience)
+            state[_INSIDE], state[_BEGIN], state[_END] = 1, start, stop
+            if not state[_LOST]:
+                _begin(memory, first, start, stop, inputs)
+        begin, stop = state[_BEGIN], state[_END]
+        reached, reason = stop, DONE
+        if state[_LOST]:
+            _lose(memory, start, stop, command)
+        else:
+            angle = _angle(memory, first + begin, 0, inputs[0][begin:stop])
+            reached, reason = angle_memory.advance(control, first + begin, start - begin, angle, command[begin:stop])
+            reached += begin
+            if reason in (angle_memory.AHEAD, angle_memory.BEHIND, angle_memory.JUMPED) and memory.listens:
+                state[_LOST], state[_LOST_AT] = 1, first + reached
+                _lose(memory, reached, stop, command)
+                reached, reason = stop, DONE
+            elif memory.identifies:
+                accumulate(memory.identifier, first, start, reached, inputs[4 + memory.finer])
+                command_sent(memory.identifier, first, start, reached, command)
+        for published in range(1, len(outputs)):
+            outputs[published][start:reached] = memory.margin[0]
+        if reason != DONE:
+            return reached, reason
+        if memory.listens:
+            apply(memory.obedience, command[begin:stop])
+        state[_INSIDE] = 0
+        start = stop
+    return n, DONE
+
+
+@kernel
+def step(
+    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`."""
+    return _control(memory, first, start, inputs, _UNHEARD, outputs)
+
+
+@kernel
+def obedient_step(
+    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """The same under the supervisor, whose reactions are the last of the inputs."""
+    return _control(memory, first, start, inputs[:-1], inputs[-1], outputs)
 
 
 class LearningController(Stage):
@@ -60,6 +219,9 @@ class LearningController(Stage):
             step=parameters.step,
         )
         self._joined = self._controller.joined
+        self._asks = parameters.identify or parameters.publish_margin
+        self._controller.table.whole[angle_memory.ASKS] = self._asks
+        self._state, self._margin = np.array([0, 0, 0, 0, -1]), np.zeros(1)
         self._check_identification()
         self._model = Identified(parameters.model_natural_frequency, parameters.model_damping, np.nan)
         self._margins = _Margins(self)
@@ -73,7 +235,6 @@ class LearningController(Stage):
         inputs += [Input(f"{drive}/state", messages.STATE, ("measured_position",), delay) for drive in parameters.finer]
         if parameters.identify:
             inputs.append(Input("coarse/state", messages.STATE, ("measured_position",), delay))
-        self._lost = False  # there is no angle that it could read its memory at
         self._obedience = self._obeys() if parameters.reaction_delay else None
         inputs += listens(parameters)
         self._identifier = DriveIdentifier(
@@ -87,7 +248,7 @@ class LearningController(Stage):
         outputs = [Output("coarse/command", messages.COMMAND)]
         if parameters.publish_margin:
             outputs.append(Output("coarse/margin", messages.MARGIN))
-            self._margin = self._margins.untabulated(parameters.nominal_speed, self._model)
+            self._margin[0] = self._margins.untabulated(parameters.nominal_speed, self._model)
         self.declare(inputs=inputs, outputs=outputs)
         self.sparse_topics["coarse/learning"] = messages.LEARNING
         if self._scheduled_actions("load") and not self._scheduled_actions("save"):
@@ -100,11 +261,7 @@ class LearningController(Stage):
         bounds = parameters.bounds()
         reach = bounds.reach(parameters.retract_time)
         takeover = Takeover(bounds, parameters.retract_position, parameters.step, reach=reach)
-        return Obedience(self.name, self, takeover, settled=settled)
-
-    def may_learn(self, *, on: bool) -> None:
-        """See `lathe_rc.cell.stages.obedience.Learner`."""
-        self._controller.learning = on
+        return Obedience(self.name, takeover, settled=settled)
 
     def _check_identification(self) -> None:
         parameters = self.parameters
@@ -195,84 +352,68 @@ class LearningController(Stage):
 
     # ---- samples ------------------------------------------------------------------------------------
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    @property
+    def step(self) -> Step:  # type: ignore[override]
         """See `Stage`."""
-        command, *margin = outputs
-        sparse: list[Sparse] = []
-        if self._obedience is None:
-            self._control(first, inputs, command["position"], sparse)
-        else:
-            self._obey(first, inputs, command["position"], sparse)
-        for published in margin:
-            self._fill_margin(first, published["stability_margin"], sparse)
+        return obedient_step if self._obedience else step
+
+    @property
+    def memory(self) -> Memory:
+        """See `Stage`."""
+        parameters = self.parameters
+        return Memory(
+            control=self._controller.table,
+            preview=self._controller.preview.table,
+            identifier=self._identifier.table,
+            obedience=self._obedience.table if self._obedience else NOBODY,
+            nominal=parameters.nominal_speed,
+            period=parameters.step,
+            by_time=parameters.law == "time_periodic",
+            falls_back=parameters.fall_back == "constant_lead",
+            rates=self.correction.law is not CorrectionLaw.NONE,
+            finer=len(parameters.finer),
+            identifies=parameters.identify,
+            listens=self._obedience is not None,
+            margin=self._margin,
+            state=self._state,
+        )
+
+    def serve(
+        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
+    ) -> list[Sparse]:
+        """See `Stage`.
+
+        Raises:
+            AngleLostError: the memory cannot be read at the angle that was measured.
+        """
+        if reason == OBEY:
+            assert self._obedience is not None, "nobody else listens"
+            return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)
+        if reason == angle_memory.SMOOTH:
+            self._controller.smooth()
+            return []
+        if reason == angle_memory.CYCLE_ENDED:
+            return self._newest_cycle(reached, outputs) if self._asks else []
+        angle, speed, past_angle = inputs[0]["angle"], inputs[0]["speed"], inputs[1]["angle"]
+        raise self._controller.lost(reason, first, reached, angle, speed, past_angle)
+
+    def _newest_cycle(self, reached: int, outputs: Sequence[Signals]) -> list[Sparse]:
+        """End the cycle that has ended with the sample before; what it gives holds from that one on."""
+        sparse = [message for cycle in self._controller.ended() for message in self._end_cycle(cycle)]
+        self._margin[0] = sparse[0].values["stability_margin"]
+        for published in outputs[1:]:
+            published["stability_margin"][reached - 1] = self._margin[0]
         return sparse
 
-    def _obey(self, first: int, inputs: Sequence[Signals], command: Samples, sparse: list[Sparse]) -> None:
-        """The same under the supervisor, whose reactions are the last of the inputs."""
-        assert self._obedience is not None, "that is what listens"
-        *inputs, safety = inputs
-        if self._obedience.idle(safety["reaction"]):
-            self._control_until_lost(first, inputs, command, sparse)
-            self._obedience.apply(command)
-            return
-        for start, stop in self._obedience.pieces(safety["reaction"]):
-            sparse += self._obedience.told(first + start)
-            self._control_until_lost(first + start, cut(inputs, start, stop), command[start:stop], sparse)
-            self._obedience.apply(command[start:stop])
-
-    def _fill_margin(self, first: int, margin: Samples, sparse: Sequence[Sparse]) -> None:
-        """Each sample has the margin of the newest cycle; ``sparse`` has the cycles that end in the block."""
-        margin.fill(self._margin)
-        for message in sparse:
-            if message.type == messages.LEARNING:
-                self._margin = message.values["stability_margin"]
-                margin[message.index - first :] = self._margin
-
-    def _control_until_lost(
-        self, first: int, inputs: Sequence[Signals], command: Samples, sparse: list[Sparse]
-    ) -> None:
-        """The same, but without an angle that it can use the controller gives up, and the command stays."""
-        assert self._obedience is not None, "without one there is nobody to take over"
-        if self._lost:
-            command[:] = self._obedience.newest
-            return
-        try:
-            self._control(first, inputs, command, sparse)
-        except AngleLostError as error:
-            self._lost = True
-            command[error.reached :] = command[error.reached - 1] if error.reached else self._obedience.newest
-            sparse.append(Sparse(f"{self.name}/events", messages.EVENT, first + error.reached, {"action": "lost"}))
-
-    def _falls_back(self) -> bool:
-        """Whether the lead angle shall be that of the nominal speed."""
-        asked = self._obedience is not None and self._obedience.reaction >= Reaction.FALL_BACK
-        return asked and self.parameters.fall_back == "constant_lead"
-
-    def _control(self, first: int, inputs: Sequence[Signals], command: Samples, sparse: list[Sparse]) -> None:
-        """Fill the command; what is said of cycles goes to ``sparse``, also where the angle is lost after them."""
-        encoder, past, tool, *others = inputs
-        parameters = self.parameters
-        angle, speed, past_angle, error = encoder["angle"], encoder["speed"], past["angle"], tool["measured_error"]
-        if parameters.law == "time_periodic":
-            angle = parameters.nominal_speed * (parameters.step * np.arange(first, first + angle.size))
-            past_angle = angle - parameters.nominal_speed * (parameters.step * parameters.feedback_delay)
-        if parameters.law == "time_periodic" or self._falls_back():
-            speed = np.full(angle.size, parameters.nominal_speed)
-        for finer in others[: len(parameters.finer)]:
-            error = error + finer["measured_position"]
-        position = others[-1]["measured_position"] if parameters.identify else None
-        identified = 0
-        for cycle in self._controller.block(
-            first, angle=angle, speed=speed, past_angle=past_angle, error=error, command=command
-        ):
-            if position is not None:
-                reached = cycle.sample_index + 1 - first
-                self._identifier.block(first, identified, reached, position)
-                identified = reached
-            sparse += self._end_cycle(cycle)
-        if position is not None:
-            self._identifier.block(first, identified, position.size, position)
-            self._identifier.commanded(first, command)
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """See `Stage`."""
+        sparse: list[Sparse] = []
+        if not self._asks:
+            sparse += [message for cycle in self._controller.ended() for message in self._end_cycle(cycle)]
+        if self._state[_LOST_AT] >= 0:
+            index, self._state[_LOST_AT] = int(self._state[_LOST_AT]), -1
+            sparse.append(Sparse(f"{self.name}/events", messages.EVENT, index, {"action": "lost"}))
+        return sparse
 
     def _end_cycle(self, cycle: Cycle) -> list[Sparse]:
         parameters = self.parameters
@@ -292,13 +433,13 @@ class LearningController(Stage):
             "contraction": cycle.contraction,
             "stability_margin": self._margins.at(2 * np.pi * parameters.cycle_revolutions / seconds, self._model),
             "learning": cycle.learning,
-            "joined": self._controller.joined,
+            "joined": cycle.joined,
             "model_natural_frequency": self._model.natural_frequency,
             "model_damping": self._model.damping,
             "model_residual": self._model.residual,
         }
         sparse = [Sparse("coarse/learning", messages.LEARNING, cycle.sample_index, status)]
-        if self._controller.joined and not self._joined:
+        if cycle.joined and not self._joined:
             self._joined = True
             sparse.append(Sparse(f"{self.name}/events", messages.EVENT, cycle.sample_index, {"action": "joined"}))
         return sparse

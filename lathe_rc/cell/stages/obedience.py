@@ -2,11 +2,10 @@
 """What a controller or a feed drive does when the supervisor asks for a reaction."""
 
 import math
-from collections.abc import Iterator
-from itertools import pairwise
-from typing import Annotated, Protocol
+from typing import Annotated, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from annotated_types import Gt
 
 from lathe_rc.cell import messages
@@ -14,11 +13,13 @@ from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import ObedientParameters, parameter
 from lathe_rc.cell.stage import Input, Sparse
 from lathe_rc.control import bounded
-from lathe_rc.control.bounded import Bounds, Mode, Takeover
+from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, take_over
 from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
 from lathe_rc.safety.state_machine import Reaction
 
 OUT_OF_REACH = "out of reach"  #: event of a takeover that could not begin where the command was
+OBEY = 100  #: why a step stops: a reaction has to be obeyed
 
 
 def listens(parameters: ObedientParameters) -> list[Input]:
@@ -40,7 +41,7 @@ class FeedObedientParameters(ObedientParameters):
     )
 
     def obedience(
-        self, name: str, learner: "Learner | None", *, speed: bool, limit: float, settled: int
+        self, name: str, *, speed: bool, limit: float, settled: int
     ) -> "Obedience":
         """What obeys for a command of the feed.
 
@@ -49,7 +50,6 @@ class FeedObedientParameters(ObedientParameters):
 
         Args:
             name: of the node.
-            learner: see `Obedience`.
             speed: whether the command stands for a speed.
             limit: largest command to each side, in its unit; 0: there is none.
             settled: see `Obedience`.
@@ -69,14 +69,63 @@ class FeedObedientParameters(ObedientParameters):
             bounded.prepare()
         rest = Mode.RETRACT if speed else Mode.HOLD
         takeover = Takeover(bounds, 0.0, self.step, reach=reach, carries=False)
-        return Obedience(name, learner, takeover, settled=settled, hold=rest, retract=rest)
+        return Obedience(name, takeover, settled=settled, hold=rest, retract=rest)
 
 
-class Learner(Protocol):
-    """Who learns."""
+_REACTION, _WANTS = 0, 1  # places in the state: the reaction that is obeyed, whether learning is wanted
 
-    def may_learn(self, *, on: bool) -> None:
-        """Learn, or do not."""
+
+class ObedienceTable(NamedTuple):
+    """An `Obedience` for kernels.
+
+    Attributes:
+        whole: the reaction that is obeyed, and whether learning is wanted.
+        forbidden: samples until learning is no longer forbidden, shape (1,).
+        takeover: of the command.
+    """
+
+    whole: npt.NDArray[np.int64]
+    forbidden: npt.NDArray[np.float64]
+    takeover: TakeoverTable
+
+
+@kernel
+def piece(obedience: ObedienceTable, start: int, reaction: Samples) -> int:
+    """Where the piece of a block ends that begins with sample ``start`` and in which nothing changes.
+
+    It is ``start`` itself where another reaction has to be obeyed first (`OBEY`).
+    """
+    obeyed, stop = obedience.whole[_REACTION], start
+    while stop < reaction.size and reaction[stop] == obeyed:
+        stop += 1
+    forbidden = obedience.forbidden[0]
+    if 0.0 < forbidden < stop - start:
+        stop = start + int(forbidden)
+    return stop
+
+
+@kernel
+def may_learn(obedience: ObedienceTable) -> bool:
+    """Whether there is learning in the next piece."""
+    return bool(obedience.whole[_WANTS] and obedience.forbidden[0] == 0.0)
+
+
+@kernel
+def obeyed(obedience: ObedienceTable) -> int:
+    """The reaction."""
+    return int(obedience.whole[_REACTION])
+
+
+@kernel
+def apply(obedience: ObedienceTable, command: Samples) -> None:
+    """Make of what the controller wants in a piece what the drive gets; in place, in its unit."""
+    take_over(obedience.takeover, command)
+    obedience.forbidden[0] = max(obedience.forbidden[0] - command.size, 0.0)
+
+
+NOBODY = ObedienceTable(
+    np.zeros(2, np.int64), np.zeros(1), TakeoverTable(np.zeros(0), np.zeros(2, np.int64), np.zeros(2), np.zeros(2))
+)  #: for who listens to nobody
 
 
 class Obedience:
@@ -84,96 +133,45 @@ class Obedience:
 
     Args:
         name: of the node.
-        learner: that learns at first; None: there is nothing to learn.
         takeover: of the command.
         settled: samples from where a command is given back until errors are worth learning from.
         hold: what to hold is.
         retract: what to retract and to stop are.
-
-    Attributes:
-        reaction: that is obeyed.
     """
 
     def __init__(
         self,
         name: str,
-        learner: Learner | None,
         takeover: Takeover,
         *,
         settled: int,
         hold: Mode = Mode.HOLD,
         retract: Mode = Mode.RETRACT,
     ) -> None:
-        self._name, self._learner, self._takeover, self._settled = name, learner, takeover, settled
+        self._name, self._takeover, self._settled = name, takeover, settled
         self._hold, self._retract = hold, retract
-        self.reaction = Reaction.NONE
-        self._wants_to_learn = True
-        self._skipped = 0.0  # where the command was out of reach: by how much, in its unit
-        self._forbidden = 0.0  # samples until learning is no longer forbidden
+        self._whole, self._forbidden = np.array([Reaction.NONE, 1], np.int64), np.zeros(1)
 
     @property
-    def newest(self) -> float:
-        """The command of the last sample, in its unit."""
-        return self._takeover.newest
-
-    @property
-    def held(self) -> bool:
-        """Whether the command is not the controller's."""
-        return self.reaction >= Reaction.HOLD
-
-    def idle(self, reaction: Samples) -> bool:
-        """Whether a block is one piece without a reaction, and nothing of an earlier one is left to wait for."""
-        # Bytes are compared in a third of the time that np.count_nonzero takes.
-        return not self.reaction and not self._forbidden and reaction.tobytes() == bytes(reaction.size)
-
-    def pieces(self, reaction: Samples) -> Iterator[tuple[int, int]]:
-        """Pieces of a block in which the reaction stays the same; it is obeyed when its piece is handed out."""
-        if self.idle(reaction):
-            yield 0, reaction.size
-            return
-        changes = np.flatnonzero(np.diff(reaction, prepend=reaction.dtype.type(self.reaction))).tolist()
-        for start, stop in pairwise([0, *(change for change in changes if change), reaction.size]):
-            if start in changes:
-                self.obey(Reaction(reaction[start]))
-            if 0 < self._forbidden < stop - start:
-                free = start + int(self._forbidden)
-                yield start, free
-                self._forbid(0.0)
-                yield free, stop
-            else:
-                yield start, stop
-                self._forbid(max(self._forbidden - (stop - start), 0.0))
+    def table(self) -> ObedienceTable:
+        """For `piece` and `apply`."""
+        return ObedienceTable(self._whole, self._forbidden, self._takeover.table)
 
     def learn(self, *, wanted: bool) -> None:
         """Learn or freeze as soon as no reaction forbids it."""
-        self._wants_to_learn = wanted
-        if self._learner:
-            self._learner.may_learn(on=wanted and not self._forbidden)
+        self._whole[_WANTS] = wanted
 
-    def _forbid(self, samples: float) -> None:
-        """Let nobody learn for so many samples."""
-        self._forbidden = samples
-        self.learn(wanted=self._wants_to_learn)
-
-    def obey(self, reaction: Reaction) -> None:
-        """Do what a reaction asks for, from the next sample on."""
-        self.reaction = reaction
+    def obey(self, reaction: Reaction, index: int) -> list[Sparse]:
+        """Do what a reaction asks for, from sample ``index``, the next one, on; what is to be said of that."""
+        self._whole[_REACTION] = reaction
         following = self._hold if reaction == Reaction.HOLD else Mode.FOLLOW
         self._takeover.change(self._retract if reaction >= Reaction.RETRACT else following)
-        self._skipped = self._takeover.skipped
         if reaction >= Reaction.FREEZE:
-            self._forbid(math.inf)
-        elif self._forbidden:
+            self._forbidden[0] = math.inf
+        elif self._forbidden[0]:
             # The errors of the way back are nothing to learn from; they come late.
-            self._forbid(float(self._takeover.remaining + self._settled))
-
-    def told(self, index: int) -> list[Sparse]:
-        """What is to be said of what has just been obeyed, from sample ``index`` on."""
-        if not self._skipped:
+            self._forbidden[0] = self._takeover.remaining + self._settled
+        skipped, self._takeover.skipped = self._takeover.skipped, 0.0
+        if not skipped:
             return []
-        action, self._skipped = f"{OUT_OF_REACH}: by {self._skipped:g}", 0.0
-        return [Sparse(f"{self._name}/events", messages.EVENT, index, {"action": action})]
-
-    def apply(self, command: Samples) -> None:
-        """Make of what the controller wants what the drive gets; in place, in its unit."""
-        self._takeover.apply(command)
+        return [Sparse(f"{self._name}/events", messages.EVENT, index, {"action": f"{OUT_OF_REACH}: by {skipped:g}"})]

@@ -189,7 +189,7 @@ class PiezoActuator(Drive):
         """See `Stage`."""
         return Memory(self.set_point.signs, self._limited.table, self.drive.table, self._sensor.table)
 
-    def prepare(self, samples: int) -> None:
+    def prepare(self, first: int, samples: int) -> None:
         """See `Stage`."""
         self._sensor.draw(samples)
 

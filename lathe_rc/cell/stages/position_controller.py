@@ -3,25 +3,28 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from annotated_types import Ge, Gt
 
 from lathe_rc import resources
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import Input, Output, Sparse, Stage, cut
+from lathe_rc.cell.stage import DONE, Input, Output, Sparse, Stage, Step
 from lathe_rc.cell.stages.feed_drive import Axis
-from lathe_rc.cell.stages.obedience import listens
-from lathe_rc.cell.stages.servo import ServoParameters
-from lathe_rc.cell.stages.trajectory import Trajectory
+from lathe_rc.cell.stages.obedience import OBEY, apply, listens, may_learn, piece
+from lathe_rc.cell.stages.servo import Listener, ServoParameters, listener, pid_along
+from lathe_rc.cell.stages.trajectory import Course, Trajectory, follow
 from lathe_rc.control import periodic
-from lathe_rc.control.periodic import PeriodicController
-from lathe_rc.control.pid import POSITION, Pid
-from lathe_rc.control.predistortion import Predistortion
-from lathe_rc.control.sampled_link import SampledLink
+from lathe_rc.control.periodic import PeriodicController, PeriodicLaw, PeriodicState
+from lathe_rc.control.pid import POSITION, Pid, PidTable
+from lathe_rc.control.predistortion import PathTable, Predistortion, offset_along
+from lathe_rc.control.sampled_link import HeldLink, SampledLink, correct_along
+from lathe_rc.jit import kernel
+from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.example_002 import PERIOD
 
 
@@ -67,11 +70,165 @@ class PositionControllerParameters(ServoParameters):
     anti_windup: bool = parameter(default=True, doc="periodic_hyperstable: false: the published switch alone")
 
 
-class _Law(Protocol):
-    """Any of the laws."""
+_NO_PATH = PathTable(np.empty(0), np.empty(0), np.zeros(1, np.int64))
+_PERIODS = 64  # in the log: that end until somebody reads of them, at most
+_TOLD = 1  # why a step stops: the log is full
 
-    def block(self, first: int, set_point: Samples, measurement: Samples, command: Samples) -> None:
-        """Fill ``command``; arrays of shape (n,)."""
+
+class Wanted(NamedTuple):
+    """What is controlled, for the steps of all laws.
+
+    Attributes:
+        course: of the set point.
+        path: taken off the set point; without heights there is none.
+        edge: whether the deflection of the edge counts.
+        who: may have to obey.
+    """
+
+    course: Course
+    path: PathTable
+    edge: bool
+    who: Listener
+
+
+class PidMemory(NamedTuple):
+    """What the step of the PID works on."""
+
+    wanted: Wanted
+    pid: PidTable
+    state: Samples
+
+
+class LinkMemory(NamedTuple):
+    """What the step of the sampled link works on."""
+
+    wanted: Wanted
+    link: HeldLink
+
+
+class PeriodicMemory(NamedTuple):
+    """What the step of the periodic law works on.
+
+    Attributes:
+        wanted: see above.
+        law, state: of the law.
+        unit: displacement that the law takes for 1 [m].
+        divisor: computes every so many samples.
+        held: the command, and the largest error in the period [m].
+        log: of each period the sample after it, the largest error, and what `periodic.achieved` fills in.
+        logged: rows of it, shape (1,).
+    """
+
+    wanted: Wanted
+    law: PeriodicLaw
+    state: PeriodicState
+    unit: float
+    divisor: int
+    held: Samples
+    log: Samples
+    logged: npt.NDArray[np.int64]
+
+
+@kernel
+def _look(
+    wanted: Wanted, first: int, start: int, inputs: tuple[Samples, ...], set_point: Samples, error: Samples
+) -> Samples:
+    """The position that is controlled [m]; fills set point and error of a block that begins."""
+    position = inputs[1]
+    if wanted.edge:
+        # The slide is positive into the part, the deflection out of it.
+        position = position - inputs[2]
+    if start == 0:
+        follow(wanted.course, first, set_point)
+        if wanted.path.heights.size:
+            offset = np.empty(position.size)
+            offset_along(wanted.path, inputs[3 if wanted.edge else 2], offset)
+            set_point -= offset
+        for k in range(error.size):
+            error[k] = set_point[k] - position[k]
+    return position
+
+
+@kernel
+def pid_step(
+    memory: PidMemory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`."""
+    command, set_point, error = outputs
+    position = _look(memory.wanted, first, start, inputs, set_point, error)
+    return pid_along(
+        memory.pid, memory.state, memory.wanted.who, first, start, inputs[-1], set_point, position, command
+    )
+
+
+@kernel
+def link_step(
+    memory: LinkMemory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """The same with a sampled link, which has nothing that it could learn with."""
+    command, set_point, error = outputs
+    position, who = _look(memory.wanted, first, start, inputs, set_point, error), memory.wanted.who
+    while start < command.size:
+        stop = command.size
+        if who.listens:
+            stop = piece(who.obedience, start, inputs[-1])
+            if stop == start:
+                return start, OBEY
+        correct_along(memory.link, first + start, set_point[start:stop], position[start:stop], command[start:stop])
+        if who.listens:
+            apply(who.obedience, command[start:stop])
+        start = stop
+    return start, DONE
+
+
+@kernel
+def _repeat(
+    memory: PeriodicMemory, first: int, start: int, stop: int, set_point: Samples, position: Samples,
+    error: Samples, command: Samples,
+) -> int:  # fmt: skip
+    """Step the periodic law through a piece; returns the sample that is reached, its end unless the log is full."""
+    held, divisor, unit = memory.held, memory.divisor, memory.unit
+    period = memory.law.samples * divisor
+    for k in range(start, stop):
+        n = first + k
+        if n % divisor == 0:
+            held[0] = periodic.advance_and_count(
+                memory.law, memory.state, n // divisor, set_point[k] / unit, position[k] / unit
+            )
+        command[k] = held[0]
+        held[1] = max(held[1], abs(error[k]))
+        if (n + 1) % period == 0:
+            row = memory.log[memory.logged[0]]
+            row[0], row[1] = n + 1, held[1]
+            periodic.achieved(memory.state, row[2:])
+            held[1] = 0.0
+            memory.logged[0] += 1
+            if memory.logged[0] == memory.log.shape[0]:
+                return k + 1
+    return stop
+
+
+@kernel
+def periodic_step(
+    memory: PeriodicMemory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """The same with the periodic law."""
+    command, set_point, error = outputs
+    position, who = _look(memory.wanted, first, start, inputs, set_point, error), memory.wanted.who
+    while start < command.size:
+        stop = command.size
+        if who.listens:
+            stop = piece(who.obedience, start, inputs[-1])
+            if stop == start:
+                return start, OBEY
+            periodic.freeze(memory.state, not may_learn(who.obedience))
+        reached = _repeat(memory, first, start, stop, set_point, position, error, command)
+        if who.listens:
+            apply(who.obedience, command[start:reached])
+        start = reached
+        if memory.logged[0] == memory.log.shape[0]:
+            return start, _TOLD
+    return start, DONE
 
 
 class PositionController(Stage):
@@ -102,14 +259,13 @@ class PositionController(Stage):
         if parameters.predistortion_file:
             self._path = Predistortion.load(resources.find(Path(parameters.predistortion_file)))
             inputs.append(Input("longitudinal/state", messages.STATE, ("measured_position",), delay))
-        self._offset = np.empty(messages.MAX_BLOCK)
-        self._largest, self._held = 0.0, 0.0
-        self._obedience = parameters.obeys(name, self)
+        self._held, self._log, self._logged = np.zeros(2), np.empty((_PERIODS, 8)), np.zeros(1, np.int64)
+        self._obedience = parameters.obeys(name)
         self.declare(inputs=[*inputs, *listens(parameters)], outputs=[Output(f"{axis}/command", messages.SERVO)])
         if parameters.law == "periodic_hyperstable":
             self.sparse_topics[f"{axis}/periodic"] = messages.PERIODIC
 
-    def _make(self) -> _Law:
+    def _make(self) -> Pid | SampledLink | PeriodicController:
         parameters = self.parameters
         if parameters.law == "pid":
             return parameters.pid(
@@ -137,77 +293,58 @@ class PositionController(Stage):
             command_step=parameters.dac_step,
         )
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    @property
+    def step(self) -> Step:  # type: ignore[override]
         """See `Stage`."""
-        (_, state, *others), (servo,) = inputs, outputs
-        reaction = others.pop()["reaction"] if self._obedience else None
-        wanted, position = servo["set_point"], state["measured_position"]
-        self.trajectory.block(first, wanted)
-        if self.parameters.measures == "edge":
-            # The slide is positive into the part, the deflection out of it.
-            position = position - others[0]["deflection"]
-        if self._path:
-            offset = self._offset[: wanted.size]
-            self._path.block(others[-1]["measured_position"], offset)
-            wanted -= offset
-        np.subtract(wanted, position, out=servo["error"])
-        if self._obedience is None or reaction is None:
-            return self._control(first, wanted, position, servo)
-        sparse: list[Sparse] = []
-        for start, stop in self._obedience.pieces(reaction):
-            if isinstance(self.law, Pid):
-                self.law.waits = self._obedience.held
-            (written,) = cut([servo], start, stop)
-            sparse += self._control(first + start, wanted[start:stop], position[start:stop], written)
-            self._obedience.apply(written["command"])
-        return sparse
+        return {"pid": pid_step, "sampled_link": link_step, "periodic_hyperstable": periodic_step}[self.parameters.law]
 
-    def may_learn(self, *, on: bool) -> None:
-        """Let the law learn, or not; a sampled link has nothing that it could learn with."""
+    @property
+    def memory(self) -> PidMemory | LinkMemory | PeriodicMemory:
+        """See `Stage`."""
+        path, edge = self._path.table if self._path else _NO_PATH, self.parameters.measures == "edge"
+        wanted = Wanted(self.trajectory.course, path, edge, listener(self._obedience))
         if isinstance(self.law, Pid):
-            self.law.integrates = on
-        elif isinstance(self.law, PeriodicController):
-            self.law.learning = on
+            return PidMemory(wanted, self.law.table, self.law.state)
+        if isinstance(self.law, SampledLink):
+            return LinkMemory(wanted, self.law.table)
+        return PeriodicMemory(
+            wanted, self.law.law, self.law.state, self.parameters.periodic_unit, self.parameters.divisor, self._held,
+            self._log, self._logged,
+        )  # fmt: skip
 
-    def _control(self, first: int, wanted: Samples, position: Samples, servo: Signals) -> list[Sparse]:
-        if isinstance(self.law, PeriodicController):
-            return self._periodic(first, self.law, wanted, position, servo)
-        self.law.block(first, wanted, position, servo["command"])
-        return []
+    def prepare(self, first: int, samples: int) -> None:
+        """See `Stage`."""
+        self.trajectory.prepare(first, samples)
 
-    def _periodic(
-        self, first: int, law: PeriodicController, wanted: Samples, position: Samples, servo: Signals
+    def serve(
+        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """Run the law, and tell what it achieved where a period ends."""
-        sparse, start, stop = [], 0, wanted.size
-        divisor, unit = self.parameters.divisor, self.parameters.periodic_unit
-        period = law.law.samples * divisor
-        while start < stop:
-            end = min(stop, start + period - (first + start) % period)
-            due = slice(start + -(first + start) % divisor, end, divisor)
-            computed = np.empty(len(range(*due.indices(stop))))
-            law.block((first + due.start) // divisor, wanted[due] / unit, position[due] / unit, computed)
-            # What is due holds until the next; what stands before the first of the block was due earlier.
-            place = (first + np.arange(start, end)) // divisor - (first + start - 1) // divisor
-            servo["command"][start:end] = np.concatenate(([self._held], computed))[place]
-            self._held = servo["command"][end - 1]
-            self._largest = max(self._largest, float(np.abs(servo["error"][start:end]).max()))
-            start = end
-            if (first + end) % period == 0:
-                sparse.append(self._status(first + end, period, law))
-                self._largest = 0.0
-        return sparse
+        """See `Stage`: obey, if there is somebody to obey."""
+        if reason != OBEY:
+            return []
+        assert self._obedience is not None, "nobody else listens"
+        return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)
 
-    def _status(self, index: int, period: int, law: PeriodicController) -> Sparse:
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """See `Stage`: what the periodic law achieved where a period has ended."""
+        rows = self._log[: self._logged[0]].tolist()
+        self._logged[0] = 0
+        return [self._status(int(index), *row) for index, *row in rows]
+
+    def _status(
+        self, index: int, error: float, demand: float, memory: float, saturated: float, integral: float, bound: float,
+        clearance: float,
+    ) -> Sparse:  # fmt: skip
+        assert isinstance(self.law, PeriodicController), "no other law has periods"
         status = {
-            "period": index // period,
-            "max_error": self._largest,
-            "largest_demand": law.largest_demand,
-            "largest_memory": law.largest_memory,
-            "saturated": law.saturated,
-            "popov_integral": law.popov_integral,
-            "popov_bound": law.popov_bound,
-            "hyperstable": law.popov_holds,
+            "period": index // (self.law.law.samples * self.parameters.divisor),
+            "max_error": error,
+            "largest_demand": demand,
+            "largest_memory": memory,
+            "saturated": int(saturated),
+            "popov_integral": integral,
+            "popov_bound": bound,
+            "hyperstable": clearance >= 0.0,
         }
         # The last sample of the period: the one after it need not be computed yet.
         return Sparse(f"{self.parameters.axis}/periodic", messages.PERIODIC, index - 1, status)

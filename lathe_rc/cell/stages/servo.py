@@ -1,14 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """What servo controllers have in common: a PID, converters, and a feedback edge."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from annotated_types import Ge, Gt, Le
 
+from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stages.obedience import FeedObedientParameters, Learner, Obedience
+from lathe_rc.cell.stage import DONE
+from lathe_rc.cell.stages.obedience import (
+    NOBODY,
+    OBEY,
+    FeedObedientParameters,
+    Obedience,
+    ObedienceTable,
+    apply,
+    may_learn,
+    obeyed,
+    piece,
+)
 from lathe_rc.cell.stages.trajectory import TrajectoryParameters
-from lathe_rc.control.pid import Pid, PidGains
+from lathe_rc.control.pid import Pid, PidGains, PidTable, control_along, lets_learn
+from lathe_rc.jit import kernel
+from lathe_rc.safety.state_machine import Reaction
 
 
 class ServoParameters(TrajectoryParameters, FeedObedientParameters):
@@ -37,7 +51,7 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
         "speed", "what the command stands for at the drive; to stop the slide a speed goes to 0, and a position stays"
     )
 
-    def obeys(self, name: str, learner: Learner) -> Obedience | None:
+    def obeys(self, name: str) -> Obedience | None:
         """What obeys the supervisor for a node; None if nobody is listened to.
 
         Raises:
@@ -46,7 +60,7 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
         if not self.reaction_delay:
             return None
         speed, limit = self.commands == "speed", self.command_limit
-        return self.obedience(name, learner, speed=speed, limit=limit, settled=self.feedback_delay)
+        return self.obedience(name, speed=speed, limit=limit, settled=self.feedback_delay)
 
     def pid(self, proportional: float, integral: float, derivative: float, filter_: float) -> Pid:
         """The PID of a table.
@@ -65,3 +79,47 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
             smoothing=self.set_point_smoothing,
             divisor=self.divisor,
         )
+
+
+class Listener(NamedTuple):
+    """Who may have to obey, for kernels.
+
+    Attributes:
+        obedience: to the supervisor, if it ``listens``.
+        listens: see above.
+    """
+
+    obedience: ObedienceTable
+    listens: bool
+
+
+def listener(obedience: Obedience | None) -> Listener:
+    """The same of a stage."""
+    return Listener(obedience.table if obedience else NOBODY, obedience is not None)
+
+
+@kernel
+def pid_along(
+    pid: PidTable,
+    state: Samples,
+    who: Listener,
+    first: int,
+    start: int,
+    reaction: Samples,
+    wanted: Samples,
+    measured: Samples,
+    command: Samples,
+) -> tuple[int, int]:
+    """Step a PID through a block from its sample ``start`` on, see `lathe_rc.cell.stage`; arrays of shape (n,)."""
+    while start < command.size:
+        stop = command.size
+        if who.listens:
+            stop = piece(who.obedience, start, reaction)
+            if stop == start:
+                return start, OBEY
+            lets_learn(state, may_learn(who.obedience), obeyed(who.obedience) >= Reaction.HOLD.value)
+        control_along(pid, state, first + start, wanted[start:stop], measured[start:stop], command[start:stop])
+        if who.listens:
+            apply(who.obedience, command[start:stop])
+        start = stop
+    return start, DONE

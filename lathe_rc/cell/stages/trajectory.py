@@ -2,15 +2,17 @@
 """What a servo controller is told to follow, over time."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from annotated_types import Ge
 
 from lathe_rc import resources
-from lathe_rc.cell.messages import Samples
+from lathe_rc.cell.messages import MAX_BLOCK, Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
 from lathe_rc.signals.example_002 import fill_reference
 from lathe_rc.signals.table import read_table
 
@@ -30,12 +32,34 @@ class TrajectoryParameters(NodeParameters):
     )
 
 
+class Course(NamedTuple):
+    """Samples of a set point for kernels.
+
+    Attributes:
+        values: computed in advance.
+        span: sample index of the first of them, and of the one after the last.
+    """
+
+    values: Samples
+    span: npt.NDArray[np.int64]
+
+
+@kernel
+def follow(course: Course, first: int, set_point: Samples) -> None:
+    """Fill the set point from sample ``first`` on, shape (n,), which has been made ready."""
+    begin = first - course.span[0]
+    set_point[:] = course.values[begin : begin + set_point.size]
+
+
 class Trajectory:
     """The set point of a node.
 
     Args:
         node: that it is for.
         parameters: its table.
+
+    Attributes:
+        course: for `follow`.
 
     Raises:
         InputError: lists of different lengths, times that do not rise, or a file that cannot be used.
@@ -58,6 +82,15 @@ class Trajectory:
         self._times, self._values = np.array(times), np.array(values)
         if not self._times.size or np.any(np.diff(self._times) <= 0.0):
             raise InputError(f"{node}: set point at {times[:5]} s; allowed: one time or more, each later than the last")
+
+        self.course = Course(np.empty(MAX_BLOCK), np.zeros(2, np.int64))
+
+    def prepare(self, first: int, samples: int) -> None:
+        """Make the samples ``first`` on ready, up to 8192."""
+        values, span = self.course
+        if not span[0] <= first <= first + samples <= span[1]:
+            self.block(first, values[:samples])
+            span[:] = first, first + samples
 
     def block(self, first: int, set_point: Samples) -> None:
         """Fill the set point from sample ``first`` on, shape (n,)."""

@@ -2,19 +2,19 @@
 """Vibration of the tool against the part, as a source of displacement."""
 
 import zlib
-from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.cell.stage import Input, Joint, Output, Sparse, Stage
+from lathe_rc.cell.stage import DONE, Input, Joint, Output, Stage
 from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
 from lathe_rc.signals import vibration
-from lathe_rc.signals.noise import Sensor
+from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
 
 class VibrationParameters(NodeParameters):
@@ -31,6 +31,26 @@ class VibrationParameters(NodeParameters):
     resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the sensor; 0: none", "m")
 
 
+class Memory(NamedTuple):
+    """What the step works on."""
+
+    lines: Samples
+    period: float
+    sensor: SensorTable
+
+
+@kernel
+def step(
+    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`."""
+    position, velocity, effort, measured_position = outputs
+    vibration.evaluate(first, memory.period, memory.lines, position, velocity)
+    effort[:] = 0.0
+    measure(memory.sensor, position, measured_position)
+    return position.size, DONE
+
+
 class Vibration(Stage):
     """See `lathe_rc.signals.vibration`.
 
@@ -41,6 +61,7 @@ class Vibration(Stage):
 
     kind = "vibration"
     Parameters = VibrationParameters
+    step = staticmethod(step)
 
     def __init__(self, name: str, parameters: VibrationParameters) -> None:
         super().__init__(name, parameters)
@@ -68,10 +89,11 @@ class Vibration(Stage):
             outputs=[Output("vibration/state", messages.STATE, Joint("position", "velocity"))],
         )
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    @property
+    def memory(self) -> Memory:
         """See `Stage`."""
-        (state,) = outputs
-        vibration.evaluate(first, self.parameters.step, self.lines, state["position"], state["velocity"])
-        state["effort"][:] = 0.0
-        self._sensor.measure(state["position"], state["measured_position"])
-        return []
+        return Memory(self.lines, self.parameters.step, self._sensor.table)
+
+    def prepare(self, first: int, samples: int) -> None:
+        """See `Stage`."""
+        self._sensor.draw(samples)
