@@ -5,15 +5,10 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import ParamSpec, TypeVar, cast
 
 import numba
-import numpy as np
-import numpy.typing as npt
 import platformdirs
-from numba import types
-from numba.extending import intrinsic
-from numba.np.numpy_support import carray
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -66,26 +61,3 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
     """
     compiled = numba.njit(cache=True, error_model="numpy", forceinline=True)(function)
     return cast("Callable[P, R]", compiled)
-
-
-def _pointer(_context: object, _address: object) -> Any:
-    """The pointer to float64 at an address, as Numba wants it: signature, and what writes the code."""
-    pointer = types.CPointer(types.float64)  # type: ignore[no-untyped-call]
-
-    def code(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], context.get_value_type(pointer))
-
-    return pointer(types.int64), code
-
-
-_at: Any = intrinsic(_pointer)
-
-
-@inlined
-def lent(address: int, size: int) -> npt.NDArray[np.float64]:
-    """Samples at an address, shape (size,); who hands out the address keeps them meanwhile.
-
-    For a kernel of many arrays: to hand over each of them takes 0.1 µs, and twice that where they were not in use.
-    """
-    samples: npt.NDArray[np.float64] = carray(_at(address), size)
-    return samples

@@ -91,10 +91,10 @@ class Program:
 
     def __init__(self, stages: Sequence[Stage], tapes: Tapes, chunk: int) -> None:
         self._stages, self._tapes, self._chunk = list(stages), tapes, chunk
-        self._keys = list(tapes.arrays)
         self._floats = tuple(array for array in tapes.arrays.values() if array.dtype == np.float64)
         self._bytes = tuple(array for array in tapes.arrays.values() if array.dtype == np.uint8)
-        assert len(self._floats) + len(self._bytes) == len(self._keys), "float64 and uint8 are all that blocks have"
+        self._bytes = self._bytes or (np.empty(0, np.uint8),)
+        assert all(array.dtype in (np.float64, np.uint8) for array in tapes.arrays.values()), "float64 and uint8 are all that blocks have"
         self._late = np.array([port.delay for stage in self._stages for port in stage.inputs] or [0], np.int64)
         self._due, self._turn = np.empty(len(self._stages), np.int64), np.empty(len(self._stages))
         self._where = np.zeros(3, np.int64)
@@ -119,7 +119,8 @@ class Program:
                 yield f"            where[:] = first, {number}, 0"
                 yield f"            return {PYTHON}"
                 continue
-            called = [self._read(stage, port, at) for port, at in zip(range(stage.own_inputs), places, strict=False)]
+            read = [self._read(stage, port, at) for port, at in zip(range(stage.own_inputs), places, strict=False)]
+            fields = [one for some in read for one in some]
             written = [
                 f"{self._array(remapped(stage.shared, output.topic), name)}[o : o + n]"
                 for output in stage.outputs
@@ -135,7 +136,8 @@ class Program:
             yield f"                return {PYTHON}"
             yield f"            start, reason = {step.__module__}.{step.__name__}("
             yield f"                memories[{number}], first, start,"
-            yield f"                {_tuple([one for some in called for one in some])},"
+            yield f"                {_tuple([one for one in fields if one.startswith('floats')])},"
+            yield f"                {_tuple([one for one in fields if one.startswith('bytes')] or ['bytes_[0][:0]'])},"
             yield f"                {_tuple(written)},"
             yield "            )"
             yield f"            if reason != {DONE}:"

@@ -6,11 +6,12 @@ changes no bit. Hosts (the offline engine, a ROS node) feed it in order and know
 
 Most stages compute by a compiled step, which a program of many stages can call (`lathe_rc.cell.program`):
 
-    reached, reason = step(memory, first, start, inputs, outputs)
+    reached, reason = step(memory, first, start, inputs, flags, outputs)
 
 It computes the block that begins at sample ``first``, from its sample ``start`` on, until the end of the block
 (`DONE`) or until Python has to do something (any other reason, see `Stage.serve`), and is called again from there.
-Inputs and outputs are tuples of the arrays of all fields of all ports, in their order.
+Inputs are the arrays of float64 of all fields of all input ports in their order, flags are those of uint8, or an empty
+one if there are none, and outputs are the arrays of all fields of all output ports.
 """
 
 import math
@@ -92,11 +93,12 @@ class Trigger:
         return f"{self.kind} {self.value:g}: {self.action}"
 
 
-Step = Callable[[Any, int, int, tuple[Samples, ...], tuple[Samples, ...]], tuple[int, int]]
+Arrays = tuple[Samples, ...]
+Step = Callable[[Any, int, int, Arrays, Arrays, Arrays], tuple[int, int]]
 DONE, PYTHON = 0, -1  #: why a step, or a program of steps, has stopped
 NEVER = np.iinfo(np.int64).max  #: no sample at all
 
-_NOTHING = np.empty(0)
+_NOTHING, _NO_FLAGS = np.empty(0), (np.empty(0, np.uint8),)
 
 _EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)(?:\s+to\s+([0-9.eE+-]+))?\s*:\s*(\S.*?)\s*")
 _FAULT, _REPAIR = "fault", "repair"  # verbs of the events that all stages know: fault FAULT, repair FAULT or TARGET
@@ -489,13 +491,15 @@ class Stage(ABC):
             pieces = [(k, min(k + messages.MAX_BLOCK, samples)) for k in range(0, samples, messages.MAX_BLOCK)]
             return [said for k, m in pieces for said in self.process(first + k, cut(inputs, k, m), cut(outputs, k, m))]
         assert self.step is not None, "a stage without a step has its own"
-        read = tuple([part[name] for port, part in zip(self.inputs, inputs, strict=False) for name in port.fields])
+        fields = [part[name] for port, part in zip(self.inputs, inputs, strict=False) for name in port.fields]
+        read = tuple([array for array in fields if array.dtype == np.float64])
+        flags = tuple([array for array in fields if array.dtype == np.uint8]) or _NO_FLAGS
         written = tuple([array for part in outputs for array in part.values()])
         self.prepare(first, samples)
         sparse: list[Sparse] = []
         told = reached = 0
         while True:
-            reached, reason = self.step(self.memory, first, reached, read, written)
+            reached, reason = self.step(self.memory, first, reached, read, flags, written)
             if reason == DONE:
                 return sparse + self.tell(first + told, first + samples)
             sparse += self.tell(first + told, first + reached)

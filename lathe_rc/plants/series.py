@@ -20,6 +20,8 @@ For m/M -> 0 the carriage is the coarse drive and x2/e is that of the fine drive
 mass ratio: the tool's inertia bends the piezo by -x1''/ω2² while the carriage accelerates.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -36,24 +38,46 @@ _CARRIAGE, _TOOL = 0, 2  # places of the positions in the state: x1, x1', x2, x2
 _ROUNDS = 32  # at most, to find the carriage's position and the extension of the same sample
 
 
+class SeriesTable(NamedTuple):
+    """A `SeriesDrive` for kernels.
+
+    Attributes:
+        transition: of both masses, shape (4, 4).
+        coarse, fine: weights of the command and of the extension e, shape (4, 3).
+        delay, part: of the command [sample].
+        spring, damper, force_per_current: of the carriage's own loops.
+        carriage_stroke: [m].
+        stack, memory: of the piezo.
+        full_voltage: [V].
+        feedback: whether the carriage's measured position is taken off the set point.
+        resolution: of its sensor [m].
+        state: x1, x1', x2, x2' and the last e.
+        line: a ring of past commands: sample n stands at n modulo its length.
+        counts: samples at an end stop, and in saturation, so far.
+    """
+
+    transition: Array
+    coarse: Array
+    fine: Array
+    delay: int
+    part: float
+    spring: float
+    damper: float
+    force_per_current: float
+    carriage_stroke: float
+    stack: StackTable
+    memory: Array
+    full_voltage: float
+    feedback: bool
+    resolution: float
+    state: Array
+    line: Array
+    counts: npt.NDArray[np.int64]
+
+
 @kernel
-def _advance(
-    transition: Array,
-    coarse: Array,
-    fine: Array,
-    delay: int,
-    part: float,
-    spring: float,
-    damper: float,
-    force_per_current: float,
-    carriage_stroke: float,
-    stack: StackTable,
-    full_voltage: float,
-    feedback: bool,  # noqa: FBT001 - kernels take everything by position
-    resolution: float,
-    state: Array,
-    memory: Array,
-    line: Array,
+def advance(
+    drive: SeriesTable,
     first: int,
     command: Array,
     set_point: Array,
@@ -65,13 +89,11 @@ def _advance(
     extension: Array,
     extension_velocity: Array,
     voltage: Array,
-) -> tuple[int, int]:
-    """Step both masses through a block; returns the samples at an end stop and those in saturation.
-
-    ``coarse`` and ``fine`` are the weights of the command and of e, shape (4, 3). ``state`` is x1, x1', x2, x2' and
-    the last e. ``line`` is a ring of past commands: sample n stands at n modulo its length.
-    """
-    size = line.size
+) -> None:
+    """Step both masses through a block, see `SeriesDrive.block`."""
+    transition, coarse, fine, delay, part = drive.transition, drive.coarse, drive.fine, drive.delay, drive.part
+    carriage_stroke, stack, memory, resolution = drive.carriage_stroke, drive.stack, drive.memory, drive.resolution
+    state, line, feedback, size = drive.state, drive.line, drive.feedback, drive.line.size
     stopped = saturated = 0
     free, trial = np.empty(4), np.empty_like(memory)
     for k in range(command.size):
@@ -111,10 +133,11 @@ def _advance(
         if not feedback:
             measured[k] = quantise(state[0] + noise[k], resolution)
         delayed = (1.0 - part) * u0 + part * u1
-        current[k] = (spring * (delayed - state[0]) - damper * state[1]) * force_per_current
+        current[k] = (drive.spring * (delayed - state[0]) - drive.damper * state[1]) * drive.force_per_current
         extension[k], extension_velocity[k] = state[2] - state[0], state[3] - state[1]
-        voltage[k] = memory[VOLTAGE] * full_voltage
-    return stopped, saturated
+        voltage[k] = memory[VOLTAGE] * drive.full_voltage
+    drive.counts[0] += stopped
+    drive.counts[1] += saturated
 
 
 def _seen_at(plant: DiscretePlant, place: int) -> DiscretePlant:
@@ -145,8 +168,7 @@ class SeriesDrive:
         method: discretisation, see `lathe_rc.plants.linear.discretise`.
 
     Attributes:
-        stopped: samples so far that the carriage spent at an end stop.
-        saturated: samples so far in which the piezo's set point or voltage was cut off.
+        table: for `advance`.
 
     Raises:
         InputError: direct compensation that would oscillate, or a step too coarse for it.
@@ -178,14 +200,38 @@ class SeriesDrive:
         a[1, :2] -= spring, damper
         self._coarse = discretise(a, np.array([0.0, spring, 0.0, 0.0]), delay, step, method)
         self._fine = discretise(a, np.array([0.0, -mass_ratio * stiff, 0.0, stiff]), 0.0, step, method)
-        self.stopped = self.saturated = 0
-        self._servo = spring, damper, moving_mass / force_constant, carriage_stroke
-        self._stack, self._full_voltage = stack, full_voltage
-        self._feedback, self._resolution = feedback, resolution
-        self._state = np.zeros(5)
-        self._line = np.zeros(self._coarse.delay + 3)
+        self._stack, self._feedback = stack, feedback
+        self.table = SeriesTable(
+            transition=self._coarse.transition,
+            coarse=self._coarse.weights,
+            fine=self._fine.weights,
+            delay=self._coarse.delay,
+            part=self._coarse.fraction,
+            spring=spring,
+            damper=damper,
+            force_per_current=moving_mass / force_constant,
+            carriage_stroke=carriage_stroke,
+            stack=stack.table,
+            memory=stack.state,
+            full_voltage=full_voltage,
+            feedback=feedback,
+            resolution=resolution,
+            state=np.zeros(5),
+            line=np.zeros(self._coarse.delay + 3),
+            counts=np.zeros(2, np.int64),
+        )
         if feedback:
             self._check_feedback(mass_ratio)
+
+    @property
+    def stopped(self) -> int:
+        """Samples so far that the carriage spent at an end stop."""
+        return int(self.table.counts[0])
+
+    @property
+    def saturated(self) -> int:
+        """Samples so far in which the piezo's set point or voltage was cut off."""
+        return int(self.table.counts[1])
 
     def _check_feedback(self, mass_ratio: float) -> None:
         step = self._fine.step
@@ -256,13 +302,7 @@ class SeriesDrive:
             extension_velocity: [m/s].
             voltage: at the piezo [V].
         """
-        plant = self._coarse
-        stopped, saturated = _advance(
-            plant.transition, plant.weights, self._fine.weights, plant.delay, plant.fraction, *self._servo,
-            self._stack.table, self._full_voltage, self._feedback, self._resolution,
-            self._state, self._stack.state, self._line,
-            first, command, set_point, noise,
-            carriage, carriage_velocity, current, measured, extension, extension_velocity, voltage,
+        advance(
+            self.table, first, command, set_point, noise, carriage, carriage_velocity, current, measured, extension,
+            extension_velocity, voltage,
         )  # fmt: skip
-        self.stopped += stopped
-        self.saturated += saturated

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is watched: signals against thresholds, each by a rule of `lathe_rc.safety.rules`."""
 
-from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,11 +15,8 @@ from lathe_rc.safety.rules import (
     THRESHOLD,
     TURN,
     Array,
-    Places,
-    Pulses,
+    Watch,
     clear,
-    lasting,
-    located,
     walk,
 )
 from lathe_rc.safety.state_machine import Reaction
@@ -40,7 +35,7 @@ class Alarm:
     value: float
 
 
-class Monitor(ABC):
+class Monitor:
     """Watches signals by one of the `rules`; raises one alarm, and no other before it is reset.
 
     Args:
@@ -55,7 +50,6 @@ class Monitor(ABC):
 
     Attributes:
         name, subject, limit, reaction, rule, signal, other, memory: as given.
-        raised: whether it has raised its alarm.
     """
 
     def __init__(
@@ -73,59 +67,13 @@ class Monitor(ABC):
         self.name, self.subject, self.limit, self.reaction = name, subject, limit, reaction
         self.rule, self.signal, self.other = rule, signal, other
         self.memory = np.array(memory, np.float64)
-        self.raised = False
 
-    @property
-    def settled(self) -> bool:
-        """Whether `alarm` has nothing to do where the rule finds nothing."""
-        return True
-
-    @abstractmethod
-    def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
-        """The alarm where the rule has found something; place −1: it has not."""
+    def told(self, value: float) -> float:
+        """What an alarm says of what the rule has found, in the unit of the limit."""
+        return value
 
     def reset(self) -> None:
         """Watch as from the first sample."""
-        self.raised = False
-
-
-class Patience:
-    """Some revolutions, from the first sample or a reset on, in which nothing is wrong yet.
-
-    Args:
-        revolutions: of the encoder, the first input.
-    """
-
-    def __init__(self, revolutions: float) -> None:
-        self._turn = revolutions * TURN
-        self._until: float | None = None
-
-    @property
-    def over(self) -> bool:
-        """Whether nothing is forgiven any more."""
-        return not self._turn or self._until == -np.inf
-
-    def left(self, inputs: Sequence[Signals]) -> int:
-        """How many samples of the block are still forgiven."""
-        if self.over:
-            return 0
-        angle = inputs[0]["angle"]
-        if self._until is None:
-            if not angle.size:
-                return 0
-            self._until = float(angle[0]) + self._turn
-        over = angle >= self._until
-        begin = int(np.argmax(over)) if over.any() else angle.size
-        if begin < angle.size:
-            self._until = -np.inf  # an angle that turns back changes nothing
-        return begin
-
-    def renew(self) -> None:
-        """Forgive anew from the next sample on."""
-        self._until = None
-
-
-_NOTHING = np.empty(0)
 
 
 class Threshold(Monitor):
@@ -153,35 +101,16 @@ class Threshold(Monitor):
         samples: int = 1,
         after: float = 0.0,
     ) -> None:
-        memory = (offset, -limit, limit, samples)
+        memory = (offset, -limit, limit, samples, 0.0, after * TURN, np.nan)
         super().__init__(name, subject, limit, reaction, rule=THRESHOLD, signal=signal, other=other, memory=memory)
-        self._patience, self._run = Patience(after), 0
 
-    @property
-    def settled(self) -> bool:
+    def told(self, value: float) -> float:
         """See `Monitor`."""
-        return not self._run and self._patience.over
-
-    def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
-        """See `Monitor`."""
-        signal = inputs[self.signal[0]][self.signal[1]]
-        other = _NOTHING if self.other is None else inputs[self.other[0]][self.other[1]]
-        begin = self._patience.left(inputs)
-        signal, other = signal[begin:], other[begin:]
-        place, self._run = lasting(signal, other, self.memory, self._run)
-        if place < 0:
-            return None
-        return Alarm(begin + place, self._told(float(signal[place] - (other[place] if other.size else 0.0))))
-
-    def _told(self, value: float) -> float:
-        """What an alarm says of what is beyond the limit."""
         return abs(value - float(self.memory[0]))
 
     def reset(self) -> None:
         """See `Monitor`."""
-        super().reset()
-        self._patience.renew()
-        self._run = 0
+        self.memory[4], self.memory[6] = 0.0, np.nan
 
 
 class Below(Threshold):
@@ -201,8 +130,8 @@ class Below(Threshold):
         super().__init__(name, subject, limit, reaction, signal=signal, samples=samples, after=after)
         self.memory[:3] = 0.0, limit, np.inf
 
-    def _told(self, value: float) -> float:
-        """See `Threshold`."""
+    def told(self, value: float) -> float:
+        """See `Monitor`."""
         return value
 
 
@@ -233,9 +162,9 @@ class Rate(Monitor):
         memory = np.concatenate(((limit * self._span, np.nan), np.full(window, before)))
         super().__init__(name, subject, limit, reaction, rule=RATE, signal=signal, memory=memory)
 
-    def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
+    def told(self, value: float) -> float:
         """See `Monitor`."""
-        return Alarm(place, float(self.memory[1]) / self._span) if place >= 0 else None
+        return value / self._span
 
 
 class IndexPulses(Monitor):
@@ -245,13 +174,8 @@ class IndexPulses(Monitor):
         signal, memory = (encoder, "angle"), (limit, np.nan, np.nan, 0.0)
         super().__init__("index_pulses", "encoder", limit, reaction, rule=INDEX, signal=signal, memory=memory)
 
-    def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
-        """See `Monitor`."""
-        return Alarm(place, float(self.memory[2])) if place >= 0 else None
-
     def reset(self) -> None:
         """See `Monitor`."""
-        super().reset()
         self.memory[1:] = np.nan, np.nan, 0.0
 
 
@@ -280,13 +204,8 @@ class Growth(Monitor):
             memory=(limit, floor, cycles, *_UNKNOWN),
         )
 
-    def alarm(self, inputs: Sequence[Signals], place: int) -> Alarm | None:
-        """See `Monitor`."""
-        return Alarm(place, float(self.memory[6])) if place >= 0 else None
-
     def reset(self) -> None:
         """See `Monitor`."""
-        super().reset()
         self.memory[3:] = _UNKNOWN
 
 
@@ -296,18 +215,21 @@ class Clearance:
     Args:
         beyond: measured position of the drive beyond which it is [m].
         samples: for so many in a row.
+
+    Attributes:
+        memory: both, and how many in a row were up to the last sample, for `lathe_rc.safety.rules.clear`.
     """
 
     def __init__(self, beyond: float, samples: int) -> None:
-        self._beyond, self._samples, self._run = beyond, samples, 0
+        self.memory = np.array([beyond, samples, 0.0])
 
     def begin(self) -> None:
         """Look from the next sample on."""
-        self._run = 0
+        self.memory[2] = 0.0
 
     def first(self, position: Array) -> int | None:
         """First sample at which it is."""
-        place, self._run = clear(position, self._beyond, self._samples, self._run)
+        place, self.memory[2] = clear(position, self.memory)
         return place if place >= 0 else None
 
 
@@ -316,55 +238,45 @@ class Lookout:
 
     Args:
         monitors: in the order in which alarms at the same sample are told; their memory becomes part of the lookout's.
+        numbers: of the signals that they read, by input and field; None: as they come.
+
+    Attributes:
+        watch: for `lathe_rc.safety.rules.walk`.
     """
 
-    def __init__(self, monitors: Sequence[Monitor]) -> None:
+    def __init__(self, monitors: Sequence[Monitor], numbers: Mapping[tuple[int, str], int] | None = None) -> None:
         self._monitors = monitors
-        self._signals = list(
-            dict.fromkeys(place for monitor in monitors for place in (monitor.signal, monitor.other) if place)
-        )
-        self._memory = np.concatenate([np.empty(0), *(monitor.memory for monitor in monitors)])
-        self._plan = np.zeros((len(monitors), 5), np.int64)
-        self._places = np.zeros(len(monitors), np.int64)
-        self._known = deque[tuple[Sequence[Signals], tuple[Array, ...], Pulses, Places]](maxlen=4)
-        self._settled = False  # all monitors
-        end = 0
-        for row, monitor in zip(self._plan, monitors, strict=True):
+        signals = dict.fromkeys(place for monitor in monitors for place in (monitor.signal, monitor.other) if place)
+        self._numbers = numbers or {place: number for number, place in enumerate(signals)}
+        memory = np.concatenate([np.empty(0), *(monitor.memory for monitor in monitors)])
+        plan, count, end = np.zeros((len(monitors), 5), np.int64), len(monitors), 0
+        for row, monitor in zip(plan, monitors, strict=True):
             begin, end = end, end + monitor.memory.size
-            other = self._signals.index(monitor.other) if monitor.other else -1
-            row[:] = monitor.rule, self._signals.index(monitor.signal), other, begin, end
-            monitor.memory = self._memory[begin:end]
+            other = self._numbers[monitor.other] if monitor.other else -1
+            row[:] = monitor.rule, self._numbers[monitor.signal], other, begin, end
+            monitor.memory = memory[begin:end]
+        self.watch = Watch(plan, memory, np.zeros(count, np.int64), np.full(count, -1), np.zeros(count))
 
     def look(self, inputs: Sequence[Signals]) -> list[tuple[Monitor, Alarm]]:
         """Alarms of the next samples, by sample."""
         if not self._monitors:
             return []
-        if not walk(*self._located(inputs), self._memory, self._places) and self._settled:
-            return []
-        found = []
-        for monitor, place in zip(self._monitors, self._places.tolist(), strict=True):
-            if monitor.raised or (place < 0 and monitor.settled):
-                continue
-            alarm = monitor.alarm(inputs, place)
-            if alarm:
-                monitor.raised = True
-                found.append((monitor, alarm))
-        self._settled = all(monitor.raised or monitor.settled for monitor in self._monitors)
-        return sorted(found, key=lambda one: one[1].place)
+        signals = tuple([np.ascontiguousarray(inputs[place][name]) for place, name in self._numbers])
+        walk(self.watch, signals, np.ascontiguousarray(inputs[0]["angle"]), inputs[0]["index_pulse"])
+        return self.found()
 
-    def _located(self, inputs: Sequence[Signals]) -> tuple[Pulses, Places]:
-        """Index pulses and plan; the offline host hands out the same few inputs again and again, so they are kept."""
-        for known, _, pulse, plan in self._known:
-            if known is inputs:
-                return pulse, plan
-        signals = tuple([np.ascontiguousarray(inputs[place][name]) for place, name in self._signals])
-        pulse, plan = inputs[0]["index_pulse"], self._plan.copy()
-        located(signals, pulse.size, plan)
-        self._known.append((inputs, signals, pulse, plan))
-        return pulse, plan
+    def found(self) -> list[tuple[Monitor, Alarm]]:
+        """Alarms of the samples through which `lathe_rc.safety.rules.walk` went last."""
+        found = []
+        places, values = self.watch.places.tolist(), self.watch.values.tolist()
+        for number, (monitor, place, value) in enumerate(zip(self._monitors, places, values, strict=True)):
+            if place >= 0:
+                self.watch.raised[number] = 1
+                found.append((monitor, Alarm(place, monitor.told(value))))
+        return sorted(found, key=lambda one: one[1].place)
 
     def reset(self) -> None:
         """Watch as from the first sample."""
-        self._settled = False
+        self.watch.raised[:] = 0
         for monitor in self._monitors:
             monitor.reset()

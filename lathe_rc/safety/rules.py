@@ -6,10 +6,12 @@ where its memory is. A rule first asks whether there is anything in a stretch of
 vectors of, and takes them one by one only where there is.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.jit import inlined, kernel, lent
+from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
 Places = npt.NDArray[np.int64]
@@ -31,7 +33,7 @@ def _beyond(value: float, offset: float, low: float, high: float) -> bool:
 def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
     """0 if so many samples in a row may be beyond here or from the last one on, or -1.
 
-    The memory: offset, lower and upper limit, how many. Where n are needed, every n-th one and the last tell: n in a
+    The memory: see `_lasting_beyond`. Where n are needed, every n-th one and the last tell: n in a
     row cannot pass between them, if the sample before the first was not beyond.
     """
     offset, low, high, needed = memory[0], memory[1], memory[2], int(memory[3])
@@ -50,23 +52,53 @@ def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
     return 0 if count else -1
 
 
+@inlined
+def _over(memory: Array) -> bool:
+    """Whether nothing is forgiven any more, see `_lasting_beyond`."""
+    return memory[5] == 0.0 or memory[6] == -np.inf
+
+
 @kernel
-def lasting(signal: Array, other: Array, memory: Array, run: int) -> tuple[int, int]:
-    """First sample at which enough in a row were beyond, or -1, and how many were up to it or the last."""
-    for k in range(signal.size):
+def _forgiven(angle: Array, memory: Array) -> int:
+    """How many samples of the block are forgiven, see `_lasting_beyond`."""
+    if _over(memory) or not angle.size:
+        return 0
+    if np.isnan(memory[6]):
+        memory[6] = angle[0] + memory[5]
+    for k in range(angle.size):
+        if angle[k] >= memory[6]:
+            memory[6] = -np.inf  # an angle that turns back changes nothing
+            return k
+    return angle.size
+
+
+@kernel
+def _lasting_beyond(signal: Array, other: Array, angle: Array, memory: Array) -> int:
+    """First sample at which enough in a row were beyond, or -1.
+
+    The memory: offset, lower and upper limit, how many, how many were up to the last sample; spindle angle in which
+    nothing is wrong yet from the first sample or a reset on, and the angle at which that ends, NaN before it begins.
+    """
+    if memory[4] == 0.0 and _over(memory) and _any_beyond(signal, other, memory) < 0:
+        return -1
+    for k in range(_forgiven(angle, memory), signal.size):
         value = signal[k] - (other[k] if other.size else 0.0)
-        run = run + 1 if _beyond(value, memory[0], memory[1], memory[2]) else 0
-        if run >= memory[3]:
-            return k, run
-    return -1, run
+        memory[4] = memory[4] + 1.0 if _beyond(value, memory[0], memory[1], memory[2]) else 0.0
+        if memory[4] >= memory[3]:
+            return k
+    return -1
 
 
 @kernel
-def clear(position: Array, beyond: float, needed: int, run: int) -> tuple[int, int]:
-    """First sample at which enough in a row were beyond a position, or -1, and how many were up to it or the last."""
+def clear(position: Array, memory: Array) -> tuple[int, float]:
+    """First sample at which enough in a row were beyond a position, or -1, and how many were up to it or the last.
+
+    The memory: the position, how many, and how many were up to the sample before; it stays as it is.
+    """
+    run = memory[2]
     for k in range(position.size):
-        run = run + 1 if position[k] >= beyond else 0
-        if run >= needed:
+        run = run + 1.0 if position[k] >= memory[0] else 0.0
+        if run >= memory[1]:
             return k, run
     return -1, run
 
@@ -217,44 +249,50 @@ def _growing(error: Array, pulse: Pulses, at: int, memory: Array) -> int:
         begin, at = at, _next(pulse, at + 1)
 
 
-@kernel
-def located(signals: tuple[Array, ...], samples: int, plan: Places) -> None:
-    """Replace the signals of a plan, see `walk`, by where they are; they must be contiguous.
+class Watch(NamedTuple):
+    """The monitors of a cell, for `walk`.
 
-    Raises:
-        ValueError: one is not as long as the block.
+    Attributes:
+        plan: of each its rule, the numbers of its two signals, the second or -1, begin and end of its memory.
+        memory: of all of them.
+        raised: which have raised their alarm and look no more, shape (rules,).
+        places: where each of them finds something, or -1, shape (rules,).
+        values: what it finds there, shape (rules,).
     """
-    for signal in signals:
-        if signal.size != samples:
-            raise ValueError("a signal that is watched is not as long as the block")
-    for row in range(plan.shape[0]):
-        plan[row, 1] = signals[plan[row, 1]].ctypes.data
-        plan[row, 2] = signals[plan[row, 2]].ctypes.data if plan[row, 2] >= 0 else 0
+
+    plan: Places
+    memory: Array
+    raised: Places
+    places: Places
+    values: Array
 
 
 @kernel
-def walk(pulse: Pulses, plan: Places, memory: Array, places: Places) -> int:
-    """Fill in where each rule finds something, or -1, and say how many do.
+def walk(watch: Watch, signals: tuple[Array, ...], angle: Array, pulse: Pulses) -> int:
+    """Fill in where each monitor finds something, and what, and say how many do.
 
     Args:
+        watch: the monitors.
+        signals: that the plan numbers, shape (n,) each.
+        angle: of the encoder, shape (n,).
         pulse: index pulses of the encoder, shape (n,).
-        plan: rule, where its two signals are, the second or 0, begin and end of its memory; shape (rules, 5).
-        memory: of all of them.
-        places: that are filled in, shape (rules,).
     """
-    found, first_pulse = 0, _next(pulse, 0)
+    plan, found, first_pulse = watch.plan, 0, _next(pulse, 0)
     for row in range(plan.shape[0]):
-        rule, own, second = plan[row, 0], memory[plan[row, 3] : plan[row, 4]], plan[row, 2]
-        signal = lent(plan[row, 1], pulse.size)
-        other = lent(second, pulse.size) if second else signal[:0]
+        rule, own, second = plan[row, 0], watch.memory[plan[row, 3] : plan[row, 4]], plan[row, 2]
+        signal, place, value = signals[plan[row, 1]], -1, 0.0
+        other = signals[second] if second >= 0 else signal[:0]
         if rule == THRESHOLD:
-            place = _any_beyond(signal, other, own)
+            if not watch.raised[row]:
+                place = _lasting_beyond(signal, other, angle, own)
+                if place >= 0:
+                    value = signal[place] - (other[place] if other.size else 0.0)
         elif rule == RATE:
-            place = _changing(signal, own)
+            place, value = _changing(signal, own), own[1]
         elif rule == INDEX:
-            place = _index(signal, pulse, first_pulse, own)
+            place, value = _index(signal, pulse, first_pulse, own), own[2]
         else:
-            place = _growing(signal, pulse, first_pulse, own)
-        places[row] = place
-        found += place >= 0
+            place, value = _growing(signal, pulse, first_pulse, own), own[6]
+        watch.places[row], watch.values[row] = -1 if watch.raised[row] else place, value
+        found += watch.places[row] >= 0
     return found

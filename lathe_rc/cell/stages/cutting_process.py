@@ -188,7 +188,12 @@ class Memory(NamedTuple):
 
 @kernel
 def step(
-    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+    memory: Memory,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    flags: tuple[Samples, ...],
+    outputs: tuple[Samples, ...],
 ) -> tuple[int, int]:
     """See `lathe_rc.cell.stage`; the cross feed is positive into the part."""
     angle, speed = inputs[0], inputs[1]

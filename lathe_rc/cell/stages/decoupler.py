@@ -62,7 +62,12 @@ class Memory(NamedTuple):
 
 @kernel
 def step(
-    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+    memory: Memory,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    flags: tuple[Samples, ...],
+    outputs: tuple[Samples, ...],
 ) -> tuple[int, int]:
     """See `lathe_rc.cell.stage`; set points and errors go on unchanged."""
     force, force_set_point, force_error, position, position_set_point, position_error = inputs

@@ -115,7 +115,12 @@ class Memory(NamedTuple):
 
 @kernel
 def step(
-    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+    memory: Memory,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    flags: tuple[Samples, ...],
+    outputs: tuple[Samples, ...],
 ) -> tuple[int, int]:
     """See `lathe_rc.cell.stage`."""
     command, (position, velocity, effort, measured_position) = inputs[0], outputs
@@ -123,7 +128,7 @@ def step(
     while start < n:
         stop = n
         if memory.listens:
-            stop = piece(memory.obedience, start, inputs[-1])
+            stop = piece(memory.obedience, start, flags[0])
             if stop == start:
                 return start, OBEY
         given, samples, now = command[start:stop], stop - start, first + start
@@ -179,6 +184,7 @@ class FeedDriveStage(Stage):
         self._clipped = np.zeros(messages.MAX_BLOCK if cuts else 1, np.uint8)
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         self._obedience, self._safe = self._obeys(), False
+        self._said: list[Sparse] = []  # of going safe, to be told with the sample that comes next
         axis = parameters.axis
         self.declare(
             inputs=[
@@ -196,8 +202,7 @@ class FeedDriveStage(Stage):
     def go_safe(self) -> None:
         """See `Stage`; the slide stops, and nobody is listened to any more."""
         self._safe = True
-        # The host asks for this between two blocks, and says it with the sample of the next.
-        self._remarks += [message.values["action"] for message in self._obedience.obey(Reaction.STOP, 0)]
+        self._said = self._obedience.obey(Reaction.STOP, 0)
 
     def finish(self, index: int) -> list[Sparse]:
         """See `Stage`."""
@@ -230,6 +235,9 @@ class FeedDriveStage(Stage):
 
     def tell(self, first: int, end: int) -> list[Sparse]:
         """See `Stage`."""
-        if self._clipped.size == 1:
-            return []
-        return self._clipping.told(first, remembered(self._clipped, first, end))
+        said, self._said = self._said, []
+        for message in said:
+            message.index = first
+        if self._clipped.size > 1:
+            said += self._clipping.told(first, remembered(self._clipped, first, end))
+        return said

@@ -43,7 +43,12 @@ class Memory(NamedTuple):
 
 @kernel
 def step(
-    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+    memory: Memory,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    flags: tuple[Samples, ...],
+    outputs: tuple[Samples, ...],
 ) -> tuple[int, int]:
     """See `lathe_rc.cell.stage`."""
     force, (command, wanted, error) = inputs[1], outputs
@@ -51,7 +56,7 @@ def step(
         follow(memory.course, first, wanted)
         for k in range(error.size):
             error[k] = wanted[k] - force[k]
-    return pid_along(memory.pid, memory.state, memory.who, first, start, inputs[-1], wanted, force, command)
+    return pid_along(memory.pid, memory.state, memory.who, first, start, flags[0], wanted, force, command)
 
 
 class ForceController(Stage):

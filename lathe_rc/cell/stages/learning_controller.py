@@ -14,7 +14,7 @@ import numpy.typing as npt
 from lathe_rc.analysis.learning import LearningLoop, Response
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import MAX_BLOCK, Samples, Signals
-from lathe_rc.cell.stage import DONE, Input, Output, Sparse, Stage, Step
+from lathe_rc.cell.stage import DONE, Input, Output, Sparse, Stage
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
 from lathe_rc.cell.stages.obedience import (
     NOBODY,
@@ -48,7 +48,6 @@ _FILE_ACTIONS = ("save", "load")
 # Places in the state of a step: whether it is inside a piece of a block, where that begins and ends, and whether the
 # angle is lost, and since which sample, if that has not been told yet.
 _INSIDE, _BEGIN, _END, _LOST, _LOST_AT = range(5)
-_UNHEARD = np.empty(0, np.uint8)
 
 
 class Memory(NamedTuple):
@@ -125,22 +124,22 @@ def _lose(memory: Memory, start: int, stop: int, command: Samples) -> None:
 
 
 @kernel
-def _control(
+def step(
     memory: Memory,
     first: int,
     start: int,
     inputs: tuple[Samples, ...],
-    reaction: Samples,
+    flags: tuple[Samples, ...],
     outputs: tuple[Samples, ...],
 ) -> tuple[int, int]:
-    """The step, with the reactions that are asked for, if there are any."""
+    """See `lathe_rc.cell.stage`."""
     control, state, command = memory.control, memory.state, outputs[0]
     n = command.size
     while start < n:
         if not state[_INSIDE]:
             stop = n
             if memory.listens:
-                stop = piece(memory.obedience, start, reaction)
+                stop = piece(memory.obedience, start, flags[0])
                 if stop == start:
                     return start, OBEY
                 control.whole[angle_memory.LEARNS] = may_learn(memory.obedience)
@@ -173,22 +172,6 @@ def _control(
     return n, DONE
 
 
-@kernel
-def step(
-    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
-) -> tuple[int, int]:
-    """See `lathe_rc.cell.stage`."""
-    return _control(memory, first, start, inputs, _UNHEARD, outputs)
-
-
-@kernel
-def obedient_step(
-    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
-) -> tuple[int, int]:
-    """The same under the supervisor, whose reactions are the last of the inputs."""
-    return _control(memory, first, start, inputs[:-1], inputs[-1], outputs)
-
-
 class LearningController(Stage):
     """See `lathe_rc.control.repetitive`.
 
@@ -200,6 +183,7 @@ class LearningController(Stage):
     Parameters = LearningControllerParameters
     actions = ("freeze", "learn", "clear", *_FILE_ACTIONS)
     announces = ("joined", "lost", OUT_OF_REACH)
+    step = staticmethod(step)
 
     def __init__(self, name: str, parameters: LearningControllerParameters) -> None:
         self.parameters = parameters
@@ -351,11 +335,6 @@ class LearningController(Stage):
             controller.learning = action == "learn"
 
     # ---- samples ------------------------------------------------------------------------------------
-
-    @property
-    def step(self) -> Step:  # type: ignore[override]
-        """See `Stage`."""
-        return obedient_step if self._obedience else step
 
     @property
     def memory(self) -> Memory:

@@ -81,13 +81,14 @@ class Wanted(NamedTuple):
     Attributes:
         course: of the set point.
         path: taken off the set point; without heights there is none.
-        edge: whether the deflection of the edge counts.
+        edge, height: number of the input with the deflection of the edge, and with the height; 0: there is none.
         who: may have to obey.
     """
 
     course: Course
     path: PathTable
-    edge: bool
+    edge: int
+    height: int
     who: Listener
 
 
@@ -137,12 +138,12 @@ def _look(
     position = inputs[1]
     if wanted.edge:
         # The slide is positive into the part, the deflection out of it.
-        position = position - inputs[2]
+        position = position - inputs[wanted.edge]
     if start == 0:
         follow(wanted.course, first, set_point)
-        if wanted.path.heights.size:
+        if wanted.height:
             offset = np.empty(position.size)
-            offset_along(wanted.path, inputs[3 if wanted.edge else 2], offset)
+            offset_along(wanted.path, inputs[wanted.height], offset)
             set_point -= offset
         for k in range(error.size):
             error[k] = set_point[k] - position[k]
@@ -151,19 +152,29 @@ def _look(
 
 @kernel
 def pid_step(
-    memory: PidMemory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+    memory: PidMemory,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    flags: tuple[Samples, ...],
+    outputs: tuple[Samples, ...],
 ) -> tuple[int, int]:
     """See `lathe_rc.cell.stage`."""
     command, set_point, error = outputs
     position = _look(memory.wanted, first, start, inputs, set_point, error)
     return pid_along(
-        memory.pid, memory.state, memory.wanted.who, first, start, inputs[-1], set_point, position, command
+        memory.pid, memory.state, memory.wanted.who, first, start, flags[0], set_point, position, command
     )
 
 
 @kernel
 def link_step(
-    memory: LinkMemory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+    memory: LinkMemory,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    flags: tuple[Samples, ...],
+    outputs: tuple[Samples, ...],
 ) -> tuple[int, int]:
     """The same with a sampled link, which has nothing that it could learn with."""
     command, set_point, error = outputs
@@ -171,7 +182,7 @@ def link_step(
     while start < command.size:
         stop = command.size
         if who.listens:
-            stop = piece(who.obedience, start, inputs[-1])
+            stop = piece(who.obedience, start, flags[0])
             if stop == start:
                 return start, OBEY
         correct_along(memory.link, first + start, set_point[start:stop], position[start:stop], command[start:stop])
@@ -210,7 +221,12 @@ def _repeat(
 
 @kernel
 def periodic_step(
-    memory: PeriodicMemory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+    memory: PeriodicMemory,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    flags: tuple[Samples, ...],
+    outputs: tuple[Samples, ...],
 ) -> tuple[int, int]:
     """The same with the periodic law."""
     command, set_point, error = outputs
@@ -218,7 +234,7 @@ def periodic_step(
     while start < command.size:
         stop = command.size
         if who.listens:
-            stop = piece(who.obedience, start, inputs[-1])
+            stop = piece(who.obedience, start, flags[0])
             if stop == start:
                 return start, OBEY
             periodic.freeze(memory.state, not may_learn(who.obedience))
@@ -301,8 +317,10 @@ class PositionController(Stage):
     @property
     def memory(self) -> PidMemory | LinkMemory | PeriodicMemory:
         """See `Stage`."""
-        path, edge = self._path.table if self._path else _NO_PATH, self.parameters.measures == "edge"
-        wanted = Wanted(self.trajectory.course, path, edge, listener(self._obedience))
+        path = self._path.table if self._path else _NO_PATH
+        edge = 2 if self.parameters.measures == "edge" else 0
+        height = (3 if edge else 2) if self._path else 0
+        wanted = Wanted(self.trajectory.course, path, edge, height, listener(self._obedience))
         if isinstance(self.law, Pid):
             return PidMemory(wanted, self.law.table, self.law.state)
         if isinstance(self.law, SampledLink):

@@ -10,7 +10,12 @@ from lathe_rc.jit import kernel
 
 @kernel
 def step(
-    memory: FormTable, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+    memory: FormTable,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    flags: tuple[Samples, ...],
+    outputs: tuple[Samples, ...],
 ) -> tuple[int, int]:
     """See `lathe_rc.cell.stage`."""
     reference, expected, height = outputs

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Piezo and tool on the coarse carriage: both drives as one stage, for no block may cut what couples them."""
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, TypeVar
+from collections.abc import Mapping
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -10,19 +10,22 @@ from pydantic import create_model
 
 from lathe_rc.analysis.learning import Response
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.cell.stage import Input, Joint, Output, Sparse
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand
+from lathe_rc.cell.stage import DONE, Input, Joint, Output, Sparse
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, limited
 from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters
-from lathe_rc.cell.stages.retraction import OwnRetraction
-from lathe_rc.cell.stages.set_point import SetPoint
+from lathe_rc.cell.stages.retraction import OwnRetraction, followed
+from lathe_rc.cell.stages.set_point import SetPoint, sum_up
+from lathe_rc.control.bounded import TakeoverTable
+from lathe_rc.control.limits import LimiterTable
 from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
 from lathe_rc.plants.linear import Discretisation
-from lathe_rc.plants.series import SeriesDrive
-from lathe_rc.signals.noise import Sensor
+from lathe_rc.plants.series import SeriesDrive, SeriesTable, advance
+from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
 T = TypeVar("T", bound=NodeParameters)
 
@@ -76,6 +79,42 @@ SeriesDriveParameters = create_model(
 )
 
 
+class Memory(NamedTuple):
+    """What the step works on; the noise is that of the carriage's sensor, which the machine itself rounds."""
+
+    retraction: TakeoverTable
+    limits: LimiterTable
+    limits_fine: LimiterTable
+    signs: Samples
+    drive: SeriesTable
+    noise: SensorTable
+    sensor: SensorTable
+
+
+@kernel
+def step(
+    memory: Memory,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    flags: tuple[Samples, ...],
+    outputs: tuple[Samples, ...],
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`."""
+    command = inputs[0]
+    position, velocity, effort, measured, fine_position, fine_velocity, fine_effort, fine_measured = outputs
+    noise = np.empty(command.size)
+    measure(memory.noise, np.zeros(command.size), noise)
+    given = limited(memory.limits, first, followed(memory.retraction, command))
+    wanted = limited(memory.limits_fine, first, sum_up(memory.signs, inputs, 1, command.size))
+    advance(
+        memory.drive, first, given, wanted, noise, position, velocity, effort, measured, fine_position, fine_velocity,
+        fine_effort,
+    )  # fmt: skip
+    measure(memory.sensor, fine_position, fine_measured)
+    return command.size, DONE
+
+
 class SeriesDriveStage(Drive):
     """See `lathe_rc.plants.series`.
 
@@ -87,6 +126,7 @@ class SeriesDriveStage(Drive):
     kind = "series_drive"
     Parameters = SeriesDriveParameters
     announces = (LIMITED, FREE)
+    step = staticmethod(step)
 
     def __init__(self, name: str, parameters: SeriesParameters) -> None:
         super().__init__(name, parameters)
@@ -145,19 +185,20 @@ class SeriesDriveStage(Drive):
         """See `Stage`."""
         return [message for limited in self._limited for message in limited.finish(index)]
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    @property
+    def memory(self) -> Memory:
         """See `Stage`."""
-        command, *others = inputs
-        coarse, fine = outputs
-        set_point, noise = np.empty((2, coarse["position"].size))
-        self._set_point.fill(others, set_point)
-        self._coarse_noise.measure(np.zeros_like(noise), noise)
-        given, told = self._limited[0].block(first, self._retraction.block(command["position"]))
-        wanted, told_fine = self._limited[1].block(first, set_point)
-        self.drive.block(
-            first, given, wanted, noise,
-            coarse["position"], coarse["velocity"], coarse["effort"], coarse["measured_position"],
-            fine["position"], fine["velocity"], fine["effort"],
+        limits, limits_fine = (limited.table for limited in self._limited)
+        return Memory(
+            self._retraction.table, limits, limits_fine, self._set_point.signs, self.drive.table,
+            self._coarse_noise.table, self._fine_sensor.table,
         )  # fmt: skip
-        self._fine_sensor.measure(fine["position"], fine["measured_position"])
-        return sorted(told + told_fine, key=lambda message: message.index)
+
+    def prepare(self, first: int, samples: int) -> None:
+        """See `Stage`."""
+        self._coarse_noise.draw(samples)
+        self._fine_sensor.draw(samples)
+
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """See `Stage`."""
+        return [message for limited in self._limited for message in limited.tell(first, end)]

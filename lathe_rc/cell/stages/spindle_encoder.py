@@ -48,7 +48,12 @@ class SpindleEncoderParameters(SpeedLawParameters):
 
 @kernel
 def step(
-    memory: EncoderTable, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+    memory: EncoderTable,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    flags: tuple[Samples, ...],
+    outputs: tuple[Samples, ...],
 ) -> tuple[int, int]:
     """See `lathe_rc.cell.stage`."""
     angle, speed, index_pulse, angle_true, speed_true = outputs

@@ -2,17 +2,21 @@
 """Watches the cell and says what is to be done; who listens reads it as feedback with a declared delay."""
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 from annotated_types import Ge, Le
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.cell.stage import Input, Output, Sparse, Stage
+from lathe_rc.cell.stage import DONE, Input, Output, Sparse, Stage
 from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
 from lathe_rc.safety import state_machine
 from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Lookout, Monitor, Rate, Threshold
+from lathe_rc.safety.rules import Watch, clear, walk
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
 
 Asked = Literal["warn", "freeze", "fall_back", "hold", "retract", "stop"]
@@ -91,26 +95,72 @@ class SupervisorParameters(NodeParameters):
     clear_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
 
 
+_STATE, _REACTION, _TOLD = range(3)  # places in the state of a step
+_ANSWER = 1  # why it stops: the state changes within the block, or there is something to tell
+
+
+class Memory(NamedTuple):
+    """What the step works on.
+
+    Attributes:
+        watch: the monitors.
+        clearance: see `lathe_rc.safety.monitors.Clearance`.
+        out: number of the input with the position that it looks at; below 0: there is none.
+        state: of the cell, the reaction in force, whether there is something to tell.
+    """
+
+    watch: Watch
+    clearance: Samples
+    out: int
+    state: npt.NDArray[np.int64]
+
+
+@kernel
+def step(
+    memory: Memory,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    flags: tuple[Samples, ...],
+    outputs: tuple[Samples, ...],
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`; for `_ANSWER` it stops at the end of the block."""
+    state, reaction = outputs
+    n = state.size
+    if start == n:
+        return n, DONE
+    found = walk(memory.watch, inputs, inputs[0], flags[0])
+    if found or memory.state[_TOLD]:
+        return n, _ANSWER
+    if memory.state[_STATE] == State.RETRACTING.value and memory.out >= 0:
+        place, run = clear(inputs[memory.out], memory.clearance)
+        if place >= 0:
+            return n, _ANSWER
+        memory.clearance[2] = run
+    state[:] = memory.state[_STATE]
+    reaction[:] = memory.state[_REACTION]
+    return n, DONE
+
+
 class Supervisor(Stage):
     """See `lathe_rc.safety`.
 
     Attributes:
         parameters: its table.
         monitors: those that are on.
-        state: of the cell.
-        reaction: in force.
     """
 
     kind = "supervisor"
     Parameters = SupervisorParameters
     actions = (RESET,)
+    step = staticmethod(step)
 
     def __init__(self, name: str, parameters: SupervisorParameters) -> None:
         super().__init__(name, parameters)
         self.parameters = parameters
         self._inputs = [Input("encoder", messages.ENCODER, ("angle", "speed", "index_pulse"))]
         self.monitors: list[Monitor] = []
-        self.state, self.reaction = State.NOMINAL, Reaction.NONE
+        self._state = np.array([State.NOMINAL, Reaction.NONE, 0], np.int64)
         self._told: list[str] = []  # what others than monitors have done to the state since the last sample
         self._out = self._reads(f"{parameters.drives[0]}/state", messages.STATE, _SENSOR) if parameters.drives else None
         self._clearance = Clearance(parameters.clear_position, self._samples(parameters.clear_time))
@@ -119,7 +169,10 @@ class Supervisor(Stage):
         self._watch_drives()
         self._watch_margins()
         self._watch_cut()
-        self._lookout = Lookout(self.monitors)
+        fields = [(place, name) for place, port in enumerate(self._inputs) for name in port.fields]
+        numbers = {field: number for number, field in enumerate(f for f in fields if f[1] != "index_pulse")}
+        self._lookout = Lookout(self.monitors, numbers)
+        self._out_number = -1 if self._out is None else numbers[self._out, "measured_position"]
         self.declare(inputs=self._inputs, outputs=[Output("safety", messages.SAFETY)])
         self.sparse_topics["safety/status"] = messages.SAFETY_STATUS
 
@@ -262,7 +315,7 @@ class Supervisor(Stage):
             return  # nothing has been found since the start or the last reset
         to = state_machine.after(self.state, action)
         if to is not None and self.reaction is not Reaction.STOP:
-            self.state, self.reaction = to, Reaction.NONE
+            self._state[:2] = to, Reaction.NONE
             self._told.append(RESET)
             self._lookout.reset()
         else:
@@ -280,26 +333,38 @@ class Supervisor(Stage):
             to = State.SAFE  # there is no drive to wait for
         if to is State.RETRACTING and self.state is not to:
             self._clearance.begin()
-        self.state, self.reaction = to, max(self.reaction, reaction)
+        self._state[:2] = to, max(self.reaction, reaction)
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    @property
+    def state(self) -> State:
+        """Of the cell."""
+        return State(self._state[_STATE])
+
+    @property
+    def reaction(self) -> Reaction:
+        """In force."""
+        return Reaction(self._state[_REACTION])
+
+    @property
+    def memory(self) -> Memory:
         """See `Stage`."""
+        self._state[_TOLD] = bool(self._told)
+        return Memory(self._lookout.watch, self._clearance.memory, self._out_number, self._state)
+
+    def serve(
+        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
+    ) -> list[Sparse]:
+        """See `Stage`: say what has been found, and go from state to state."""
         (safety,) = outputs
-        samples = safety["state"].size
-        found = self._lookout.look(inputs)
-        if not (found or self._told or self.state is State.RETRACTING):
-            safety["state"].fill(int(self.state))  # a member of an enum takes numpy three times as long
-            safety["reaction"].fill(int(self.reaction))
-            return []
         sparse = [self._status(first, what, "", 0.0, 0.0) for what in self._told]
         self._told.clear()
-        reached = 0
-        for monitor, alarm in found:
-            self._fill(safety, inputs, first, reached, alarm.place, sparse)
-            reached = alarm.place
+        place = 0
+        for monitor, alarm in self._lookout.found():
+            self._fill(safety, inputs, first, place, alarm.place, sparse)
+            place = alarm.place
             self._ask_for(monitor.reaction)
-            sparse.append(self._status(first + reached, monitor.name, monitor.subject, alarm.value, monitor.limit))
-        self._fill(safety, inputs, first, reached, samples, sparse)
+            sparse.append(self._status(first + place, monitor.name, monitor.subject, alarm.value, monitor.limit))
+        self._fill(safety, inputs, first, place, reached, sparse)
         return sparse
 
     def _fill(
@@ -312,7 +377,7 @@ class Supervisor(Stage):
             if place is not None:
                 state[:place].fill(self.state)
                 state = state[place:]
-                self.state = State.SAFE
+                self._state[_STATE] = State.SAFE
                 sparse.append(self._status(first + start + place, RETRACTED, self.parameters.drives[0], 0.0, 0.0))
         state.fill(self.state)
         reaction.fill(self.reaction)

@@ -41,7 +41,12 @@ class Memory(NamedTuple):
 
 @kernel
 def step(
-    memory: Memory, first: int, start: int, inputs: tuple[Samples, ...], outputs: tuple[Samples, ...]
+    memory: Memory,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    flags: tuple[Samples, ...],
+    outputs: tuple[Samples, ...],
 ) -> tuple[int, int]:
     """See `lathe_rc.cell.stage`."""
     position, velocity, effort, measured_position = outputs
