@@ -1,43 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The program of a cell: the steps of its stages, in order, block after block, as one compiled function.
+"""The program of a cell: the steps of its stages, in order, block after block, as one compiled loop.
 
-The function stands in a module that is written for the structure of the cell (which steps, which topics between them)
-and kept beside the compiled kernels; parameters are not part of it. It comes back where Python is needed: a stage asks
-for it, an event is due, or a stage has no compiled step. It goes on at that stage and sample.
+It comes back where Python is needed: a stage asks for it, an event is due, or a stage has no compiled step. It goes on
+at that stage and sample.
 """
 
-import hashlib
-import importlib.util
-import os
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import Any, cast
+from collections.abc import Mapping, Sequence
 
-import numba
 import numpy as np
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.native import Integers
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
-from lathe_rc.files import replacing
-from lathe_rc.jit import kernel
-
-_HEAD = '''"""Written by lathe_rc.cell.program; the steps of a cell as one compiled function."""
-
-from lathe_rc.cell.program import passes
-from lathe_rc.jit import kernel
-'''
-_RUN = '''
-
-@kernel
-def run(memories, floats, bytes_, late, due, turn, where, base, end, chunk):
-    first, stage, start = where[0], where[1], where[2]
-    while first < end:
-        n = min(chunk, end - first)
-        o = base + first
-'''
+from lathe_rc.jit import call, floats, kernel
 
 
 class Tapes:
@@ -80,6 +57,68 @@ class Tapes:
         self.begin = first
 
 
+# Columns of the plan of the stages: address of the step or 0, address of its memory, its first field, the field with the
+# spindle angle or -1, the sample from which on it needs Python.
+_STEP, _WORDS, _FIELD, _ANGLE, _DUE = range(5)
+
+
+@kernel
+def _run(
+    plan: Integers, turn: Samples, fields: Integers, where: Integers, base: int, end: int, chunk: int
+) -> int:
+    """Compute from `where` (block, stage, sample in the block) up to sample ``end``; see `Program`.
+
+    Args:
+        plan: see above; one row more ends it.
+        turn: spindle angle from which on each stage needs Python [rad].
+        fields: of each the address of its first sample on the tape, the size of a sample, the delay, and the address of
+            the block at hand, shape (4, fields).
+        where: changed; where it has come to.
+        base: place of sample 0 on the tape.
+        end: see above.
+        chunk: samples that a stage computes in one go.
+
+    Returns:
+        Why it stopped: `DONE` at the end.
+    """
+    first, stage, start = where[0], where[1], where[2]
+    while first < end:
+        n = min(chunk, end - first)
+        while stage < plan.shape[0] - 1:
+            row = plan[stage]
+            for field in range(row[_FIELD], plan[stage + 1, _FIELD]):
+                fields[3, field] = fields[0, field] + (base + first - fields[2, field]) * fields[1, field]
+            waits = row[_STEP] == 0 or (start == 0 and row[_DUE] < first + n)
+            if start == 0 and turn[stage] < np.inf and row[_ANGLE] >= 0:
+                waits = waits or _passes(floats(fields[3, row[_ANGLE]], n), turn[stage])
+            where[0], where[1], where[2] = first, stage, start
+            if waits:
+                return PYTHON
+            block = fields.ctypes.data + 8 * (3 * fields.shape[1] + row[_FIELD])
+            reason = call(row[_STEP], row[_WORDS], first, start, n, block, where.ctypes.data + 16)
+            if reason != DONE:
+                return reason
+            stage += 1
+            start = 0
+        stage = 0
+        first += n
+    where[0], where[1], where[2] = first, 0, 0
+    return DONE
+
+
+@kernel
+def _passes(angle: Samples, turn: float) -> bool:
+    """Whether an angle of rising samples, shape (n,), reaches ``turn`` [rad]; the search is that of NumPy."""
+    low, high = 0, angle.size
+    while low < high:
+        middle = low + ((high - low) >> 1)
+        if angle[middle] < turn:
+            low = middle + 1
+        else:
+            high = middle
+    return low < angle.size
+
+
 class Program:
     """Some stages that compute in one go.
 
@@ -91,90 +130,39 @@ class Program:
 
     def __init__(self, stages: Sequence[Stage], tapes: Tapes, chunk: int) -> None:
         self._stages, self._tapes, self._chunk = list(stages), tapes, chunk
-        self._floats = tuple(array for array in tapes.arrays.values() if array.dtype == np.float64)
-        self._bytes = tuple(array for array in tapes.arrays.values() if array.dtype == np.uint8)
-        self._bytes = self._bytes or (np.empty(0, np.uint8),)
-        assert all(array.dtype in (np.float64, np.uint8) for array in tapes.arrays.values()), "float64 and uint8 are all that blocks have"
-        self._late = np.array([port.delay for stage in self._stages for port in stage.inputs] or [0], np.int64)
-        self._due, self._turn = np.empty(len(self._stages), np.int64), np.empty(len(self._stages))
+        self._turn = np.empty(len(self._stages))
+        self._plan = np.zeros((len(self._stages) + 1, 5), np.int64)
+        fields: list[tuple[int, int, int, int]] = []
+        for row, stage in zip(self._plan, self._stages, strict=False):
+            row[_FIELD], row[_ANGLE], angle = len(fields), -1, stage.angle_input
+            for place, port in enumerate(stage.inputs[: stage.own_inputs]):
+                if place == angle:
+                    row[_ANGLE] = len(fields) + port.fields.index("angle")
+                fields += [self._field(stage, port.topic, name, port.delay) for name in port.fields]
+            for output in stage.outputs:
+                fields += [self._field(stage, output.topic, name, 0) for name in messages.sample_fields(output.type)]
+            if angle is not None and angle >= stage.own_inputs:
+                row[_ANGLE] = len(fields)
+                fields.append(self._field(stage, stage.inputs[angle].topic, "angle", 0))
+        self._plan[-1, _FIELD] = len(fields)
+        self._fields = np.ascontiguousarray(np.array(fields, np.int64).T)
         self._where = np.zeros(3, np.int64)
         self._told = [0] * len(self._stages)
         self._sparse: list[list[Sparse]] = [[] for _ in self._stages]
-        self._run = cast("Callable[..., int]", _module("\n".join(self._source())).run)
-        self._load()
-        self._call(0)  # compiles
+        for number in range(len(self._stages)):
+            self._load(number)
 
-    # ---- the module ---------------------------------------------------------------------------------
+    def _field(self, stage: Stage, topic: str, name: str, delay: int) -> tuple[int, int, int, int]:
+        array = self._tapes.arrays[remapped(stage.shared, topic), name]
+        return array.ctypes.data, array.itemsize, delay, 0
 
-    def _source(self) -> Iterator[str]:
-        """The text of the module."""
-        steps = [stage.step for stage in self._stages]
-        modules = sorted({step.__module__ for step in steps if step is not None})
-        yield _HEAD + "\n".join(f"import {module}" for module in modules) + _RUN.rstrip("\n")
-        place = 0
-        for number, (stage, step) in enumerate(zip(self._stages, steps, strict=True)):
-            places, place = range(place, place + len(stage.inputs)), place + len(stage.inputs)
-            yield f"        if stage <= {number}:  # {stage.kind}"
-            if step is None:
-                yield f"            where[:] = first, {number}, 0"
-                yield f"            return {PYTHON}"
-                continue
-            read = [self._read(stage, port, at) for port, at in zip(range(stage.own_inputs), places, strict=False)]
-            fields = [one for some in read for one in some]
-            written = [
-                f"{self._array(remapped(stage.shared, output.topic), name)}[o : o + n]"
-                for output in stage.outputs
-                for name in messages.sample_fields(output.type)
-            ]
-            begins = f"due[{number}] < first + n"
-            angle = stage.angle_input
-            if angle is not None:
-                seen = self._array(remapped(stage.shared, stage.inputs[angle].topic), "angle")
-                begins += f" or passes({seen}[o : o + n], turn[{number}])"
-            yield f"            if start == 0 and ({begins}):"
-            yield f"                where[:] = first, {number}, 0"
-            yield f"                return {PYTHON}"
-            yield f"            start, reason = {step.__module__}.{step.__name__}("
-            yield f"                memories[{number}], first, start,"
-            yield f"                {_tuple([one for one in fields if one.startswith('floats')])},"
-            yield f"                {_tuple([one for one in fields if one.startswith('bytes')] or ['bytes_[0][:0]'])},"
-            yield f"                {_tuple(written)},"
-            yield "            )"
-            yield f"            if reason != {DONE}:"
-            yield f"                where[:] = first, {number}, start"
-            yield "                return reason"
-            yield "            start = 0"
-        yield "        stage = start = 0"
-        yield "        first += n"
-        yield "    where[:] = first, 0, 0"
-        yield f"    return {DONE}"
-        yield ""
-
-    def _read(self, stage: Stage, port: int, place: int) -> list[str]:
-        topic = remapped(stage.shared, stage.inputs[port].topic)
-        begin = f"o - late[{place}]" if stage.inputs[port].delay else "o"
-        return [f"{self._array(topic, name)}[{begin} : {begin} + n]" for name in stage.inputs[port].fields]
-
-    def _array(self, topic: str, name: str) -> str:
-        """How the function calls an array."""
-        array = self._tapes.arrays[topic, name]
-        of, all_ = ("floats", self._floats) if array.dtype == np.float64 else ("bytes_", self._bytes)
-        return f"{of}[{next(place for place, other in enumerate(all_) if other is array)}]"
-
-    # ---- running ------------------------------------------------------------------------------------
-
-    def _load(self) -> None:
-        """Take what stages have in their memories now, and when they want Python next."""
-        self._memories = tuple(stage.memory for stage in self._stages)
-        for number, stage in enumerate(self._stages):
-            self._due[number], self._turn[number] = stage.due
-
-    def _call(self, end: int) -> int:
-        base = self._tapes.history - self._tapes.begin
-        return self._run(
-            self._memories, self._floats, self._bytes, self._late, self._due, self._turn, self._where, base, end,
-            self._chunk,
-        )  # fmt: skip
+    def _load(self, number: int) -> None:
+        """Take what a stage has in its memory now, and when it wants Python next."""
+        stage, row = self._stages[number], self._plan[number]
+        if stage.step is not None:
+            native = stage.native()
+            row[_STEP], row[_WORDS] = native.address, native.words.ctypes.data
+        row[_DUE], self._turn[number] = stage.due
 
     def run(self, end: int) -> None:
         """Compute up to sample ``end``, which must lie within the piece of the tapes.
@@ -182,13 +170,14 @@ class Program:
         Raises:
             LatheError: a stage cannot go on; names it. What was computed before is on the tapes, see `reached`.
         """
-        for stage in self._stages:
+        base = self._tapes.history - self._tapes.begin
+        for number, stage in enumerate(self._stages):
             stage.prepare(self.reached, end - self.reached)
-        self._load()
-        while (reason := self._call(end)) != DONE:
+            self._load(number)
+        while (reason := _run(self._plan, self._turn, self._fields, self._where, base, end, self._chunk)) != DONE:
             first, number, reached = self._where.tolist()
             self._serve(reason, first, number, reached, min(self._chunk, end - first))
-            self._load()
+            self._load(number)
         for number in range(len(self._stages)):
             self._tell(number, end)
 
@@ -222,42 +211,3 @@ class Program:
         """What a stage has said since the last call."""
         said, self._sparse[number] = self._sparse[number], []
         return said
-
-
-@kernel
-def passes(angle: Samples, turn: float) -> bool:
-    """Whether an angle of rising samples, shape (n,), reaches ``turn`` [rad]; the search is that of NumPy."""
-    if turn == np.inf:
-        return False
-    low, high = 0, angle.size
-    while low < high:
-        middle = low + ((high - low) >> 1)
-        if angle[middle] < turn:
-            low = middle + 1
-        else:
-            high = middle
-    return low < angle.size
-
-
-def _tuple(items: Sequence[str]) -> str:
-    return f"({', '.join(items)}{',' if len(items) == 1 else ''})" if items else "()"
-
-
-def _module(text: str) -> Any:
-    """The module of a text, kept in a file: Numba keeps what it has compiled for a file."""
-    name = f"cell_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
-    full = f"lathe_rc_programs.{name}"
-    if full not in sys.modules:
-        folder = Path(os.environ.get("NUMBA_CACHE_DIR") or numba.config.CACHE_DIR) / "programs"
-        path = folder / f"{name}.py"
-        if not path.exists():
-            folder.mkdir(parents=True, exist_ok=True)
-            with replacing(path) as file:
-                file.write(text.encode())
-        spec = importlib.util.spec_from_file_location(full, path)
-        assert spec is not None, "it is a Python file"
-        assert spec.loader is not None, "it is a Python file"
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        sys.modules[full] = module
-    return sys.modules[full]

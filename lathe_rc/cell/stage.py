@@ -17,7 +17,7 @@ one if there are none, and outputs are the arrays of all fields of all output po
 import math
 import re
 from abc import ABC
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
@@ -25,7 +25,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.native import Native, Step
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety import faults
@@ -93,12 +94,10 @@ class Trigger:
         return f"{self.kind} {self.value:g}: {self.action}"
 
 
-Arrays = tuple[Samples, ...]
-Step = Callable[[Any, int, int, Arrays, Arrays, Arrays], tuple[int, int]]
 DONE, PYTHON = 0, -1  #: why a step, or a program of steps, has stopped
 NEVER = np.iinfo(np.int64).max  #: no sample at all
 
-_NOTHING, _NO_FLAGS = np.empty(0), (np.empty(0, np.uint8),)
+_NOTHING = np.empty(0)
 
 _EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)(?:\s+to\s+([0-9.eE+-]+))?\s*:\s*(\S.*?)\s*")
 _FAULT, _REPAIR = "fault", "repair"  # verbs of the events that all stages know: fault FAULT, repair FAULT or TARGET
@@ -139,6 +138,7 @@ class Stage(ABC):
         self._triggers += [trigger for text in parameters.faults for trigger in self._break_down(text)]
         self._injection: Injection | None = None
         self.own_inputs, self.tells = 0, False
+        self._native: Native | None = None
         self._scheduled: list[tuple[int, str]] = []
         self._remarks: list[str] = []  # events that came of the one that is carried out
 
@@ -465,6 +465,21 @@ class Stage(ABC):
         """What the step works on, a NamedTuple of arrays and constants; another one may be given after each stop."""
         return ()
 
+    def native(self) -> Native:
+        """The step with the memory as it is now, as a function of addresses."""
+        if self._native is None:
+            assert self.step is not None, "a stage without a step has its own `process`"
+            read = [messages.sample_fields(p.type)[n] for p in self.inputs[: self.own_inputs] for n in p.fields]
+            written = [kind for port in self.outputs for kind in messages.sample_fields(port.type).values()]
+            self._native = Native(self.step, self.memory, read, written)
+        else:
+            self._native.update(self.memory)
+        return self._native
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is worth keeping: addresses are not."""
+        return {**self.__dict__, "_native": None}
+
     def prepare(self, first: int, samples: int) -> None:  # noqa: B027 - most stages need nothing
         """Have ready what the samples ``first`` on need that a step cannot make, as random numbers."""
 
@@ -490,16 +505,13 @@ class Stage(ABC):
         if samples > messages.MAX_BLOCK:
             pieces = [(k, min(k + messages.MAX_BLOCK, samples)) for k in range(0, samples, messages.MAX_BLOCK)]
             return [said for k, m in pieces for said in self.process(first + k, cut(inputs, k, m), cut(outputs, k, m))]
-        assert self.step is not None, "a stage without a step has its own"
         fields = [part[name] for port, part in zip(self.inputs, inputs, strict=False) for name in port.fields]
-        read = tuple([array for array in fields if array.dtype == np.float64])
-        flags = tuple([array for array in fields if array.dtype == np.uint8]) or _NO_FLAGS
-        written = tuple([array for part in outputs for array in part.values()])
+        fields += [array for part in outputs for array in part.values()]
         self.prepare(first, samples)
         sparse: list[Sparse] = []
         told = reached = 0
         while True:
-            reached, reason = self.step(self.memory, first, reached, read, flags, written)
+            reached, reason = self.native()(first, reached, fields, samples)
             if reason == DONE:
                 return sparse + self.tell(first + told, first + samples)
             sparse += self.tell(first + told, first + reached)
@@ -513,11 +525,14 @@ def cut(signals: Sequence[Signals], start: int, stop: int) -> list[Signals]:
 
 
 def compile_kernels(stage: Stage) -> None:
-    """Compile what the stage runs, by an empty block: the first real block then takes no longer than the next."""
+    """Compile what the stage runs: the first block then takes no longer than the next."""
+    if stage.shared.allow_faults:
+        faults.prepare()
+    if stage.step is not None:
+        stage.native()
+        return
     inputs = [
         {name: np.empty(0, messages.sample_fields(port.type)[name]) for name in port.fields}
         for port in stage.inputs[: stage.own_inputs]
     ]
     stage.process(0, inputs, [messages.allocate(port.type, 0) for port in stage.outputs])
-    if stage.shared.allow_faults:
-        faults.prepare()

@@ -88,13 +88,13 @@ class FormTable(NamedTuple):
 
     Attributes:
         heights, table: see `lathe_rc.signals.profile.ProfileTable`.
-        slides: whether the longitudinal slide makes the height.
+        slide: number of the first input of the longitudinal slide, if that makes the height; 0: it does not.
         feed, start, part: otherwise, see `lathe_rc.signals.profile.height_along`.
     """
 
     heights: Samples
     table: Samples
-    slides: bool
+    slide: int
     feed: float
     start: float
     part: int
@@ -103,7 +103,7 @@ class FormTable(NamedTuple):
 @kernel
 def _place(form: FormTable, angle: Samples, slide: Samples, height: Samples) -> None:
     """Fill the height [m] at an angle [rad] or place of the longitudinal slide [m]."""
-    if form.slides:
+    if form.slide:
         for k in range(height.size):
             height[k] = form.start + slide[k]
     else:
@@ -119,7 +119,9 @@ def evaluate(
     The inputs of the `Form` are the first of ``inputs``.
     """
     angle, angle_true = inputs[0], inputs[1]
-    position, measured = (inputs[2], inputs[3]) if form.slides else (angle_true, angle)
+    position, measured = angle_true, angle
+    if form.slide:
+        position, measured = inputs[form.slide], inputs[form.slide + 1]
     _place(form, angle_true, position, height)
     deviation_along(form.heights, form.table, angle_true, height, reference)
     if equal(angle, angle_true) and equal(position, measured):
@@ -152,7 +154,7 @@ class Form:
         self.table = FormTable(
             heights=self.profile.heights,
             table=self.profile.table,
-            slides=slides,
+            slide=2 if slides else 0,
             feed=parameters.feed,
             start=parameters.start_height,
             part=parameters.part_revolutions,

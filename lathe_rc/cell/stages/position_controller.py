@@ -13,7 +13,8 @@ from lathe_rc import resources
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import DONE, Input, Output, Sparse, Stage, Step
+from lathe_rc.cell.native import Step
+from lathe_rc.cell.stage import DONE, Input, Output, Sparse, Stage
 from lathe_rc.cell.stages.feed_drive import Axis
 from lathe_rc.cell.stages.obedience import OBEY, apply, listens, may_learn, piece
 from lathe_rc.cell.stages.servo import Listener, ServoParameters, listener, pid_along

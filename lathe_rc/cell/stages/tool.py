@@ -85,7 +85,7 @@ def step(
     return error.size, DONE
 
 
-_ELSEWHERE = FormTable(np.empty(0), np.empty((0, 0, 0)), slides=False, feed=0.0, start=0.0, part=0)
+_ELSEWHERE = FormTable(np.empty(0), np.empty((0, 0, 0)), slide=0, feed=0.0, start=0.0, part=0)
 
 
 class Tool(Stage):
