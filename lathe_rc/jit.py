@@ -5,22 +5,17 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import ParamSpec, TypeVar, cast
 
 import numba
-import numpy as np
-import numpy.typing as npt
 import platformdirs
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
-from numba.np.numpy_support import carray
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 _PACKAGE = Path(__file__).parent
 _KERNELS = (
+    "placed.py",
     "transfer.py",
     "signals/*.py",
     "plants/*.py",
@@ -67,56 +62,3 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
     """
     compiled = numba.njit(cache=True, error_model="numpy", forceinline=True)(function)
     return cast("Callable[P, R]", compiled)
-
-
-# ---- addresses: for who keeps the arrays meanwhile --------------------------------------------------------------------
-
-
-def _pointer_to(kind: Any) -> Any:
-    """What makes a pointer of an address, as Numba wants it: signature, and what writes the code."""
-
-    def pointer(_context: object, _address: object) -> Any:
-        made = types.CPointer(kind)
-
-        def code(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-            return builder.inttoptr(arguments[0], context.get_value_type(made))
-
-        return made(types.int64), code
-
-    return intrinsic(pointer)
-
-
-_float_at, _integer_at, _octet_at = (_pointer_to(kind) for kind in (types.float64, types.int64, types.uint8))
-
-
-@inlined
-def floats(address: int, shape: Any) -> npt.NDArray[np.float64]:
-    """The array of float64 at an address."""
-    return carray(_float_at(address), shape)
-
-
-@inlined
-def integers(address: int, shape: Any) -> npt.NDArray[np.int64]:
-    """The array of int64 at an address."""
-    return carray(_integer_at(address), shape)
-
-
-@inlined
-def octets(address: int, shape: Any) -> npt.NDArray[np.uint8]:
-    """The array of uint8 at an address."""
-    return carray(_octet_at(address), shape)
-
-
-@intrinsic
-def call(_context: object, _address: Any, _a: Any, _b: Any, _c: Any, _d: Any, _e: Any, _f: Any) -> Any:
-    """Call an `entry` by its address."""
-
-    def code(_context: Any, builder: Any, _signature: Any, values: Any) -> Any:
-        whole = ir.IntType(64)
-        function = builder.inttoptr(values[0], ir.FunctionType(whole, [whole] * 6).as_pointer())
-        return builder.call(function, values[1:])
-
-    return types.int64(*[types.int64] * 7), code
-
-
-entry: Any = numba.cfunc(types.int64(*[types.int64] * 6), cache=True, error_model="numpy", nopython=True)

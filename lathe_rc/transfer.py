@@ -13,7 +13,7 @@ import numpy.typing as npt
 import scipy
 
 from lathe_rc.errors import InputError
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -86,7 +86,7 @@ class System(NamedTuple):
     through: float
 
 
-@kernel
+@inlined
 def step(system: System, state: Array, command: float) -> float:
     """The output after one more sample of the input.
 
@@ -95,6 +95,18 @@ def step(system: System, state: Array, command: float) -> float:
     order = system.now.size
     previous = state[order]
     value = system.through * command
+    if order == 1:  # loops over one or two numbers would cost more than the arithmetic
+        x = system.before[0] * previous + system.now[0] * command + system.transition[0, 0] * state[0]
+        state[0], state[1] = x, command
+        return value + system.output[0] * x
+    if order == 2:
+        a, b = state[0], state[1]
+        x = system.before[0] * previous + system.now[0] * command
+        x = x + system.transition[0, 0] * a + system.transition[0, 1] * b
+        y = system.before[1] * previous + system.now[1] * command
+        y = y + system.transition[1, 0] * a + system.transition[1, 1] * b
+        state[0], state[1], state[2] = x, y, command
+        return value + system.output[0] * x + system.output[1] * y
     for row in range(order):
         total = system.before[row] * previous + system.now[row] * command
         for column in range(order):

@@ -14,7 +14,8 @@ from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.native import Integers
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
-from lathe_rc.jit import call, floats, kernel
+from lathe_rc.jit import kernel
+from lathe_rc.placed import call, floats
 
 
 class Tapes:
@@ -88,13 +89,13 @@ def _run(
             row = plan[stage]
             for field in range(row[_FIELD], plan[stage + 1, _FIELD]):
                 fields[3, field] = fields[0, field] + (base + first - fields[2, field]) * fields[1, field]
+            block = fields.ctypes.data + 8 * (3 * fields.shape[1] + row[_FIELD])
             waits = row[_STEP] == 0 or (start == 0 and row[_DUE] < first + n)
             if start == 0 and turn[stage] < np.inf and row[_ANGLE] >= 0:
-                waits = waits or _passes(floats(fields[3, row[_ANGLE]], n), turn[stage])
+                waits = waits or _passes(floats(block, row[_ANGLE] - row[_FIELD], n), turn[stage])
             where[0], where[1], where[2] = first, stage, start
             if waits:
                 return PYTHON
-            block = fields.ctypes.data + 8 * (3 * fields.shape[1] + row[_FIELD])
             reason = call(row[_STEP], row[_WORDS], first, start, n, block, where.ctypes.data + 16)
             if reason != DONE:
                 return reason

@@ -95,7 +95,7 @@ class AngleMemory(NamedTuple):
     log: Array
 
 
-@kernel
+@inlined
 def begin(m: AngleMemory, first: int, angle: Array, past_angle: Array, error: Array) -> None:
     """Begin a block: set the errors that arrive in it behind the newest three before it, shape (n + 3,).
 
@@ -231,7 +231,7 @@ def _smooth(base: int, cycle: int, reach: int, ratio: float, memory: Array, scra
     two_sided(ratio, reach, scratch[0], scratch[1], chunk)
 
 
-@kernel
+@inlined
 def _learn(
     m: AngleMemory,
     start: int,
@@ -304,7 +304,7 @@ def _command(
     return invariant(value, before, distance, rate, bend, a1, a2, settings[2], real[INVARIANT : INVARIANT + 2])
 
 
-@kernel
+@inlined
 def _send(m: AngleMemory, start: int, stop: int, angle: Array, told: Array) -> None:
     """Fill the set points of the drive ``told`` of some samples of the block.
 
@@ -319,7 +319,7 @@ def _send(m: AngleMemory, start: int, stop: int, angle: Array, told: Array) -> N
         told[k] = _command(m.law, per_radian, place, rate[k], bend[k], m.settings, m.memory, m.real)
 
 
-@kernel
+@inlined
 def _step(m: AngleMemory, first: int, start: int, angle: Array, told: Array) -> tuple[int, int]:
     """Step from sample ``start`` of a block, whose first one is sample ``first`` of the run, until it needs help.
 
@@ -338,7 +338,7 @@ def _step(m: AngleMemory, first: int, start: int, angle: Array, told: Array) -> 
     return reached, reason
 
 
-@kernel
+@inlined
 def _end_cycle(m: AngleMemory, sample: int) -> None:
     """Log a cycle; a channel that waits may join."""
     whole, real = m.whole, m.real

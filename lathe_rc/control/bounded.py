@@ -11,7 +11,7 @@ import numpy.typing as npt
 import scipy
 
 from lathe_rc.errors import LatheError
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -112,13 +112,13 @@ class TakeoverTable(NamedTuple):
     wanted: Array
 
 
-@kernel
+@inlined
 def follows(takeover: TakeoverTable) -> bool:
     """Whether the command is the controller's, and nothing is added to it."""
     return bool(takeover.whole[_MODE] == Mode.FOLLOW.value and takeover.whole[_PLACE] >= takeover.path.size)
 
 
-@kernel
+@inlined
 def _keep_last(last: Array, samples: Array) -> None:
     if samples.size > 1:
         last[0], last[1] = samples[-2], samples[-1]

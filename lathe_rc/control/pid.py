@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.errors import InputError
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.noise import quantise
 from lathe_rc.transfer import TransferFunction
 
@@ -103,7 +103,7 @@ class PidTable(NamedTuple):
     divisor: int
 
 
-@kernel
+@inlined
 def control(pid: PidTable, state: Array, n: int, set_point: float, measurement: float) -> float:
     """The command of sample ``n``; ``state`` is changed, and counts samples at a limit."""
     if n % pid.divisor:

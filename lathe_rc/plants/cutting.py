@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined, kernel
 from lathe_rc.plants.cutting_force import STEEL, SpecificForce, cutting_stiffness
 from lathe_rc.signals.interpolation import linear
 from lathe_rc.transfer import System, TransferFunction, discretise, rest, step
@@ -223,11 +223,18 @@ class Process(NamedTuple):
     grid: int
 
 
-@kernel
+@inlined
 def _free(system: System, state: Array) -> float:
     """The next output if the input were 0; the state stays."""
     order = system.now.size
     value = 0.0
+    if order == 1:  # see `lathe_rc.transfer.step`
+        return value + system.output[0] * (system.before[0] * state[1] + system.transition[0, 0] * state[0])
+    if order == 2:
+        a, b, previous = state[0], state[1], state[2]
+        x = system.before[0] * previous + system.transition[0, 0] * a + system.transition[0, 1] * b
+        y = system.before[1] * previous + system.transition[1, 0] * a + system.transition[1, 1] * b
+        return value + system.output[0] * x + system.output[1] * y
     for row in range(order):
         total = system.before[row] * state[order]
         for column in range(order):
@@ -236,14 +243,14 @@ def _free(system: System, state: Array) -> float:
     return value
 
 
-@kernel
+@inlined
 def _within(angle: float, start: float, width: float) -> bool:
     """Whether an angle lies in a window [rad]; windows may lie across the zero."""
     since = (angle - start) / _TURN
     return bool((since - np.floor(since)) * _TURN < width)
 
 
-@kernel
+@inlined
 def _hardness(spots: Array, angle: float, height: float) -> float:
     factor = 1.0
     for i in range(spots.shape[0]):

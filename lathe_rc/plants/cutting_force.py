@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.errors import InputError
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined
 
 Array = npt.NDArray[np.float64]
 
 _REFERENCE_FEED = 1e-3  # f0 [m]
 
 
-@kernel
+@inlined
 def cutting_stiffness(kc1: float, mc: float, cw: float, feed: float, wear: float) -> float:
     """Pz/ap [N/m]."""
     return float(kc1 * _REFERENCE_FEED * (feed / _REFERENCE_FEED) ** (1.0 - mc) * (1.0 + cw * wear))

@@ -4,12 +4,12 @@
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined
 
 Array = npt.NDArray[np.float64]
 
 
-@kernel
+@inlined
 def linear(places: Array, values: Array, place: float) -> float:
     """Linear between the rising ``places``, the same beyond their ends; both of shape (n,)."""
     last = places.size - 1

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -15,7 +15,7 @@ Integers = npt.NDArray[np.int64]
 DRAWN = 8192  #: numbers that a stream draws at a time, at most
 
 
-@kernel
+@inlined
 def quantise(value: float, resolution: float) -> float:
     """What a converter or sensor of a ``resolution`` makes of a value, in the same unit; 0 for none."""
     if resolution > 0.0:

@@ -36,7 +36,7 @@ from lathe_rc.control.identification import DriveIdentifier, Identified, Identif
 from lathe_rc.control.lead import PreviewTable, look_ahead
 from lathe_rc.control.repetitive import Cycle, RepetitiveController, largest_feedback_delay
 from lathe_rc.errors import InputError
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined, kernel
 from lathe_rc.plants.linear import discretise, second_order
 from lathe_rc.safety.state_machine import Reaction
 
@@ -84,7 +84,7 @@ class Memory(NamedTuple):
     state: npt.NDArray[np.int64]
 
 
-@kernel
+@inlined
 def _angle(memory: Memory, first: int, late: int, measured: Samples) -> Samples:
     """The angle that the memory goes by [rad], ``late`` samples before the samples ``first`` on."""
     if not memory.by_time:
@@ -97,7 +97,7 @@ def _angle(memory: Memory, first: int, late: int, measured: Samples) -> Samples:
     return angle
 
 
-@kernel
+@inlined
 def _begin(memory: Memory, first: int, start: int, stop: int, inputs: tuple[Samples, ...]) -> None:
     """Look ahead along a piece of a block, and take its errors."""
     control, samples = memory.control, stop - start
@@ -117,7 +117,7 @@ def _begin(memory: Memory, first: int, start: int, stop: int, inputs: tuple[Samp
     angle_memory.begin(control, first + start, angle, past_angle, error)
 
 
-@kernel
+@inlined
 def _lose(memory: Memory, start: int, stop: int, command: Samples) -> None:
     """Without an angle the command stays, from sample ``start`` of a block on."""
     command[start:stop] = command[start - 1] if start > memory.state[_BEGIN] else memory.obedience.takeover.given[1]
@@ -135,7 +135,7 @@ def step(
     """See `lathe_rc.cell.stage`."""
     control, state, command = memory.control, memory.state, outputs[0]
     n = command.size
-    while start < n:
+    while start < n or state[_INSIDE]:
         if not state[_INSIDE]:
             stop = n
             if memory.listens:
