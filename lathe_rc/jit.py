@@ -44,6 +44,11 @@ if "NUMBA_CACHE_DIR" not in os.environ:
     setattr(numba.config, "CACHE_DIR", str(platformdirs.user_cache_path("lathe_rc") / _source_hash()))  # noqa: B010 - the module makes its names at run time
 
 
+def cache_folder() -> Path:
+    """Where compiled code is kept."""
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or getattr(numba.config, "CACHE_DIR"))  # noqa: B009 - see above
+
+
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function of scalars and arrays; compiled code is kept between runs.
 

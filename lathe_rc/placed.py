@@ -6,7 +6,7 @@ A placed one is its address. It is laid out in words of 64 bits: of an array whe
 its value, of a NamedTuple its members. Who lays it out keeps the arrays meanwhile, and changes no word during a call.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numba
@@ -21,6 +21,7 @@ from numba.np.arrayobj import populate_array
 
 Integers = npt.NDArray[np.int64]
 
+_populate: Any = populate_array  # Numba has few types
 _WORD = ir.IntType(64)
 _KINDS = {np.dtype(np.float64): types.float64, np.dtype(np.int64): types.int64, np.dtype(np.uint8): types.uint8}
 
@@ -41,7 +42,8 @@ class Placed(types.Type):
 
 def placed(value: tuple[Any, ...]) -> Placed:
     """The type of a NamedTuple of arrays of float64, int64 or uint8, constants, and NamedTuples of those."""
-    members, place = {}, 0
+    members: dict[str, tuple[types.Type, int]] = {}
+    place = 0
     for name, part in zip(getattr(value, "_fields"), value, strict=True):  # noqa: B009 - tuple does not tell mypy of it
         member: types.Type
         if isinstance(part, tuple):
@@ -113,14 +115,14 @@ def _replaced(kind: Placed, begin: int, value: tuple[Any, ...], known: tuple[Any
 @register_model(Placed)
 class _PlacedModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Placed) -> None:
-        super().__init__(manager, kind, _WORD)
+        super().__init__(manager, kind, _WORD)  # type: ignore[no-untyped-call]  # Numba has few types
 
 
 @infer_getattr
 class _Members(AttributeTemplate):
     key = Placed
 
-    def generic_resolve(self, kind: Placed, name: str) -> types.Type | None:
+    def generic_resolve(self, kind: Placed, name: str) -> types.Type | None:  # type: ignore[override]  # Numba has none
         return kind.members[name][0] if name in kind.members else None
 
 
@@ -139,42 +141,39 @@ def _array(context: Any, builder: Any, kind: types.Array, address: Any, shape: l
     for length in reversed(shape[1:]):
         strides.insert(0, builder.mul(strides[0], length))
     data = builder.inttoptr(address, context.get_data_type(kind.dtype).as_pointer())
-    populate_array(array, data=data, shape=shape, strides=strides, itemsize=itemsize, meminfo=None)
+    _populate(array, data=data, shape=shape, strides=strides, itemsize=itemsize, meminfo=None)
     return array._getvalue()  # noqa: SLF001 - there is no other way
 
 
-@lower_getattr_generic(Placed)
 def _member(context: Any, builder: Any, kind: Placed, address: Any, name: str) -> Any:
     member, place = kind.members[name]
-    at = [builder.add(address, _WORD(8 * (place + k))) for k in range(_words_of(member) or 1)]
+    words = [builder.add(address, _WORD(8 * (place + k))) for k in range(_words_of(member) or 1)]
     if isinstance(member, Placed):
-        return at[0]
+        return words[0]
     if isinstance(member, types.Array):
-        return _array(context, builder, member, *_split([_load(builder, word, _WORD) for word in at]))
+        where, *shape = (_load(builder, word, _WORD) for word in words)
+        return _array(context, builder, member, where, shape)
     if member == types.float64:
-        return _load(builder, at[0], ir.DoubleType())
-    loaded = _load(builder, at[0], _WORD)
+        return _load(builder, words[0], ir.DoubleType())
+    loaded = _load(builder, words[0], _WORD)
     return builder.icmp_signed("!=", loaded, _WORD(0)) if member == types.boolean else loaded
 
 
-def _split(words: list[Any]) -> tuple[Any, list[Any]]:
-    return words[0], words[1:]
+_lower: Any = lower_getattr_generic
+_lower(Placed)(_member)
 
 
-@intrinsic
-def at(_context: object, _address: Any, kind: Any) -> Any:
-    """The NamedTuple of a type that is placed at an address."""
-
+def _at(_context: object, _address: Any, kind: Any) -> Any:
     def code(_context: Any, _builder: Any, _signature: Any, arguments: Any) -> Any:
         return arguments[0]
 
     return kind.instance_type(types.int64, kind), code
 
 
-def _field_of(element: types.Type) -> Any:
+def _array_of(element: types.Type) -> Any:
     """What reads an array of some element type, as Numba wants it."""
 
-    def field(_context: object, _addresses: Any, _number: Any, _samples: Any) -> Any:
+    def array(_context: object, _addresses: Any, _number: Any, _samples: Any) -> Any:
         kind = types.Array(element, 1, "C")
 
         def code(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
@@ -184,18 +183,10 @@ def _field_of(element: types.Type) -> Any:
 
         return kind(types.int64, types.int64, types.int64), code
 
-    return intrinsic(field)
+    return intrinsic(array)
 
 
-floats: Any = _field_of(types.float64)  #: the array of so many float64 whose address stands at a number of a table
-octets: Any = _field_of(types.uint8)  #: the same of uint8
-integers: Any = _field_of(types.int64)  #: the same of int64
-
-
-@intrinsic
-def store(_context: object, _address: Any, _value: Any) -> Any:
-    """Write a whole number to an address."""
-
+def _store(_context: object, _address: Any, _value: Any) -> Any:
     def code(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         builder.store(arguments[1], builder.inttoptr(arguments[0], _WORD.as_pointer()))
         return context.get_dummy_value()
@@ -203,10 +194,7 @@ def store(_context: object, _address: Any, _value: Any) -> Any:
     return types.void(types.int64, types.int64), code
 
 
-@intrinsic
-def call(_context: object, _address: Any, _a: Any, _b: Any, _c: Any, _d: Any, _e: Any, _f: Any) -> Any:
-    """Call an `entry` by its address."""
-
+def _call(_context: object, _address: Any, _a: Any, _b: Any, _c: Any, _d: Any, _e: Any, _f: Any) -> Any:
     def code(_context: Any, builder: Any, _signature: Any, values: Any) -> Any:
         function = builder.inttoptr(values[0], ir.FunctionType(_WORD, [_WORD] * 6).as_pointer())
         return builder.call(function, values[1:])
@@ -214,7 +202,10 @@ def call(_context: object, _address: Any, _a: Any, _b: Any, _c: Any, _d: Any, _e
     return types.int64(*[types.int64] * 7), code
 
 
-#: a function of six addresses and whole numbers that returns one
-entry: Callable[[Any], Any] = numba.cfunc(
-    types.int64(*[types.int64] * 6), cache=True, error_model="numpy", nopython=True
-)
+at: Any = intrinsic(_at)  #: (address, type): the NamedTuple of a `Placed` type that stands there
+floats: Any = _array_of(types.float64)  #: (table, number, size): the float64 whose address stands in a table
+octets: Any = _array_of(types.uint8)  #: the same of uint8
+store: Any = intrinsic(_store)  #: (address, value): write a whole number
+call: Any = intrinsic(_call)  #: (address, six whole numbers): call an `entry`
+#: decorates a function of six addresses and whole numbers that returns one, whose ``address`` others can call
+entry: Any = numba.cfunc(types.int64(*[types.int64] * 6), cache=True, error_model="numpy")

@@ -98,7 +98,7 @@ def step(system: System, state: Array, command: float) -> float:
     if order == 1:  # loops over one or two numbers would cost more than the arithmetic
         x = system.before[0] * previous + system.now[0] * command + system.transition[0, 0] * state[0]
         state[0], state[1] = x, command
-        return value + system.output[0] * x
+        return float(value + system.output[0] * x)
     if order == 2:
         a, b = state[0], state[1]
         x = system.before[0] * previous + system.now[0] * command
@@ -106,7 +106,7 @@ def step(system: System, state: Array, command: float) -> float:
         y = system.before[1] * previous + system.now[1] * command
         y = y + system.transition[1, 0] * a + system.transition[1, 1] * b
         state[0], state[1], state[2] = x, y, command
-        return value + system.output[0] * x + system.output[1] * y
+        return float(value + system.output[0] * x + system.output[1] * y)
     for row in range(order):
         total = system.before[row] * previous + system.now[row] * command
         for column in range(order):

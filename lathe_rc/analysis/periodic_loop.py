@@ -49,16 +49,13 @@ def _run(
     load: Array,
     output: Array,
     command: Array,
-) -> int:
-    """Fill output and command; returns the samples in which the command was limited."""
-    saturated = 0
+) -> None:
+    """Fill output and command."""
     for k in range(wanted.size):
         # The input acts from this sample to the next: the output, which it does not reach at once, is known first.
         output[k] = step(plant, plant_state, 0.0)
-        command[k], limited = advance(law, state, first + k, wanted[k], output[k])
+        command[k] = advance(law, state, first + k, wanted[k], output[k])
         plant_state[plant.now.size] = command[k] + load[k]
-        saturated += limited
-    return saturated
 
 
 class PeriodicLoop:
@@ -88,6 +85,4 @@ class PeriodicLoop:
             command: filled with S(u).
         """
         controller = self.controller
-        controller.saturated += _run(
-            controller.law, controller.state, self._plant, self._state, first, wanted, load, output, command
-        )
+        _run(controller.law, controller.state, self._plant, self._state, first, wanted, load, output, command)

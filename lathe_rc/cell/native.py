@@ -8,20 +8,17 @@ the ports are made, not on what is in them.
 
 import hashlib
 import importlib.util
-import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.files import replacing
-from lathe_rc.jit import kernel
+from lathe_rc.jit import cache_folder, kernel
 from lathe_rc.placed import Placed, Words, call
 
 Integers = npt.NDArray[np.int64]
@@ -95,7 +92,8 @@ class Native:
 def _call(
     address: int, words: Integers, first: int, start: int, samples: int, fields: Integers, reached: Integers
 ) -> int:
-    return call(address, words.ctypes.data, first, start, samples, fields.ctypes.data, reached.ctypes.data)
+    reason: int = call(address, words.ctypes.data, first, start, samples, fields.ctypes.data, reached.ctypes.data)
+    return reason
 
 
 # ---- the module ----------------------------------------------------------------------------------------------------
@@ -123,7 +121,7 @@ def _text(step: Step, memory: Placed, inputs: Sequence[np.dtype[Any]], outputs: 
 def _module(text: str, memory: Placed) -> ModuleType:
     """The module of a text, kept in a file: Numba keeps what it has compiled for a file."""
     name = f"step_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or numba.config.CACHE_DIR) / "steps"
+    folder = cache_folder() / "steps"
     path = folder / f"{name}.py"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)

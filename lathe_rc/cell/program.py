@@ -58,15 +58,13 @@ class Tapes:
         self.begin = first
 
 
-# Columns of the plan of the stages: address of the step or 0, address of its memory, its first field, the field with the
-# spindle angle or -1, the sample from which on it needs Python.
+# Columns of the plan of the stages: address of the step or 0, address of its memory, its first field, the field with
+# the spindle angle or -1, the sample from which on it needs Python.
 _STEP, _WORDS, _FIELD, _ANGLE, _DUE = range(5)
 
 
 @kernel
-def _run(
-    plan: Integers, turn: Samples, fields: Integers, where: Integers, base: int, end: int, chunk: int
-) -> int:
+def _run(plan: Integers, turn: Samples, fields: Integers, where: Integers, base: int, end: int, chunk: int) -> int:
     """Compute from `where` (block, stage, sample in the block) up to sample ``end``; see `Program`.
 
     Args:
@@ -96,7 +94,7 @@ def _run(
             where[0], where[1], where[2] = first, stage, start
             if waits:
                 return PYTHON
-            reason = call(row[_STEP], row[_WORDS], first, start, n, block, where.ctypes.data + 16)
+            reason: int = call(row[_STEP], row[_WORDS], first, start, n, block, where.ctypes.data + 16)
             if reason != DONE:
                 return reason
             stage += 1

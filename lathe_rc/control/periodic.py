@@ -195,8 +195,8 @@ def _monitor(law: PeriodicLaw, state: PeriodicState, n: int, wanted: float, v: f
 
 
 @kernel
-def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, measurement: float) -> tuple[float, bool]:
-    """One sample of the law: the limited command, and whether the limit was in use.
+def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, measurement: float) -> float:
+    """One sample of the law: the limited command; counts the samples in which the limit was in use.
 
     Args:
         law: its constants.
@@ -232,17 +232,8 @@ def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, me
     values[_MEMORY] = max(values[_MEMORY], abs(stored))
     if not frozen:
         _monitor(law, state, n, wanted, v, applied)
-    return quantise(applied, law.command_step), applied != demand
-
-
-@kernel
-def advance_and_count(
-    law: PeriodicLaw, state: PeriodicState, n: int, reference: float, measurement: float
-) -> float:
-    """`advance`, with the samples counted in which the limit was in use."""
-    command, limited = advance(law, state, n, reference, measurement)
-    state.values[_SATURATED] += limited
-    return command
+    values[_SATURATED] += applied != demand
+    return quantise(applied, law.command_step)
 
 
 @kernel
@@ -250,7 +241,7 @@ def _block(
     law: PeriodicLaw, state: PeriodicState, first: int, reference: Array, measurement: Array, command: Array
 ) -> None:
     for k in range(command.size):
-        command[k] = advance_and_count(law, state, first + k, reference[k], measurement[k])
+        command[k] = advance(law, state, first + k, reference[k], measurement[k])
 
 
 @kernel
@@ -369,7 +360,7 @@ class PeriodicController:
 
     @property
     def saturated(self) -> int:
-        """Samples so far in which the command was limited; a kernel that closes the loop counts them itself."""
+        """Samples so far in which the command was limited."""
         return int(self.state.values[_SATURATED])
 
     @property

@@ -150,13 +150,14 @@ class RepetitiveController:
 
     def __getstate__(self) -> dict[str, Any]:
         """What is worth keeping between two blocks: room for one is not."""
-        table = self.table._replace(**dict.fromkeys(_ROOM))
+        nothing: dict[str, Any] = dict.fromkeys(_ROOM)
+        table = self.table._replace(**nothing)
         return {**self.__dict__, "table": table}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """See `__getstate__`."""
         self.__dict__.update(state)
-        room = {name: np.empty(shape) for name, shape in _ROOM.items()}
+        room: dict[str, Any] = {name: np.empty(shape) for name, shape in _ROOM.items()}
         self.table = self.table._replace(**room)
 
     @property

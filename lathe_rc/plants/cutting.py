@@ -229,12 +229,12 @@ def _free(system: System, state: Array) -> float:
     order = system.now.size
     value = 0.0
     if order == 1:  # see `lathe_rc.transfer.step`
-        return value + system.output[0] * (system.before[0] * state[1] + system.transition[0, 0] * state[0])
+        return float(value + system.output[0] * (system.before[0] * state[1] + system.transition[0, 0] * state[0]))
     if order == 2:
         a, b, previous = state[0], state[1], state[2]
         x = system.before[0] * previous + system.transition[0, 0] * a + system.transition[0, 1] * b
         y = system.before[1] * previous + system.transition[1, 0] * a + system.transition[1, 1] * b
-        return value + system.output[0] * x + system.output[1] * y
+        return float(value + system.output[0] * x + system.output[1] * y)
     for row in range(order):
         total = system.before[row] * state[order]
         for column in range(order):
@@ -524,8 +524,8 @@ def failure(reason: int, angle: float, speed: float, feed: float) -> LatheError:
         )
     if reason == _TURNS_BACK:
         return LatheError(
-            f"the spindle turns back or jumps to {angle:.6g} rad; regeneration needs an angle that rises by less than a "
-            "revolution a sample"
+            f"the spindle turns back or jumps to {angle:.6g} rad; regeneration needs an angle that rises by less than "
+            "a revolution a sample"
         )
     return LatheError(
         f"the force draws the edge into the part without end at a feed of {feed:.4g} m/rev; reduce the feed, the "

@@ -55,7 +55,7 @@ def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
 @inlined
 def _over(memory: Array) -> bool:
     """Whether nothing is forgiven any more, see `_lasting_beyond`."""
-    return memory[5] == 0.0 or memory[6] == -np.inf
+    return bool(memory[5] == 0.0 or memory[6] == -np.inf)
 
 
 @kernel

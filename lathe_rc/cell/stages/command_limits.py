@@ -76,7 +76,8 @@ def limited(limits: LimiterTable, first: int, command: Samples) -> Samples:
 
 def remembered(flags: Samples, first: int, end: int) -> Samples:
     """Flags of the samples from ``first`` on and before ``end``, where that of sample n stands at n modulo the size."""
-    return flags[np.arange(first, end) & (flags.size - 1)]
+    found: Samples = flags[np.arange(first, end) & (flags.size - 1)]
+    return found
 
 
 class Clipping:

@@ -23,8 +23,8 @@ from lathe_rc.cell.stages.obedience import (
     piece,
 )
 from lathe_rc.errors import InputError
-from lathe_rc.plants import feed
 from lathe_rc.jit import kernel
+from lathe_rc.plants import feed
 from lathe_rc.plants.feed import Feedback, FeedDrive, FeedTable, advance
 from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.example_002 import fill_disturbance

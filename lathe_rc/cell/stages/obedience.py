@@ -40,9 +40,7 @@ class FeedObedientParameters(ObedientParameters):
         1.0, "longest duration: a command that is farther away begins where the way takes so long", "s"
     )
 
-    def obedience(
-        self, name: str, *, speed: bool, limit: float, settled: int
-    ) -> "Obedience":
+    def obedience(self, name: str, *, speed: bool, limit: float, settled: int) -> "Obedience":
         """What obeys for a command of the feed.
 
         A command for a speed goes to 0, one for a position stays: so the slide stands. Nothing is taken out of the

@@ -12,8 +12,8 @@ from annotated_types import Ge, Gt
 from lathe_rc import resources
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
-from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.native import Step
+from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import DONE, Input, Output, Sparse, Stage
 from lathe_rc.cell.stages.feed_drive import Axis
 from lathe_rc.cell.stages.obedience import OBEY, apply, listens, may_learn, piece
@@ -163,9 +163,7 @@ def pid_step(
     """See `lathe_rc.cell.stage`."""
     command, set_point, error = outputs
     position = _look(memory.wanted, first, start, inputs, set_point, error)
-    return pid_along(
-        memory.pid, memory.state, memory.wanted.who, first, start, flags[0], set_point, position, command
-    )
+    return pid_along(memory.pid, memory.state, memory.wanted.who, first, start, flags[0], set_point, position, command)
 
 
 @kernel
@@ -204,9 +202,7 @@ def _repeat(
     for k in range(start, stop):
         n = first + k
         if n % divisor == 0:
-            held[0] = periodic.advance_and_count(
-                memory.law, memory.state, n // divisor, set_point[k] / unit, position[k] / unit
-            )
+            held[0] = periodic.advance(memory.law, memory.state, n // divisor, set_point[k] / unit, position[k] / unit)
         command[k] = held[0]
         held[1] = max(held[1], abs(error[k]))
         if (n + 1) % period == 0:
@@ -313,7 +309,8 @@ class PositionController(Stage):
     @property
     def step(self) -> Step:  # type: ignore[override]
         """See `Stage`."""
-        return {"pid": pid_step, "sampled_link": link_step, "periodic_hyperstable": periodic_step}[self.parameters.law]
+        steps: dict[str, Step] = {"pid": pid_step, "sampled_link": link_step, "periodic_hyperstable": periodic_step}
+        return steps[self.parameters.law]
 
     @property
     def memory(self) -> PidMemory | LinkMemory | PeriodicMemory:
