@@ -21,9 +21,11 @@ _KERNELS = (
     "plants/*.py",
     "control/*.py",
     "analysis/*.py",
+    "bag/played.py",
     "bag/walk.py",
     "safety/*.py",
     "cell/collect.py",
+    "cell/native.py",
     "cell/program.py",
     "cell/stages/*.py",
 )

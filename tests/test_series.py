@@ -333,7 +333,8 @@ def advance(made, *inputs, lengths=None):
         rest = iter(parts[len(inputs) :])
         made.advance(first, given_to, [{name: next(rest) for name in state} for state in states])
 
-    in_blocks(lengths or [samples], block, *inputs, *(array for state in states for array in state.values()))
+    given = map(np.ascontiguousarray, inputs)
+    in_blocks(lengths or [samples], block, *given, *(array for state in states for array in state.values()))
     return states
 
 

@@ -320,8 +320,9 @@ def test_a_killed_node_leaves_the_last_seconds(node, tmp_path, whole):
         if event["event"] == ("snapshot" if node == "recorder" else "cycle") and node in pids:
             os.kill(pids.pop(node), signal.SIGKILL)
 
-    events = ["sample 9000: freeze"] if node == "recorder" else []
-    running = cell(events, 2000.0, mode="snapshot", chunk_size=4096)
+    # The recorder's is under way for as long as the cell runs.
+    asked = {"events": ["sample 9000: freeze"], "post": 100.0} if node == "recorder" else {"events": []}
+    running = cell(**asked, revolutions=2000.0, mode="snapshot", chunk_size=4096)
     with pytest.raises(LatheError, match=f"^{node} was killed by SIGKILL"):
         harness.run(running, mode="processes", groups=[], bag=tmp_path / "bag", watch=kill)
     (path,) = (tmp_path / "bag_snapshots").iterdir()

@@ -2,44 +2,102 @@
 """A cell whose spindle is the one of a bag."""
 
 from collections import deque
-from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 from lathe_rc.bag.compare import Comparison, positions
 from lathe_rc.bag.recorded import Recorded, Spindle
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.stream import Tape
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stage import DONE
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.jit import kernel
+
+
+class Memory(NamedTuple):
+    """What the step works on: samples that have been read.
+
+    Attributes:
+        span: index of the first, and of the one after the last.
+        angle, speed, angle_true, speed_true, index_pulse: of them, from element 0 on.
+    """
+
+    span: npt.NDArray[np.int64]
+    angle: Samples
+    speed: Samples
+    angle_true: Samples
+    speed_true: Samples
+    index_pulse: Samples
+
+
+@kernel
+def step(
+    memory: Memory,
+    first: int,
+    start: int,
+    inputs: tuple[Samples, ...],
+    flags: tuple[Samples, ...],
+    outputs: tuple[Samples, ...],
+) -> tuple[int, int]:
+    """See `lathe_rc.cell.stage`."""
+    angle, speed, angle_true, speed_true, index_pulse = outputs
+    at, n = first - memory.span[0], angle.size
+    angle[:], speed[:] = memory.angle[at : at + n], memory.speed[at : at + n]
+    angle_true[:], speed_true[:] = memory.angle_true[at : at + n], memory.speed_true[at : at + n]
+    index_pulse[:] = memory.index_pulse[at : at + n]
+    return n, DONE
 
 
 class _PlayedSpindle(SpindleEncoder):
     """The spindle as it was recorded."""
 
+    step = staticmethod(step)
+
     def __init__(self, made: SpindleEncoder, tape: Tape, samples: int, said: Spindle | None = None) -> None:
         super().__init__(made.name, made.parameters)
         self._tape, self.samples, self._said = tape, samples, said
+        self._ready = messages.allocate(messages.ENCODER, messages.MAX_BLOCK)
+        self._span = np.zeros(2, np.int64)
 
     def speed_range(self) -> tuple[float, float]:
         """Of the law, which the bag's scenario has; without one, as recorded [rad/s]."""
         return self._said.speed if self._said else super().speed_range()
 
-    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+    @property
+    def memory(self) -> Memory:
         """See `Stage`."""
-        (signals,) = outputs
+        return Memory(self._span, *self._ready.values())
+
+    def prepare(self, first: int, samples: int) -> None:
+        """See `Stage`: read ahead.
+
+        Raises:
+            LatheError: the recording has not so many samples, or some are missing.
+        """
+        begin, end = self._span.tolist()
+        if first + samples <= end:
+            return
+        left = end - first
+        for array in self._ready.values():
+            array[:left] = array[first - begin : end - begin].copy()
+        self._span[:] = first, end
+        signals = {name: array[left:samples] for name, array in self._ready.items()}
         self._tape.take_into(signals)
+        self._span[1] = first + samples
         if self._said and not self._said.has_truth:
             signals["angle_true"][:], signals["speed_true"][:] = signals["angle"], signals["speed"]
         if self._said:
             signals["angle"] -= self._said.turns
             signals["angle_true"] -= self._said.turns
-        return []
 
     def replay(self, action: str, index: int) -> None:
         """See `Stage`: as it was said."""

@@ -2,7 +2,7 @@
 """The offline host: all stages of a cell in one program."""
 
 import gc
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -33,16 +33,20 @@ class Engine:
 
     Args:
         cell: the wired cell; must have passed its check.
+        heard: topics whose sparse messages the sinks take; None: all.
 
     Raises:
         InputError: the run has no end.
     """
 
-    def __init__(self, cell: Cell) -> None:
+    def __init__(self, cell: Cell, heard: Collection[str] | None = None) -> None:
         if cell.master.samples is None:
             raise InputError(f"{cell.master.name}.revolutions = 0; an offline run needs an end: allowed above 0")
         self.samples: int = cell.master.samples
         self._stages = list(cell.stages.values())
+        if heard is not None:
+            for stage in self._stages:
+                stage.unheard = {topic for topic in stage.sparse_topics if remapped(stage.shared, topic) not in heard}
         block = cell.master.shared.block_size
         chunk = min(cell.shortest_feedback or _CHUNK, _CHUNK) // block * block or block
         self._piece = MAX_BLOCK // chunk * chunk

@@ -60,7 +60,6 @@ class Native:
     Attributes:
         address: of the function.
         words: of the memory, see `Words`.
-        order: the fields as the function takes them, inputs before outputs.
     """
 
     def __init__(
@@ -83,6 +82,7 @@ class Native:
         """Call the step for the arrays of all fields, shape (samples,)."""
         for place, array in enumerate(fields):
             assert array.flags.c_contiguous, "kernels take it for contiguous"
+            assert array.size == samples, "and as long as the block"
             self._fields[place] = array.ctypes.data
         reason = _call(self.address, self.words, first, start, samples, self._fields, self._reached)
         return int(self._reached[0]), reason

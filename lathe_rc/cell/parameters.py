@@ -6,6 +6,7 @@ ROS descriptors, validation, help and the documentation are made from these tabl
 
 import math
 from collections.abc import Mapping
+from functools import cache
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
@@ -84,9 +85,9 @@ class Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True)
 
     @classmethod
-    def rows(cls) -> dict[str, Row]:
+    def rows(cls) -> Mapping[str, Row]:
         """The parameters by name."""
-        return {name: Row(name, info) for name, info in cls.model_fields.items()}
+        return _rows(cls)
 
     @classmethod
     def read(cls: type[T], node: str, values: Mapping[str, object]) -> T:
@@ -105,6 +106,11 @@ class Table(BaseModel):
                 raise InputError(f"{shown(f'{node}.{name}')}: unknown parameter; allowed: {known}") from None
             given = f"{values[name]!r:.200}"
             raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
+
+
+@cache
+def _rows(table: type[Table]) -> Mapping[str, Row]:
+    return {name: Row(name, info) for name, info in table.model_fields.items()}
 
 
 class SharedParameters(Table):

@@ -171,7 +171,8 @@ class Program:
         """
         base = self._tapes.history - self._tapes.begin
         for number, stage in enumerate(self._stages):
-            stage.prepare(self.reached, end - self.reached)
+            with stage.named():
+                stage.prepare(self.reached, end - self.reached)
             self._load(number)
         while (reason := _run(self._plan, self._turn, self._fields, self._where, base, end, self._chunk)) != DONE:
             first, number, reached = self._where.tolist()

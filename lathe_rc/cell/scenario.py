@@ -4,7 +4,7 @@
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import yaml
@@ -66,10 +66,12 @@ class Scenario:
     Attributes:
         name: the file's name without its ending.
         nodes: the table of each node by its name, in the order of the file.
+        fingerprints: of the tables; what the run id is made of.
     """
 
     name: str
     nodes: dict[str, NodeParameters]
+    fingerprints: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def shared(self) -> SharedParameters:
@@ -107,6 +109,29 @@ class Scenario:
             seen.add(name)
         return split + [[name] for name in self.nodes if name not in seen]
 
+    def varied(self, values: Mapping[str, Value]) -> "Scenario":
+        """The same cell with other values, without reading its file again.
+
+        Args:
+            values: by ``NODE.PARAM``, or ``PARAM`` for a shared parameter.
+
+        Raises:
+            InputError: one line for the first thing that is wrong.
+        """
+        changes: dict[str, dict[str, Value]] = {}
+        for target, value in values.items():
+            node, name = _target(target, self.nodes, target)
+            for each in [node] if node != _EVERYONE else self.nodes:
+                changes.setdefault(each, {})[name] = _absolute(self.kind(each), name, value, Path())
+        tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
+        given = self.shared.run_id != _identity(fingerprints)
+        for node, changed in changes.items():
+            tables[node] = TABLES[self.kind(node)].read(node, {**self.nodes[node].model_dump(), **changed})
+            fingerprints[node] = _fingerprint(tables[node])
+        if not given:
+            tables = {node: table.model_copy(update={"run_id": ""}) for node, table in tables.items()}
+        return _agreed(self.name, tables, fingerprints)
+
     def to_yaml(self) -> str:
         """The complete parameter file; empty lists are left out, since rcl cannot read them."""
         tree = {}
@@ -116,25 +141,37 @@ class Scenario:
         return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=None)
 
 
+def _target(text: str, nodes: Iterable[str], what: str) -> tuple[str, str]:
+    """Node and parameter of ``NODE.PARAM`` or, for a shared parameter, ``PARAM``; ``what`` is said in messages.
+
+    Raises:
+        InputError: there is no such node, or the parameter is not shared.
+    """
+    node, dot, name = text.strip().partition(".")
+    if not dot:
+        if node not in SharedParameters.model_fields:
+            shared = ", ".join(SharedParameters.model_fields)
+            raise InputError(f"{what}: {node!r} is not shared; allowed: {shared}, or NODE.PARAM=VALUE")
+        return _EVERYONE, node
+    if node not in nodes:
+        present = ", ".join(name for name in nodes if name != _EVERYONE)
+        raise InputError(f"{what}: no node {node!r} in the scenario; allowed: {present}")
+    return node, name
+
+
 def _override(text: str, nodes: dict[str, dict[str, Value]]) -> None:
     """Apply ``NODE.PARAM=VALUE`` or, for a shared parameter, ``PARAM=VALUE``."""
     target, equals, value = text.partition("=")
-    node, dot, name = target.strip().partition(".")
     if not equals:
         raise InputError(f"--set {text!r}; allowed: NODE.PARAM=VALUE, or PARAM=VALUE for a shared parameter")
-    if not dot:
-        node, name = _EVERYONE, node
-        if name not in SharedParameters.model_fields:
-            shared = ", ".join(SharedParameters.model_fields)
-            raise InputError(f"--set {text!r}: {name!r} is not shared; allowed: {shared}, or NODE.PARAM=VALUE")
-    elif node not in nodes:
-        present = ", ".join(name for name in nodes if name != _EVERYONE)
-        raise InputError(f"--set {text!r}: no node {node!r} in the scenario; allowed: {present}")
+    node, name = _target(target, nodes, f"--set {text!r}")
     parsed = ros_yaml.parse_value(value, f"--set {shown(target)}")
     if node == _EVERYONE:
         for values in nodes.values():
             values.pop(name, None)
-    nodes.setdefault(node, {})[name] = _absolute(kind_of(node, nodes[node]), name, parsed, Path()) if dot else parsed
+        nodes.setdefault(node, {})[name] = parsed
+    else:
+        nodes[node][name] = _absolute(kind_of(node, nodes[node]), name, parsed, Path())
 
 
 def _absolute(kind: str, name: str, value: Value, folder: Path) -> Value:
@@ -153,18 +190,40 @@ def _content(path: Path) -> str:
         return path.name  # who needs the file says why it cannot be read
 
 
-def _identity(nodes: Mapping[str, NodeParameters]) -> str:
+def _fingerprint(table: NodeParameters) -> str:
+    """A hash of what a table says of a run; empty if that changes none."""
+    if isinstance(table, RecorderParameters):
+        return ""
+    values = table.model_dump(exclude=_HOST_PARAMETERS)
+    for row in type(table).rows().values():
+        if row.is_path and values[row.name]:
+            values[row.name] = _content(Path(values[row.name]))
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def _identity(fingerprints: Mapping[str, str]) -> str:
     """A run id that names the scenario's content: two runs of it give the same messages."""
-    content = {}
-    for name, table in nodes.items():
-        if isinstance(table, RecorderParameters):
-            continue
-        values = table.model_dump(exclude=_HOST_PARAMETERS)
-        for row in type(table).rows().values():
-            if row.is_path and values[row.name]:
-                values[row.name] = _content(Path(values[row.name]))
-        content[name] = values
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+    said = {node: fingerprint for node, fingerprint in fingerprints.items() if fingerprint}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mapping[str, str]) -> Scenario:
+    """The scenario of some tables, with its run id.
+
+    Raises:
+        InputError: the nodes do not agree on what they share.
+    """
+    agreed = next(iter(tables.values()))
+    for node, table in tables.items():
+        for key in SharedParameters.model_fields:
+            if getattr(table, key) != getattr(agreed, key):
+                raise InputError(
+                    f"{node}.{key} = {getattr(table, key)}: other nodes have {getattr(agreed, key)}; "
+                    f"set it under {_EVERYONE}"
+                )
+    identity = agreed.run_id or _identity(fingerprints)
+    named = {node: table.model_copy(update={"run_id": identity}) for node, table in tables.items()}
+    return Scenario(name, named, fingerprints)
 
 
 def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
@@ -195,14 +254,4 @@ def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
             if key in values and key in shared and values[key] != shared[key]:
                 raise InputError(f"{name}.{key} = {values[key]}: {_EVERYONE} says {shared[key]}; keep one")
         tables[name] = TABLES[kind_of(name, values)].read(name, {**shared, **values})
-    agreed = next(iter(tables.values()))
-    for name, table in tables.items():
-        for key in SharedParameters.model_fields:
-            if getattr(table, key) != getattr(agreed, key):
-                raise InputError(
-                    f"{name}.{key} = {getattr(table, key)}: other nodes have {getattr(agreed, key)}; "
-                    f"set it under {_EVERYONE}"
-                )
-    identity = agreed.run_id or _identity(tables)
-    named = {name: table.model_copy(update={"run_id": identity}) for name, table in tables.items()}
-    return Scenario(path.stem, named)
+    return _agreed(path.stem, tables, {name: _fingerprint(table) for name, table in tables.items()})

@@ -17,7 +17,7 @@ one if there are none, and outputs are the arrays of all fields of all output po
 import math
 import re
 from abc import ABC
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
@@ -115,6 +115,7 @@ class Stage(ABC):
     Attributes:
         inputs, outputs: the ports; the arrays handed to `advance` stand in their order.
         sparse_topics: relative name and type of every topic that carries `Sparse` messages.
+        unheard: those of them that nobody reads; their messages need not be made.
         tells: events come about by themselves that only `process` knows of.
         own_inputs: number of inputs that `process` gets; one more may tell the spindle angle to the events.
         step: compiled; None: the stage has its own `process`, in Python.
@@ -130,10 +131,16 @@ class Stage(ABC):
     outputs: tuple[Output, ...] = ()
     step: ClassVar[Step | None] = None
 
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "process" in vars(cls) and "step" not in vars(cls):
+            cls.step = None  # what it inherits computes something else
+
     def __init__(self, name: str, parameters: NodeParameters) -> None:
         self.name = name
         self.shared = parameters
         self.sparse_topics: dict[str, str] = {}
+        self.unheard: Collection[str] = ()
         self._triggers = [self._trigger("events", text) for text in parameters.events]
         self._triggers += [trigger for text in parameters.faults for trigger in self._break_down(text)]
         self._injection: Injection | None = None
@@ -357,8 +364,9 @@ class Stage(ABC):
         """The sparse messages of the samples ``first`` on, by sample: those of `compute` and what follows from all."""
         if last:
             sparse = sparse + self.finish(first + next(iter(outputs[0].values())).size - 1)
-        for place, joint in self._joints:
-            sparse = sparse + self._joint_states(first, joint, outputs[place])
+        if self._joints and f"{self.name}/joint_states" not in self.unheard:
+            for place, joint in self._joints:
+                sparse = sparse + self._joint_states(first, joint, outputs[place])
         if len(sparse) > 1:
             sparse.sort(key=lambda message: message.index)
         return sparse

@@ -276,7 +276,7 @@ def _check_convergence(stage: LearningController, drive: str, response: Response
     loop, parameters = stage.loop(response), stage.parameters
     if parameters.law == "time_periodic":
         low = high = parameters.nominal_speed
-    (supremum, waves), speed = max((loop.worst(s), s) for s in (low, (low + high) / 2, high))
+    (supremum, waves), speed = max((loop.worst(s), s) for s in {low, (low + high) / 2, high})
     if supremum >= 1.0 and not parameters.allow_unstable:
         raise InputError(
             f"{stage.name}: learning diverges with {drive}: sup|Q - Z| = {supremum:.4g} at {waves * speed:.5g} rad/s "

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading a grid between its points: value and derivatives."""
 
+from functools import lru_cache
+
 import numpy as np
 import numpy.typing as npt
 
@@ -87,6 +89,13 @@ def cubic_response(radians: Array) -> Array:
     The interpolator also makes images at multiples of the sampling rate less this frequency; the drive
     attenuates those and they are left out here.
     """
+    return _cubic_response(np.asarray(radians, np.float64).tobytes())
+
+
+@lru_cache(maxsize=256)
+def _cubic_response(content: bytes) -> Array:
+    """The same of the bytes of ``radians``: loops that are alike ask for the same frequencies."""
+    radians = np.frombuffer(content)
     phase = np.cos(_DISTANCE[None] * radians[:, None, None])
     return np.asarray((phase * _TAPS * _WEIGHT).sum(axis=(1, 2)))
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lathe_rc.cell.messages import Signals
 from lathe_rc.safety.rules import (
     GROWTH,
     INDEX,
@@ -17,7 +16,6 @@ from lathe_rc.safety.rules import (
     Array,
     Watch,
     clear,
-    walk,
 )
 from lathe_rc.safety.state_machine import Reaction
 
@@ -238,32 +236,22 @@ class Lookout:
 
     Args:
         monitors: in the order in which alarms at the same sample are told; their memory becomes part of the lookout's.
-        numbers: of the signals that they read, by input and field; None: as they come.
+        numbers: of the signals that they read, by input and field.
 
     Attributes:
         watch: for `lathe_rc.safety.rules.walk`.
     """
 
-    def __init__(self, monitors: Sequence[Monitor], numbers: Mapping[tuple[int, str], int] | None = None) -> None:
+    def __init__(self, monitors: Sequence[Monitor], numbers: Mapping[tuple[int, str], int]) -> None:
         self._monitors = monitors
-        signals = dict.fromkeys(place for monitor in monitors for place in (monitor.signal, monitor.other) if place)
-        self._numbers = numbers or {place: number for number, place in enumerate(signals)}
         memory = np.concatenate([np.empty(0), *(monitor.memory for monitor in monitors)])
         plan, count, end = np.zeros((len(monitors), 5), np.int64), len(monitors), 0
         for row, monitor in zip(plan, monitors, strict=True):
             begin, end = end, end + monitor.memory.size
-            other = self._numbers[monitor.other] if monitor.other else -1
-            row[:] = monitor.rule, self._numbers[monitor.signal], other, begin, end
+            other = numbers[monitor.other] if monitor.other else -1
+            row[:] = monitor.rule, numbers[monitor.signal], other, begin, end
             monitor.memory = memory[begin:end]
         self.watch = Watch(plan, memory, np.zeros(count, np.int64), np.full(count, -1), np.zeros(count))
-
-    def look(self, inputs: Sequence[Signals]) -> list[tuple[Monitor, Alarm]]:
-        """Alarms of the next samples, by sample."""
-        if not self._monitors:
-            return []
-        signals = tuple([np.ascontiguousarray(inputs[place][name]) for place, name in self._numbers])
-        walk(self.watch, signals, np.ascontiguousarray(inputs[0]["angle"]), inputs[0]["index_pulse"])
-        return self.found()
 
     def found(self) -> list[tuple[Monitor, Alarm]]:
         """Alarms of the samples through which `lathe_rc.safety.rules.walk` went last."""

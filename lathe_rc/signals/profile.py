@@ -18,7 +18,7 @@ import scipy
 
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
-from lathe_rc.signals.table import read_table
+from lathe_rc.signals.table import parse_table, read_text
 
 Array = npt.NDArray[np.float64]
 
@@ -179,7 +179,13 @@ def read_csv(path: Path) -> Measured:
     Raises:
         InputError: the file is missing, malformed, holds a number that is not finite, or repeats an angle.
     """
-    header, rows = read_table(path, _HEADERS, "profile")
+    return _measured(read_text(path, "profile"), path)
+
+
+@lru_cache(maxsize=8)
+def _measured(text: str, path: Path) -> Measured:
+    """The profile in a text: to make it takes longer than some cells run, and nobody changes it."""
+    header, rows = parse_table(text, path, _HEADERS)
     if not rows.size:
         raise InputError(f"{path}: no points; give at least three angles")
     if len(header) == 2:
@@ -334,16 +340,21 @@ class ProfileTable:
 
     def demand(self, speed: float, acceleration: float, feed: float) -> Demand:
         """What the profile asks at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], ``feed`` in m/rev."""
-        per_radian = self.table.shape[1] / _TURN
-        value, slope = self.table[..., 3], self.table[..., 2] * per_radian
-        curvature = 2.0 * self.table[..., 1] * per_radian**2
-        along = np.zeros_like(value)
-        if self.heights.size > 1:
-            steepest = np.abs(np.diff(value, axis=0) / np.diff(self.heights)[:, None])
-            along[:-1] = steepest
-            along[1:] = np.maximum(along[1:], steepest)
-        return Demand(
-            stroke=float(np.abs(value).max()),
-            velocity=float(speed * (np.abs(slope) + along * feed / _TURN).max()),
-            acceleration=float((speed**2 * np.abs(curvature) + acceleration * np.abs(slope)).max()),
-        )
+        return _demand(self, speed, acceleration, feed)
+
+
+@lru_cache(maxsize=8)
+def _demand(form: ProfileTable, speed: float, acceleration: float, feed: float) -> Demand:
+    per_radian = form.table.shape[1] / _TURN
+    value, slope = form.table[..., 3], form.table[..., 2] * per_radian
+    curvature = 2.0 * form.table[..., 1] * per_radian**2
+    along = np.zeros_like(value)
+    if form.heights.size > 1:
+        steepest = np.abs(np.diff(value, axis=0) / np.diff(form.heights)[:, None])
+        along[:-1] = steepest
+        along[1:] = np.maximum(along[1:], steepest)
+    return Demand(
+        stroke=float(np.abs(value).max()),
+        velocity=float(speed * (np.abs(slope) + along * feed / _TURN).max()),
+        acceleration=float((speed**2 * np.abs(curvature) + acceleration * np.abs(slope)).max()),
+    )

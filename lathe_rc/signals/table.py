@@ -16,7 +16,12 @@ from lathe_rc.errors import InputError
 Array = npt.NDArray[np.float64]
 
 
-def _text(path: Path, what: str) -> str:
+def read_text(path: Path, what: str) -> str:
+    """The text of a CSV file that holds ``what``.
+
+    Raises:
+        InputError: the file is missing, far too large, or none of text.
+    """
     try:
         return files.contents(path).decode("utf-8-sig")
     except OSError as error:
@@ -38,21 +43,30 @@ def _number(text: str, path: Path, line: int) -> float:
 
 
 def read_table(path: Path, headers: Sequence[Sequence[str]], what: str) -> tuple[list[str], Array]:
-    """Read a CSV file of numbers; empty lines and those that start with # are left out.
+    """Read a CSV file of numbers; see `parse_table`.
+
+    Raises:
+        InputError: the file is missing, far too large, malformed, or holds a number that is not finite.
+    """
+    return parse_table(read_text(path, what), path, headers)
+
+
+def parse_table(text: str, path: Path, headers: Sequence[Sequence[str]]) -> tuple[list[str], Array]:
+    """Read CSV with numbers; empty lines and those that start with # are left out.
 
     Args:
-        path: of the file.
+        text: of the file.
+        path: of the file, for messages.
         headers: the headers of which it must have one.
-        what: the file holds, for messages.
 
     Returns:
         The header and the rows, shape (n, columns).
 
     Raises:
-        InputError: the file is missing, far too large, malformed, or holds a number that is not finite.
+        InputError: the file is malformed, or holds a number that is not finite.
     """
     rows: list[tuple[int, list[str]]] = []
-    for n, line in enumerate(_text(path, what).splitlines(), 1):
+    for n, line in enumerate(text.splitlines(), 1):
         if line.strip() and line.lstrip()[0] != "#":
             try:
                 rows += [(n, row) for row in csv.reader([line], strict=True)]

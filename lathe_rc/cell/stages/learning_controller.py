@@ -43,6 +43,7 @@ from lathe_rc.safety.state_machine import Reaction
 _SETTLED = 4.0  # lead times until a drive has followed
 _MOST = 1024  # entries of a table of margins
 _FILE_ACTIONS = ("save", "load")
+_STATUS = "coarse/learning"  # topic
 
 
 # Places in the state of a step: whether it is inside a piece of a block, where that begins and ends, and whether the
@@ -234,7 +235,7 @@ class LearningController(Stage):
             outputs.append(Output("coarse/margin", messages.MARGIN))
             self._margin[0] = self._margins.untabulated(parameters.nominal_speed, self._model)
         self.declare(inputs=inputs, outputs=outputs)
-        self.sparse_topics["coarse/learning"] = messages.LEARNING
+        self.sparse_topics[_STATUS] = messages.LEARNING
         if self._scheduled_actions("load") and not self._scheduled_actions("save"):
             self._read_memory()
 
@@ -405,19 +406,22 @@ class LearningController(Stage):
                 )
         start, self._cycle_start = self._cycle_start, cycle.sample_index
         seconds = (cycle.sample_index - start) * self.shared.step
+        unheard = not self._asks and _STATUS in self.unheard  # a margin costs as much as a cycle of samples
         status = {
             "cycle": cycle.number,
             "rms_error": cycle.rms,
             "max_error": cycle.largest,
             "contraction": cycle.contraction,
-            "stability_margin": self._margins.at(2 * np.pi * parameters.cycle_revolutions / seconds, self._model),
+            "stability_margin": np.nan
+            if unheard
+            else self._margins.at(2 * np.pi * parameters.cycle_revolutions / seconds, self._model),
             "learning": cycle.learning,
             "joined": cycle.joined,
             "model_natural_frequency": self._model.natural_frequency,
             "model_damping": self._model.damping,
             "model_residual": self._model.residual,
         }
-        sparse = [Sparse("coarse/learning", messages.LEARNING, cycle.sample_index, status)]
+        sparse = [Sparse(_STATUS, messages.LEARNING, cycle.sample_index, status)]
         if cycle.joined and not self._joined:
             self._joined = True
             sparse.append(Sparse(f"{self.name}/events", messages.EVENT, cycle.sample_index, {"action": "joined"}))

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spindle and encoder: where time, angle and the run itself begin and end."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Ge, Le
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
+from lathe_rc.cell.native import Step
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import DONE, Joint, Output, Stage, Trigger
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
@@ -72,7 +73,7 @@ class SpindleEncoder(Stage):
 
     kind = "spindle_encoder"
     Parameters = SpindleEncoderParameters
-    step = staticmethod(step)
+    step: ClassVar[Step | None] = staticmethod(step)
 
     def __init__(self, name: str, parameters: SpindleEncoderParameters) -> None:
         super().__init__(name, parameters)
@@ -99,6 +100,6 @@ class SpindleEncoder(Stage):
         return self.law.speed_range(np.inf if self.samples is None else self.samples * self.shared.step)
 
     @property
-    def memory(self) -> EncoderTable:
+    def memory(self) -> tuple[Any, ...]:
         """See `Stage`."""
         return self._encoder.table
