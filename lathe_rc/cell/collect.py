@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checking the signals of an offline run, and keeping them in memory."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import NotFiniteError, check_finite
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import LatheError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.jit import kernel
 
 
@@ -52,25 +52,40 @@ class Finite:
 
 
 class Collector:
-    """Collects whole arrays; a sink of the engine."""
+    """Collects whole arrays; a sink of the engine.
 
-    def __init__(self, cell: Cell, samples: int) -> None:
-        self._cell = cell
+    Args:
+        cell: that runs.
+        samples: of the run.
+        topics: relative names of those to collect; None: all.
+
+    Raises:
+        InputError: the cell has no such topic.
+    """
+
+    def __init__(self, cell: Cell, samples: int, topics: Collection[str] | None = None) -> None:
+        known = {**cell.dense, **cell.sparse}
+        self._sources = known if topics is None else {topic: known[topic] for topic in topics if topic in known}
+        if missing := [topic for topic in topics or () if topic not in known]:
+            raise InputError(f"no topic {missing[0]!r} in the cell; allowed: {', '.join(known)}")
         self._framer = Framer("", "", cell.master.shared.step_ns)
-        self._dense = {topic: messages.allocate(source.type, samples) for topic, source in cell.dense.items()}
+        self._dense = {
+            topic: messages.allocate(source.type, samples)
+            for topic, source in self._sources.items()
+            if topic in cell.dense
+        }
         for signals in self._dense.values():
             for array in signals.values():
                 array.fill(0)  # touches the memory now: page faults would cost a quarter of the run
-        self._sparse: dict[str, list[Sparse]] = {topic: [] for topic in cell.sparse}
+        self._sparse: dict[str, list[Sparse]] = {topic: [] for topic in self._sources if topic in cell.sparse}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
-        for topic, signals in dense.items():
-            whole = self._dense[topic]
-            for name, array in signals.items():
+        for topic, whole in self._dense.items():
+            for name, array in dense[topic].items():
                 whole[name][first : first + samples] = array
-        for topic, found in sparse.items():
-            self._sparse[topic] += found
+        for topic, kept in self._sparse.items():
+            kept.extend(sparse.get(topic, ()))
 
     def recording(self) -> Recording:
         """What was collected, by fully qualified topic."""
@@ -80,5 +95,5 @@ class Collector:
             for message in found:
                 framed = self._framer.sparse(message)
                 part.add(messages.stamp_ns(framed), framed)
-        types = {f"/{topic}": source.type for topic, source in {**self._cell.dense, **self._cell.sparse}.items()}
+        types = {f"/{topic}": source.type for topic, source in self._sources.items()}
         return Recording(types, {f"/{topic}": signals for topic, signals in self._dense.items()}, sparse)

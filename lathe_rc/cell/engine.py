@@ -55,6 +55,7 @@ class Engine:
         for stage in self._stages:
             compile_kernels(stage)
         self._program = Program(self._stages, self._tapes, chunk)
+        self._outputs = [[remapped(stage.shared, port.topic) for port in stage.outputs] for stage in self._stages]
 
     def run(self, sinks: Iterable[Sink]) -> None:
         """Run to the end."""
@@ -84,8 +85,7 @@ class Engine:
             return
         dense: dict[str, Signals] = {}
         sparse: dict[str, list[Sparse]] = {}
-        for number, stage in enumerate(self._stages):
-            topics = [remapped(stage.shared, port.topic) for port in stage.outputs]
+        for number, (stage, topics) in enumerate(zip(self._stages, self._outputs, strict=True)):
             outputs = [self._tapes.view(topic, first, end - first) for topic in topics]
             dense.update(zip(topics, outputs, strict=True))
             for message in stage.conclude(first, self._program.said(number), outputs, last=end == self.samples):

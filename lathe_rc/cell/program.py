@@ -173,7 +173,7 @@ class Program:
         for number, stage in enumerate(self._stages):
             with stage.named():
                 stage.prepare(self.reached, end - self.reached)
-            self._load(number)
+            self._plan[number, _DUE], self._turn[number] = stage.due
         while (reason := _run(self._plan, self._turn, self._fields, self._where, base, end, self._chunk)) != DONE:
             first, number, reached = self._where.tolist()
             self._serve(reason, first, number, reached, min(self._chunk, end - first))

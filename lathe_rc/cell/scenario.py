@@ -124,7 +124,7 @@ class Scenario:
             for each in [node] if node != _EVERYONE else self.nodes:
                 changes.setdefault(each, {})[name] = _absolute(self.kind(each), name, value, Path())
         tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
-        given = self.shared.run_id != _identity(fingerprints)
+        given = "run_id" in values or self.shared.run_id != _identity(fingerprints)
         for node, changed in changes.items():
             tables[node] = TABLES[self.kind(node)].read(node, {**self.nodes[node].model_dump(), **changed})
             fingerprints[node] = _fingerprint(tables[node])

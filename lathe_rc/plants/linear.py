@@ -3,7 +3,7 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -14,7 +14,7 @@ Array = npt.NDArray[np.float64]
 Discretisation = Literal["foh", "tustin"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DiscretePlant:
     """x[n] = Φ·x[n-1] + w0·u[n-k] + w1·u[n-k-1] + w2·u[n-k-2], with the position as first state.
 
@@ -34,12 +34,8 @@ class DiscretePlant:
 
     def response(self, frequency: npt.ArrayLike) -> npt.NDArray[np.complex128]:
         """Response of the position to the command at ``frequency`` [rad/s], of the difference equation itself."""
-        z = np.exp(1j * np.asarray(frequency, dtype=np.float64) * self.step)
-        terms = [
-            np.polyval(top, z) / np.polyval(bottom, z) * z ** (1.0 - lag - self.delay)
-            for lag, (top, bottom) in enumerate(self._rational)
-        ]
-        return np.asarray(sum(terms))
+        wanted = np.asarray(frequency, dtype=np.float64)
+        return _response(self, wanted.tobytes()).reshape(wanted.shape)
 
     @cached_property
     def _rational(self) -> list[tuple[Array, Array]]:
@@ -52,6 +48,17 @@ class DiscretePlant:
         position, bottom = np.eye(1, self.transition.shape[0]), np.asarray(np.poly(self.transition))
         ways = [np.outer(self.weights[:, lag], position) for lag in range(3)]
         return [(np.asarray(np.poly(self.transition - way)) - bottom, bottom) for way in ways]
+
+
+@lru_cache(maxsize=64)
+def _response(plant: DiscretePlant, content: bytes) -> npt.NDArray[np.complex128]:
+    """The response of the bytes of the frequencies: checks of cells that are alike ask for the same."""
+    z = np.exp(1j * np.frombuffer(content) * plant.step)
+    terms = [
+        np.polyval(top, z) / np.polyval(bottom, z) * z ** (1.0 - lag - plant.delay)
+        for lag, (top, bottom) in enumerate(plant._rational)  # noqa: SLF001 - its own
+    ]
+    return np.asarray(sum(terms))
 
 
 def _foh(a: Array, b: Array, step: float) -> tuple[Array, Array, Array]:
@@ -75,7 +82,14 @@ def discretise(a: Array, b: Array, delay: float, step: float, method: Discretisa
         method: ``foh`` is exact for a command that is linear between its samples, also within the fraction of
             a step that the delay leaves; ``tustin`` is the bilinear rule with that fraction interpolated.
     """
-    samples = delay / step
+    return _discretised(a.tobytes(), b.tobytes(), delay, step, method)
+
+
+@lru_cache(maxsize=64)
+def _discretised(a_bytes: bytes, b_bytes: bytes, delay: float, step: float, method: Discretisation) -> DiscretePlant:
+    """The same of the bytes of a and b: cells that are alike share it, and what it has computed of itself."""
+    b = np.frombuffer(b_bytes)
+    a, samples = np.frombuffer(a_bytes).reshape(b.size, b.size), delay / step
     # Less than a billionth of a step is rounding, on either side, and its inverse would overflow.
     whole = math.floor(samples + 1e-9)
     part = samples - whole if samples - whole > 1e-9 else 0.0

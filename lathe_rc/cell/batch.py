@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many cells at once: each with its own memory, all through the same compiled program, on all cores.
+
+    piston = scenario.load(Path("config/piston.yaml"))
+    cells = (piston.varied({"learning_controller.learning_gain": gain}) for gain in (0.25, 0.5, 1.0))
+    for outcome in run(cells, Errors):
+        print(outcome.kept.rms[-1])
+
+A cell gets the bits that it gets alone. Nothing is kept of its signals but what is asked for, and cells are made when
+their turn comes, so that the memory that a batch takes does not depend on how many they are.
+"""
+
+import os
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+
+from lathe_rc.analysis.metrology import FormErrors, form_errors
+from lathe_rc.cell import messages
+from lathe_rc.cell.collect import Collector, Finite
+from lathe_rc.cell.engine import Engine, Sink
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.recording import Recording
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError, LatheError
+
+K_co = TypeVar("K_co", covariant=True)
+
+_AHEAD = 2  # cells that are made for each thread before the first of them has been taken
+
+
+class Keeper(Sink, Protocol[K_co]):
+    """A sink that keeps of a run what is asked for."""
+
+    @property
+    def heard(self) -> Collection[str]:
+        """Relative topics whose sparse messages it takes; others are not made."""
+
+    def kept(self) -> K_co:
+        """What is kept, at the end of the run."""
+
+
+Make = Callable[[Cell, int], Keeper[K_co]]  #: makes a keeper for a cell and so many samples
+
+
+@dataclass(frozen=True)
+class Outcome(Generic[K_co]):
+    """What a cell gave.
+
+    Attributes:
+        scenario: of the cell.
+        kept: what its keeper kept; None if it failed.
+        error: why it was refused or failed; None if it was not.
+    """
+
+    scenario: Scenario
+    kept: K_co | None
+    error: LatheError | None = None
+
+
+def run(scenarios: Iterable[Scenario], keep: Make[K_co], *, threads: int | None = None) -> Iterator[Outcome[K_co]]:
+    """Run cells to their ends.
+
+    Args:
+        scenarios: of the cells; each needs a number of revolutions. They are asked for as their turn comes.
+        keep: what to keep of each: `Errors`, `partial(Topics, topics=...)`, or a keeper of one's own.
+        threads: that compute; None: one for each core.
+
+    Yields:
+        The outcomes, in the order of the scenarios. A cell that is refused, or that fails on the way, is one of them.
+    """
+    count = threads or os.cpu_count() or 1
+    waiting: deque[Future[Outcome[K_co]]] = deque()
+    pool = ThreadPoolExecutor(count)
+    try:
+        for number, scenario in enumerate(scenarios):
+            waiting.append(pool.submit(_outcome, scenario, keep))
+            # The first compiles what the others use.
+            if number == 0 or len(waiting) > _AHEAD * count:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _outcome(scenario: Scenario, keep: Make[K_co]) -> Outcome[K_co]:
+    try:
+        cell = Cell(scenario.nodes)
+        cell.check()
+        if cell.master.samples is None:
+            raise InputError(f"{cell.master.name}.revolutions = 0; an offline run needs an end: allowed above 0")
+        keeper = keep(cell, cell.master.samples)
+        Engine(cell, keeper.heard).run([Finite(cell), keeper])
+    except LatheError as error:
+        return Outcome(scenario, None, error)
+    return Outcome(scenario, keeper.kept())
+
+
+class Errors:
+    """Keeps the form error by revolution."""
+
+    heard: Collection[str] = ()
+
+    def __init__(self, cell: Cell, samples: int) -> None:
+        named = {source.type: topic for topic, source in reversed(cell.dense.items())}
+        self._encoder, self._tool = named.get(messages.ENCODER), named.get(messages.TOOL)
+        self._angle, self._error = np.empty((2, samples if self._tool else 0))
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        if self._encoder and self._tool:
+            self._angle[first : first + samples] = dense[self._encoder]["angle_true"]
+            self._error[first : first + samples] = dense[self._tool]["error"]
+
+    def kept(self) -> FormErrors:
+        """Of each complete revolution; of none if the scenario has no tool."""
+        return form_errors(self._angle, self._error)
+
+
+class Topics(Collector):
+    """Keeps some topics whole.
+
+    Args:
+        cell: that runs.
+        samples: of the run.
+        topics: relative names.
+
+    Raises:
+        InputError: the cell has no such topic.
+    """
+
+    def __init__(self, cell: Cell, samples: int, topics: Collection[str]) -> None:
+        super().__init__(cell, samples, topics)
+        self.heard = [topic for topic in topics if topic in cell.sparse]
+
+    def kept(self) -> Recording:
+        """By fully qualified topic."""
+        return self.recording()

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many cells at once: each gets the bits that it gets alone, and one that fails is told of."""
+
+import itertools
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from lathe_rc import harness, resources
+from lathe_rc.cell import batch, scenario
+from lathe_rc.errors import InputError, LatheError
+
+
+def load(name, revolutions, *overrides):
+    path = resources.find(Path(f"{name}.yaml"))
+    return scenario.load(path, [f"spindle_encoder.revolutions={revolutions}", *overrides])
+
+
+def between(low, high):
+    return st.integers(0, 1000).map(lambda part: low + (high - low) * part / 1000)
+
+
+values = st.fixed_dictionaries(
+    {
+        "learning_controller.lead_time": between(1.3e-3, 1.5e-3),
+        "learning_controller.learning_gain": between(0.1, 1.0),
+        "learning_controller.soft_start": st.sampled_from([0.0, 2.5]),
+        "learning_controller.identify": st.booleans(),
+        "fine_controller.join_below": st.sampled_from([0.0, 1e-6, 30e-6]),
+        "fine_controller.q_time": between(20e-6, 60e-6),
+        "fine_controller.events": st.sampled_from([[], ["revolution 2: freeze", "revolution 3: learn"]]),
+        "electrodynamic_actuator.delay": between(0.0, 0.5e-3),
+        "piezo_actuator.hysteresis": st.sampled_from(["prandtl_ishlinskii", "bouc_wen"]),
+        "piezo_actuator.stroke": st.sampled_from([15e-6, 4e-6]),
+        "spindle_encoder.counts_per_revolution": st.sampled_from([0, 20_000]),
+    }
+)
+
+
+# Without shrinking: a run takes seconds.
+@settings(max_examples=6, deadline=None, phases=[Phase.explicit, Phase.generate])
+@given(st.lists(values, min_size=2, max_size=6))
+def test_each_cell_has_the_digests_that_it_has_alone(cells):
+    stable = [f"{node}.allow_unstable=true" for node in ("learning_controller", "fine_controller")]
+    two_channel = load("two_channel", 4, *stable)
+    scenarios = [two_channel.varied(cell) for cell in cells]
+    topics = ["tool", "fine/command", "coarse/learning"]
+    for cell, outcome in zip(
+        scenarios, batch.run(scenarios, partial(batch.Topics, topics=topics), threads=3), strict=True
+    ):
+        assert outcome.scenario is cell
+        alone = harness.run(cell).digest
+        assert outcome.kept.digests() == {f"/{topic}": alone[f"/{topic}"] for topic in sorted(topics)}
+
+
+def test_errors_are_those_of_a_run():
+    scenarios = [load("piston", 5), load("full_cell", 3), load("interrupted_cut", 3)]
+    piston, full, round_part = (outcome.kept for outcome in batch.run(scenarios, batch.Errors))
+    for cell, kept in ((scenarios[0], piston), (scenarios[1], full)):
+        alone = harness.run(cell).errors
+        for name in ("rms", "largest", "peak_to_valley", "starts"):
+            assert np.array_equal(getattr(kept, name), getattr(alone, name))
+    assert round_part.rms.size == 0, "it has no tool"
+
+
+def test_a_cell_that_cannot_work_is_an_outcome_and_the_others_go_on():
+    piston = load("piston", 3)
+    changes = [
+        {},
+        {"learning_controller.lead_time": 3e-3},
+        {"electrodynamic_actuator.noise_rms": 1e308},
+        {"spindle_encoder.revolutions": 0.0},
+        {},
+    ]
+    good, refused, diverged, endless, again = batch.run([piston.varied(each) for each in changes], batch.Errors)
+    assert np.array_equal(good.kept.rms, again.kept.rms)
+    assert isinstance(refused.error, InputError)
+    assert "learning diverges" in str(refused.error)
+    assert isinstance(diverged.error, LatheError)
+    assert "/coarse/state: " in str(diverged.error)
+    assert "needs an end" in str(endless.error)
+    assert refused.kept is diverged.kept is endless.kept is None
+
+
+def test_cells_are_made_when_their_turn_comes():
+    piston, asked = load("piston", 1), itertools.count()
+    outcomes = batch.run((piston.varied({"seed": next(asked)}) for _ in range(1000)), batch.Errors, threads=2)
+    assert [next(outcomes).scenario.shared.seed for _ in range(3)] == [0, 1, 2]
+    outcomes.close()
+    assert next(asked) < 20
+
+
+def test_a_topic_that_is_not_there_is_named():
+    (outcome,) = batch.run([load("piston", 1)], partial(batch.Topics, topics=["tool", "fine/state"]))
+    assert str(outcome.error).startswith("no topic 'fine/state' in the cell; allowed: encoder, ")
+
+
+class TestVaried:
+    """`Scenario.varied` gives what `load` gives with the same overrides."""
+
+    @pytest.mark.parametrize(
+        "changes",
+        [
+            {"learning_controller.lead_time": 1.3e-3},
+            {"tool.profile_file": "profiles/piston.csv", "tool.profile": "csv", "spindle_encoder.revolutions": 7},
+            {"seed": 3, "block_size": 128},
+            {"run_id": "mine"},
+        ],
+    )
+    def test_is_what_the_file_with_overrides_says(self, changes):
+        loaded = load("piston", 5, *(f"{name}={value}" for name, value in changes.items()))
+        assert load("piston", 5).varied(changes) == loaded
+
+    def test_a_given_run_id_stays(self):
+        assert load("piston", 5, "run_id=mine").varied({"seed": 3}).shared.run_id == "mine"
+
+    @pytest.mark.parametrize(
+        ("changes", "words"),
+        [
+            ({"tol.feed": 1.0}, "tol.feed: no node 'tol' in the scenario; allowed: spindle_encoder, "),
+            ({"feed": 1.0}, "feed: 'feed' is not shared; allowed: sample_rate, "),
+            ({"tool.fed": 1.0}, "tool.fed: unknown parameter; allowed: "),
+            ({"tool.feed": -1.0}, "tool.feed = -1.0; allowed: "),
+            ({"tool.seed": 4}, "tool.seed = 4: other nodes have 0; "),
+        ],
+    )
+    def test_what_cannot_be_is_refused(self, changes, words):
+        with pytest.raises(InputError) as refusal:
+            load("piston", 5).varied(changes)
+        assert words in str(refusal.value)

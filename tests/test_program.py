@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The program of a cell and its tapes: what is read late is the past, and Python is asked where it is needed."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import COMMAND, ENCODER
+from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.program import Program, Tapes
+from lathe_rc.cell.stage import Input, Output, Sparse, Stage
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.errors import LatheError
+
+
+@given(
+    piece=st.integers(1, 20),
+    pieces=st.integers(1, 12),
+    last=st.integers(0, 19),
+    delays=st.lists(st.integers(1, 70), min_size=1, max_size=3),
+)
+def test_what_is_read_late_is_what_was_written(piece, pieces, last, delays):
+    longest = max(delays)
+    tapes = Tapes({"encoder": (messages.ENCODER, {"angle": longest})}, piece)
+    samples = piece * pieces + min(last, piece - 1)
+    whole = np.concatenate([np.zeros(longest), np.arange(1.0, samples + 1)])  # from sample -longest on
+    for first in range(0, samples, piece):
+        size = min(piece, samples - first)
+        tapes.advance(first)
+        for array in tapes.view("encoder", first, size).values():
+            array[:] = whole[longest + first :][:size]
+        for delay in delays:
+            seen = tapes.view("encoder", first, size, delay)["angle"]
+            assert np.array_equal(seen, whole[longest + first - delay :][:size])
+
+
+class Halving(Stage):
+    """A stage in Python: the angle of the spindle, halved, as a command; it says each block that it takes."""
+
+    kind = "halving"
+    Parameters = NodeParameters
+    actions = ("stop",)
+
+    def __init__(self, name, table):
+        super().__init__(name, table)
+        self.blocks, self.on = [], True
+        self.declare(inputs=[Input("encoder", ENCODER, ("angle",))], outputs=[Output("half", COMMAND)])
+
+    def perform(self, action):
+        self.on = False
+
+    def process(self, first, inputs, outputs):
+        self.blocks.append((first, inputs[0]["angle"].size))
+        outputs[0]["position"][:] = inputs[0]["angle"] / 2 if self.on else 0.0
+        return [Sparse("halving/events", messages.EVENT, first, {"action": "block"})]
+
+
+class Refusing(Halving):
+    """The same, but it cannot go on at sample 300."""
+
+    def process(self, first, inputs, outputs):
+        if first >= 300:
+            raise LatheError("no more")
+        return super().process(first, inputs, outputs)
+
+
+def program(stage, chunk=100, samples=1000):
+    spindle = SpindleEncoder("spindle", SpindleEncoder.Parameters.read("spindle", {"revolutions": 1.0}))
+    tapes = Tapes({"encoder": (ENCODER, {}), "half": (COMMAND, {})}, samples)
+    return Program([spindle, stage], tapes, chunk), tapes
+
+
+def made(kind, **values):
+    return kind("halving", NodeParameters.read("halving", values))
+
+
+def test_a_stage_in_python_is_asked_for_each_chunk_and_what_it_says_is_kept():
+    stage = made(Halving)
+    cell, tapes = program(stage)
+    cell.run(450)
+    cell.run(1000)
+    assert stage.blocks == [(k, 100) for k in range(0, 400, 100)] + [(400, 50)] + [
+        (k, 100) for k in range(450, 950, 100)
+    ] + [(950, 50)]
+    assert [message.index for message in cell.said(1)] == [first for first, _ in stage.blocks]
+    assert cell.said(1) == []
+    angle = tapes.view("encoder", 0, 1000)["angle"]
+    assert angle[-1] > 0.0
+    assert np.array_equal(tapes.view("half", 0, 1000)["position"], angle / 2)
+
+
+def test_an_event_cuts_the_block_in_which_it_falls():
+    stage = made(Halving, events=["sample 250: stop"])
+    cell, tapes = program(stage)
+    cell.run(1000)
+    assert stage.blocks[2:5] == [(200, 50), (250, 50), (300, 100)]
+    half = tapes.view("half", 0, 1000)["position"]
+    assert half[249] > 0.0
+    assert not half[250:].any()
+
+
+def test_what_was_computed_before_an_error_is_there_and_the_stage_is_named():
+    cell, tapes = program(made(Refusing))
+    with pytest.raises(LatheError, match=r"^halving: no more"):
+        cell.run(1000)
+    assert cell.reached == 300
+    assert tapes.view("half", 0, 300)["position"][-1] > 0.0
+
+
+def test_a_stage_that_has_its_own_process_does_not_inherit_a_step():
+    class Other(SpindleEncoder):
+        def process(self, first, inputs, outputs):
+            return []
+
+    assert Other.step is None
+    assert SpindleEncoder.step is not None
