@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from mcap.reader import make_reader
 
-from lathe_rc import cli
+from lathe_rc import cli, harness
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks import page, sides, suite
+from benchmarks import page, ros, sides, suite, transport
 
 RESULT = {
     "commit": "abc",
@@ -23,6 +24,16 @@ RESULT = {
         "target_c_ratio": 0.9,
         "real_time_factor": {"median": 140.0, "low": 120.0, "high": 160.0, "runs": 3},
         "target_real_time_factor": 150.0,
+        "full_cell": {
+            "c_ratio": {"median": 0.5, "low": 0.4, "high": 0.6, "runs": 3},
+            "target_c_ratio": 0.85,
+            "ns_per_sample": {"engine": {"median": 300.0, "low": 300.0, "high": 300.0, "runs": 3}},
+        },
+        "took_s": 1.0,
+    },
+    "ros": {
+        "piston_5_nodes": {"block_64": {"processes": {"real_time_factor": 4.0, "target_real_time_factor": 3}}},
+        "bare_transport": {"block_64": {"bare_transport_ratio": 0.45, "target_bare_transport_ratio": 0.6}},
         "took_s": 1.0,
     },
 }
@@ -89,6 +100,32 @@ def test_the_page_says_what_is_met_and_what_is_not():
     assert "0.95 (0.9 … 1)" in text
     assert "≥ 0.9: met" in text
     assert "≥ 150: **not met**" in text
+
+
+def test_the_page_has_what_stands_in_groups():
+    lines = page.page(RESULT).splitlines()
+    for figure, found, goal in [
+        ("engine.full_cell.c_ratio", "0.5 (0.4 … 0.6)", "≥ 0.85: **not met**"),
+        ("ros.bare_transport.block_64.bare_transport_ratio", "0.45", "≥ 0.6: **not met**"),
+        ("ros.piston_5_nodes.block_64.processes.real_time_factor", "4", "≥ 3: met"),
+    ]:
+        assert f"| `{figure}` | {found} | {goal} |" in lines
+    for heading in ("### full cell", "### piston 5 nodes", "### bare transport"):
+        assert heading in lines
+
+
+def test_bare_transport_passes_every_message(tmp_path):
+    scenario = harness.with_recorder(ros.load("piston", spindle_encoder__revolutions=1.5), tmp_path / "bag", keep=True)
+    passing = transport.Transport(scenario, tmp_path)
+    passed = passing.run()
+    found = {topic: [] for topic in passing.sent}
+    with passing.bag.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            found[channel.topic].append(message.data)
+    assert found == passing.sent
+    assert passed.taken == {topic: len(sent) for topic, sent in passing.sent.items()}
+    assert passed.taken["/tool"] > scenario.shared.window
+    assert passed.taken["/tool/joint_states"]
 
 
 def test_every_part_is_there():

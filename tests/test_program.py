@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import COMMAND, ENCODER
 from lathe_rc.cell.parameters import NodeParameters
-from lathe_rc.cell.program import Program, Tapes
+from lathe_rc.cell.program import Program, Tapes, wired
 from lathe_rc.cell.stage import Input, Output, Sparse, Stage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import LatheError
@@ -69,7 +69,7 @@ class Refusing(Halving):
 def program(stage, chunk=100, samples=1000):
     spindle = SpindleEncoder("spindle", SpindleEncoder.Parameters.read("spindle", {"revolutions": 1.0}))
     tapes = Tapes({"encoder": (ENCODER, {}), "half": (COMMAND, {})}, samples)
-    return Program([spindle, stage], tapes, chunk), tapes
+    return Program([wired(spindle), wired(stage)], tapes, chunk), tapes
 
 
 def made(kind, **values):

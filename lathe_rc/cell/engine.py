@@ -9,7 +9,7 @@ import numpy as np
 
 from lathe_rc.cell.messages import MAX_BLOCK, Signals
 from lathe_rc.cell.parameters import remapped
-from lathe_rc.cell.program import Program, Tapes
+from lathe_rc.cell.program import Program, Tapes, wired
 from lathe_rc.cell.stage import Sparse, compile_kernels
 from lathe_rc.cell.track import longest_delays
 from lathe_rc.cell.wiring import Cell
@@ -54,8 +54,8 @@ class Engine:
         self._tapes = Tapes(topics, self._piece)
         for stage in self._stages:
             compile_kernels(stage)
-        self._program = Program(self._stages, self._tapes, chunk)
-        self._outputs = [[remapped(stage.shared, port.topic) for port in stage.outputs] for stage in self._stages]
+        self._wired = [wired(stage) for stage in self._stages]
+        self._program = Program(self._wired, self._tapes, chunk)
 
     def run(self, sinks: Iterable[Sink]) -> None:
         """Run to the end."""
@@ -85,10 +85,12 @@ class Engine:
             return
         dense: dict[str, Signals] = {}
         sparse: dict[str, list[Sparse]] = {}
-        for number, (stage, topics) in enumerate(zip(self._stages, self._outputs, strict=True)):
+        for number, (stage, _, topics) in enumerate(self._wired):
             outputs = [self._tapes.view(topic, first, end - first) for topic in topics]
             dense.update(zip(topics, outputs, strict=True))
-            for message in stage.conclude(first, self._program.said(number), outputs, last=end == self.samples):
+            # Where a stage has failed, those before it have gone on.
+            said = [message for message in self._program.said(number) if message.index < end]
+            for message in stage.conclude(first, said, outputs, last=end == self.samples):
                 sparse.setdefault(remapped(stage.shared, message.topic), []).append(message)
         for sink in sinks:
             sink.chunk(first, end - first, dense, sparse)

@@ -6,6 +6,7 @@ at that stage and sample.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -118,31 +119,56 @@ def _passes(angle: Samples, turn: float) -> bool:
     return low < angle.size
 
 
+class Wired(NamedTuple):
+    """A stage and the tapes that it reads and writes.
+
+    Attributes:
+        stage: see above.
+        inputs: tape of each input, and the delay at which it is read [sample].
+        outputs: tape of each output.
+    """
+
+    stage: Stage
+    inputs: Sequence[tuple[str, int]]
+    outputs: Sequence[str]
+
+
+def wired(stage: Stage) -> Wired:
+    """A stage whose tapes are its topics."""
+    inputs = [(remapped(stage.shared, port.topic), port.delay) for port in stage.inputs]
+    return Wired(stage, inputs, [remapped(stage.shared, port.topic) for port in stage.outputs])
+
+
 class Program:
     """Some stages that compute in one go.
 
     Args:
         stages: in the order in which they compute; none may read what a later one writes without a delay.
-        tapes: of all topics that they read and write.
+        tapes: that they read and write.
         chunk: samples that a stage computes in one go: at most the shortest feedback between them.
+
+    Attributes:
+        number: of the stage that could not go on, when `run` raises.
+        ends: sample up to which each stage has computed: after that, those before it may be a chunk ahead.
     """
 
-    def __init__(self, stages: Sequence[Stage], tapes: Tapes, chunk: int) -> None:
-        self._stages, self._tapes, self._chunk = list(stages), tapes, chunk
+    def __init__(self, stages: Sequence[Wired], tapes: Tapes, chunk: int) -> None:
+        self._wired, self._stages, self._tapes, self._chunk = stages, [each.stage for each in stages], tapes, chunk
+        self.number, self.ends = 0, [0] * len(stages)
         self._turn = np.empty(len(self._stages))
         self._plan = np.zeros((len(self._stages) + 1, 5), np.int64)
         fields: list[tuple[int, int, int, int]] = []
-        for row, stage in zip(self._plan, self._stages, strict=False):
+        for row, (stage, inputs, outputs) in zip(self._plan, stages, strict=False):
             row[_FIELD], row[_ANGLE], angle = len(fields), -1, stage.angle_input
             for place, port in enumerate(stage.inputs[: stage.own_inputs]):
                 if place == angle:
                     row[_ANGLE] = len(fields) + port.fields.index("angle")
-                fields += [self._field(stage, port.topic, name, port.delay) for name in port.fields]
-            for output in stage.outputs:
-                fields += [self._field(stage, output.topic, name, 0) for name in messages.sample_fields(output.type)]
+                fields += [self._field(*inputs[place], name) for name in port.fields]
+            for tape, output in zip(outputs, stage.outputs, strict=True):
+                fields += [self._field(tape, 0, name) for name in messages.sample_fields(output.type)]
             if angle is not None and angle >= stage.own_inputs:
                 row[_ANGLE] = len(fields)
-                fields.append(self._field(stage, stage.inputs[angle].topic, "angle", 0))
+                fields.append(self._field(*inputs[angle], "angle"))
         self._plan[-1, _FIELD] = len(fields)
         self._fields = np.ascontiguousarray(np.array(fields, np.int64).T)
         self._where = np.zeros(3, np.int64)
@@ -151,8 +177,8 @@ class Program:
         for number in range(len(self._stages)):
             self._load(number)
 
-    def _field(self, stage: Stage, topic: str, name: str, delay: int) -> tuple[int, int, int, int]:
-        array = self._tapes.arrays[remapped(stage.shared, topic), name]
+    def _field(self, tape: str, delay: int, name: str) -> tuple[int, int, int, int]:
+        array = self._tapes.arrays[tape, name]
         return array.ctypes.data, array.itemsize, delay, 0
 
     def _load(self, number: int) -> None:
@@ -169,17 +195,27 @@ class Program:
         Raises:
             LatheError: a stage cannot go on; names it. What was computed before is on the tapes, see `reached`.
         """
-        base = self._tapes.history - self._tapes.begin
+        self.number = 0
+        try:
+            self._compute(end)
+        finally:
+            first = self.reached
+            ahead = min(first + self._chunk, end)
+            self.ends = [ahead if number < self._where[1] else first for number in range(len(self._stages))]
+            for number, reached in enumerate(self.ends):
+                self._tell(number, reached)
+
+    def _compute(self, end: int) -> None:
         for number, stage in enumerate(self._stages):
+            self.number = number
             with stage.named():
                 stage.prepare(self.reached, end - self.reached)
             self._plan[number, _DUE], self._turn[number] = stage.due
+        base = self._tapes.history - self._tapes.begin
         while (reason := _run(self._plan, self._turn, self._fields, self._where, base, end, self._chunk)) != DONE:
-            first, number, reached = self._where.tolist()
-            self._serve(reason, first, number, reached, min(self._chunk, end - first))
-            self._load(number)
-        for number in range(len(self._stages)):
-            self._tell(number, end)
+            first, self.number, reached = self._where.tolist()
+            self._serve(reason, first, self.number, reached, min(self._chunk, end - first))
+            self._load(self.number)
 
     @property
     def reached(self) -> int:
@@ -189,8 +225,8 @@ class Program:
     def _serve(self, reason: int, first: int, number: int, reached: int, samples: int) -> None:
         """Do in Python what a stage needs."""
         stage, tapes = self._stages[number], self._tapes
-        inputs = [tapes.view(remapped(stage.shared, p.topic), first, samples, p.delay) for p in stage.inputs]
-        outputs = [tapes.view(remapped(stage.shared, p.topic), first, samples) for p in stage.outputs]
+        inputs = [tapes.view(tape, first, samples, delay) for tape, delay in self._wired[number].inputs]
+        outputs = [tapes.view(tape, first, samples) for tape in self._wired[number].outputs]
         with stage.named():
             if reason == PYTHON:
                 self._tell(number, first)

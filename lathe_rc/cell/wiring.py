@@ -62,7 +62,7 @@ class Cell:
         order: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(made, ()))
         for name, stage in made.items():
             for port in stage.inputs:
-                source = self._source(stage, port)
+                source = self.source(stage, port)
                 if port.delay == 0:
                     order.add(name, source.node)
         try:
@@ -76,7 +76,12 @@ class Cell:
             raise InputError(f"{topic} is published by {other.node} and {source.node}; remap one of them")
         topics[topic] = source
 
-    def _source(self, stage: Stage, port: Input) -> Source:
+    def source(self, stage: Stage, port: Input) -> Source:
+        """Who publishes what a stage reads.
+
+        Raises:
+            InputError: nobody, or as another type.
+        """
         topic = remapped(stage.shared, port.topic)
         source = self.dense.get(topic)
         if source is None:

@@ -44,10 +44,12 @@ class Exchange:
 
     Attributes:
         master: takes the Progress of a node, if the time master is in this process.
+        stages: nodes with a stage that are active and have not computed yet, see `lathe_rc.nodes.chain`.
     """
 
     def __init__(self) -> None:
         self.master: Callable[[Any], None] | None = None
+        self.stages: list[Any] = []
         self._inside: set[str] = set()
         self._readers: dict[str, dict[str, Callable[[Any], None]]] = defaultdict(dict)
 

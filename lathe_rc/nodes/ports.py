@@ -153,6 +153,13 @@ class BlockQueue:
             self._gap(block, self.end)
         return self._append(block)
 
+    def drop(self, until: int) -> None:
+        """Forget what waits of the samples before ``until``."""
+        while self.blocks and self.blocks[0].first_index < until:
+            block = self.blocks.popleft()
+            if block.first_index + block.samples > until:
+                self.blocks.appendleft(block.part(until - block.first_index, block.samples))
+
     def state(self) -> tuple[int, int, list[Block], Block | None]:
         """What another process needs to go on: next sample, blocks received, those that wait, and the newest."""
         return self.end, self.received, list(self.blocks), self._newest

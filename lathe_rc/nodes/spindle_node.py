@@ -15,6 +15,7 @@ from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.nodes.chain import form
 from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.shell import given_up, why_failed
 from lathe_rc.nodes.stage_node import StageNode
@@ -134,6 +135,7 @@ class SpindleNode(StageNode):
         self.reporter("block0", self.get_name())
         self._schedule = self._heard = self._looked = time.monotonic()
         self._members_moved = dict.fromkeys(self._member_names, self._heard)
+        form(self)
         self.release()
 
     # ---- run ----------------------------------------------------------------------------------------
@@ -178,6 +180,19 @@ class SpindleNode(StageNode):
             return 1
         return self.table.window - (self.blocks - self._least)
 
+    def _possible(self) -> int:
+        """Samples to let go at once; 0 while others in its chain wait for an input."""
+        blocks = 1 if self._pace.speed_factor else min(self._credit(), self.together)
+        samples = self.table.block_size * blocks
+        ready = self.chain.ready() if self.chain is not None else (samples, False)
+        return min(samples, ready[0]) if ready else 0
+
+    def _let_go(self, samples: int, *, last: bool) -> None:
+        if self.chain is not None:
+            self.chain.compute(samples, last=last)
+        else:
+            self.compute(samples, [], last=last)
+
     def release(self) -> None:
         """Let go every block that credit and pace allow."""
         if not self._running or self.failure or self.done or self._unsafe:
@@ -202,14 +217,19 @@ class SpindleNode(StageNode):
                     # Less is made up by the next blocks. The schedule slips by more: no long burst to catch up.
                     self._schedule += late
                     self.slipped += late
-            samples = size if factor else size * min(self._credit(), self.together)
+            if not (samples := self._possible()):
+                return
             last = self._end is not None and self._end - self.samples <= samples
             if last:
                 samples = cast("int", self._end) - self.samples
             if self._completed:
                 self._released.extend([time.monotonic()] * -(-samples // size))
-            self.compute(samples, [], last=last)
+            self._let_go(samples, last=last)
         self.next_tick = time.monotonic()
+
+    def lead(self) -> None:
+        """See `StageNode`: as far as credit and pace allow."""
+        self.attempt(self.release)
 
     def advance(self) -> None:
         """Take what members in this process have told: not at once, the block that they tell of may be under way."""

@@ -3,7 +3,7 @@
 
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,14 @@ from lathe_rc_msgs.srv import Schedule
 from lathe_rc.bag.record import signal_depth
 from lathe_rc.cell import messages, state_file
 from lathe_rc.cell.framing import Framer
-from lathe_rc.cell.messages import Signals
-from lathe_rc.cell.stage import Input, Stage, compile_kernels
+from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.stage import Input, Sparse, Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wire import Block, Encoder, Pool
 from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.nodes.chain import Chain, form
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import BlockQueue, message_class, signal_qos
 from lathe_rc.nodes.shell import CellNode
@@ -38,9 +39,12 @@ class StageNode(CellNode):
         blocks: computed so far.
         samples: computed so far.
         together: blocks that are computed in one go, at most.
+        dense: fully qualified topic of each output.
+        chain: that it computes in; None: it computes alone.
     """
 
     stage: Stage
+    chain: Chain | None = None
 
     def configure_part(self) -> None:
         """Build the stage and compile its kernels: the first block then takes no longer than the next."""
@@ -62,6 +66,7 @@ class StageNode(CellNode):
             )
             for port in self.stage.outputs
         ]
+        self.dense = [topic for topic, _ in self._encoders]
         for _, encoder in self._encoders:
             encoder.prepare(self.table.block_size)
         most = min(self.table.window // _TOGETHER, messages.MAX_BLOCK // self.table.block_size)
@@ -70,23 +75,25 @@ class StageNode(CellNode):
         self._sparse_topics = {topic: self.topic(topic) for topic in self.stage.sparse_topics}
         self._queues: dict[str, BlockQueue] = {}
         self._tracks: dict[str, Track] = {}
-        ports = self._ports()
+        ports = self.ports()
         for topic, port in ports:
             delays = longest_delays(p for other, p in ports if other == topic)
             self._queues[topic] = BlockQueue(topic, port.type, self.table, sorted(delays))
             self._tracks[topic] = Track(port.type, delays, self.together * self.table.block_size)
         self._wire()
 
-    def _ports(self) -> list[tuple[str, Input]]:
+    def ports(self) -> list[tuple[str, Input]]:
+        """Fully qualified topic of each input, and the input."""
         return [(self.topic(port.topic), port) for port in self.stage.inputs]
 
-    def _wire(self) -> None:
-        """Put queues and tracks in the order in which they are read."""
-        ports = self._ports()
+    def _wire(self, without: Collection[str] = ()) -> None:
+        """Put queues and tracks in the order in which they are read; nothing waits for the topics ``without``."""
+        ports = self.ports()
         self._inputs = [(self._queues[topic], self._tracks[topic], port.delay) for topic, port in ports]
-        self._delayed = [port for port in self._inputs if port[2]]
-        self._feedback = [self._queues[topic] for topic in dict.fromkeys(t for t, p in ports if p.delay)]
-        self._forward = [self._queues[topic] for topic in dict.fromkeys(t for t, p in ports if p.delay == 0)]
+        self._delayed = [port for port in self._inputs if port[2] and port[0].topic not in without]
+        waits = [(topic, port.delay) for topic, port in ports if topic not in without]
+        self._feedback = [self._queues[topic] for topic in dict.fromkeys(t for t, delay in waits if delay)]
+        self._forward = [self._queues[topic] for topic in dict.fromkeys(t for t, delay in waits if not delay)]
 
     def activate_part(self) -> None:
         """Make publishers, subscriptions and the service that schedules events."""
@@ -104,6 +111,7 @@ class StageNode(CellNode):
             maxlen=_EARLY * signal_depth(self.table) * len(self._queues)
         )
         self.create_service(Schedule, "~/schedule", self._on_schedule)
+        self.exchange.stages.append(self)
 
     def tick(self, now: float) -> None:
         """See `CellNode`."""
@@ -230,8 +238,16 @@ class StageNode(CellNode):
         self.get_logger().info(f"goes on from block {self.blocks}")
         self.reporter("resumed", self.get_name(), blocks=self.blocks, sample=self.samples)
 
+    def fail(self, error: LatheError, *, cause: str = "error") -> None:
+        """See `CellNode`; those that it computes with go on alone."""
+        super().fail(error, cause=cause)
+        if self.chain is not None:
+            self.chain.leave()
+
     def lose(self, lost: set[str], first: int, end: int) -> None:
         """See `CellNode`; what is read from them is held."""
+        if self.chain is not None:
+            self.chain.leave()
         for queue in self._queues.values():
             if queue.source in lost and queue.held_from is None:
                 queue.hold(end)
@@ -309,7 +325,72 @@ class StageNode(CellNode):
             samples -= block.samples
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
-    def _next(self) -> tuple[int, bool] | None:
+    # ---- in a chain ---------------------------------------------------------------------------------
+
+    @property
+    def may_join(self) -> bool:
+        """Whether it can compute in a chain from now on."""
+        return not self._started and not self._restart_file and bool(self.table.window) and self.computes
+
+    @property
+    def cell(self) -> str:
+        """Name of its time master; empty as long as it has none."""
+        return self.master.name if self.master is not None else ""
+
+    @property
+    def computes(self) -> bool:
+        """Whether it takes part in a cell that runs."""
+        return self.active and self.master is not None and not (self.failure or self.over or self._waits)
+
+    def join(self, chain: Chain, inside: Collection[str]) -> None:
+        """Compute in a chain from sample 0 on; what its nodes publish is ``inside``."""
+        self.chain = chain
+        self._wire(inside)
+        self._shared = []
+        self._join(0)
+
+    def lead(self) -> None:
+        """As the first of a chain, let it compute what the inputs allow."""
+        while self.chain is not None and (ready := self.chain.ready()):
+            self.chain.compute(ready[0], last=ready[1])
+
+    def take(self, place: int, samples: int) -> Signals:
+        """The next samples of an input."""
+        queue, track, delay = self._inputs[place]
+        self._load(queue, track, self.samples + samples - delay)
+        return track.view(self.samples - delay, samples)
+
+    def publish_copies(self, sparse: list[Sparse], outputs: Sequence[Signals], *, last: bool) -> None:
+        """Publish what the chain has computed: copies, for readers keep what they are given."""
+        samples = next(iter(outputs[0].values())).size
+        memory = [pool.take(samples) for pool in self._pools]
+        for (copies, _), signals in zip(memory, outputs, strict=True):
+            for name, array in copies.items():
+                array[:] = signals[name]
+        sparse = self.stage.conclude(self.samples, sparse, [copies for copies, _ in memory], last=last)
+        self._publish(sparse, memory, last=last)
+
+    def pass_over(self, inside: Collection[str]) -> None:
+        """Put what has been handed over to it ``inside`` of the chain where it would be had it computed alone."""
+        for topic, track in self._tracks.items():
+            if topic in inside:
+                queue = self._queues[topic]
+                if track.delay:
+                    self._load(queue, track, self.samples)
+                else:
+                    queue.drop(self.samples)
+
+    def part(self, inside: Collection[str]) -> None:
+        """Compute alone from now on."""
+        self.chain, self.due = None, True
+        for topic, track in self._tracks.items():
+            if topic in inside and not track.delay:
+                track.restart(self.samples)
+        self._wire()
+
+    # ---- alone --------------------------------------------------------------------------------------
+
+    def next(self) -> tuple[int, bool] | None:
         """Samples to compute in one go, and whether the run ends with them; None while an input is missing."""
         if not self._started:
             if not all(queue.blocks for queue in self._forward):
@@ -362,8 +443,13 @@ class StageNode(CellNode):
 
     def advance(self) -> None:
         """Compute every block whose inputs are there."""
+        if not self._started and any(queue.blocks for queue in self._forward):
+            form(self)
+        if self.chain is not None:
+            self.chain.advance()
+            return
         while not self.over and not self.failure:
-            ready = self._next()
+            ready = self.next()
             if ready is None:
                 return
             samples, last = ready
@@ -385,8 +471,14 @@ class StageNode(CellNode):
     def compute(self, samples: int, inputs: Sequence[Signals], *, last: bool) -> None:
         """Compute some blocks in one go, and publish each; the last one of the run may be shorter."""
         memory = [pool.take(samples) for pool in self._pools]
+        self._publish(
+            self.stage.advance(self.samples, inputs, [signals for signals, _ in memory], last=last), memory, last=last
+        )
+
+    def _publish(self, said: Sequence[Sparse], memory: Sequence[tuple[Signals, Samples | None]], *, last: bool) -> None:
+        samples = next(iter(memory[0][0].values())).size
         before, found = self._framer.companions, []
-        for sparse in self.stage.advance(self.samples, inputs, [signals for signals, _ in memory], last=last):
+        for sparse in said:
             found.append(sparse.index)
             framed = self._framer.sparse(sparse)
             topic, data = self._sparse_topics[sparse.topic], messages.encode(sparse.type, framed)
