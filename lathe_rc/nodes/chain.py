@@ -51,6 +51,7 @@ class Chain:
         self._busy = self._over = False
         for node in nodes:
             node.join(self, self._inside)
+        nodes[0].reporter("chain", nodes[0].get_name(), nodes=[node.get_name() for node in nodes])
 
     def advance(self) -> None:
         """Compute what the inputs from outside allow; the first of the nodes says how far."""
