@@ -34,6 +34,7 @@ from lathe_rc.bag.check import write_digests
 from lathe_rc.bag.record import OfflineRecorder, begin, begin_snapshots, recorder_of
 from lathe_rc.bag.writer import refuse_existing
 from lathe_rc.cell import messages
+from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.collect import Collector, Finite
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.messages import Signals
@@ -210,9 +211,7 @@ def run(
         LossyRunError: a free-running cell lost blocks.
     """
     if mode != "offline" and start == "fork":
-        starting.server().preload(
-            {name: (scenario.kind(name), table.model_dump()) for name, table in scenario.nodes.items()}
-        )  # meanwhile the cell is checked
+        starting.server()  # it imports while the cell is checked
     cell = Cell(scenario.nodes)
     cell.check()
     if cell.master.samples is None:
@@ -238,8 +237,13 @@ def _run(
 ) -> Result:
     assert cell.master.samples is not None
     watch({"event": "checked", "node": cell.master.name, "samples": cell.master.samples, "step": scenario.shared.step})
+    for left in compile_ahead(cell.stages.values()):
+        watch({"event": "compiling", "node": left[0], "nodes": left})
     if mode == "offline":
         return _offline(scenario, cell, bag, watch)
+    if start == "fork":
+        nodes = {name: (scenario.kind(name), table.model_dump()) for name, table in scenario.nodes.items()}
+        starting.server().preload(nodes)
     with contextlib.ExitStack() as stack:
         table = recorder_of(scenario)[1]
         folder = table.snapshots_of(bag) if bag is not None and table.mode != "continuous" else None

@@ -10,7 +10,7 @@ import hashlib
 import importlib.util
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache
+from functools import cache, cached_property
 from types import ModuleType
 from typing import Any
 
@@ -58,7 +58,7 @@ class Native:
         inputs, outputs: element types of the arrays of all fields of all ports.
 
     Attributes:
-        address: of the function.
+        name: of the module that it stands in.
         words: of the memory, see `Words`.
     """
 
@@ -71,8 +71,14 @@ class Native:
     ) -> None:
         self._words = Words(memory)
         self.words = self._words.words
-        self.address: int = _module(_text(step, self._words.kind, inputs, outputs), self._words.kind).enter.address
+        self._text = _text(step, self._words.kind, inputs, outputs)
+        self.name = f"step_{hashlib.sha256(self._text.encode()).hexdigest()[:16]}"
         self._reached, self._fields = np.zeros(1, np.int64), np.zeros(len(inputs) + len(outputs), np.int64)
+
+    @cached_property
+    def address(self) -> int:
+        """Of the function, which is compiled if it never was."""
+        return int(_module(self.name, self._text, self._words.kind).enter.address)
 
     def update(self, memory: tuple[Any, ...]) -> None:
         """See `Words`."""
@@ -117,10 +123,14 @@ def _text(step: Step, memory: Placed, inputs: Sequence[np.dtype[Any]], outputs: 
     )
 
 
+def compiled() -> set[str]:
+    """Names of the modules that have been compiled on this machine."""
+    return {path.name.partition(".")[0] for path in cache_folder().rglob("step_*.nbi")}
+
+
 @cache
-def _module(text: str, memory: Placed) -> ModuleType:
+def _module(name: str, text: str, memory: Placed) -> ModuleType:
     """The module of a text, kept in a file: Numba keeps what it has compiled for a file."""
-    name = f"step_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
     folder = cache_folder() / "steps"
     path = folder / f"{name}.py"
     if not path.exists():

@@ -537,7 +537,7 @@ def compile_kernels(stage: Stage) -> None:
     if stage.shared.allow_faults:
         faults.prepare()
     if stage.step is not None:
-        stage.native()
+        assert stage.native().address, "that compiles it"
         return
     inputs = [
         {name: np.empty(0, messages.sample_fields(port.type)[name]) for name in port.fields}

@@ -22,6 +22,7 @@ class Watch:
         self._start = time.monotonic()
         self._due = {"progress": 0.0, "cycle": 0.0}
         self._silent = ""  # who was said to be
+        self._compiles = False
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -41,6 +42,9 @@ class Watch:
 
     def _log(self, event: harness.Event, now: float) -> None:
         """Without a terminal, a line now and then."""
+        if event["event"] == "compiling" and not self._compiles:
+            self._compiles = True
+            self._bar.console.print(f"compiling {len(event['nodes'])} stages, once on this machine: some 20 s")
         if event["event"] == "cycle" and now >= self._due["cycle"]:
             self._due["cycle"] = now + _LOG_PERIOD
             error = f"error {event['rms_error'] * 1e6:.3g} µm RMS"
@@ -64,6 +68,9 @@ class Watch:
             self._step = event["step"]
             update(self._task, total=event["samples"])
             self._bar.start()
+        elif kind == "compiling":
+            text = f"compiling {len(event['nodes'])} stages, once on this machine: {', '.join(event['nodes'])}"
+            update(self._task, description=text)
         elif kind == "block0":
             self._start = now
             update(self._task, description="turning")

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiling the steps of stages ahead of a run: once on a machine, on all cores.
+
+Numba compiles one function at a time, so processes do it: each gets some stages and says when it is done with one.
+What they have compiled is on the disk, where whoever runs the stages finds it.
+"""
+
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+
+from lathe_rc.cell import native
+from lathe_rc.cell.scenario import TABLES
+from lathe_rc.cell.stage import Stage, compile_kernels
+from lathe_rc.cell.stages import STAGES
+from lathe_rc.errors import LatheError
+
+
+def uncompiled(stages: Iterable[Stage]) -> list[Stage]:
+    """Those whose steps nobody has compiled on this machine; of those that have the same one, the first."""
+    known, found = native.compiled(), []
+    for stage in stages:
+        if stage.step is not None and (name := stage.native().name) not in known:
+            known.add(name)
+            found.append(stage)
+    return found
+
+
+def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
+    """Compile the steps that nobody has compiled.
+
+    Yields:
+        The names of the stages that are left, before the first and after each but the last.
+
+    Raises:
+        LatheError: a process that compiles has ended.
+    """
+    left = uncompiled(stages)
+    names = [stage.name for stage in left]
+    parts = [left[k :: os.cpu_count() or 1] for k in range(os.cpu_count() or 1)]
+    done: queue.SimpleQueue[str] = queue.SimpleQueue()
+    processes = [_start(part, done) for part in parts if part]
+    try:
+        while names:
+            yield list(names)
+            name = done.get()
+            if not name:
+                raise LatheError("a process that compiles the steps of stages has ended: see what it has written")
+            names.remove(name)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def _start(stages: Sequence[Stage], done: "queue.SimpleQueue[str]") -> "subprocess.Popen[str]":
+    """Start a process that compiles the steps of some stages; ``done`` gets their names, and in the end nothing."""
+    process = subprocess.Popen([sys.executable, "-m", __name__], stdin=-1, stdout=-1, text=True)
+    asked = {stage.name: (stage.kind, stage.shared.model_dump()) for stage in stages}
+
+    def talk() -> None:
+        told, _ = process.stdin, process.stdout
+        assert told is not None, "it is a pipe"
+        told.write(json.dumps(asked))
+        told.close()
+        for line in process.stdout or ():
+            done.put(line.rstrip())
+        if process.wait():
+            done.put("")
+
+    threading.Thread(target=talk, daemon=True).start()
+    return process
+
+
+def main() -> None:
+    """Compile what the standard input names."""
+    for name, (kind, values) in json.load(sys.stdin).items():
+        compile_kernels(STAGES[kind](name, TABLES[kind].read(name, values)))
+        print(name, flush=True)
+
+
+if __name__ == "__main__":
+    main()
