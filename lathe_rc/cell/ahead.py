@@ -5,6 +5,7 @@ Numba compiles one function at a time, so processes do it: each gets some stages
 What they have compiled is on the disk, where whoever runs the stages finds it.
 """
 
+import contextlib
 import json
 import os
 import queue
@@ -63,11 +64,11 @@ def _start(stages: Sequence[Stage], done: "queue.SimpleQueue[str]") -> "subproce
     asked = {stage.name: (stage.kind, stage.shared.model_dump()) for stage in stages}
 
     def talk() -> None:
-        told, _ = process.stdin, process.stdout
-        assert told is not None, "it is a pipe"
-        told.write(json.dumps(asked))
-        told.close()
-        for line in process.stdout or ():
+        assert process.stdin is not None, "it is a pipe"
+        assert process.stdout is not None, "the same"
+        with contextlib.suppress(BrokenPipeError), process.stdin as told:
+            told.write(json.dumps(asked))
+        for line in process.stdout:
             done.put(line.rstrip())
         if process.wait():
             done.put("")
