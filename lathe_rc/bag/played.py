@@ -15,7 +15,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stage import DONE
+from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
@@ -40,14 +40,7 @@ class Memory(NamedTuple):
 
 
 @kernel
-def step(
-    memory: Memory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     angle, speed, angle_true, speed_true, index_pulse = outputs
     at, n = first - memory.span[0], angle.size

@@ -25,7 +25,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.native import Native, Step
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.errors import InputError, LatheError
@@ -94,6 +94,8 @@ class Trigger:
         return f"{self.kind} {self.value:g}: {self.action}"
 
 
+Fields = tuple[Samples, ...]  #: arrays of a step, each of shape (n,)
+Reached = tuple[int, int]  #: sample of the block that a step has reached, and why it has stopped
 DONE, PYTHON = 0, -1  #: why a step, or a program of steps, has stopped
 NEVER = np.iinfo(np.int64).max  #: no sample at all
 

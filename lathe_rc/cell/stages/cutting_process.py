@@ -9,9 +9,9 @@ from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc.analysis.shaft import STEEL_MODULUS, Shaft, Support
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.cell.stage import DONE, Input, Output, Sparse, Stage
+from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.cutting import (
@@ -187,14 +187,7 @@ class Memory(NamedTuple):
 
 
 @kernel
-def step(
-    memory: Memory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`; the cross feed is positive into the part."""
     angle, speed = inputs[0], inputs[1]
     force, measured_force, depth_of_cut, feed, allowance, wear, deflection = outputs

@@ -8,7 +8,7 @@ from annotated_types import Ge, Gt
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.cell.stage import DONE, Input, Output, Stage
+from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Stage
 from lathe_rc.control.decoupler import LAG, LEAK, PRESETS, Channels, Decoupler, compensators, decouple_along
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
@@ -61,14 +61,7 @@ class Memory(NamedTuple):
 
 
 @kernel
-def step(
-    memory: Memory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`; set points and errors go on unchanged."""
     force, force_set_point, force_error, position, position_set_point, position_error = inputs
     outputs[1][:], outputs[2][:] = force_set_point, force_error

@@ -8,9 +8,8 @@ from annotated_types import Ge, Gt, Le
 
 from lathe_rc.analysis.learning import Response
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import DONE, Input, Joint, Output, Sparse
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
 from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.cell.stages.retraction import OwnRetraction, RetractionParameters, followed
@@ -48,14 +47,7 @@ class Memory(NamedTuple):
 
 
 @kernel
-def step(
-    memory: Memory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     (command,), (position, velocity, effort, measured_position) = inputs, outputs
     given = limited(memory.limits, first, followed(memory.retraction, command))

@@ -10,7 +10,7 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import DONE, Input, Joint, Output, Sparse, Stage
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse, Stage
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedParameters, remembered
 from lathe_rc.cell.stages.obedience import (
     OBEY,
@@ -114,14 +114,7 @@ class Memory(NamedTuple):
 
 
 @kernel
-def step(
-    memory: Memory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     command, (position, velocity, effort, measured_position) = inputs[0], outputs
     n, mask = command.size, memory.clipped.size - 1

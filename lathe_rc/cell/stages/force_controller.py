@@ -9,7 +9,7 @@ from annotated_types import Ge, Gt
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import Input, Output, Sparse, Stage
+from lathe_rc.cell.stage import Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.cell.stages.obedience import listens
 from lathe_rc.cell.stages.servo import Listener, ServoParameters, listener, pid_along
 from lathe_rc.cell.stages.trajectory import Course, Trajectory, follow
@@ -42,14 +42,7 @@ class Memory(NamedTuple):
 
 
 @kernel
-def step(
-    memory: Memory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     force, (command, wanted, error) = inputs[1], outputs
     if start == 0:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from lathe_rc.analysis.learning import LearningLoop, Response
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import MAX_BLOCK, Samples, Signals
-from lathe_rc.cell.stage import DONE, Input, Output, Sparse, Stage
+from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
 from lathe_rc.cell.stages.obedience import (
     NOBODY,
@@ -99,7 +99,7 @@ def _angle(memory: Memory, first: int, late: int, measured: Samples) -> Samples:
 
 
 @inlined
-def _begin(memory: Memory, first: int, start: int, stop: int, inputs: tuple[Samples, ...]) -> None:
+def _begin(memory: Memory, first: int, start: int, stop: int, inputs: Fields) -> None:
     """Look ahead along a piece of a block, and take its errors."""
     control, samples = memory.control, stop - start
     speed, error = inputs[1][start:stop], inputs[3][start:stop]
@@ -125,14 +125,7 @@ def _lose(memory: Memory, start: int, stop: int, command: Samples) -> None:
 
 
 @kernel
-def step(
-    memory: Memory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     control, state, command = memory.control, memory.state, outputs[0]
     n = command.size

@@ -11,7 +11,7 @@ from lathe_rc.analysis.learning import Response
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import DONE, Joint, Output, Sparse
+from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
 from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.set_point import SetPoint, SetPointParameters, sum_up
@@ -131,14 +131,7 @@ class Memory(NamedTuple):
 
 
 @kernel
-def step(
-    memory: Memory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     position, velocity, effort, measured_position = outputs
     set_point = sum_up(memory.signs, inputs, 0, position.size)

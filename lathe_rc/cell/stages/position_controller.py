@@ -14,7 +14,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.native import Step
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import DONE, Input, Output, Sparse, Stage
+from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.cell.stages.feed_drive import Axis
 from lathe_rc.cell.stages.obedience import OBEY, apply, listens, may_learn, piece
 from lathe_rc.cell.stages.servo import Listener, ServoParameters, listener, pid_along
@@ -132,9 +132,7 @@ class PeriodicMemory(NamedTuple):
 
 
 @kernel
-def _look(
-    wanted: Wanted, first: int, start: int, inputs: tuple[Samples, ...], set_point: Samples, error: Samples
-) -> Samples:
+def _look(wanted: Wanted, first: int, start: int, inputs: Fields, set_point: Samples, error: Samples) -> Samples:
     """The position that is controlled [m]; fills set point and error of a block that begins."""
     position = inputs[1]
     if wanted.edge:
@@ -152,14 +150,7 @@ def _look(
 
 
 @kernel
-def pid_step(
-    memory: PidMemory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def pid_step(memory: PidMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     command, set_point, error = outputs
     position = _look(memory.wanted, first, start, inputs, set_point, error)
@@ -167,14 +158,7 @@ def pid_step(
 
 
 @kernel
-def link_step(
-    memory: LinkMemory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def link_step(memory: LinkMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """The same with a sampled link, which has nothing that it could learn with."""
     command, set_point, error = outputs
     position, who = _look(memory.wanted, first, start, inputs, set_point, error), memory.wanted.who
@@ -218,13 +202,8 @@ def _repeat(
 
 @kernel
 def periodic_step(
-    memory: PeriodicMemory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+    memory: PeriodicMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields
+) -> Reached:
     """The same with the periodic law."""
     command, set_point, error = outputs
     position, who = _look(memory.wanted, first, start, inputs, set_point, error), memory.wanted.who

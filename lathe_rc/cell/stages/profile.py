@@ -2,21 +2,13 @@
 """The desired form under the tool as a node of its own, for drives that need it before the tool computes."""
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
-from lathe_rc.cell.stage import DONE, Joint, Output, Stage
+from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached, Stage
 from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, evaluate
 from lathe_rc.jit import kernel
 
 
 @kernel
-def step(
-    memory: FormTable,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: FormTable, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     reference, expected, height = outputs
     evaluate(memory, inputs, reference, expected, height)

@@ -12,7 +12,7 @@ from lathe_rc.analysis.learning import Response
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.cell.stage import DONE, Input, Joint, Output, Sparse
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, limited
 from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
@@ -92,14 +92,7 @@ class Memory(NamedTuple):
 
 
 @kernel
-def step(
-    memory: Memory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     command = inputs[0]
     position, velocity, effort, measured, fine_position, fine_velocity, fine_effort, fine_measured = outputs

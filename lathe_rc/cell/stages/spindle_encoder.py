@@ -7,10 +7,9 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.native import Step
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import DONE, Joint, Output, Stage, Trigger
+from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached, Stage, Trigger
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.jit import kernel
 from lathe_rc.signals.encoder import Encoder, EncoderTable, encode
@@ -48,14 +47,7 @@ class SpindleEncoderParameters(SpeedLawParameters):
 
 
 @kernel
-def step(
-    memory: EncoderTable,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: EncoderTable, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     angle, speed, index_pulse, angle_true, speed_true = outputs
     encode(memory, first, angle, speed, index_pulse, angle_true, speed_true)

@@ -11,7 +11,7 @@ from annotated_types import Ge, Le
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.cell.stage import DONE, Input, Output, Sparse, Stage
+from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.safety import state_machine
@@ -116,14 +116,7 @@ class Memory(NamedTuple):
 
 
 @kernel
-def step(
-    memory: Memory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`; for `_ANSWER` it stops at the end of the block."""
     state, reaction = outputs
     n = state.size

@@ -7,9 +7,8 @@ import numpy as np
 from annotated_types import Ge, Le, MinLen
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import DONE, Input, Joint, Output, Stage
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
 from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, evaluate
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
@@ -55,14 +54,7 @@ class Memory(NamedTuple):
 
 
 @kernel
-def step(
-    memory: Memory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     reference, displacement, error, known, height = outputs
     if memory.form.heights.size:

@@ -10,7 +10,7 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.cell.stage import DONE, Input, Joint, Output, Stage
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.signals import vibration
@@ -40,14 +40,7 @@ class Memory(NamedTuple):
 
 
 @kernel
-def step(
-    memory: Memory,
-    first: int,
-    start: int,
-    inputs: tuple[Samples, ...],
-    flags: tuple[Samples, ...],
-    outputs: tuple[Samples, ...],
-) -> tuple[int, int]:
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     position, velocity, effort, measured_position = outputs
     vibration.evaluate(first, memory.period, memory.lines, position, velocity)
