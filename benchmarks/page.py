@@ -246,7 +246,7 @@ def _growth(found: Mapping[str, Any]) -> list[str]:
 def _ros(found: Mapping[str, Any]) -> list[str]:
     """A table of each cell: block sizes and arrangements below each other; then what else there is."""
     lines: list[str] = []
-    cells = {name: sizes for name, sizes in found.items() if isinstance(sizes, Mapping) and "block_64" in sizes}
+    cells = {name: sizes for name, sizes in found.items() if name.endswith("_nodes")}
     for name, sizes in cells.items():
         runs = {f"{size}, {each}": run for size, split in sizes.items() for each, run in split.items()}
         rates = {key: {what: value for what, value in run.items() if _is_figure(value)} for key, run in runs.items()}

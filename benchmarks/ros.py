@@ -12,7 +12,10 @@ loops of the 13 close within 64 samples, so they know no longer blocks. Of each 
   controller, drive, tool, recorder, spindle again. It contains what the nodes compute.
 
 Against: the same cell with a message a sample (`benchmarks.naive.piston`), at the pace of a timer, which loses samples,
-and in lockstep; and lathe_rc itself with a SingleThreadedExecutor (`benchmarks.naive.container`).
+and in lockstep; lathe_rc itself with a SingleThreadedExecutor (`benchmarks.naive.container`); and bare transport
+(`benchmarks.transport`): as many processes as the piston with one process a node, which pass the bytes of the same
+messages along the same topics and compute nothing. ``bare_transport_ratio`` is the pace of the cell over that of bare
+transport, measured by turns: what is left of what the middleware allows.
 """
 
 import contextlib
@@ -30,6 +33,7 @@ from typing import Any
 from unittest import mock
 
 from benchmarks import sides
+from benchmarks.transport import Transport
 from lathe_rc import harness, resources
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import Scenario
@@ -54,9 +58,12 @@ TARGETS = {"processes": {64: 3, 256: 10, 1024: 25}, "composed": {64: 6, 256: 20,
 Say = Callable[[str], None]
 _HOPS = 5
 _RATE = 64000  # [Hz]
-_ROUNDS, _QUICK_SHARE = 3, 0.3
+_ROUNDS, _BARE_ROUNDS, _QUICK_SHARE = 3, 7, 0.3
 _NAIVE = {"timer": (6000, 2000), "lockstep": (3000, 500)}  # samples by pace: in full, quick
 _PATIENCE = 60.0  # [s]
+#: Simulated revolutions of the piston beside bare transport, which takes a third of its time, by block size.
+_BARE = {64: 180, 256: 300, 1024: 450}
+_BARE_TARGET = 0.6
 
 
 @dataclass(frozen=True)
@@ -184,6 +191,35 @@ def _cells(
     return found
 
 
+def _alone(scenario: Scenario) -> float:
+    """Real-time factor of the piston with one process a node."""
+    return run(scenario, partial(split, name="piston", arrangement="processes")).real_time_factor
+
+
+def _pace(transport: Transport) -> float:
+    return transport.run().real_time_factor
+
+
+def _bare_transport(sizes: Sequence[int], rounds: int, say: Say, share: float = 1.0) -> dict[str, Any]:
+    """The piston, one process a node, beside its messages alone, by turns."""
+    found: dict[str, Any] = {}
+    for size in sizes:
+        scenario = load("piston", block_size=size, spindle_encoder__revolutions=share * _BARE[size])
+        with tempfile.TemporaryDirectory(prefix="lathe-bench-") as folder:
+            transport = Transport(harness.with_recorder(scenario, Path(folder) / "bag", keep=True), Path(folder))
+            turns = {"cell": partial(_alone, scenario), "bare": partial(_pace, transport)}
+            paces = sides.alternate(turns, rounds)
+        ratio = sides.ratio(paces["cell"], paces["bare"])
+        say(f"  blocks of {size}: {ratio['median']:.2f} of the pace of bare transport")
+        found[f"block_{size}"] = {
+            "cell_real_time_factor": sides.spread(paces["cell"]),
+            "bare_real_time_factor": sides.spread(paces["bare"]),
+            "bare_transport_ratio": ratio,
+            "target_bare_transport_ratio": _BARE_TARGET,
+        }
+    return found
+
+
 def _latency(rounds: int) -> dict[str, Any]:
     """One block of the piston in flight."""
     scenario = load("piston", window=1, spindle_encoder__revolutions=20)
@@ -265,23 +301,26 @@ def _naive(ours: Callable[[], float], *, quick: bool) -> dict[str, Any]:
 
 
 def measure(*, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
-    """All of it, 12 minutes; quick: the piston once with short blocks, as processes and composed."""
+    """All of it, 14 minutes; quick: the piston once with short blocks, as processes and composed."""
     found: dict[str, Any] = {}
     if quick:
         # Not the longer blocks: most of the time goes into starting the processes.
         found["piston_5_nodes"] = _cells("piston", [64], ["processes", "composed"], 1, say, _QUICK_SHARE)
         ours = found["piston_5_nodes"]["block_64"]["processes"]["real_time_factor"]["median"]
+        say("  bare transport")
+        found["bare_transport"] = _bare_transport([64], 1, say, _QUICK_SHARE)
         say("  a message a sample")
         return {**found, "naive": _naive(lambda: float(ours), quick=True)}
     arrangements = ["processes", "grouped", "composed"]
     for name, sizes in REVOLUTIONS.items():
         count = len(harness.with_recorder(load(name), Path("bag"), keep=True).nodes)
         found[f"{name}_{count}_nodes"] = _cells(name, list(sizes), arrangements, _ROUNDS, say)
+    say("  bare transport")
+    found["bare_transport"] = _bare_transport(list(_BARE), _BARE_ROUNDS, say)
     say("  one block in flight")
     found["latency_per_hop_us"] = _latency(_ROUNDS)
     say("  executors")
     found["executor"] = _executors(_ROUNDS)
     say("  a message a sample")
     scenario = load("piston", spindle_encoder__revolutions=REVOLUTIONS["piston"][64])
-    alone = partial(split, name="piston", arrangement="processes")
-    return {**found, "naive": _naive(lambda: run(scenario, alone).real_time_factor, quick=False)}
+    return {**found, "naive": _naive(partial(_alone, scenario), quick=False)}

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measuring side by side: A B A B ..., so that a machine whose speed wanders slows all sides alike."""
 
+import contextlib
+import os
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 Spread = dict[str, float]
 
@@ -23,6 +25,17 @@ def seconds(action: Callable[[], object]) -> float:
     start = time.perf_counter()
     action()
     return time.perf_counter() - start
+
+
+@contextlib.contextmanager
+def one_core() -> Iterator[None]:
+    """This thread, and those that it starts meanwhile, on one core of those that it may use."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(before)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
 
 
 def alternate(sides: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, list[float]]:

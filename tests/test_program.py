@@ -11,8 +11,10 @@ from lathe_rc.cell.messages import COMMAND, ENCODER
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.program import Program, Tapes, wired
 from lathe_rc.cell.stage import Input, Output, Sparse, Stage
+from lathe_rc.cell.stages.form import FormTable
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import LatheError
+from lathe_rc.jit import kernel
 
 
 @given(
@@ -107,6 +109,34 @@ def test_what_was_computed_before_an_error_is_there_and_the_stage_is_named():
         cell.run(1000)
     assert cell.reached == 300
     assert tapes.view("half", 0, 300)["position"][-1] > 0.0
+
+
+@kernel
+def raising_step(memory, first, start, inputs, flags, outputs):
+    if first >= 300:
+        raise ValueError("a slip")
+    return outputs[0].size, 0
+
+
+class Raising(Halving):
+    """A step with an error in it."""
+
+    step = staticmethod(raising_step)
+
+    @property
+    def memory(self):
+        return FormTable(np.zeros(1), np.zeros((1, 2, 4)), 0, 0.0, 0.0, 0)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_exception_in_a_step_is_not_lost():
+    cell, _ = program(made(Raising))
+    with pytest.raises(RuntimeError, match="halving: the step has raised an exception"):
+        cell.run(1000)
+    assert cell.reached == 300
+    alone = made(Raising)
+    with pytest.raises(RuntimeError, match="has raised an exception"):
+        Stage.process(alone, 300, [{"angle": np.zeros(10)}], [{"position": np.zeros(10)}])
 
 
 def test_a_stage_that_has_its_own_process_does_not_inherit_a_step():

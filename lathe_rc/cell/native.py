@@ -49,6 +49,14 @@ def enter(memory, first, start, samples, fields, reached):
 '''
 
 
+BROKEN = -2  #: where a step has come to that has raised an exception: Numba prints it, and the function returns 0
+
+
+def broken(name: str) -> RuntimeError:
+    """The error of a step that has raised an exception."""
+    return RuntimeError(f"{name}: the step has raised an exception, which Numba has printed on the error stream")
+
+
 class Native:
     """A step with its memory as a function of addresses.
 
@@ -90,7 +98,10 @@ class Native:
             assert array.flags.c_contiguous, "kernels take it for contiguous"
             assert array.size == samples, "and as long as the block"
             self._fields[place] = array.ctypes.data
+        self._reached[0] = BROKEN
         reason = _call(self.address, self.words, first, start, samples, self._fields, self._reached)
+        if self._reached[0] == BROKEN:
+            raise broken(self.name)
         return int(self._reached[0]), reason
 
 

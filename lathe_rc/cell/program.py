@@ -12,7 +12,7 @@ import numpy as np
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
-from lathe_rc.cell.native import Integers
+from lathe_rc.cell.native import BROKEN, Integers, broken
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
 from lathe_rc.jit import kernel
@@ -95,7 +95,10 @@ def _run(plan: Integers, turn: Samples, fields: Integers, where: Integers, base:
             where[0], where[1], where[2] = first, stage, start
             if waits:
                 return PYTHON
+            where[2] = BROKEN
             reason: int = call(row[_STEP], row[_WORDS], first, start, n, block, where.ctypes.data + 16)
+            if where[2] == BROKEN:
+                return BROKEN
             if reason != DONE:
                 return reason
             stage += 1
@@ -228,6 +231,8 @@ class Program:
         inputs = [tapes.view(tape, first, samples, delay) for tape, delay in self._wired[number].inputs]
         outputs = [tapes.view(tape, first, samples) for tape in self._wired[number].outputs]
         with stage.named():
+            if reason == BROKEN:
+                raise broken(stage.name)
             if reason == PYTHON:
                 self._tell(number, first)
                 self._sparse[number] += stage.compute(first, inputs, outputs)

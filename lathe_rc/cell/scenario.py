@@ -46,7 +46,7 @@ class _Text(str):
     __slots__ = ()
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]  # absent without libyaml
     """Writes what rcl reads back as the same value."""
 
 
