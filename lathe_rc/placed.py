@@ -4,11 +4,14 @@
 A kernel takes a NamedTuple of arrays by value: each call hands over seven words an array and counts references to it.
 A placed one is its address. It is laid out in words of 64 bits: of an array where it is and its shape, of a constant
 its value, of a NamedTuple its members. Who lays it out keeps the arrays meanwhile, and changes no word during a call.
+
+Of a NamedTuple that is `sized` the shapes of the arrays are part of the type: the compiler then unrolls the loops over
+matrices of two or six rows. That is for few and small arrays, since each shape is compiled by itself.
 """
 
 from collections.abc import Iterator
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
@@ -27,35 +30,50 @@ _WORD = ir.IntType(64)
 _KINDS = {np.dtype(np.float64): types.float64, np.dtype(np.int64): types.int64, np.dtype(np.uint8): types.uint8}
 
 
+T = TypeVar("T", bound=type)
+_SIZED: set[type] = set()
+
+
+def sized(kind: T) -> T:
+    """Let the compiler know the shapes of the arrays of a NamedTuple; decorates its class."""
+    _SIZED.add(kind)
+    return kind
+
+
 class Placed(types.Type):
     """The type of a placed NamedTuple.
 
     Attributes:
         members: type and place [word] of each, by name.
+        shapes: those that are known, by name.
         size: of all of them [word].
     """
 
-    def __init__(self, kind: str, members: dict[str, tuple[types.Type, int]], size: int) -> None:
-        self.members, self.size = members, size
-        told = ", ".join(f"{name}: {member}" for name, (member, _) in members.items())
+    def __init__(
+        self, kind: str, members: dict[str, tuple[types.Type, int]], shapes: dict[str, tuple[int, ...]], size: int
+    ) -> None:
+        self.members, self.shapes, self.size = members, shapes, size
+        told = ", ".join(f"{name}: {member}{shapes.get(name, '')}" for name, (member, _) in members.items())
         super().__init__(name=f"{kind}({told})")
 
 
 def placed(value: tuple[Any, ...]) -> Placed:
     """The type of a NamedTuple of arrays of float64, int64 or uint8, constants, and NamedTuples of those."""
-    return _placed(type(value), tuple(map(_sort, value)))
+    return _placed(*_sort(value))
 
 
 def _sort(part: Any) -> Any:
     """What the type of a member depends on: types of NamedTuples are made once for all that are alike."""
     if isinstance(part, tuple):
-        return type(part), tuple(map(_sort, part))
+        shapes = [each.shape for each in part if isinstance(each, np.ndarray)]
+        return type(part), tuple(map(_sort, part)), tuple(shapes) if type(part) in _SIZED else ()
     return (part.dtype, part.ndim) if isinstance(part, np.ndarray) else type(part)
 
 
 @cache
-def _placed(kind: Any, sorts: tuple[Any, ...]) -> Placed:
+def _placed(kind: Any, sorts: tuple[Any, ...], known: tuple[tuple[int, ...], ...]) -> Placed:
     members: dict[str, tuple[types.Type, int]] = {}
+    shapes: dict[str, tuple[int, ...]] = {}
     place = 0
     for name, sort in zip(kind._fields, sorts, strict=True):
         member: types.Type
@@ -64,11 +82,13 @@ def _placed(kind: Any, sorts: tuple[Any, ...]) -> Placed:
             member = types.boolean if sort in (bool, np.bool_) else member
         elif isinstance(sort[0], np.dtype):
             member = types.Array(_KINDS[sort[0]], sort[1], "C")
+            if known:
+                shapes[name] = known[len(shapes)]
         else:
             member = _placed(*sort)
         members[name] = member, place
         place += _words_of(member)
-    return Placed(f"{kind.__module__}.{kind.__qualname__}", members, place)
+    return Placed(f"{kind.__module__}.{kind.__qualname__}", members, shapes, place)
 
 
 def _words_of(member: types.Type) -> int:
@@ -164,6 +184,8 @@ def _member(context: Any, builder: Any, kind: Placed, address: Any, name: str) -
         return words[0]
     if isinstance(member, types.Array):
         where, *shape = (_load(builder, word, _WORD) for word in words)
+        if name in kind.shapes:
+            shape = [_WORD(length) for length in kind.shapes[name]]
         return _array(context, builder, member, where, shape)
     if member == types.float64:
         return _load(builder, words[0], ir.DoubleType())

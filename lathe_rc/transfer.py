@@ -14,6 +14,7 @@ import scipy
 
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
+from lathe_rc.placed import sized
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -69,6 +70,7 @@ class TransferFunction:
         )
 
 
+@sized
 class System(NamedTuple):
     """x[n] = Φ·x[n-1] + g0·u[n-1] + g1·u[n], y[n] = c·x[n] + d·u[n].
 
@@ -95,18 +97,6 @@ def step(system: System, state: Array, command: float) -> float:
     order = system.now.size
     previous = state[order]
     value = system.through * command
-    if order == 1:  # loops over one or two numbers would cost more than the arithmetic
-        x = system.before[0] * previous + system.now[0] * command + system.transition[0, 0] * state[0]
-        state[0], state[1] = x, command
-        return float(value + system.output[0] * x)
-    if order == 2:
-        a, b = state[0], state[1]
-        x = system.before[0] * previous + system.now[0] * command
-        x = x + system.transition[0, 0] * a + system.transition[0, 1] * b
-        y = system.before[1] * previous + system.now[1] * command
-        y = y + system.transition[1, 0] * a + system.transition[1, 1] * b
-        state[0], state[1], state[2] = x, y, command
-        return float(value + system.output[0] * x + system.output[1] * y)
     for row in range(order):
         total = system.before[row] * previous + system.now[row] * command
         for column in range(order):

@@ -71,8 +71,8 @@ def _run(plan: Integers, turn: Samples, fields: Integers, where: Integers, base:
     Args:
         plan: see above; one row more ends it.
         turn: spindle angle from which on each stage needs Python [rad].
-        fields: of each the address of its first sample on the tape, the size of a sample, the delay, and the address of
-            the block at hand, shape (4, fields).
+        fields: of each the address of its first sample on the tape less the delay, the size of a sample, and the
+            address of the block at hand, shape (3, fields).
         where: changed; where it has come to.
         base: place of sample 0 on the tape.
         end: see above.
@@ -82,13 +82,14 @@ def _run(plan: Integers, turn: Samples, fields: Integers, where: Integers, base:
         Why it stopped: `DONE` at the end.
     """
     first, stage, start = where[0], where[1], where[2]
+    origin, size, at = fields[0], fields[1], fields[2]
     while first < end:
         n = min(chunk, end - first)
+        for field in range(at.size):
+            at[field] = origin[field] + (base + first) * size[field]
         while stage < plan.shape[0] - 1:
             row = plan[stage]
-            for field in range(row[_FIELD], plan[stage + 1, _FIELD]):
-                fields[3, field] = fields[0, field] + (base + first - fields[2, field]) * fields[1, field]
-            block = fields.ctypes.data + 8 * (3 * fields.shape[1] + row[_FIELD])
+            block = at.ctypes.data + 8 * row[_FIELD]
             waits = row[_STEP] == 0 or (start == 0 and row[_DUE] < first + n)
             if start == 0 and turn[stage] < np.inf and row[_ANGLE] >= 0:
                 waits = waits or _passes(floats(block, row[_ANGLE] - row[_FIELD], n), turn[stage])
@@ -160,7 +161,7 @@ class Program:
         self.number, self.ends = 0, [0] * len(stages)
         self._turn = np.empty(len(self._stages))
         self._plan = np.zeros((len(self._stages) + 1, 5), np.int64)
-        fields: list[tuple[int, int, int, int]] = []
+        fields: list[tuple[int, int, int]] = []
         for row, (stage, inputs, outputs) in zip(self._plan, stages, strict=False):
             row[_FIELD], row[_ANGLE], angle = len(fields), -1, stage.angle_input
             for place, port in enumerate(stage.inputs[: stage.own_inputs]):
@@ -180,9 +181,9 @@ class Program:
         for number in range(len(self._stages)):
             self._load(number)
 
-    def _field(self, tape: str, delay: int, name: str) -> tuple[int, int, int, int]:
+    def _field(self, tape: str, delay: int, name: str) -> tuple[int, int, int]:
         array = self._tapes.arrays[tape, name]
-        return array.ctypes.data, array.itemsize, delay, 0
+        return array.ctypes.data - delay * array.itemsize, array.itemsize, 0
 
     def _load(self, number: int) -> None:
         """Take what a stage has in its memory now, and when it wants Python next."""

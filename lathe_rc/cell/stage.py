@@ -132,6 +132,7 @@ class Stage(ABC):
     inputs: tuple[Input, ...] = ()
     outputs: tuple[Output, ...] = ()
     step: ClassVar[Step | None] = None
+    rooms: ClassVar[int] = 0  #: arrays of a block that the step needs for itself
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -148,6 +149,7 @@ class Stage(ABC):
         self._injection: Injection | None = None
         self.own_inputs, self.tells = 0, False
         self._native: Native | None = None
+        self._room: Samples | None = None
         self._scheduled: list[tuple[int, str]] = []
         self._remarks: list[str] = []  # events that came of the one that is carried out
 
@@ -486,9 +488,16 @@ class Stage(ABC):
             self._native.update(self.memory)
         return self._native
 
+    @property
+    def room(self) -> Samples:
+        """For the step alone, shape (rooms, MAX_BLOCK): to make an array takes as long as some of its samples."""
+        if self._room is None:
+            self._room = np.empty((self.rooms, messages.MAX_BLOCK))
+        return self._room
+
     def __getstate__(self) -> dict[str, Any]:
-        """What is worth keeping: addresses are not."""
-        return {**self.__dict__, "_native": None}
+        """What is worth keeping: addresses and room are not."""
+        return {**self.__dict__, "_native": None, "_room": None}
 
     def prepare(self, first: int, samples: int) -> None:  # noqa: B027 - most stages need nothing
         """Have ready what the samples ``first`` on need that a step cannot make, as random numbers."""

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.errors import InputError
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined, kernel
 from lathe_rc.transfer import System, TransferFunction, discretise, rest, step
 
 Array = npt.NDArray[np.float64]
@@ -117,7 +117,7 @@ def compensators(channels: Channels, lag: float = LAG, leak: float = LEAK) -> tu
     return _leaking(k1, leak), _leaking(k2, leak)
 
 
-@kernel
+@inlined
 def decouple(k1: System, state1: Array, k2: System, state2: Array, u1: float, u2: float) -> tuple[float, float]:
     """v1 and v2 of one sample; the states are those of `lathe_rc.transfer.step`."""
     return u1 - step(k1, state1, u2), u2 - step(k2, state2, u1)

@@ -228,13 +228,6 @@ def _free(system: System, state: Array) -> float:
     """The next output if the input were 0; the state stays."""
     order = system.now.size
     value = 0.0
-    if order == 1:  # see `lathe_rc.transfer.step`
-        return float(value + system.output[0] * (system.before[0] * state[1] + system.transition[0, 0] * state[0]))
-    if order == 2:
-        a, b, previous = state[0], state[1], state[2]
-        x = system.before[0] * previous + system.transition[0, 0] * a + system.transition[0, 1] * b
-        y = system.before[1] * previous + system.transition[1, 0] * a + system.transition[1, 1] * b
-        return float(value + system.output[0] * x + system.output[1] * y)
     for row in range(order):
         total = system.before[row] * state[order]
         for column in range(order):

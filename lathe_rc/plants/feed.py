@@ -37,7 +37,8 @@ import scipy
 
 from lathe_rc.control.limits import CommandLimits, keep_position, keep_velocity, rest
 from lathe_rc.errors import InputError
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined, kernel
+from lathe_rc.placed import sized
 from lathe_rc.plants.backlash import follow
 from lathe_rc.plants.linear import discretise
 from lathe_rc.signals.noise import quantise
@@ -100,6 +101,7 @@ def sampled(gain: float = 6.25, lag: float = 0.08) -> TransferFunction:
     return dc_screw(gain, (lag,))
 
 
+@sized
 class DriveTable(NamedTuple):
     """Constants of a `FeedDrive` for kernels.
 
@@ -140,7 +142,7 @@ class LimitTable(NamedTuple):
     coming: Array
 
 
-@kernel
+@inlined
 def _keep(limits: LimitTable, memory: Array, state: Array, command: float) -> bool:
     """Keep a command within its limits; ``state`` is the drive's. The first of ``memory`` is what is given."""
     stroke, velocity, acceleration, jerk, step = (
@@ -166,7 +168,7 @@ def load_of(state: Array) -> float:
     return float(state[_LOAD])
 
 
-@kernel
+@inlined
 def move(table: DriveTable, state: Array) -> bool:
     """Step a drive with the command that it holds; returns whether it is at its greatest speed."""
     order = table.weights.size
@@ -191,7 +193,7 @@ def move(table: DriveTable, state: Array) -> bool:
     return limited
 
 
-@kernel
+@inlined
 def hold(table: DriveTable, state: Array, command: float) -> bool:
     """Give a drive the command to hold from now on; returns whether it was cut off."""
     state[_EFFORT] = min(max(command, -table.command_limit), table.command_limit)
@@ -236,9 +238,10 @@ def advance(
     measured: Array,
     clipped: npt.NDArray[np.uint8],
 ) -> None:
-    """Step through a block, see `FeedDrive.block`."""
+    """Step through a block, see `FeedDrive.block`; what is ``clipped`` of sample n stands at n modulo its size."""
     table, state, memory, divisor = feed.drive, feed.state, feed.memory, feed.divisor
     saturated = limited = 0
+    mask = clipped.size - 1
     for k in range(command.size):
         before = state[_LOAD]
         limited += move(table, state)
@@ -250,8 +253,7 @@ def advance(
             cut = hold(table, state, wanted)
             saturated += cut
             memory[-1] = 1.0 if changed or cut else 0.0
-        if clipped.size:
-            clipped[k] = memory[-1] > 0.0
+        clipped[(first + k) & mask] = memory[-1] > 0.0
         state[_DISTURBANCE] = disturbance[k] if disturbance.size else 0.0
         motor[k], position[k], effort[k] = state[0], state[_LOAD], state[_EFFORT]
         # Within the gap the slide stands.
@@ -433,4 +435,6 @@ class FeedDrive:
         """
         wanted = command.size if self.whole.kept or clipped.size else 0
         assert clipped.size == wanted, "room for what is clipped"
-        advance(self.whole, first, command, disturbance, position, velocity, effort, motor, measured, clipped)
+        ring = np.zeros(1 << max(clipped.size - 1, 0).bit_length(), np.uint8)
+        advance(self.whole, first, command, disturbance, position, velocity, effort, motor, measured, ring)
+        clipped[:] = ring[np.arange(first, first + clipped.size) & (ring.size - 1)]

@@ -9,7 +9,7 @@ from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc.analysis.shaft import STEEL_MODULUS, Shaft, Support
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.errors import InputError
@@ -174,6 +174,7 @@ class Memory(NamedTuple):
         tool, cross, longitudinal: number of the first input of each that moves the edge; -1: it does not.
         even: whether the blank has the form that is wanted.
         feed: unless the longitudinal slide makes it [m/rad].
+        room: for displacement, position of the cross slide, feed velocity and height.
     """
 
     cut: CutTable
@@ -184,6 +185,7 @@ class Memory(NamedTuple):
     longitudinal: int
     even: bool
     feed: float
+    room: Samples
 
 
 @kernel
@@ -191,18 +193,21 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     """See `lathe_rc.cell.stage`; the cross feed is positive into the part."""
     angle, speed = inputs[0], inputs[1]
     force, measured_force, depth_of_cut, feed, allowance, wear, deflection = outputs
-    still = np.zeros(angle.size)
-    displacement = height = cross_position = still
+    n = angle.size
+    displacement, cross_position, feed_velocity = memory.room[0, :n], memory.room[1, :n], memory.room[2, :n]
+    height = memory.room[3, :n]
+    displacement[:] = cross_position[:] = height[:] = 0.0
     if memory.tool >= 0:
-        displacement, height = inputs[memory.tool], inputs[memory.tool + 2]
+        height = inputs[memory.tool + 2]
+        displacement[:] = inputs[memory.tool]
         if memory.even:
-            displacement = displacement - inputs[memory.tool + 1]
+            displacement -= inputs[memory.tool + 1]
     if memory.cross >= 0:
-        cross_position = -inputs[memory.cross]
+        cross_position[:] = -inputs[memory.cross]
     if memory.longitudinal >= 0:
         height, feed_velocity = inputs[memory.longitudinal], inputs[memory.longitudinal + 1]
     else:
-        feed_velocity = speed * memory.feed
+        feed_velocity[:] = speed * memory.feed
     allow(memory.allowance, angle, allowance)
     reached, reason = cut_along(
         memory.cut, angle, speed, height, cross_position, displacement, feed_velocity, allowance, force, deflection,
@@ -225,6 +230,7 @@ class CuttingProcessStage(Stage):
     kind = "cutting_process"
     Parameters = CuttingProcessParameters
     devices = ("cut",)
+    rooms = 4
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: CuttingProcessParameters) -> None:
@@ -289,6 +295,7 @@ class CuttingProcessStage(Stage):
             **places,
             even=parameters.blank == "form",
             feed=parameters.feed / (2.0 * np.pi),
+            room=self.room,
         )
 
     def prepare(self, first: int, samples: int) -> None:

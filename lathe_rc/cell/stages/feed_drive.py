@@ -101,6 +101,7 @@ class Memory(NamedTuple):
         disturbance: amplitude of what adds to the command.
         period: sampling step [s].
         clipped: whether the command was not given as it was commanded, of sample n at n modulo its length.
+        room: for the command, the disturbance, the motor and what the sensor sees.
     """
 
     drive: FeedTable
@@ -111,13 +112,14 @@ class Memory(NamedTuple):
     disturbance: float
     period: float
     clipped: Samples
+    room: Samples
 
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     command, (position, velocity, effort, measured_position) = inputs[0], outputs
-    n, mask = command.size, memory.clipped.size - 1
+    n = command.size
     while start < n:
         stop = n
         if memory.listens:
@@ -126,18 +128,17 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
                 return start, OBEY
         given, samples, now = command[start:stop], stop - start, first + start
         if memory.listens or memory.safe:
-            given = given.copy()
+            given = memory.room[0, :samples]
+            given[:] = command[start:stop]
         apply(memory.obedience, given)
-        load, clipped = np.empty(samples if memory.disturbance else 0), np.empty(samples if mask else 0, np.uint8)
+        load = memory.room[1, : samples if memory.disturbance else 0]
         fill_disturbance(now, memory.period, memory.disturbance, load)
-        motor, seen = np.empty(samples), np.empty(samples)
+        motor, seen = memory.room[2, :samples], memory.room[3, :samples]
         advance(
             memory.drive, now, given, load, position[start:stop], velocity[start:stop], effort[start:stop], motor, seen,
-            clipped,
+            memory.clipped,
         )  # fmt: skip
         measure(memory.sensor, seen, measured_position[start:stop])
-        for k in range(clipped.size):
-            memory.clipped[(now + k) & mask] = clipped[k]
         start = stop
     return n, DONE
 
@@ -153,6 +154,7 @@ class FeedDriveStage(Stage):
     kind = "feed_drive"
     Parameters = FeedDriveParameters
     announces = (LIMITED, FREE, OUT_OF_REACH)
+    rooms = 4
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: FeedDriveParameters) -> None:
@@ -214,6 +216,7 @@ class FeedDriveStage(Stage):
             disturbance=parameters.disturbance,
             period=parameters.step,
             clipped=self._clipped,
+            room=self.room,
         )
 
     def prepare(self, first: int, samples: int) -> None:
