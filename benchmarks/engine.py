@@ -79,19 +79,6 @@ def cell(name: str, revolutions: float, *overrides: str) -> Cell:
     return Cell(loaded(name, revolutions, *OVERRIDES[name], *overrides).nodes)
 
 
-def variation(lane: int, revolutions: float) -> Cell:
-    """The two-channel cell with numbers of its own in every stage but the spindle."""
-    return cell(
-        "two_channel",
-        revolutions,
-        f"learning_controller.lead_time={1.425e-3 * (1 + 0.002 * (lane % 5))}",
-        f"learning_controller.q_time={66.9e-6 * (1 + 0.01 * (lane % 3))}",
-        f"electrodynamic_actuator.delay={0.36e-3 * (1 + 0.001 * lane)}",
-        f"fine_controller.learning_gain={1 - 0.005 * lane}",
-        f"piezo_actuator.identified_scale={1 - 0.005 * lane}",
-    )
-
-
 def difference(name: str, revolutions: float) -> str:
     """The first signal in which C without contraction differs from the engine; empty if all bits are equal."""
     engine = Engine(cell(name, revolutions))
@@ -123,7 +110,8 @@ def _unchanged(name: str, revolutions: float) -> float:
     return _engine(Cell(loaded(name, revolutions).nodes))
 
 
-def _plain(name: str, revolutions: float, *flags: str) -> Callable[[], float]:
+def plain(name: str, revolutions: float, *flags: str) -> Callable[[], float]:
+    """A side that runs a cell in C, compiled with ``flags``."""
     library = compiled(name, *flags)
 
     def side() -> float:
@@ -145,8 +133,8 @@ def sides(name: str, revolutions: float) -> dict[str, Callable[[], float]]:
     """What takes turns on a cell."""
     return {
         "engine": lambda: _engine(cell(name, revolutions)),
-        "c": _plain(name, revolutions, "-ffp-contract=off"),
-        "c_contracted": _plain(name, revolutions),
+        "c": plain(name, revolutions, "-ffp-contract=off"),
+        "c_contracted": plain(name, revolutions),
     }
 
 

@@ -18,6 +18,7 @@ GROWTH_IMAGE = "img/growth.png"  #: of the page, in docs/
 
 _TITLES = {
     "engine": "Offline engine",
+    "batch": "Batches",
     "ros": "Over ROS",
     "real_time": "Real time",
     "supervisor": "Supervisor",
@@ -297,7 +298,7 @@ def page(result: Mapping[str, Any]) -> str:
         "",
         *_targets(result),
     ]
-    for part in ("engine", "ros", "real_time", "supervisor", "resimulation", "start"):
+    for part in ("engine", "batch", "ros", "real_time", "supervisor", "resimulation", "start"):
         if part in result:
             lines += [f"## {_TITLES[part]}", "", *_about(part)]
             lines += _ros(result[part]) if part == "ros" else _part(part, result[part])

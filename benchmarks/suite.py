@@ -11,7 +11,19 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-PARTS = ("engine", "ros", "real_time", "supervisor", "recorder", "viewer", "resimulation", "start", "growth", "peers")
+PARTS = (
+    "engine",
+    "batch",
+    "ros",
+    "real_time",
+    "supervisor",
+    "recorder",
+    "viewer",
+    "resimulation",
+    "start",
+    "growth",
+    "peers",
+)
 QUICK = tuple(part for part in PARTS if part != "real_time")  #: which takes minutes by its nature
 ROOT = Path(__file__).resolve().parents[1]
 STORE = ROOT / ".lathe" / "bench"

@@ -202,7 +202,7 @@ class LearningController(Stage):
         self._state, self._margin = np.array([0, 0, 0, 0, -1]), np.zeros(1)
         self._check_identification()
         self._model = Identified(parameters.model_natural_frequency, parameters.model_damping, np.nan)
-        self._margins = _Margins(self)
+        self._margins = _Margins(parameters)
         delay = parameters.feedback_delay
         self._cycle_start = delay  # where the first error becomes visible
         inputs = [
@@ -226,7 +226,7 @@ class LearningController(Stage):
         outputs = [Output("coarse/command", messages.COMMAND)]
         if parameters.publish_margin:
             outputs.append(Output("coarse/margin", messages.MARGIN))
-            self._margin[0] = self._margins.untabulated(parameters.nominal_speed, self._model)
+            self._margin[0] = self._margins.untabulated(self, parameters.nominal_speed, self._model)
         self.declare(inputs=inputs, outputs=outputs)
         self.sparse_topics[_STATUS] = messages.LEARNING
         if self._scheduled_actions("load") and not self._scheduled_actions("save"):
@@ -407,7 +407,7 @@ class LearningController(Stage):
             "contraction": cycle.contraction,
             "stability_margin": np.nan
             if unheard
-            else self._margins.at(2 * np.pi * parameters.cycle_revolutions / seconds, self._model),
+            else self._margins.at(self, 2 * np.pi * parameters.cycle_revolutions / seconds, self._model),
             "learning": cycle.learning,
             "joined": cycle.joined,
             "model_natural_frequency": self._model.natural_frequency,
@@ -424,9 +424,9 @@ class LearningController(Stage):
 class _Margins:
     """1 - sup|Q - γZ| of a drive model, tabulated as it is asked for: one costs as much as a cycle of samples."""
 
-    def __init__(self, stage: LearningController) -> None:
-        self._stage = stage
-        self._speeds: list[float] = (stage.parameters.nominal_speed / 40 * np.arange(20, 61)).tolist()
+    def __init__(self, parameters: LearningControllerParameters) -> None:
+        self._parameters = parameters
+        self._speeds: list[float] = (parameters.nominal_speed / 40 * np.arange(20, 61)).tolist()
         self._models: dict[tuple[str, ...], Identified] = {}
         self._responses: dict[tuple[str, ...], Response] = {}
         self._suprema: dict[tuple[object, ...], float] = {}
@@ -448,30 +448,30 @@ class _Margins:
         return self._responses[key]
 
     def _computed(self, model: Identified) -> Response:
-        parameters = self._stage.parameters
+        parameters = self._parameters
         a, b = second_order(model.natural_frequency, model.damping)
         return discretise(a, b, parameters.model_delay, parameters.step, "foh").response
 
-    def untabulated(self, speed: float, model: Identified) -> float:
+    def untabulated(self, stage: LearningController, speed: float, model: Identified) -> float:
         """The margin at ``speed`` [rad/s] of this very model; what was tabulated before and after does not matter."""
-        return 1.0 - self._stage.loop(self._computed(model)).supremum(speed)
+        return 1.0 - stage.loop(self._computed(model)).supremum(speed)
 
-    def _supremum(self, speed: float, model: Identified) -> float:
-        inverted = self._stage.correction
+    def _supremum(self, stage: LearningController, speed: float, model: Identified) -> float:
+        inverted = stage.correction
         models = (model.natural_frequency, model.damping, inverted.natural_frequency, inverted.damping)
         key = (speed, _three_digits(*models))
         if key not in self._suprema:
             _make_room(self._suprema)
-            self._suprema[key] = self._stage.loop(self._response(model)).supremum(speed)
+            self._suprema[key] = stage.loop(self._response(model)).supremum(speed)
         return self._suprema[key]
 
-    def at(self, speed: float, model: Identified) -> float:
+    def at(self, stage: LearningController, speed: float, model: Identified) -> float:
         """The margin at ``speed`` [rad/s], between tabulated speeds by interpolation."""
         after = bisect_left(self._speeds, speed)
         if not 0 < after < len(self._speeds):
-            return 1.0 - self._stage.loop(self._response(model)).supremum(speed)
+            return 1.0 - stage.loop(self._response(model)).supremum(speed)
         below, above = self._speeds[after - 1], self._speeds[after]
-        lower, upper = self._supremum(below, model), self._supremum(above, model)
+        lower, upper = self._supremum(stage, below, model), self._supremum(stage, above, model)
         return 1.0 - ((upper - lower) / (above - below) * (speed - below) + lower)
 
 

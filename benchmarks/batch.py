@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Batches: variations of a cell on all cores, against plain C on one.
+
+1000 two-channel cells of 20 revolutions that differ in five parameters, and 200 full cells that differ in three; of each
+the form error by revolution is kept. A ratio is the speed a core over that of C, so 1 is as fast as C on every core.
+``prepared_c_ratio`` counts the computing alone: the cells stand ready, and threads run them. ``c_ratio`` counts all of
+it, from the scenario's values to the errors. The threads share Python's lock: preparing a cell is Python, computing is
+not. ``memory_mb`` is what the process takes more after the whole batch than after a tenth of it.
+"""
+
+import os
+import resource
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from benchmarks.engine import OVERRIDES, loaded, plain
+from benchmarks.sides import alternate, ratio, seconds, spread
+from lathe_rc.cell import batch
+from lathe_rc.cell.engine import Engine
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.wiring import Cell
+
+_REVOLUTIONS = 20.0
+_CELLS = {"two_channel": 1000, "full_cell": 200}
+_READY = 40  # cells that stand ready at a time: they take memory
+_TARGETS = {"target_prepared_c_ratio": 0.9, "target_c_ratio": 0.7}
+_CORES = os.cpu_count() or 1
+
+
+def variations(name: str, count: int) -> Iterator[Scenario]:
+    """Scenarios of a batch."""
+    base = loaded(name, _REVOLUTIONS, *OVERRIDES[name])
+    for k in range(count):
+        values = {
+            "learning_controller.lead_time": 1.425e-3 * (1.0 + 0.01 * k / count),
+            "learning_controller.q_time": 66.9e-6 * (1.0 + 0.02 * (k % 7) / 7),
+            "fine_controller.learning_gain": 1.0 - 0.1 * (k % 11) / 11,
+        }
+        if name == "two_channel":
+            values["electrodynamic_actuator.delay"] = 0.36e-3 * (1.0 + 0.01 * (k % 13) / 13)
+            values["piezo_actuator.identified_scale"] = 1.0 - 0.01 * (k % 17) / 17
+        yield base.varied(values)
+
+
+def _whole(name: str, count: int) -> float:
+    """Time of a batch, by sample and core [s]."""
+    failed, samples = 0, Engine(Cell(next(variations(name, 1)).nodes)).samples
+
+    def go() -> None:
+        nonlocal failed
+        failed = sum(outcome.error is not None for outcome in batch.run(variations(name, count), batch.Errors))
+
+    time = seconds(go)
+    assert not failed, "all of them work"
+    return time * _CORES / count / samples
+
+
+def _prepared(name: str, count: int) -> float:
+    """The same of the computing alone."""
+    total, samples = 0.0, 0
+    with ThreadPoolExecutor(_CORES) as pool:
+        for _ in range(0, count, _READY):
+            engines = [Engine(Cell(each.nodes), ()) for each in variations(name, _READY)]
+            samples += sum(engine.samples for engine in engines)
+            total += seconds(lambda ready=engines: list(pool.map(lambda engine: engine.run([]), ready)))
+    return total * _CORES / samples
+
+
+def _taken() -> float:
+    """Largest memory of this process so far [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def measure(*, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
+    """See the module."""
+    found: dict[str, Any] = {}
+    for name, cells in _CELLS.items():
+        say(f"batch {name}")
+        count, rounds = (cells // 5, 2) if quick else (cells, 5)
+        c = plain(name, _REVOLUTIONS * 5, "-ffp-contract=off")
+        c()
+        _whole(name, count // 10)
+        before = _taken()
+        _whole(name, count)
+        grown = _taken() - before
+        times = alternate(
+            {"batch": lambda: _whole(name, count), "prepared": lambda: _prepared(name, count), "c": c}, rounds
+        )
+        found[name] = {
+            "cells": count,
+            "c_ratio": ratio(times["c"], times["batch"]),
+            "prepared_c_ratio": ratio(times["c"], times["prepared"]),
+            **_TARGETS,
+            "cells_per_s": spread([_CORES / (time * 64_000 * 1.2) for time in times["batch"]]),
+            "memory_mb": grown,
+        }
+    return found
