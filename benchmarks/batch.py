@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Batches: variations of a cell on all cores, against plain C on one.
 
-1000 two-channel cells of 20 revolutions that differ in five parameters, and 200 full cells that differ in three; of each
-the form error by revolution is kept. A ratio is the speed a core over that of C, so 1 is as fast as C on every core.
+1000 two-channel cells of 20 revolutions that differ in five parameters, and 200 full cells that differ in three. Of each
+the form error by revolution is kept. A ratio is the speed a core over that of C: 1 is as fast as C on every core.
 ``prepared_c_ratio`` counts the computing alone: the cells stand ready, and threads run them. ``c_ratio`` counts all of
 it, from the scenario's values to the errors. The threads share Python's lock: preparing a cell is Python, computing is
 not. ``memory_mb`` is what the process takes more after the whole batch than after a tenth of it.
@@ -10,8 +10,9 @@ not. ``memory_mb`` is what the process takes more after the whole batch than aft
 
 import os
 import resource
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 from benchmarks.engine import OVERRIDES, loaded, plain
@@ -63,8 +64,13 @@ def _prepared(name: str, count: int) -> float:
         for _ in range(0, count, _READY):
             engines = [Engine(Cell(each.nodes), ()) for each in variations(name, _READY)]
             samples += sum(engine.samples for engine in engines)
-            total += seconds(lambda ready=engines: list(pool.map(lambda engine: engine.run([]), ready)))
+            total += seconds(partial(_run, pool, engines))
     return total * _CORES / samples
+
+
+def _run(pool: ThreadPoolExecutor, engines: Iterable[Engine]) -> None:
+    for _ in pool.map(lambda engine: engine.run([]), engines):
+        pass
 
 
 def _taken() -> float:
@@ -84,9 +90,8 @@ def measure(*, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
         before = _taken()
         _whole(name, count)
         grown = _taken() - before
-        times = alternate(
-            {"batch": lambda: _whole(name, count), "prepared": lambda: _prepared(name, count), "c": c}, rounds
-        )
+        turns = {"batch": partial(_whole, name, count), "prepared": partial(_prepared, name, count), "c": c}
+        times = alternate(turns, rounds)
         found[name] = {
             "cells": count,
             "c_ratio": ratio(times["c"], times["batch"]),

@@ -5,8 +5,8 @@ The same arithmetic stands in benchmarks/c, one sample after the other, compiled
 -ffp-contract=off it gives the same bits, which is checked here in every field of every topic that carries blocks. Sides
 take turns on the same run: the engine, C, and C with contraction. A ratio is the speed of the engine over that of C, so
 1 is as fast as C. The random numbers of the full cell's allowance are drawn by NumPy on both sides, and count on both.
-Nobody takes the signals, and neither side makes messages at chosen samples (joint states, learning status) or identifies
-its drives.
+Nobody takes the signals, and neither side makes messages at chosen samples (joint states, learning status) or
+identifies its drives.
 
 ``real_time_factor`` is that of the engine in the same run, ``unchanged_real_time_factor`` that of the scenario as it
 stands, and ``recorded_real_time_factor`` that of ``harness.run`` with a bag, from the first sample until the bag is

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many cells at once: each gets the bits that it gets alone, and one that fails is told of."""
 
+import gc
 import itertools
+import weakref
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +14,8 @@ from hypothesis import strategies as st
 
 from lathe_rc import harness, resources
 from lathe_rc.cell import batch, scenario
+from lathe_rc.cell.engine import Engine
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 
 
@@ -92,6 +96,21 @@ def test_cells_are_made_when_their_turn_comes():
     assert [next(outcomes).scenario.shared.seed for _ in range(3)] == [0, 1, 2]
     outcomes.close()
     assert next(asked) < 20
+
+
+@pytest.mark.parametrize("name", ["two_channel", "full_cell", "supervised_turning", "series"])
+def test_a_cell_is_gone_when_nobody_holds_it(name):
+    """Without the collector of cycles: in a batch of thousands they would pile up."""
+    cell = Cell(load(name, 1).nodes)
+    engine = Engine(cell)
+    engine.run([])
+    left = [weakref.ref(stage) for stage in cell.stages.values()]
+    gc.disable()
+    try:
+        del cell, engine
+        assert [alive for each in left if (alive := each()) is not None] == []
+    finally:
+        gc.enable()
 
 
 def test_a_topic_that_is_not_there_is_named():
