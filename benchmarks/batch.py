@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Batches: variations of a cell on all cores, against plain C on one.
 
-1000 two-channel cells of 20 revolutions that differ in five parameters, and 200 full cells that differ in three. Of each
-the form error by revolution is kept. A ratio is the speed a core over that of C: 1 is as fast as C on every core.
+1000 two-channel cells of 20 revolutions that differ in five parameters, and 200 full cells that differ in three; what
+is kept of each is the form error by revolution. A ratio is the speed a core over that of C: 1 is as fast as C on every core.
 ``prepared_c_ratio`` counts the computing alone: the cells stand ready, and threads run them. ``c_ratio`` counts all of
 it, from the scenario's values to the errors. The threads share Python's lock: preparing a cell is Python, computing is
 not. ``memory_mb`` is what the process takes more after the whole batch than after a tenth of it.

@@ -130,7 +130,7 @@ def test_file_without_shared_parameters_takes_them_from_the_command_line(cell):
         ("sample_rate=65536", "sample_rate = 65536 Hz: its step is not a whole number of ns"),
         ("tool.block_size=8", "tool.block_size = 8: /** says 32; keep one"),
         ("tool.seed=8", "seed = "),
-        ("/**.block_size=8", "no stage '/**'"),
+        ("/**.block_size=8", "no node '/**' in the scenario"),
         ('tool.profile_file="a\\0b"', "allowed: text without NUL"),
     ],
 )

@@ -46,13 +46,14 @@ class _Text(str):
     __slots__ = ()
 
 
+_TEXT = "tag:yaml.org,2002:str"
+
+
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]  # absent without libyaml
     """Writes what rcl reads back as the same value."""
 
 
-_Dumper.add_representer(
-    _Text, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", str(text), style='"')
-)
+_Dumper.add_representer(_Text, lambda dumper, text: dumper.represent_scalar(_TEXT, str(text), style='"'))
 
 
 def _quoted(value: Value) -> object:
@@ -155,7 +156,7 @@ def _target(text: str, nodes: Iterable[str], what: str) -> tuple[str, str]:
             shared = ", ".join(SharedParameters.model_fields)
             raise InputError(f"{what}: {node!r} is not shared; allowed: {shared}, or NODE.PARAM=VALUE")
         return _EVERYONE, node
-    if node not in nodes:
+    if node not in nodes or node == _EVERYONE:
         present = ", ".join(name for name in nodes if name != _EVERYONE)
         raise InputError(f"{what}: no node {node!r} in the scenario; allowed: {present}")
     return node, name
