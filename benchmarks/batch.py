@@ -2,10 +2,10 @@
 """Batches: variations of a cell on all cores, against plain C on one.
 
 1000 two-channel cells of 20 revolutions that differ in five parameters, and 200 full cells that differ in three; what
-is kept of each is the form error by revolution. A ratio is the speed a core over that of C: 1 is as fast as C on every core.
-``prepared_c_ratio`` counts the computing alone: the cells stand ready, and threads run them. ``c_ratio`` counts all of
-it, from the scenario's values to the errors. The threads share Python's lock: preparing a cell is Python, computing is
-not. ``memory_mb`` is what the process takes more after the whole batch than after a tenth of it.
+is kept of each is the form error by revolution. A ratio is the speed a core over that of C: 1 is as fast as C on every
+core. ``prepared_c_ratio`` counts the computing alone: the cells stand ready, and threads run them. ``c_ratio`` counts
+all of it, from the scenario's values to the errors. The threads share Python's lock: preparing a cell is Python,
+computing is not. ``memory_mb`` is what the process takes more after the whole batch than after a tenth of it.
 """
 
 import os
