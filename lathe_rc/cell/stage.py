@@ -500,7 +500,7 @@ class Stage(ABC):
         return {**self.__dict__, "_native": None, "_room": None}
 
     def prepare(self, first: int, samples: int) -> None:  # noqa: B027 - most stages need nothing
-        """Have ready what the samples ``first`` on need that a step cannot make, as random numbers."""
+        """Have ready, in the arrays of the memory, what a step cannot make for the samples ``first`` on."""
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
