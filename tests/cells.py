@@ -53,6 +53,17 @@ def told_until_all_have_ended(processes: harness.Processes) -> list[harness.Even
 
 
 @contextlib.contextmanager
+def held(cell: Scenario, domain: int) -> Iterator[tuple[harness.Processes, Callable[[], None]]]:
+    """The processes of a cell that does not begin, since its recorder is missing, and what starts that.
+
+    To stop a recorder instead costs the 3 s after which DDS tells it again of whom it has not heard meanwhile.
+    """
+    groups = [[name] for name in cell.nodes if name != "recorder"]
+    with harness.Processes(cell, groups, domain=domain) as processes:
+        yield processes, lambda: processes._start(["recorder"])
+
+
+@contextlib.contextmanager
 def files_up_to(size: int) -> Iterator[None]:
     """No file may grow beyond ``size`` [B]: to who writes one, the disk is full."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -101,9 +112,10 @@ def same(a: messages.Signals, b: messages.Signals) -> bool:
 
 
 @contextlib.contextmanager
-def started(*arguments):
-    """A process of this project; killed at the end if it has not ended by itself."""
-    command = [sys.executable, "-m", "lathe_rc", *map(str, arguments)]
+def started(*arguments, first=""):
+    """A process of this project, killed at the end if it has not ended by itself; ``first``: what it runs before."""
+    program = ["-c", f"{first}; from lathe_rc.cli import main; main()"] if first else ["-m", "lathe_rc"]
+    command = [sys.executable, *program, *map(str, arguments)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             yield process

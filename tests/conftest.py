@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings that all tests share."""
 
+import os
 import signal
+from pathlib import Path
 
 import pytest
 import rclpy
 from hypothesis import HealthCheck, settings
 
+import slow_tests
 from lathe_rc import harness
+from lathe_rc.nodes import dds
 
 # The same examples on every machine; --hypothesis-profile=explore looks for new ones.
 settings.register_profile(
@@ -19,6 +23,16 @@ settings.load_profile("steady")
 
 # A shell without job control makes what it starts in the background ignore it, and so would the commands under test.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Nodes that the tests make have the DDS settings of those of a cell: by default what one missed comes after 3 s.
+os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(dds.__file__).with_name("fastdds.xml")))
+
+
+def pytest_collection_modifyitems(config, items):
+    """On a worker, files that take long come first: else one of them would be the last, with nothing beside it."""
+    if hasattr(config, "workerinput"):
+        shares = slow_tests.shares()
+        items.sort(key=lambda item: -shares.get(item.path.stem, 0.0))
 
 
 @pytest.fixture

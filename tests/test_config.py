@@ -19,6 +19,9 @@ WITH_A_TOOL = [path for path in SCENARIOS if "\n/tool:" in path.read_text(encodi
 
 @pytest.mark.parametrize("path", WITH_A_TOOL, ids=lambda path: path.stem)
 def test_whole_scenario_cuts_the_form_error(path):
-    """To its end, with its events; what the others promise is in test_feed_cell.py."""
+    """To its end and with its events, a scenario cuts the form error to a hundredth.
+
+    What scenarios without a tool promise is in test_feed_cell.py.
+    """
     result = harness.run(scenario.load(path))
     assert result.errors.rms[-1] < 0.01 * result.errors.rms[0]

@@ -76,7 +76,7 @@ def largest_error(law, lead_law, **changes):
 
 
 def test_dynamic_inverse_with_preview_makes_the_drive_transparent():
-    """Z = 1 at any speed, however fast it changes: what is left is interpolation."""
+    """With the dynamic inverse Z = 1 at any speed, however fast it changes: what is left is interpolation."""
     assert largest_error(CorrectionLaw.SECOND_ORDER_INVERSE_DYNAMIC, LeadLaw.EXACT_PREVIEW) < 3e-6
 
 

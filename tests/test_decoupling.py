@@ -96,16 +96,6 @@ def test_disturbance_is_that_of_the_paper_in_the_mean():
     assert not np.array_equal(found, disturbance(STUDY.parameters(seconds=200.0, seed=1)))
 
 
-def test_people_get_a_table_of_80_columns_and_a_figure(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    result = CliRunner(env={"COLUMNS": "80"}).invoke(main, ["study", "decoupling", "--set", "seconds=4"])
-    assert result.exit_code == 0, result.stderr
-    assert max(map(len, result.stdout.splitlines())) <= 80
-    assert "…" not in result.stdout
-    assert result.stdout.splitlines()[-1] == "figure: study-decoupling.png"
-    assert (tmp_path / "study-decoupling.png").read_bytes().startswith(b"\x89PNG")
-
-
 def test_delay_between_samples_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(main, ["study", "decoupling", "--set", "delay_ms=0.12", "--set", "seconds=4"])

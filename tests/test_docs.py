@@ -2,6 +2,7 @@
 """What users read is true: the reference page, links, the examples of the README, scenarios, the launch file."""
 
 import ast
+import functools
 import importlib.util
 import re
 import runpy
@@ -117,6 +118,7 @@ class TestHostTopics:
                 assert (outlet.qos_profile.durability.name == "TRANSIENT_LOCAL") == topic.latched
 
 
+@functools.cache
 def names_of_tests() -> set[str]:
     """Names of all tests."""
     found = set()
@@ -176,7 +178,7 @@ class TestPages:
 
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=name)
 def test_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All examples of a page, one after the other, as one program."""
+    """The Python of a page runs, all its examples one after the other, as one program."""
     monkeypatch.chdir(tmp_path)
     program = tmp_path / "page.py"
     program.write_text("\n".join(_BLOCK.findall(page.read_text(encoding="utf-8"))), encoding="utf-8")

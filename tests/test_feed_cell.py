@@ -44,7 +44,7 @@ class TestForce:
         assert_allclose(cut["feed"][ends[1]].mean() / cut["feed"][ends[0]].mean(), expected, rtol=0.02)
 
     def test_varies_less_than_without_control(self, turning):
-        """The paper has a factor of 1.88 for its own allowance."""
+        """The force varies less than without control; the paper has a factor of 1.88 for its own allowance."""
         cut = dense(turning, "cut")
         settled = slice(after(turning, 2.0), None)
         free = harness.run(load("force_turning", "cutting_process.moved_by=['cross']", *held_open()))
@@ -149,14 +149,19 @@ class TestFullCell:
     def offline(cls):
         return harness.run(load("full_cell", *cls.SHORT))
 
-    @pytest.mark.parametrize("outside", [[], ["recorder"], ["cutting_process", "longitudinal", "force_controller"]])
-    def test_grouped_processes_give_its_digests(self, outside):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def longer(cls):
         """Long enough for a recorder beside the spindle to complete a block while the spindle makes another."""
-        loaded = load("full_cell", "spindle_encoder.revolutions=40.0")
-        groups = [[name for name in loaded.nodes if name not in outside], outside] if outside else None
-        grouped = harness.run(loaded, mode="processes", groups=groups)
+        return harness.run(load("full_cell", "spindle_encoder.revolutions=40.0"))
+
+    @pytest.mark.parametrize("outside", [[], ["recorder"], ["cutting_process", "longitudinal", "force_controller"]])
+    def test_grouped_processes_give_its_digests(self, longer, outside):
+        nodes = longer.scenario.nodes
+        groups = [[name for name in nodes if name not in outside], outside] if outside else None
+        grouped = harness.run(longer.scenario, mode="processes", groups=groups)
         assert grouped.mode == "grouped"
-        assert grouped.digest == harness.run(loaded).digest
+        assert grouped.digest == longer.digest
 
     def test_thirteen_processes_give_its_digests(self, offline):
         assert harness.run(load("full_cell", *self.SHORT), mode="processes", groups=[]).digest == offline.digest
@@ -232,7 +237,7 @@ def test_bad_cuts_are_refused_in_one_line(changes, told):
 
 
 def test_predistorted_shaft_comes_out_straight(tmp_path):
-    """A thin shaft between centres: the path that cancels its deflection, followed by the position loop."""
+    """A thin shaft comes out straight where the position loop follows the path that cancels its deflection."""
     from lathe_rc.control.predistortion import Predistortion, cancelling, proportional
 
     straight = ["cutting_process.moved_by=['cross', 'longitudinal']", "cutting_process.shaft=centres", *SHAFT]

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Studies on the cells of config/: the tables and figures of papers 000 and 001."""
 
+import functools
 import json
 
 import numpy as np
@@ -9,17 +10,34 @@ from click.testing import CliRunner
 
 from lathe_rc import cli
 from lathe_rc.analysis.tuning import LIMITS
+from lathe_rc.commands.study import read
+from lathe_rc.studies import STUDIES
 from lathe_rc.studies.speed_deviation import LAWS
 
 
-def study(tmp_path, name, **parameters):
-    """The JSON of a study."""
+@functools.cache
+def study(name, **parameters):
+    """What a study finds, as it is printed."""
+    subject = STUDIES[name]
+    given = read(subject, [f"{key}={value}" for key, value in parameters.items()])
+    return json.loads(json.dumps(subject.run(given).to_json(), allow_nan=False))
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("speed-deviation", {"wd": 106, "protocol": "frozen"}),
+        ("multichannel", {"omega": 500, "samples_per_revolution": 128}),
+        ("piston", {"height_mm": 1}),
+    ],
+)
+def test_the_command_prints_what_the_study_finds_and_draws_it(tmp_path, name, parameters):
     changes = [part for key, value in parameters.items() for part in ("--set", f"{key}={value}")]
     place = tmp_path / "figure.png"
     result = CliRunner().invoke(cli.main, ["study", name, *changes, "--figure", str(place), "--json"])
     assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout) == {**study(name, **parameters), "figure": str(place)}
     assert place.read_bytes().startswith(b"\x89PNG")
-    return json.loads(result.stdout)
 
 
 # In the order of the spec; second-order inverse with dΩ/dt and exact preview stand last.
@@ -38,9 +56,9 @@ ORDER = [
         {"wd": "75", "harmonic": 3, "amplitude_um": 100},
     ],
 )
-def test_ordering_of_the_laws_holds_at_every_frequency(tmp_path, settings):
-    found = study(tmp_path, "speed-deviation", **settings)
-    assert set(found) == {"wd", "max_um", "rms_um", "figure"}
+def test_ordering_of_the_laws_holds_at_every_frequency(settings):
+    found = study("speed-deviation", **settings)
+    assert set(found) == {"wd", "max_um", "rms_um"}
     assert set(found["max_um"]) == set(found["rms_um"]) == set(LAWS)
     errors = np.array([found["max_um"][law] for law in ORDER])
     assert np.all(np.diff(errors[:-1], axis=0) < 0.0)
@@ -48,8 +66,8 @@ def test_ordering_of_the_laws_holds_at_every_frequency(tmp_path, settings):
     assert np.all(errors[-1] < 1.001 * errors[-2])
 
 
-def test_figures_of_the_paper_s_three_frequencies(tmp_path):
-    found = study(tmp_path, "speed-deviation")["max_um"]
+def test_figures_of_the_paper_s_three_frequencies():
+    found = study("speed-deviation")["max_um"]
     constant, variable = np.array(found["constant_lead"]), np.array(found["variable_lead"])
     assert np.all(constant >= 5 * variable)
     assert np.all(np.diff(constant / variable) < 0.0)
@@ -57,17 +75,18 @@ def test_figures_of_the_paper_s_three_frequencies(tmp_path):
     assert np.ptp(found["exact_invariance"]) < 1e-3 * found["exact_invariance"][0]
 
 
-def test_learning_that_goes_on_depends_on_the_cycle(tmp_path):
+def test_learning_that_goes_on_depends_on_the_cycle():
     """106 and 213 rad/s are nearly synchronous with the revolution, so that a memory can learn the deviation."""
     frozen, learning = (
-        study(tmp_path, "speed-deviation", wd=106, protocol=protocol)["max_um"] for protocol in ("frozen", "learning")
+        study("speed-deviation", wd=106, protocol=protocol)["max_um"] for protocol in ("frozen", "learning")
     )
     assert learning["constant_lead"][0] < 0.3 * frozen["constant_lead"][0]
 
 
 @pytest.mark.parametrize("correction", ["none", "lead_lag"])
-def test_table_of_paper_001(tmp_path, correction):
-    found = study(tmp_path, "multichannel", correction=correction)
+def test_table_of_paper_001(correction):
+    """Formulas give the table of paper 001, and cells what the formulas say."""
+    found = study("multichannel", correction=correction)
     printed, analytic, simulated = (np.array(found[name]) for name in ("printed", "analytic", "simulated"))
     assert found["omega"] == [500.0, 1000.0, 1500.0, 2000.0]
     limits = LIMITS[:, None] if correction == "none" else 0.06
@@ -78,22 +97,22 @@ def test_table_of_paper_001(tmp_path, correction):
         np.testing.assert_allclose(found["contraction"]["coarse"], [0.259, 0.506, 0.652, 0.744], atol=5e-4)
 
 
-def test_table_at_frequencies_that_the_paper_does_not_have(tmp_path):
-    found = study(tmp_path, "multichannel", omega="300,1234.5", samples_per_revolution=2048)
+def test_table_at_frequencies_that_the_paper_does_not_have():
+    found = study("multichannel", omega="300,1234.5", samples_per_revolution=2048)
     assert found["printed"] == [[None, None]] * 4
     np.testing.assert_allclose(found["simulated"], found["analytic"], rtol=0.01)
 
 
 @pytest.mark.parametrize(("samples", "low", "high"), [(128, 0.05, 0.13), (512, 1e-4, 0.013), (2048, 1e-6, 7e-4)])
-def test_coarse_sampling_errs_as_the_spec_says(tmp_path, samples, low, high):
-    """No more than 13 % at 128 samples per revolution, 1.3 % at 512, .07 % at 2048."""
-    found = study(tmp_path, "multichannel", samples_per_revolution=samples)
+def test_coarse_sampling_errs_as_the_spec_says(samples, low, high):
+    """Coarse sampling errs by no more than 13 % at 128 samples per revolution, 1.3 % at 512, .07 % at 2048."""
+    found = study("multichannel", samples_per_revolution=samples)
     worst = np.abs(np.array(found["simulated"]) / found["analytic"] - 1).max()
     assert low < worst < high
 
 
-def test_piston_in_the_four_structures(tmp_path):
-    found = study(tmp_path, "piston", height_mm=5)
+def test_piston_in_the_four_structures():
+    found = study("piston", height_mm=5)
     for measure in ("max_um", "rms_um"):
         analytic, simulated = np.array(found["analytic"][measure]), np.array(found["simulated"][measure])
         np.testing.assert_allclose(simulated[:2], analytic[:2], rtol=0.02)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cells import scenario
+from cells import held, scenario
 from numpy.testing import assert_allclose, assert_array_equal
 
 pytest.importorskip("rerun")
@@ -34,7 +34,7 @@ from lathe_rc.view.rerun_signals import drawn
 PISTON = Path(__file__).parents[1] / "config" / "piston.yaml"
 STEP_NS = 15625
 DRAWN = 6  # topics of the piston
-LENGTH = 16.0  # revolutions
+LENGTH = 12.0  # revolutions
 
 
 # --- without ROS: the backlog, the order, the pieces
@@ -266,13 +266,10 @@ def watching(domain, folder, *options):
 
 @contextlib.contextmanager
 def cell(folder, domain, *overrides):
-    """The processes of a cell whose recorder is held until somebody calls ``begin``; without it, no block goes out."""
+    """The processes of a cell that begins when somebody calls ``begin``."""
     piston = load(PISTON, [f"spindle_encoder.revolutions={LENGTH}", *overrides])
-    complete = harness.with_recorder(piston, folder / "bag", keep=True)
-    with harness.Processes(complete, [[name] for name in complete.nodes], domain=domain) as processes:
-        recorder = processes.pids["recorder"]
-        os.kill(recorder, signal.SIGSTOP)
-        yield processes, lambda: os.kill(recorder, signal.SIGCONT)
+    with held(harness.with_recorder(piston, folder / "bag", keep=True), domain) as (processes, begin):
+        yield processes, begin
 
 
 def listens(bridge):
@@ -321,7 +318,7 @@ def test_a_bridge_that_is_stuck_holds_nobody_up(until_the_end, offline, tmp_path
             begin()
             processes.wait_for("cycle", cycle=2.0)
             bridge.send_signal(signal.SIGSTOP)
-            processes.wait_for("cycle", cycle=12.0)
+            processes.wait_for("cycle", cycle=9.0)
             if not until_the_end:
                 bridge.send_signal(signal.SIGCONT)
             processes.wait_for_end()

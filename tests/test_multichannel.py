@@ -23,7 +23,7 @@ def error(result):
 
 @pytest.mark.parametrize("structure", ["direct_compensation", "two_channel", "series"])
 def test_processes_give_the_digests_of_the_offline_run(structure):
-    """A channel of a topic more, and a drive that compensates within the sample, over DDS."""
+    """Processes give the offline bits also with a channel more, or a drive that compensates within the sample."""
     loaded = cells.load(structure, **SHORT)
     offline, processes = harness.run(loaded), harness.run(loaded, mode="processes")
     assert processes.digest == offline.digest

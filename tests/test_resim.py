@@ -55,7 +55,7 @@ def test_an_unchanged_process_run_comes_out_to_the_bit(processes):
 
 @pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
 def test_every_scenario_comes_out_to_the_bit(path, tmp_path):
-    """Whatever its stages announce on the way, like a channel that joins."""
+    """Every scenario is simulated again to the bit, whatever its stages announce, like a channel that joins."""
     loaded = scenarios.load(path, ["spindle_encoder.revolutions=25", "spindle_encoder.speed_factor=0"])
     harness.run(loaded, bag=tmp_path / "bag")
     found = resimulate(tmp_path / "bag")

@@ -102,7 +102,7 @@ class Killer:
 
 
 def test_a_killed_controller_goes_on_in_another_process_to_the_bit(tmp_path):
-    """Twice in one run, under the supervisor: what it had sent before it comes twice, and is taken once."""
+    """A killed controller goes on to the bit, twice in a supervised run: what comes twice is taken once."""
     kept = [f"{OWN}.restart_file={tmp_path}/state", "spindle_encoder.revolutions=40.0"]
     kept += [f"{OWN}.events=['sample 9000: clear', 'sample 9000: clear']"]  # equal messages that are no repeats
     cell, killer = load(CONFIG / "supervised.yaml", kept), Killer(OWN, [30_000, 90_000])

@@ -38,7 +38,10 @@ def test_coarse_steps_agree_with_fine_ones(step, within):
 
 
 def test_published_law_diverges_slowly():
-    """The spec has 5e-4, 1.1e-2, 0.45; how soon it shows depends on the high frequencies of the first period."""
+    """The published law diverges slowly, 5e-4, 1.1e-2, 0.45 in the spec.
+
+    How soon it shows depends on the high frequencies of the first period.
+    """
     for step in (0.001, STEP):
         errors = simulate(
             Case(periods=200, step=step, memory_filter=0.0, anti_windup=False), NOMINAL
@@ -58,7 +61,7 @@ def test_eq_15_tells_the_divergence():
 
 
 def test_filter_keeps_the_error_small_at_every_corner():
-    """Below 1e-4 from period 100 to 400, on all 32."""
+    """The filter keeps the error below 1e-4 from period 100 to 400, at all 32 corners of the drive."""
     for drive in corners():
         outcome = simulate(Case(periods=400, step=COARSEST), drive)
         assert outcome.period_max_error[99:].max() < 1e-4

@@ -304,6 +304,7 @@ def test_the_cell_uses_what_its_file_allows_and_nothing_else(path, observer, tmp
 
 
 def test_a_namespaced_cell_in_groups_and_those_that_listen_to_it(observer, tmp_path):
+    """A cell in groups and those that listen to it use what their policy allows, and nothing else."""
     rerun = [RERUN_BRIDGE] if importlib.util.find_spec("rerun") else []
     options = {
         TOPIC_RECORDER: ["-p", f"bag:={tmp_path / 'any'}"],
@@ -324,6 +325,7 @@ def test_a_namespaced_cell_in_groups_and_those_that_listen_to_it(observer, tmp_p
 
 
 def test_the_replayer(observer, tmp_path):
+    """The replayer uses what its policy allows, and nothing else."""
     piston = scenarios.load(CONFIG / "piston.yaml", ["spindle_encoder.revolutions=1.0"])
     harness.run(piston, mode="composed", bag=tmp_path / "bag")
     root = parsed(made("piston", "--with", REPLAYER))

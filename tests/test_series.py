@@ -120,7 +120,7 @@ def test_row_of_the_spec():
 @pytest.mark.parametrize("lag", [0.0, 40e-6])
 @pytest.mark.parametrize("feedback", [False, True])
 def test_tool_and_carriage_answer_as_their_responses_say(feedback, lag):
-    """Command at one frequency, set point at another; with feedback the piezo answers to both."""
+    """Both answer at the command's frequency and at the set point's; with feedback the piezo does to both."""
     command, set_point = sine(SLOW, 4e-6), sine(FAST, 4e-6)
     machine = make_drive(make_stack(lag=lag), feedback=feedback)
     motion = drive(machine, command, set_point)

@@ -531,10 +531,11 @@ def checkers(monkeypatch):
     return seen
 
 
-@pytest.mark.parametrize("failing", [set(), {"ruff check"}, {"mypy", "ruff format"}, {"pytest"}])
+@pytest.mark.parametrize("failing", [set(), {"ruff check"}, {"mypy", "ruff format"}, {"kernels"}, {"pytest"}])
 def test_all_checkers_run_and_any_failure_counts(checkers, failing):
     checkers.failing = failing
     assert (check.main([]) != 0) == bool(failing)
+    checkers.ran.remove("kernels")
     assert checkers.ran == ["ruff check", "ruff format", "mypy"]
     for name in failing - {"pytest"}:
         assert f"{name} FAILED: see above" in checkers.verdicts
@@ -543,7 +544,8 @@ def test_all_checkers_run_and_any_failure_counts(checkers, failing):
 def test_system_tests_run_only_when_asked_for(checkers, monkeypatch):
     monkeypatch.setattr(system, "provide", lambda: "")
     check.main(["-k", "cell"])
-    assert checkers.pytest == ["-m", "not system", *check.AT_ONCE, "-k", "cell"]
+    assert checkers.pytest == ["-m", "not system", *check.AT_ONCE, *check.REPORTED, "-k", "cell"]
+    assert "kernels" not in checkers.ran, "some tests need some kernels only"
     assert any("--system" in line for line in checkers.verdicts)
     checkers.ran.clear()
     assert check.main(["--system", "-k", "cell"]) == 0
@@ -576,5 +578,5 @@ def test_what_the_machine_lacks_is_installed_or_said(monkeypatch, root, installe
 def test_mypy_judges_only_the_locked_numpy(checkers, monkeypatch):
     monkeypatch.setattr(check, "version", lambda _name: "1.26.4")
     assert check.main([]) == 0
-    assert checkers.ran == ["ruff check", "ruff format"]
+    assert set(checkers.ran) == {"kernels", "ruff check", "ruff format"}
     assert any("1.26.4" in line for line in checkers.verdicts)

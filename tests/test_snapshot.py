@@ -184,7 +184,7 @@ def test_mcap_reads_snapshots(recorded):
     st.sampled_from([16, 64, 320]),
 )
 def test_no_sample_is_missing_or_written_twice(tmp_path_factory, samples, pre, post, block):
-    """Spans that overlap or touch are one snapshot, and so are those whose blocks do."""
+    """No sample is missing or in two snapshots: spans that overlap or touch, or whose blocks do, are one."""
     path = tmp_path_factory.mktemp("spans") / "bag"
     times = {"mode": "both", "pre": pre / 64_000, "post": post / 64_000, "triggers": ["*"], "chunk_size": 4096}
     events = {"events": [f"sample {at}: clear" for at in samples]}
@@ -281,8 +281,8 @@ def test_service_makes_a_snapshot_and_an_interrupted_run_leaves_one(domain, tmp_
             assert (closed["first"], closed["samples"], closed["whole"]) == (first, last - first + 1, True)
             assert read(Path(path)) == span(expected, first, last)
             # Whatever is closed is complete while the run goes on; what follows it is the next snapshot's.
-            while processes.wait_for("cycle")["cycle"] < 40.0:
-                pass
+            begun = processes.wait_for("cycle")["cycle"]
+            processes.wait_for("cycle", cycle=begun + 3.0)
     finally:
         asker.close()
     assert not (tmp_path / "bag").exists()
@@ -311,7 +311,7 @@ def test_service_says_why_there_is_no_snapshot(domain, tmp_path):
 
 @pytest.mark.parametrize("node", ["tool", "recorder"])
 def test_a_killed_node_leaves_the_last_seconds(node, tmp_path, whole):
-    """Those before and after a node's death, or, of the recorder's, what had come to the disk of the one under way."""
+    """A killed node leaves the seconds around its death, a killed recorder what had come to the disk."""
     pids = {}
 
     def kill(event):

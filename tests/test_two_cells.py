@@ -16,7 +16,7 @@ from lathe_rc.bag.resim import resimulate
 from lathe_rc.cell import messages
 from lathe_rc.cli import main
 
-LEFT = scenario({"run_id": "left"}, spindle_encoder={"revolutions": 60.0})
+LEFT = scenario({"run_id": "left"}, spindle_encoder={"revolutions": 20.0, "speed_factor": 1.0})  # there for 1.2 s
 RIGHT = scenario(
     {"run_id": "right", "nominal_rpm": 1100.0, "block_size": 128},
     spindle_encoder={"revolutions": 6.0},

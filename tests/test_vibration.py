@@ -48,7 +48,7 @@ def test_random_lines_have_their_rms_and_stay_in_the_band(rms, low, width, lines
 
 
 def test_random_vibration_looks_random():
-    """RMS, mean and kurtosis over many periods, and no frequencies outside of the band."""
+    """Random vibration has its RMS, mean and kurtosis, and no frequencies outside of the band."""
     position, _ = move(draw(), 4_000_000)
     assert position.std() == pytest.approx(1e-6, rel=0.01)
     assert abs(position.mean()) < 1e-8

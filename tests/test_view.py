@@ -251,7 +251,7 @@ def test_an_angle_that_no_spindle_has_is_refused(jump):
 
 
 def test_a_long_run_stays_small(tmp_path):
-    """2000 revolutions: the map has at most 512 rows, rings become rarer, nothing else piles up."""
+    """Of 2000 revolutions the map has at most 512 rows, rings become rarer, nothing else piles up."""
     types = {"encoder": messages.ENCODER, "tool": messages.TOOL}
     recording = rr.RecordingStream("test")
     recording.save(tmp_path / "long.rrd")

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """./lathe test: the linters, then the tests, all of them, whatever the others find.
 
---lint: the linters alone; --system: the tests that need packages or privileges of the machine.
+--lint: the linters alone; --system: the tests that need packages or privileges of the machine; --table: no tests, but
+docs/tests.md from the report of the last.
 """
 
 import os
@@ -10,10 +11,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 
 import pytest
 
+import slow_tests
 import system
 from workplace import REQUIREMENTS, ROOT
 
@@ -22,8 +25,12 @@ LINTERS = {
     "ruff format": ["ruff", "format", "--check", "--quiet"],
     "mypy": ["mypy", "--no-error-summary"],
 }
+# What would be compiled in the middle of the tests, by several of them at once; the linters leave cores for it.
+KERNELS = [sys.executable, str(ROOT / "tools" / "kernels.py")]
 # Tests wait for processes more than they compute, so two files run at once; what a file's tests share is made once.
-AT_ONCE = ["--numprocesses=2", "--dist=loadfile"]
+# Which files come first says tests/conftest.py.
+AT_ONCE = ["--numprocesses=2", "--dist=loadfile", "--no-loadscope-reorder"]
+REPORTED = [f"--junitxml={slow_tests.REPORT}"]
 LOCKED_NUMPY = re.compile(r"^numpy==(\S+) ; python_full_version >=", re.MULTILINE)
 
 
@@ -68,17 +75,23 @@ def main(arguments: list[str]) -> int:
             print(f"lathe: {against}", file=sys.stderr)
             return 1
         return int(pytest.main(["-m", "system", "tests/system", *arguments]))
+    if "--table" in arguments:
+        return slow_tests.main()
     linters, verdicts = dict(LINTERS), list[str]()
     if (here := version("numpy")) != (locked := locked_numpy()):
         del linters["mypy"]
         verdicts.append(f"not run: mypy, because its verdict is for the types of NumPy {locked}, not {here}")
-    failed = [name for name, command in linters.items() if not lint(name, command)]
+    with ThreadPoolExecutor(1) as beside:
+        compiled = beside.submit(lint, "kernels", KERNELS) if not arguments else None
+        failed = [name for name, command in linters.items() if not lint(name, command)]
+    if compiled is not None and not compiled.result():
+        failed.append("kernels")
     if "--lint" in arguments:
         print(*verdicts, sep="\n", end="\n" if verdicts else "")
         return int(bool(failed))
     verdicts += [f"{name} FAILED: see above" for name in failed]
     verdicts.append("not run: the tests that need system packages or privileges (./lathe test --system)")
-    code = pytest.main(["-m", "not system", *AT_ONCE, *arguments], plugins=[Verdicts(verdicts)])
+    code = pytest.main(["-m", "not system", *AT_ONCE, *REPORTED, *arguments], plugins=[Verdicts(verdicts)])
     return int(code) or int(bool(failed))
 
 

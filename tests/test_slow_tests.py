@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of the slow tests says what the tests say, and is made of what they took."""
+
+import pytest
+
+import slow_tests
+from slow_tests import Cost, Name, Told
+from workplace import RefusalError
+
+REPORT = """<testsuites><testsuite>
+<testcase classname="tests.test_a" name="test_one[x-[y]]" time="2.5"/>
+<testcase classname="tests.test_a" name="test_one[z]" time="0.5"/>
+<testcase classname="tests.test_a.TestFullCell" name="test_is_held" time="4"/>
+<testcase classname="" name="tests.test_b" time="0"><skipped message="no rerun"/></testcase>
+</testsuite></testsuites>
+"""
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """A report of two files of tests, of which one was skipped."""
+    (tmp_path / "test_a.py").write_text(
+        """
+import harness
+
+def helper():
+    return harness.run("piston", mode="composed")
+
+class TestFullCell:
+    def test_is_held(self):
+        '''The force|edge is held.
+
+        More of it.
+        '''
+        helper()
+
+def test_one(x):
+    '''Not what "processes" do.'''
+
+def test_the_paper_s_two():
+    subprocess.run([])
+""",
+        encoding="utf-8",
+    )
+    (tmp_path / "test_b.py").touch()
+    monkeypatch.setattr(slow_tests, "TESTS", tmp_path)
+    report = tmp_path / "report.xml"
+    report.write_text(REPORT, encoding="utf-8")
+    return report
+
+
+def test_the_page_says_what_the_tests_say():
+    assert slow_tests.wrong(slow_tests.PAGE.read_text(encoding="utf-8"), slow_tests.told()) == []
+
+
+def test_the_page_has_all_rows_and_the_share_of_each_file():
+    page = slow_tests.PAGE.read_text(encoding="utf-8")
+    assert len(slow_tests._ROW.findall(page)) == slow_tests.SLOWEST
+    rows = [line for line in page.splitlines() if line.startswith("| ")][2:]
+    assert len(rows) == slow_tests.SLOWEST + len(slow_tests.shares())
+    assert 50.0 < sum(slow_tests.shares().values()) <= 100.0
+
+
+def test_cases_are_added_up_by_test_and_class(files):
+    assert slow_tests.took(files) == {
+        Name("test_a", "", "test_one"): Cost(3.0, 2),
+        Name("test_a", "TestFullCell", "test_is_held"): Cost(4.0, 1),
+        Name("test_b", "", "tests.test_b"): Cost(0.0, 1),
+    }
+
+
+def test_a_promise_is_the_first_line_of_the_docstring_or_else_the_name(files):
+    assert slow_tests.told() == {
+        Name("test_a", "TestFullCell", "test_is_held"): Told("The force|edge is held.", "composed"),
+        Name("test_a", "", "test_one"): Told('Not what "processes" do.', ""),
+        Name("test_a", "", "test_the_paper_s_two"): Told("the paper's two", "programs"),
+    }
+    assert slow_tests.in_words(Name("test_a", "TestFullCell", "test_is_held")) == "full cell: is held"
+
+
+def test_the_slowest_come_first_by_file_and_what_is_wrong_is_named(files):
+    said = slow_tests.told()
+    page = slow_tests.written(slow_tests.took(files), said)
+    assert page.splitlines()[-3:] == [
+        "| **test_a** | 100.0 % | | | |",
+        r"| TestFullCell.`test_is_held` | 57.1 % | 1 | composed | The force\|edge is held. |",
+        '| `test_one` | 42.9 % | 2 |  | Not what "processes" do. |',
+    ]
+    assert slow_tests.wrong(page, said) == []
+    del said[Name("test_a", "", "test_one")]
+    said[Name("test_a", "TestFullCell", "test_is_held")] = Told("The force is held.", "")
+    assert slow_tests.wrong(page, said) == [
+        "test_is_held says: The force is held.",
+        "no test test_one in tests/test_a.py",
+    ]
+
+
+def test_a_report_of_some_files_makes_no_page(files):
+    (files.parent / "test_c.py").touch()
+    with pytest.raises(RefusalError, match=r"the last ./lathe test ran 2 of 3 files of tests \(test_c is missing\)"):
+        slow_tests.took(files)
+    with pytest.raises(RefusalError, match=r"run ./lathe test first"):
+        slow_tests.took(files.with_name("none.xml"))

@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""./lathe test --table: docs/tests.md, which promise each slow test holds and what that costs.
+
+The times are those of the last ./lathe test, the promises those that stand at the tests: a docstring's first line, or
+else the test's name. What a test starts is read off its source and that of the helpers and fixtures in its file.
+"""
+
+import ast
+import re
+import sys
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree as ET
+
+from workplace import HOME, ROOT, RefusalError, say
+
+REPORT = HOME / "test-report.xml"  #: of the last ./lathe test, as JUnit has it
+PAGE = ROOT / "docs" / "tests.md"
+TESTS = ROOT / "tests"
+SLOWEST = 60  #: tests in the table
+
+_FILE = re.compile(r"^\| \*\*(test_\w+)\*\* \| ([\d.]+) % \|", re.MULTILINE)
+_ROW = re.compile(r"^\| (?:(\w+)\.)?`(test_\w+)` \| [\d.]+ % \| \d+ \| [a-z, ]*\| (.*) \|$", re.MULTILINE)
+_HOSTS = ("offline", "composed", "processes")
+_PROCESSES = {"Processes", "starting", "held"}
+_PROGRAMS = {"Popen", "subprocess", "started"}
+_RUN = {"harness.run", "cell_run", "cells.run", "run"}
+_HEAD = """\
+# The slow tests
+
+Which promise each of the {slowest} slowest tests of `./lathe test` holds, and its share of the time of all {tests}
+tests ({seconds:.0f} s, one after the other). `./lathe test && ./lathe test --table` writes this page anew. Machines
+differ, so it is the share that counts. The cases of a test are added up; what several tests share counts for the first
+of them. A promise is the first line of the test's docstring, or else its name, and what a test starts is read off its
+source: change them there. tests/test_slow_tests.py checks that the page says what the tests say. `./lathe test` starts
+with the files that take longest.
+
+| test | share | cases | starts | promise |
+| --- | --- | --- | --- | --- |
+"""
+
+
+class Name(NamedTuple):
+    """A test without its parameters.
+
+    Attributes:
+        file: stem of its file.
+        owner: its class, or nothing.
+        test: its function.
+    """
+
+    file: str
+    owner: str
+    test: str
+
+
+class Cost(NamedTuple):
+    """What a test took: seconds, and how many cases it has."""
+
+    seconds: float
+    cases: int
+
+
+class Told(NamedTuple):
+    """What a test says of itself: its promise, and what it starts."""
+
+    promise: str
+    starts: str
+
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+# ---- what the tests say
+
+
+def in_words(name: Name) -> str:
+    """Return a test's name as a sentence."""
+    said = name.test.removeprefix("test_").replace("_s_", "'s_").replace("_", " ")
+    owner = re.sub(r"(?<!^)(?=[A-Z])", " ", name.owner.removeprefix("Test")).lower()
+    return f"{owner}: {said}" if owner else said
+
+
+def _defined(tree: ast.Module) -> Iterator[tuple[str, str, ast.stmt]]:
+    """Yield class or nothing, name and statement of all that a module and its classes define."""
+    for outer in tree.body:
+        owner, body = (outer.name, outer.body) if isinstance(outer, ast.ClassDef) else ("", [outer])
+        for node in body:
+            if isinstance(node, Function):
+                yield owner, node.name, node
+            if isinstance(node, ast.Assign):
+                yield from ((owner, target.id, node) for target in node.targets if isinstance(target, ast.Name))
+
+
+def _parts(node: ast.stmt) -> Iterator[ast.AST]:
+    """Yield all of a statement but the docstring."""
+    told = node.body[0] if isinstance(node, Function) and ast.get_docstring(node) is not None else None
+    waiting: list[ast.AST] = [node]
+    while waiting:
+        if (part := waiting.pop()) is not told:
+            yield part
+            waiting += ast.iter_child_nodes(part)
+
+
+def _starts(test: Function, defined: Mapping[str, ast.stmt]) -> str:
+    """Return what a test starts, with what it calls in its own file."""
+    found, seen, waiting = set[str](), {test.name}, [test.name]
+    while waiting:
+        for part in _parts(defined[waiting.pop()]):
+            words = [getattr(part, key, None) for key in ("id", "attr", "arg", "value")]
+            names = {word for word in words if isinstance(word, str)}
+            found |= names & set(_HOSTS)
+            found |= {"programs"} if names & _PROGRAMS else set()
+            found |= {"processes"} if names & _PROCESSES else set()
+            if isinstance(part, ast.Call) and ast.unparse(part.func) in _RUN:
+                found |= set() if any(word.arg in ("mode", None) for word in part.keywords) else {"offline"}
+            for word in (names & defined.keys()) - seen:
+                seen.add(word)
+                waiting.append(word)
+    return ", ".join(kind for kind in (*_HOSTS, "programs") if kind in found)
+
+
+def told() -> dict[Name, Told]:
+    """Return what all tests say of themselves, those of tests/system apart."""
+    found = {}
+    for path in sorted(TESTS.glob("test_*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        defined = {name: node for _, name, node in _defined(tree)}
+        for owner, test, node in _defined(tree):
+            if isinstance(node, Function) and test.startswith("test_"):
+                name = Name(path.stem, owner, test)
+                said = (ast.get_docstring(node) or in_words(name)).splitlines()[0]
+                found[name] = Told(said, _starts(node, defined))
+    return found
+
+
+# ---- what they took
+
+
+def took(report: Path) -> dict[Name, Cost]:
+    """Return what each test took, all of its cases together.
+
+    Raises:
+        RefusalError: no report, or not one of all tests.
+    """
+    if not report.exists():
+        raise RefusalError("no report of a run is here; run ./lathe test first")
+    found: dict[Name, list[float]] = defaultdict(list)
+    files = set[str]()
+    for case in ET.parse(report).getroot().iter("testcase"):  # noqa: S314 - pytest wrote it here
+        _, _, place = (case.get("classname") or case.get("name") or "").partition("tests.")
+        file, _, owner = place.partition(".")
+        files.add(file)
+        found[Name(file, owner, case.get("name", "").partition("[")[0])].append(float(case.get("time", 0.0)))
+    here = {path.stem for path in TESTS.glob("test_*.py")}
+    if missing := sorted(here - files):
+        raise RefusalError(
+            f"the last ./lathe test ran {len(here) - len(missing)} of {len(here)} files of tests "
+            f"({missing[0]} is missing); run it without arguments first"
+        )
+    return {name: Cost(sum(times), len(times)) for name, times in found.items()}
+
+
+def shares() -> dict[str, float]:
+    """Return the share of the time [%] of each file in the page."""
+    page = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
+    return {file: float(share) for file, share in _FILE.findall(page)}
+
+
+# ---- the page
+
+
+def written(costs: Mapping[Name, Cost], said: Mapping[Name, Told]) -> str:
+    """Return the page: the slowest tests by file, whatever takes longest first."""
+    whole = sum(cost.seconds for cost in costs.values())
+    files: dict[str, float] = defaultdict(float)
+    for name, cost in costs.items():
+        files[name.file] += cost.seconds
+    known = sorted((name for name in costs if name in said), key=lambda name: -costs[name].seconds)[:SLOWEST]
+    lines = []
+    for file in sorted({name.file for name in known}, key=lambda file: -files[file]):
+        lines.append(f"| **{file}** | {100 * files[file] / whole:.1f} % | | | |")
+        for name in known:
+            if name.file == file:
+                owner, cost, test = name.owner and f"{name.owner}.", costs[name], said[name]
+                share, promise = 100 * cost.seconds / whole, test.promise.replace("|", r"\|")
+                lines.append(f"| {owner}`{name.test}` | {share:.1f} % | {cost.cases} | {test.starts} | {promise} |")
+    tests = sum(cost.cases for cost in costs.values())
+    return _HEAD.format(slowest=len(known), tests=tests, seconds=whole) + "\n".join(lines) + "\n"
+
+
+def wrong(page: str, said: Mapping[Name, Told]) -> list[str]:
+    """Return what a page says otherwise than the tests."""
+    found, file = [], ""
+    for line in page.splitlines():
+        if begun := _FILE.match(line):
+            file = begun[1]
+        if row := _ROW.match(line):
+            name, promise = Name(file, row[1] or "", row[2]), row[3].replace(r"\|", "|")
+            if name not in said:
+                found.append(f"no test {row[2]} in tests/{file}.py")
+            elif promise != said[name].promise:
+                found.append(f"{row[2]} says: {said[name].promise}")
+    return found
+
+
+def main() -> int:
+    """Write the page."""
+    try:
+        page = written(took(REPORT), told())
+    except RefusalError as error:
+        print(f"lathe: {error}", file=sys.stderr)
+        return 2
+    PAGE.write_text(page, encoding="utf-8")
+    say(f"{PAGE.relative_to(ROOT)} written")
+    return 0
