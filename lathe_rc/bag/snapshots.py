@@ -131,7 +131,7 @@ class Snapshots:
             node, colon, _ = pattern.partition(": ")
             if colon and not any(fnmatchcase(name, node) for name in nodes):
                 raise InputError(
-                    f"{self._name}.triggers = {pattern!r}: no node {node!r} in the cell; allowed: {', '.join(nodes)}"
+                    f"{self._name}.triggers = {pattern!r}: no node {node!r} in the cell; allowed: {', '.join(sorted(nodes))}"
                 )
 
     # ---- what comes in ------------------------------------------------------------------------------
