@@ -20,6 +20,21 @@ SEGMENT = "fastrtps_0123456789abcdef"
 
 
 @pytest.fixture
+def domain(monkeypatch):
+    """A domain of which nothing is in this process's memory, where nodes of other tests stay until collected."""
+    with contextlib.ExitStack() as held:
+        while True:
+            number = held.enter_context(harness.free_domain())
+            ports = range(7400 + 250 * number, 7650 + 250 * number)
+            used = re.findall(r"fastrtps_port(\d+)", Path("/proc/self/maps").read_text(encoding="utf-8"))
+            if not any(int(port) in ports for port in used):
+                break
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield number
+
+
+@pytest.fixture
 def port(tmp_path):
     file = tmp_path / "fastrtps_port7661"
     file.write_bytes(b"broken")

@@ -130,9 +130,8 @@ class Snapshots:
         for pattern in self._table.triggers:
             node, colon, _ = pattern.partition(": ")
             if colon and not any(fnmatchcase(name, node) for name in nodes):
-                raise InputError(
-                    f"{self._name}.triggers = {pattern!r}: no node {node!r} in the cell; allowed: {', '.join(sorted(nodes))}"
-                )
+                known = ", ".join(sorted(nodes))
+                raise InputError(f"{self._name}.triggers = {pattern!r}: no node {node!r} in the cell; allowed: {known}")
 
     # ---- what comes in ------------------------------------------------------------------------------
 
