@@ -3,6 +3,7 @@
 
 import os
 import queue
+import select
 import signal
 import socket
 import subprocess
@@ -111,3 +112,25 @@ def test_separate_interpreters_give_the_bits_of_forked_processes():
     cell = scenario()
     runs = [harness.run(cell, mode="composed", start=start) for start in ("fork", "spawn")]
     assert runs[0].digest == runs[1].digest
+
+
+STUCK = """
+import os, socket, sys, time
+from lathe_rc import starting
+ours, theirs = socket.socketpair()
+child = starting.server().start(
+    [], environment=dict(os.environ), report=theirs, log=2, changed=print,
+    command=["/bin/sh", "-c", "trap '' TERM HUP; exec sleep 1000"],
+)
+print(child.pid, flush=True)
+time.sleep(1000.0)
+"""
+
+
+def test_a_process_that_does_not_end_by_itself_is_killed_when_nobody_is_left_to_do_it():
+    """Its harness has been killed, and it hears nothing: as one that waits for a lock of DDS."""
+    with subprocess.Popen([sys.executable, "-c", STUCK], stdout=subprocess.PIPE) as harness_process:
+        descriptor = os.pidfd_open(int(harness_process.stdout.readline()))
+        harness_process.kill()
+    assert select.select([descriptor], [], [], 60.0)[0], "readable when the process has ended"
+    os.close(descriptor)

@@ -22,6 +22,7 @@ import select
 import signal
 import socket
 import sys
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -29,6 +30,7 @@ from lathe_rc.nodes.report import VARIABLE
 
 _NODES = "lathe_rc.nodes.process"
 _MOST = 2**18  # [B] of a request; the environment is the most of it
+_FAREWELL = 10.0  # [s] for processes to end by themselves when nobody asks any more
 _CHANGES = os.WEXITED | os.WSTOPPED | os.WCONTINUED | os.WNOHANG
 
 
@@ -65,6 +67,30 @@ def _changed() -> Iterator[dict[str, Any]]:
             yield {"pid": found.si_pid, "state": state, "code": code}
 
 
+def _tell(line: socket.socket, living: set[int]) -> bool:
+    """Say what has become of processes since the last call; whether anybody is left to hear it."""
+    for change in _changed():
+        if change["state"] == "ended":
+            living.discard(change["pid"])
+        try:
+            line.send(json.dumps(change).encode())
+        except BrokenPipeError:
+            return False
+    return True
+
+
+def _see_off(woken: socket.socket, living: set[int]) -> int:
+    """Wait for processes to end when nobody can ask any more; one that DDS holds up is killed. The exit code."""
+    end = time.monotonic() + _FAREWELL
+    while living and (left := end - time.monotonic()) > 0.0:
+        if select.select([woken], [], [], left)[0]:
+            woken.recv(_MOST)
+        living -= {change["pid"] for change in _changed() if change["state"] == "ended"}
+    for pid in living:
+        os.kill(pid, signal.SIGKILL)
+    return 0
+
+
 def serve(line: socket.socket) -> int:
     """Fork as asked until nobody can ask any more.
 
@@ -76,17 +102,18 @@ def serve(line: socket.socket) -> int:
         end.setblocking(False)  # noqa: FBT003 - it has no other form
     signal.signal(signal.SIGCHLD, lambda _number, _frame: None)
     signal.set_wakeup_fd(woken.fileno(), warn_on_full_buffer=False)
+    living: set[int] = set()
     while True:
         readable, _, _ = select.select([line, ours], [], [])
         if ours in readable:
             ours.recv(_MOST)
-            for change in _changed():
-                line.send(json.dumps(change).encode())
+            if not _tell(line, living):
+                return _see_off(ours, living)
         if line not in readable:
             continue
         asked, descriptors, _, _ = socket.recv_fds(line, _MOST, 2)
         if not asked:
-            return 0
+            return _see_off(ours, living)
         request = json.loads(asked)
         if "preload" in request:
             _load(request["preload"])
@@ -99,6 +126,7 @@ def serve(line: socket.socket) -> int:
             for end in (line, ours, woken):
                 end.close()
             return _become(request, *descriptors)
+        living.add(pid)
         process = os.pidfd_open(pid)
         socket.send_fds(line, [json.dumps({"pid": pid, "state": "started", "code": 0}).encode()], [process])
         for descriptor in (process, *descriptors):
