@@ -44,6 +44,7 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.extensions import search_path
 from lathe_rc.happened import Happening, listed
 from lathe_rc.namespace import absolute, checked
 from lathe_rc.nodes import leftovers
@@ -214,8 +215,6 @@ def run(
         starting.server()  # it imports while the cell is checked
     cell = Cell(scenario.nodes)
     cell.check()
-    if cell.master.samples is None:
-        raise InputError(f"{cell.master.name}.revolutions = 0; the run needs an end: allowed above 0")
     if bag is not None:
         refuse_existing(bag)
     result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace), start)
@@ -235,8 +234,7 @@ def _run(
     namespace: str,
     start: Start,
 ) -> Result:
-    assert cell.master.samples is not None
-    watch({"event": "checked", "node": cell.master.name, "samples": cell.master.samples, "step": scenario.shared.step})
+    watch({"event": "checked", "node": cell.master.name, "samples": cell.samples, "step": scenario.shared.step})
     for left in compile_ahead(cell.stages.values()):
         watch({"event": "compiling", "node": left[0], "nodes": left})
     if mode == "offline":
@@ -425,6 +423,7 @@ class Processes:
 
     def _start(self, group: Sequence[str]) -> None:
         environment = os.environ | {"ROS_DOMAIN_ID": str(self.domain), "ROS_LOG_DIR": str(self._folder)}
+        environment["PYTHONPATH"] = search_path()
         if all(getattr(table, "speed_factor", 0.0) == 0.0 for table in self._scenario.nodes.values()):
             environment[THROUGHPUT] = "1"
         name = "+".join(group)

@@ -54,7 +54,7 @@ class HostTopic:
     doc: str
 
 
-_ALL = tuple(TABLES)
+_ALL = tuple(TABLES.own)
 _SPINDLE = ("spindle_encoder",)
 HOST_TOPICS = (
     HostTopic(
@@ -114,7 +114,7 @@ BESIDE: dict[str, type[Table]] = {
 
 def page() -> str:
     """The whole page."""
-    parts = [_introduction(), _shared(), *map(_node, TABLES), *map(_beside, BESIDE), _host(), _messages()]
+    parts = [_introduction(), _shared(), *map(_node, TABLES.own), *map(_beside, BESIDE), _host(), _messages()]
     return "\n\n".join(parts) + "\n"
 
 

@@ -140,6 +140,7 @@ class ForkServer:
             "arguments": list(arguments),
             "environment": dict(environment),
             "folder": str(Path.cwd()),
+            "path": sys.path,
             "command": list(command),
         }
         with self._asking:

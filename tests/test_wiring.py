@@ -8,7 +8,7 @@ import pytest
 from cells import NODES, run, scenario
 
 from lathe_rc import harness
-from lathe_rc.cell import messages, wiring
+from lathe_rc.cell import messages
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.stage import Input, Output, Stage
@@ -21,7 +21,6 @@ CONFIG = Path(__file__).parents[1] / "config"
 class Repeater(Stage):
     """A stage that commands what it is commanded."""
 
-    kind = "repeater"
     Parameters = NodeParameters
 
     def __init__(self, name, parameters):
@@ -36,11 +35,7 @@ class Repeater(Stage):
         return []
 
 
-@pytest.fixture
-def repeater(monkeypatch):
-    """Makes the stage known."""
-    monkeypatch.setitem(wiring.STAGES, "repeater", Repeater)
-    monkeypatch.setitem(scenarios.TABLES, "repeater", NodeParameters)
+REPEATER = "test_wiring:Repeater"
 
 
 def refusal(shared=None, **nodes):
@@ -80,16 +75,16 @@ def test_topic_of_another_type_is_refused():
     )
 
 
-def test_loop_without_a_delay_is_refused(repeater):
-    there = {"stage": "repeater", "remap": ["command_in:=back", "command_out:=there"]}
-    back = {"stage": "repeater", "remap": ["command_in:=there", "command_out:=back"]}
+def test_loop_without_a_delay_is_refused():
+    there = {"stage": REPEATER, "remap": ["command_in:=back", "command_out:=there"]}
+    back = {"stage": REPEATER, "remap": ["command_in:=there", "command_out:=back"]}
     told = refusal(there=there, back=back)
     assert told.endswith("a loop without a feedback delay cannot start")
     assert "there -> back" in told or "back -> there" in told
 
 
-def test_stage_may_be_put_between_two_others(repeater):
-    between = {"stage": "repeater", "remap": ["command_in:=coarse/command", "command_out:=coarse/checked"]}
+def test_stage_may_be_put_between_two_others():
+    between = {"stage": REPEATER, "remap": ["command_in:=coarse/command", "command_out:=coarse/checked"]}
     with_it = run(between=between, electrodynamic_actuator={"remap": ["coarse/command:=coarse/checked"]})
     without = run()
     assert with_it.digest["/coarse/checked"] == without.digest["/coarse/command"]

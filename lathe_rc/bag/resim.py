@@ -125,7 +125,7 @@ def with_controller(scenario: Scenario, file: Path) -> Scenario:
             raise InputError(f"{file}: no node {name!r} in the bag's scenario; allowed: {', '.join(nodes)}")
         own = {key: value for key, value in values.items() if key not in SharedParameters.model_fields}
         stage = own.get("stage") or nodes[name].stage
-        kind = kind_of(name, {"stage": stage})
+        kind = kind_of(name, stage)
         nodes[name] = TABLES[kind].read(name, {**shared, "remap": nodes[name].remap, **own, "stage": stage})
     return Scenario(scenario.name, nodes)
 

@@ -15,10 +15,11 @@ import threading
 from collections.abc import Iterable, Iterator, Sequence
 
 from lathe_rc.cell import native
-from lathe_rc.cell.scenario import TABLES
+from lathe_rc.cell.scenario import TABLES, kind_of
 from lathe_rc.cell.stage import Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.errors import LatheError
+from lathe_rc.extensions import search_path
 
 
 def uncompiled(stages: Iterable[Stage]) -> list[Stage]:
@@ -60,8 +61,9 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
 
 def _start(stages: Sequence[Stage], done: "queue.SimpleQueue[str]") -> "subprocess.Popen[str]":
     """Start a process that compiles the steps of some stages; ``done`` gets their names, and in the end nothing."""
-    process = subprocess.Popen([sys.executable, "-m", __name__], stdin=-1, stdout=-1, text=True)
-    asked = {stage.name: (stage.kind, stage.shared.model_dump()) for stage in stages}
+    environment = os.environ | {"PYTHONPATH": search_path()}
+    process = subprocess.Popen([sys.executable, "-m", __name__], stdin=-1, stdout=-1, text=True, env=environment)
+    asked = {stage.name: (kind_of(stage.name, stage.shared.stage), stage.shared.model_dump()) for stage in stages}
 
     def talk() -> None:
         assert process.stdin is not None, "it is a pipe"

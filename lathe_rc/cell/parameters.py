@@ -15,6 +15,7 @@ from pydantic.fields import FieldInfo
 
 from lathe_rc.cell.messages import MAX_BLOCK
 from lathe_rc.errors import InputError, shown
+from lathe_rc.extensions import Named
 
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
 
@@ -39,6 +40,7 @@ class Row:
         type: of the value, or of its elements.
         is_list: whether it is an array.
         choices: allowed texts; empty where any will do.
+        named: what else may be named, classes of other packages; None: nothing.
         low, high: range of a number, ends allowed or not as ``limits`` says; infinite where there is none.
         limits: the range in words, empty where there is none.
     """
@@ -57,6 +59,9 @@ class Row:
             annotation, *inner = get_args(annotation)
             metadata += inner
         self.choices: tuple[str, ...] = get_args(annotation) if get_origin(annotation) is Literal else ()
+        self.named: Named[Any] | None = next((limit for limit in metadata if isinstance(limit, Named)), None)
+        if self.named is not None:
+            self.choices = self.named.choices
         self.type: type = str if self.choices else annotation
         self.low, self.high, words = -math.inf, math.inf, []
         for limit in metadata:
@@ -73,6 +78,7 @@ class Row:
     def allowed(self) -> str:
         """What the parameter accepts, in words."""
         what = f"one of {', '.join(self.choices)}" if self.choices else _NAMES[self.type]
+        what = self.named.allowed() if self.named else what
         text = " ".join(filter(None, (what, self.limits)))
         if self.is_list:
             text = f"a list, each {text}"
@@ -106,6 +112,12 @@ class Table(BaseModel):
                 raise InputError(f"{shown(f'{node}.{name}')}: unknown parameter; allowed: {known}") from None
             given = f"{values[name]!r:.200}"
             raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
+
+
+def names_others(table: type[Table], values: Mapping[str, object]) -> bool:
+    """Whether one of the values names a class of another package."""
+    rows = ((row, values.get(name, row.default)) for name, row in table.rows().items())
+    return any(row.named and value not in row.choices for row, value in rows)
 
 
 @cache

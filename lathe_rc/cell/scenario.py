@@ -3,7 +3,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,8 +17,31 @@ from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.errors import InputError, shown
 
-TABLES: dict[str, type[NodeParameters]] = {kind: stage.Parameters for kind, stage in STAGES.items()}
-TABLES[RECORDER] = RecorderParameters
+
+class _Tables(Mapping[str, type[NodeParameters]]):
+    """The table of each kind of node, also of those that other packages offer; see `lathe_rc.extensions.Registry`."""
+
+    @property
+    def own(self) -> list[str]:
+        """The kinds that are ours."""
+        return [*STAGES.own, RECORDER]
+
+    def allowed(self) -> str:
+        """The kinds, in words."""
+        return f"{RECORDER}, {STAGES.allowed()}"
+
+    def __iter__(self) -> Iterator[str]:
+        yield from STAGES
+        yield RECORDER
+
+    def __len__(self) -> int:
+        return len(STAGES) + 1
+
+    def __getitem__(self, kind: str) -> type[NodeParameters]:
+        return RecorderParameters if kind == RECORDER else STAGES[kind].Parameters
+
+
+TABLES = _Tables()
 
 _EVERYONE = "/**"
 # What changes neither a sample nor a message of a run, and so not its identity.
@@ -28,15 +51,15 @@ _HOST_PARAMETERS = {
 }
 
 
-def kind_of(node: str, values: Mapping[str, object]) -> str:
+def kind_of(node: str, stage: object) -> str:
     """What a node is: its ``stage`` parameter, or its name.
 
     Raises:
         InputError: there is no such stage.
     """
-    kind = str(values.get("stage") or node)
+    kind = str(stage or node)
     if kind not in TABLES:
-        raise InputError(f"{node}: no stage {kind!r}; allowed: {', '.join(TABLES)} (set {node}.stage)")
+        raise InputError(f"{node}: no stage {kind!r}; allowed: {TABLES.allowed()} (set {node}.stage)")
     return kind
 
 
@@ -83,7 +106,7 @@ class Scenario:
 
     def kind(self, node: str) -> str:
         """What a node is."""
-        return kind_of(node, {"stage": self.nodes[node].stage})
+        return kind_of(node, self.nodes[node].stage)
 
     def of_kind(self, kind: str) -> list[str]:
         """Names of the nodes of a kind."""
@@ -174,7 +197,7 @@ def _override(text: str, nodes: dict[str, dict[str, Value]]) -> None:
             values.pop(name, None)
         nodes.setdefault(node, {})[name] = parsed
     else:
-        nodes[node][name] = _absolute(kind_of(node, nodes[node]), name, parsed, Path())
+        nodes[node][name] = _absolute(kind_of(node, nodes[node].get("stage")), name, parsed, Path())
 
 
 def _absolute(kind: str, name: str, value: Value, folder: Path) -> Value:
@@ -242,7 +265,7 @@ def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
     nodes = ros_yaml.read(path)
     for name, values in nodes.items():
         if name != _EVERYONE:
-            kind = kind_of(name, values)
+            kind = kind_of(name, values.get("stage"))
             for key, value in values.items():
                 values[key] = _absolute(kind, key, value, path.parent)
     for text in overrides:
@@ -256,5 +279,5 @@ def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
         for key in SharedParameters.model_fields:
             if key in values and key in shared and values[key] != shared[key]:
                 raise InputError(f"{name}.{key} = {values[key]}: {_EVERYONE} says {shared[key]}; keep one")
-        tables[name] = TABLES[kind_of(name, values)].read(name, {**shared, **values})
+        tables[name] = TABLES[kind_of(name, values.get("stage"))].read(name, {**shared, **values})
     return _agreed(path.stem, tables, {name: _fingerprint(table) for name, table in tables.items()})

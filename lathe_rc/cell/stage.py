@@ -136,6 +136,8 @@ class Stage(ABC):
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
+        if not getattr(cls, "kind", ""):
+            cls.kind = cls.__name__
         if "process" in vars(cls) and "step" not in vars(cls):
             cls.step = None  # what it inherits computes something else
 

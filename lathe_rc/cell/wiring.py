@@ -49,7 +49,7 @@ class Cell:
     def __init__(self, nodes: Mapping[str, NodeParameters]) -> None:
         made: dict[str, Stage] = {}
         for name, table in nodes.items():
-            kind = kind_of(name, {"stage": table.stage})
+            kind = kind_of(name, table.stage)
             if kind in STAGES:
                 made[name] = STAGES[kind](name, table)
         self.dense: dict[str, Source] = {}
@@ -101,6 +101,17 @@ class Cell:
         if len(found) != 1:
             raise InputError(f"{len(found)} spindle_encoder nodes in the scenario; allowed: 1")
         return found[0]
+
+    @property
+    def samples(self) -> int:
+        """Length of a run.
+
+        Raises:
+            InputError: it has no end, or there is no time master.
+        """
+        if self.master.samples is None:
+            raise InputError(f"{self.master.name}.revolutions = 0; this run needs an end: allowed above 0")
+        return self.master.samples
 
     def readers(self, topic: str) -> list[Stage]:
         """Stages that read a relative topic."""

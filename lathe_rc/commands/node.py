@@ -38,13 +38,17 @@ class _PassingThrough(click.Command):
 
 
 @click.command(cls=_PassingThrough, context_settings=_PASS_THROUGH)
-@click.argument("name", type=click.Choice(list(TABLES)))
+@click.argument("name", metavar="NAME[:STAGE]")
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
 def node(name: str, arguments: tuple[str, ...]) -> None:
     """Run one node, as ``ros2 run lathe_rc NAME`` does; --help lists its parameters."""
+    _, _, kind = name.partition(":")
+    kind = kind or name
+    if kind not in TABLES:
+        raise InputError(f"no node {kind!r}; allowed: {TABLES.allowed()}")
     if "--help" in arguments or "-h" in arguments:
         click.echo(f"usage: lathe node {name} [--ros-args -p PARAM:=VALUE --params-file FILE -r OLD:=NEW ...]\n")
-        Console().print(_parameters(name))
+        Console().print(_parameters(kind))
         return
     sys.exit(_nodes([name, *arguments]))
 
@@ -54,7 +58,7 @@ def node(name: str, arguments: tuple[str, ...]) -> None:
 def container(arguments: tuple[str, ...]) -> None:
     """Run several nodes in one process: NODE[:STAGE]... [--ros-args ...]."""
     if not arguments or arguments[0].startswith("-"):
-        raise InputError(f"no nodes named; allowed: {', '.join(TABLES)}, each once, or NAME:STAGE")
+        raise InputError(f"no nodes named; allowed: {TABLES.allowed()}, each once, or NAME:STAGE")
     sys.exit(_nodes(arguments))
 
 

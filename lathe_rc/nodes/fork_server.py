@@ -53,25 +53,26 @@ def _become(request: dict[str, Any], report: int, log: int) -> int:
     if request["command"]:
         os.set_inheritable(report, True)  # noqa: FBT003 - it has no other form
         os.execvpe(request["command"][0], request["command"], os.environ)
+    sys.path[:] = request["path"]  # modules of others are found where who asks finds them
     process = importlib.import_module(_NODES)
     return int(process.run(*process.split(request["arguments"])))
 
 
-def _changed() -> Iterator[dict[str, Any]]:
-    """What has become of processes since the last call."""
+def _changed(living: set[int]) -> Iterator[dict[str, Any]]:
+    """What has become of processes since the last call; those that have ended are not ``living`` any more."""
     with contextlib.suppress(ChildProcessError):  # there is none
         while found := os.waitid(os.P_ALL, 0, _CHANGES):
             ended = found.si_code in (os.CLD_EXITED, os.CLD_KILLED, os.CLD_DUMPED)
             state = "ended" if ended else "continued" if found.si_code == os.CLD_CONTINUED else "stopped"
             code = found.si_status if found.si_code == os.CLD_EXITED or not ended else -found.si_status
+            if ended:
+                living.discard(found.si_pid)
             yield {"pid": found.si_pid, "state": state, "code": code}
 
 
 def _tell(line: socket.socket, living: set[int]) -> bool:
     """Say what has become of processes since the last call; whether anybody is left to hear it."""
-    for change in _changed():
-        if change["state"] == "ended":
-            living.discard(change["pid"])
+    for change in _changed(living):
         try:
             line.send(json.dumps(change).encode())
         except BrokenPipeError:
@@ -85,7 +86,8 @@ def _see_off(woken: socket.socket, living: set[int]) -> int:
     while living and (left := end - time.monotonic()) > 0.0:
         if select.select([woken], [], [], left)[0]:
             woken.recv(_MOST)
-        living -= {change["pid"] for change in _changed() if change["state"] == "ended"}
+        for _ in _changed(living):
+            pass
     for pid in living:
         os.kill(pid, signal.SIGKILL)
     return 0

@@ -22,6 +22,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 from rclpy.type_support import check_for_type_support
 
+from lathe_rc.cell.parameters import names_others
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stage import compile_kernels
@@ -47,7 +48,7 @@ _LONGEST_WAIT = 0.1  # [s] until signals and the harness are looked at again
 
 def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellNode:
     if kind not in TABLES:
-        raise InputError(f"{name}: no stage {kind!r}; allowed: {', '.join(TABLES)}")
+        raise InputError(f"{name}: no stage {kind!r}; allowed: {TABLES.allowed()}")
     classes: dict[str, type[CellNode]] = {RECORDER: RecorderNode, SpindleEncoder.kind: SpindleNode}
     try:
         return classes.get(kind, StageNode)(name, kind, reporter, exchange)
@@ -205,7 +206,8 @@ def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
     """Load what nodes load when they are configured, above all their compiled kernels, for forked processes to share.
 
     Args:
-        nodes: kind and parameters of each.
+        nodes: kind and parameters of each; those with classes of others load them themselves, which may have changed
+            since.
     """
     inspect.getframeinfo(cast("FrameType", inspect.currentframe()))  # rclpy's first log message reads all modules
     for package in _MESSAGES:
@@ -214,7 +216,7 @@ def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
                 check_for_type_support(found)
     for name, (kind, values) in nodes.items():
         with contextlib.suppress(Exception):  # the node itself says what is wrong
-            if kind in STAGES:
+            if kind in STAGES.own and not names_others(STAGES[kind].Parameters, values):
                 compile_kernels(STAGES[kind](name, TABLES[kind].read(name, values)))
 
 

@@ -16,23 +16,24 @@ from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.supervisor import Supervisor
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.stages.vibration import Vibration
+from lathe_rc.extensions import Registry
 
-STAGES: dict[str, type[Stage]] = {
-    stage.kind: stage
-    for stage in (
-        SpindleEncoder,
-        LearningController,
-        ElectrodynamicActuator,
-        PiezoActuator,
-        SeriesDriveStage,
-        Vibration,
-        ProfileStage,
-        Tool,
-        FeedDriveStage,
-        CuttingProcessStage,
-        PositionController,
-        ForceController,
-        DecouplerStage,
-        Supervisor,
-    )
-}
+_OWN: tuple[type[Stage], ...] = (
+    SpindleEncoder,
+    LearningController,
+    ElectrodynamicActuator,
+    PiezoActuator,
+    SeriesDriveStage,
+    Vibration,
+    ProfileStage,
+    Tool,
+    FeedDriveStage,
+    CuttingProcessStage,
+    PositionController,
+    ForceController,
+    DecouplerStage,
+    Supervisor,
+)
+
+#: by name, ours and those of other packages
+STAGES: Registry[Stage] = Registry("stage", Stage, {stage.kind: stage for stage in _OWN}, "lathe_rc.stages")
