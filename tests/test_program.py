@@ -10,7 +10,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import COMMAND, ENCODER
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.program import Program, Tapes, wired
-from lathe_rc.cell.stage import Input, Output, Sparse, Stage
+from lathe_rc.cell.stage import NEVER, Input, Output, Sparse, Stage
 from lathe_rc.cell.stages.form import FormTable
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import LatheError
@@ -86,8 +86,8 @@ def test_a_stage_in_python_is_asked_for_each_chunk_and_what_it_says_is_kept():
     assert stage.blocks == [(k, 100) for k in range(0, 400, 100)] + [(400, 50)] + [
         (k, 100) for k in range(450, 950, 100)
     ] + [(950, 50)]
-    assert [message.index for message in cell.said(1)] == [first for first, _ in stage.blocks]
-    assert cell.said(1) == []
+    assert [message.index for message in cell.said(1, NEVER)] == [first for first, _ in stage.blocks]
+    assert cell.said(1, NEVER) == []
     angle = tapes.view("encoder", 0, 1000)["angle"]
     assert angle[-1] > 0.0
     assert np.array_equal(tapes.view("half", 0, 1000)["position"], angle / 2)

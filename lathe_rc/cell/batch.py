@@ -28,7 +28,7 @@ from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import LatheError
 
 K_co = TypeVar("K_co", covariant=True)
 
@@ -94,9 +94,7 @@ def _outcome(scenario: Scenario, keep: Make[K_co]) -> Outcome[K_co]:
     try:
         cell = Cell(scenario.nodes)
         cell.check()
-        if cell.master.samples is None:
-            raise InputError(f"{cell.master.name}.revolutions = 0; an offline run needs an end: allowed above 0")
-        keeper = keep(cell, cell.master.samples)
+        keeper = keep(cell, cell.samples)
         Engine(cell, keeper.heard).run([Finite(cell), keeper])
     except LatheError as error:
         return Outcome(scenario, None, error)

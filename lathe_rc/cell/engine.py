@@ -9,13 +9,10 @@ import numpy as np
 
 from lathe_rc.cell.messages import MAX_BLOCK, Signals
 from lathe_rc.cell.parameters import remapped
-from lathe_rc.cell.program import Program, Tapes, wired
+from lathe_rc.cell.program import Program, Tapes, chunk_of, wired
 from lathe_rc.cell.stage import Sparse, compile_kernels
 from lathe_rc.cell.track import longest_delays
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError
-
-_CHUNK = 1024  # samples that a stage computes in one go, at most: what stages hand on stays in the cache
 
 
 class Sink(Protocol):
@@ -40,15 +37,12 @@ class Engine:
     """
 
     def __init__(self, cell: Cell, heard: Collection[str] | None = None) -> None:
-        if cell.master.samples is None:
-            raise InputError(f"{cell.master.name}.revolutions = 0; an offline run needs an end: allowed above 0")
-        self.samples: int = cell.master.samples
+        self.samples = cell.samples
         self._stages = list(cell.stages.values())
         if heard is not None:
             for stage in self._stages:
                 stage.unheard = {topic for topic in stage.sparse_topics if remapped(stage.shared, topic) not in heard}
-        block = cell.master.shared.block_size
-        chunk = min(cell.shortest_feedback or _CHUNK, _CHUNK) // block * block or block
+        chunk = chunk_of(cell.master.shared.block_size, [cell.shortest_feedback or 0])
         self._piece = MAX_BLOCK // chunk * chunk
         topics = {topic: (source.type, longest_delays(cell.inputs(topic))) for topic, source in cell.dense.items()}
         self._tapes = Tapes(topics, self._piece)
@@ -89,7 +83,7 @@ class Engine:
             outputs = [self._tapes.view(topic, first, end - first) for topic in topics]
             dense.update(zip(topics, outputs, strict=True))
             # Where a stage has failed, those before it have gone on.
-            said = [message for message in self._program.said(number) if message.index < end]
+            said = self._program.said(number, end)
             for message in stage.conclude(first, said, outputs, last=end == self.samples):
                 sparse.setdefault(remapped(stage.shared, message.topic), []).append(message)
         for sink in sinks:

@@ -5,7 +5,7 @@ It comes back where Python is needed: a stage asks for it, an event is due, or a
 at that stage and sample.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,8 @@ from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
 from lathe_rc.jit import kernel
 from lathe_rc.placed import call, floats
+
+_CHUNK = 1024  # samples that a stage computes in one go, at most: what stages hand on stays in the cache
 
 
 class Tapes:
@@ -121,6 +123,12 @@ def _passes(angle: Samples, turn: float) -> bool:
         else:
             high = middle
     return low < angle.size
+
+
+def chunk_of(block: int, delays: Iterable[int]) -> int:
+    """Samples that a stage computes in one go: whole blocks, no more than the shortest feedback; 0 is no feedback."""
+    most = min([_CHUNK, *(delay for delay in delays if delay)])
+    return most // block * block or block
 
 
 class Wired(NamedTuple):
@@ -249,7 +257,7 @@ class Program:
             self._sparse[number] += self._stages[number].tell(self._told[number], end)
             self._told[number] = end
 
-    def said(self, number: int) -> list[Sparse]:
-        """What a stage has said since the last call."""
+    def said(self, number: int, end: int) -> list[Sparse]:
+        """What a stage has said since the last call of the samples before ``end``."""
         said, self._sparse[number] = self._sparse[number], []
-        return said
+        return [message for message in said if message.index < end]

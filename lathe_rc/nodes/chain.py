@@ -10,14 +10,12 @@ and tracks hold what it would find there. So when anything goes wrong the chain 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from lathe_rc.cell.program import Program, Tapes, Wired
+from lathe_rc.cell.program import Program, Tapes, Wired, chunk_of
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 
 if TYPE_CHECKING:
     from lathe_rc.nodes.stage_node import StageNode
-
-_CHUNK = 1024  # samples that a stage computes in one go, at most
 
 
 class Chain:
@@ -35,7 +33,7 @@ class Chain:
         for node in nodes:
             topics |= {topic: (port.type, {}) for topic, port in zip(node.dense, node.stage.outputs, strict=True)}
         self._inside = set(topics)
-        self._stages, chunk = [], _CHUNK
+        self._stages, delays_inside = [], []
         for node in nodes:
             inputs = []
             for place, (topic, port) in enumerate(node.ports()):
@@ -43,11 +41,11 @@ class Chain:
                 delay = port.delay if topic in self._inside else 0  # what comes from outside is late already
                 delays = topics.setdefault(tape, (port.type, {}))[1]
                 delays |= {name: max(delays.get(name, 0), delay) for name in port.fields}
-                chunk = min(chunk, delay or chunk)
+                delays_inside.append(delay)
                 inputs.append((tape, delay))
             self._stages.append(Wired(node.stage, inputs, node.dense))
         self._tapes = Tapes(topics, self._most)
-        self._program = Program(self._stages, self._tapes, chunk // size * size or size)
+        self._program = Program(self._stages, self._tapes, chunk_of(size, delays_inside))
         self._busy = self._over = False
         for node in nodes:
             node.join(self, self._inside)
@@ -85,7 +83,7 @@ class Chain:
         except LatheError as error:
             failure, self._over = error, True
         for number, (node, end) in enumerate(zip(self._nodes, self._program.ends, strict=True)):
-            said = [message for message in self._program.said(number) if message.index < end]
+            said = self._program.said(number, end)
             if end > first:
                 outputs = [self._tapes.view(topic, first, end - first) for topic in node.dense]
                 node.publish_copies(said, outputs, last=last and end == first + samples)
@@ -105,8 +103,13 @@ class Chain:
                 node.part(self._inside)
 
 
-def form(node: "StageNode") -> None:
-    """Make chains of a node and others of its process and cell, none of which has computed yet."""
+def form(node: "StageNode", cell: Cell | None = None) -> None:
+    """Make chains of a node and others of its process and cell, none of which has computed yet.
+
+    Args:
+        node: see above.
+        cell: that the members make, if it is known.
+    """
     waiting = node.exchange.stages
     mates = {other.full_name: other for other in waiting if other.may_join and other.cell == node.cell}
     waiting[:] = [other for other in waiting if other.full_name not in mates]
@@ -114,7 +117,7 @@ def form(node: "StageNode") -> None:
         return
     namespace = node.get_namespace().rstrip("/") + "/"
     try:
-        cell = Cell(node.tables(node.master.members))
+        cell = cell or Cell(node.tables(node.master.members))
     except InputError:
         return  # members that nobody here knows: each node computes alone
     here = {name: mates[namespace + name] for name in cell.stages if namespace + name in mates}

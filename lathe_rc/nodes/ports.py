@@ -153,12 +153,14 @@ class BlockQueue:
             self._gap(block, self.end)
         return self._append(block)
 
-    def drop(self, until: int) -> None:
-        """Forget what waits of the samples before ``until``."""
-        while self.blocks and self.blocks[0].first_index < until:
+    def until(self, end: int) -> Iterator[Block]:
+        """Take out what waits of the samples before ``end``."""
+        while self.blocks and self.blocks[0].first_index < end:
             block = self.blocks.popleft()
-            if block.first_index + block.samples > until:
-                self.blocks.appendleft(block.part(until - block.first_index, block.samples))
+            if (samples := end - block.first_index) < block.samples:
+                self.blocks.appendleft(block.part(samples, block.samples))
+                block = block.part(0, samples)
+            yield block
 
     def state(self) -> tuple[int, int, list[Block], Block | None]:
         """What another process needs to go on: next sample, blocks received, those that wait, and the newest."""

@@ -121,21 +121,19 @@ class SpindleNode(StageNode):
             return
         known = [self.members.get(name) for name in self.member_names()]
         if all(member is not None and member.state == member.READY for member in known):
-            self._check_cell()
-            self._begin()
+            # The same check as before an offline run, with the parameters that the members really have.
+            cell = Cell(self.tables(self.member_names()))
+            cell.check()
+            self._begin(cell)
 
-    def _check_cell(self) -> None:
-        """The same check as before an offline run, with the parameters that the members really have."""
-        Cell(self.tables(self.member_names())).check()
-
-    def _begin(self) -> None:
+    def _begin(self, cell: Cell) -> None:
         self._running = True
         self.get_logger().info(f"run {self.table.run_id or '(no id)'} begins with {len(self._member_names)} members")
         self._say(CellState.RUNNING, 0)
         self.reporter("block0", self.get_name())
         self._schedule = self._heard = self._looked = time.monotonic()
         self._members_moved = dict.fromkeys(self._member_names, self._heard)
-        form(self)
+        form(self, cell)
         self.release()
 
     # ---- run ----------------------------------------------------------------------------------------

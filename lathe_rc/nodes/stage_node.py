@@ -315,14 +315,7 @@ class StageNode(CellNode):
         """The next samples of blocks that were computed in this process; without a copy if they are one piece."""
         if queue.blocks[0].samples == samples:
             return queue.blocks.popleft().signals
-        pieces: list[Signals] = []
-        while samples:
-            block = queue.blocks.popleft()
-            if block.samples > samples:
-                queue.blocks.appendleft(block.part(samples, block.samples))
-                block = block.part(0, samples)
-            pieces.append(block.signals)
-            samples -= block.samples
+        pieces = [block.signals for block in queue.until(queue.blocks[0].first_index + samples)]
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
     # ---- in a chain ---------------------------------------------------------------------------------
@@ -378,7 +371,8 @@ class StageNode(CellNode):
                 if track.delay:
                     self._load(queue, track, self.samples)
                 else:
-                    queue.drop(self.samples)
+                    for _ in queue.until(self.samples):
+                        pass
 
     def part(self, inside: Collection[str]) -> None:
         """Compute alone from now on."""
