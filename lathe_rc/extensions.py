@@ -113,14 +113,14 @@ class Registry(Offers[type[T]], Generic[T]):
         base: class that all of them derive from.
     """
 
-    def __init__(self, what: str, base: type[T], own: Mapping[str, type[T]], group: str) -> None:
+    def __init__(self, what: str, base: Any, own: Mapping[str, type[T]], group: str) -> None:
         super().__init__(what, own, group)
         self._base = base
 
     def _checked(self, name: str, found: Any) -> type[T]:
-        if not (isinstance(found, type) and issubclass(found, self._base)):
-            raise self._refused(name, found, f"a class that derives from {self._base.__module__}.{self._base.__name__}")
-        return found
+        if isinstance(found, type) and issubclass(found, self._base):
+            return found
+        raise self._refused(name, found, f"a class that derives from {self._base.__module__}.{self._base.__name__}")
 
     def allowed(self) -> str:
         """The names, in words."""

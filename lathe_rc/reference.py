@@ -138,7 +138,8 @@ as volatile. Every node is a lifecycle node with the standard parameter and life
 
 def _allowed(row: Row) -> str:
     choices = ("true", "false") if row.type is bool else row.choices
-    return ", ".join(f"`{choice}`" for choice in choices) or row.limits or "any"
+    names = ", ".join(f"`{choice}`" for choice in choices if choice) or row.limits or "any"
+    return f"{names}, or a class of others" if row.named else names
 
 
 def _parameters(rows: Mapping[str, Row]) -> str:

@@ -85,6 +85,10 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
         if key == story.SCENARIO:
             console.print("scenario:")
             console.print(Text("  " + text.strip().replace("\n", "\n  ")))
+        elif key == story.ORIGINS:
+            for origin in story.origins({key: text}):
+                used = ", ".join(origin.used)
+                console.print(Text(f"{origin.name}: {used}; {origin.package}, source {origin.source}"))
         elif key.startswith(story.FILE):
             console.print(Text(f"{key.removeprefix(story.FILE)}: a file, {len(text)} characters in base64"))
         else:

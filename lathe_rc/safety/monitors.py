@@ -22,7 +22,6 @@ from lathe_rc.safety.rules import (
 )
 from lathe_rc.safety.state_machine import Reaction
 
-
 _LONGEST_NAME = 64  # of a monitor [B], as SafetyStatus.msg says
 _NOTHING = np.empty(0)
 
@@ -274,6 +273,7 @@ class Plain:
             raise InputError(f"{name!r} is longer than messages carry; allowed: {_LONGEST_NAME} bytes (an entry point)")
         self.name, self.subject, self.limit, self.reaction = name, subject, limit, reaction
         self._signals, self._make = signals, make
+        self._monitor: PlainMonitor | None = None
         self.reset()
 
     def find(self, first: int, inputs: Sequence[Mapping[str, Array]]) -> Alarm | None:
@@ -305,11 +305,11 @@ class Plain:
     def reset(self) -> None:
         """Watch as from the first sample."""
         with code_of_others(f"monitor {self.name}"):
-            self._monitor: PlainMonitor | None = self._make()
+            self._monitor = self._make()
 
 
 def _read_only(signal: Array) -> Array:
-    view = signal.view()
+    view: Array = signal.view()
     view.flags.writeable = False
     return view
 

@@ -37,7 +37,7 @@ def tabulated(nominal: float, law: DeviationLaw, step: float, end: float) -> Spe
         raise InputError(
             f"{end:g} s in steps of {step:g} s are {points} points; allowed: {_MOST} (a longer step or an earlier end)"
         )
-    time = step * np.arange(points)
+    time: Array = step * np.arange(points, dtype=np.float64)
     deviation = np.asarray(law.deviation(time))
     if deviation.shape != time.shape or deviation.dtype.kind not in "fiu":
         raise InputError(

@@ -77,4 +77,6 @@ class SpeedLawParameters(NodeParameters):
             )
         with code_of_others(f"deviation_law = {self.deviation_law!r}"):
             make: Callable[..., DeviationLaw] = SPEED_LAWS[self.deviation_law]
-            return tabulated(self.nominal_speed, make(*self.deviation_values), self.deviation_law_step, self.deviation_law_end)
+            return tabulated(
+                self.nominal_speed, make(*self.deviation_values), self.deviation_law_step, self.deviation_law_end
+            )

@@ -40,8 +40,8 @@ MEMBERS_LOST = "members_lost"  #: stands for a monitor where the host says that 
 RESET_REFUSED = "reset refused"  #: the same: while the tool is on its way out, or after a stop
 _SENSOR, _COMMAND, _MARGIN = ("measured_position", "effort"), ("position",), ("stability_margin",)
 _WATCHED = {
-    **{"encoder": messages.ENCODER, "tool": messages.TOOL, "cut": messages.CUT, "command": messages.COMMAND},
-    **{"state": messages.STATE, "margin": messages.MARGIN},
+    "encoder": messages.ENCODER, "tool": messages.TOOL, "cut": messages.CUT, "command": messages.COMMAND,
+    "state": messages.STATE, "margin": messages.MARGIN,
 }  # types of topics by the last part of their names
 
 #: by name, those of other packages: ours have thresholds of their own
@@ -361,8 +361,9 @@ class Supervisor(Stage):
         msgtype = _WATCHED.get(topic.rpartition("/")[2], "")
         known = messages.sample_fields(msgtype) if msgtype else {}
         if field not in known:
-            allowed = [f"{topic}.{each}" for each in known] or [f"TOPIC.FIELD, TOPIC with the end {', '.join(_WATCHED)}"]
-            raise InputError(f"{self.name}.{name}: {text!r}; allowed: {', '.join(allowed)}")
+            fields = ", ".join(f"{topic}.{each}" for each in known)
+            allowed = fields or f"TOPIC.FIELD with a TOPIC that ends in {', '.join(_WATCHED)}"
+            raise InputError(f"{self.name}.{name}: {text!r}; allowed: {allowed}")
         place = self._reads(topic, msgtype, (field,))
         port = self._inputs[place]
         if field not in port.fields:
@@ -431,9 +432,7 @@ class Supervisor(Stage):
         self._fill(safety, inputs, first, place, reached, sparse)
         return sparse
 
-    def _found(
-        self, first: int, reached: int, inputs: Sequence[Signals]
-    ) -> Sequence[tuple[Monitor | Plain, Alarm]]:
+    def _found(self, first: int, reached: int, inputs: Sequence[Signals]) -> Sequence[tuple[Monitor | Plain, Alarm]]:
         """Alarms in the samples up to ``reached``, by sample."""
         found: list[tuple[Monitor | Plain, Alarm]] = [*self._lookout.found()]
         piece = cut(inputs, 0, reached) if self._plain else ()
