@@ -224,9 +224,15 @@ def _sources(module: str) -> list[Path]:
     return [Path(top.__file__)] if top.__file__ else []
 
 
+@cache
+def _packages() -> Mapping[str, list[str]]:
+    """Distributions by package; to look through all of them takes half a second."""
+    return importlib.metadata.packages_distributions()
+
+
 def origin(module: str) -> Mapping[str, str]:
-    """Where a module that has been imported comes from: distribution and version if it is of one, hash of its source."""
-    names = importlib.metadata.packages_distributions().get(module.partition(".")[0], [])
+    """Where a module that has been imported comes from: distribution and version, if it has one; hash of its source."""
+    names = _packages().get(module.partition(".")[0], [])
     dist = importlib.metadata.distribution(names[0]) if names else None
     told = {"distribution": dist.name, "version": dist.version} if dist else {}
     return {**told, "source": source_hash(module)}

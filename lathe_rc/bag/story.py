@@ -102,8 +102,8 @@ class Origin:
 
     @property
     def package(self) -> str:
-        """Distribution and version, or that it is none."""
-        return f"{self.distribution} {self.version}" if self.distribution else "no distribution"
+        """Distribution and version; empty if it was not installed as one."""
+        return f"{self.distribution} {self.version}".strip()
 
 
 def origins(about: Mapping[str, str]) -> list[Origin]:
@@ -111,7 +111,8 @@ def origins(about: Mapping[str, str]) -> list[Origin]:
     found: list[Origin] = []
     try:
         for name, said in list(json.loads(about.get(ORIGINS, "{}")).items())[:_MOST_ORIGINS]:
-            distribution, version, source = (shown(said.get(key, "")) for key in ("distribution", "version", "source"))
+            texts = [str(said.get(key, "")) for key in ("distribution", "version", "source")]
+            distribution, version, source = (shown(text) if text else "" for text in texts)
             used = tuple(shown(each) for each in said["used"][:_MOST_ORIGINS])
             found.append(Origin(shown(name), distribution, version, source, used))
     except (ValueError, TypeError, AttributeError, KeyError, RecursionError):
@@ -130,11 +131,11 @@ def _check_installed(about: Mapping[str, str]) -> None:
             extensions.find(origin.name, "it")
         except InputError as error:
             module = origin.name.partition(":")[0].partition(".")[0]
-            where = f"the module {module} where Python looks for it (the current folder, or PYTHONPATH)"
-            allowed = f"install {origin.package}" if origin.distribution else f"put {where}"
+            allowed = f"put {module} where Python looks for it (the current folder, or PYTHONPATH)"
+            if origin.package:
+                allowed = f"install {origin.package}"
             raise InputError(
-                f"{', '.join(origin.used)}: the bag was made with {origin.name} of {origin.package}, and {error}; "
-                f"allowed: {allowed}"
+                f"{', '.join(origin.used)}: the bag was made with {origin.name}, and {error}; allowed: {allowed}"
             ) from None
 
 

@@ -271,7 +271,7 @@ def _origins(told: Gathered) -> Grid | None:
     if not found:
         return None
     rows = (
-        [printable(text) for text in (origin.name, origin.package, ", ".join(origin.used), origin.source)]
+        [printable(text) for text in (origin.name, origin.package or "–", ", ".join(origin.used), origin.source)]
         for origin in found
     )
     columns = ("class of others", "of", "used by", "source")

@@ -89,7 +89,7 @@ class SpindleEncoder(Stage):
         if parameters.deviation_law and seconds > parameters.deviation_law_end:
             raise InputError(
                 f"{self.name}.deviation_law_end = {parameters.deviation_law_end:g} s: the run takes {seconds:.5g} s; "
-                "allowed: that or more"
+                "allowed: not before its end"
             )
 
     def _by_sample(self, trigger: Trigger) -> Trigger:

@@ -40,8 +40,12 @@ MEMBERS_LOST = "members_lost"  #: stands for a monitor where the host says that 
 RESET_REFUSED = "reset refused"  #: the same: while the tool is on its way out, or after a stop
 _SENSOR, _COMMAND, _MARGIN = ("measured_position", "effort"), ("position",), ("stability_margin",)
 _WATCHED = {
-    "encoder": messages.ENCODER, "tool": messages.TOOL, "cut": messages.CUT, "command": messages.COMMAND,
-    "state": messages.STATE, "margin": messages.MARGIN,
+    "encoder": messages.ENCODER,
+    "tool": messages.TOOL,
+    "cut": messages.CUT,
+    "command": messages.COMMAND,
+    "state": messages.STATE,
+    "margin": messages.MARGIN,
 }  # types of topics by the last part of their names
 
 #: by name, those of other packages: ours have thresholds of their own
