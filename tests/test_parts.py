@@ -5,6 +5,7 @@ Those of docs/parts.py are what a good one looks like; those that are refused st
 """
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -24,6 +25,8 @@ from lathe_rc.bag import story
 from lathe_rc.bag.resim import resimulate
 from lathe_rc.bag.source import Source
 from lathe_rc.cell import batch, messages
+from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.cli import main
 from lathe_rc.control.q_filter import Exponential, Gaussian, QFilter, Weights
@@ -69,6 +72,18 @@ def lathe(*arguments):
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
+# ---- the page
+
+
+def test_the_page_shows_the_parts_as_they_are():
+    """The classes on docs/parts.md, and the hash of their source, are those of docs/parts.py."""
+    page, source = (DOCS / "parts.md").read_text(), (DOCS / "parts.py").read_text()
+    shown = re.findall(r"^```py\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    assert len(shown) == 4
+    assert [part for part in shown if part not in source] == []
+    assert extensions.source_hash("parts") in page
+
+
 # ---- hosts
 
 
@@ -82,9 +97,12 @@ def recorded(tmp_path_factory):
 @pytest.mark.parametrize(
     ("mode", "block_size"), [("offline", 1), ("offline", 384), ("composed", 200), ("processes", 64)]
 )
-def test_every_host_and_block_size_gives_the_same_bits(recorded, mode, block_size):
-    """A cell with parts of others has the same digests in every host and with every block size."""
-    assert harness.run(cell({"block_size": block_size}), mode=mode).digest == recorded[1].digest
+def test_every_host_and_block_size_gives_the_same_bits(recorded, tmp_path, mode, block_size):
+    """A cell with parts of others has the same digests in every host and with every block size; its bag says the same."""
+    bag = tmp_path / "bag"
+    assert harness.run(cell({"block_size": block_size}), mode=mode, bag=bag).digest == recorded[1].digest
+    with Source(recorded[0]) as one, Source(bag) as other:
+        assert story.origins(other.about) == story.origins(one.about)
 
 
 def test_a_batch_gives_the_same_bits(recorded):
@@ -330,6 +348,12 @@ def test_what_a_monitor_cannot_watch_is_refused(values, says):
     assert refusal("supervisor", **values).startswith(says)
 
 
+def test_a_monitor_of_others_asks_for_a_retraction_only_where_somebody_listens():
+    asked = {"drives": ["coarse"], "clear_position": 1e-4, "monitor_reactions": ["warn", "retract"]}
+    with pytest.raises(InputError, match="monitor parts:Drift asks for retract, but nobody who moves coarse listens"):
+        Cell(cell(learning_controller={"reaction_delay": 0}, supervisor=asked).nodes).check()
+
+
 class Impatient(PlainMonitor):
     """Goes wrong on the way."""
 
@@ -386,6 +410,13 @@ def installed(tmp_path, monkeypatch):
     for found in (extensions._offered, extensions._packages):
         found.cache_clear()
     sys.modules.pop("lathe_hann", None)
+
+
+def test_a_bag_says_where_a_stage_of_others_came_from():
+    table = NodeParameters.read("filter", {"stage": "test_wiring:Repeater", "run_id": "test"})
+    told = story.tell(Scenario("test", {**scenario().nodes, "filter": table}), [])
+    (origin,) = story.origins(told)
+    assert (origin.name, origin.used) == ("test_wiring:Repeater", ("filter.stage",))
 
 
 def test_an_installed_part_has_a_name_and_its_bag_says_where_it_came_from(installed, tmp_path):
@@ -461,7 +492,7 @@ from lathe_rc.cli import main
 from lathe_rc.view.report import write
 bag, folder = Path(sys.argv[1]), Path(sys.argv[2])
 codes = []
-for words in (["bag", "info", bag], ["bag", "check", bag], ["export", bag, "-o", folder / "out"], ["resim", bag]):
+for words in (["bag", "info", bag], ["bag", "check", bag], ["export", bag, "--npz", "-o", folder / "out"], ["resim", bag]):
     with contextlib.redirect_stdout(io.StringIO()):
         try:
             main([str(word) for word in words])
