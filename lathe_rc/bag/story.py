@@ -65,21 +65,22 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
 
 def _origins(nodes: Mapping[str, NodeParameters]) -> dict[str, dict[str, object]]:
     """Of each class of others where it comes from, see `Registry.origin`, and the parameters that name it."""
-    found: dict[str, dict[str, object]] = {}
-
-    def add(parameter: str, origin: Mapping[str, str] | None) -> None:
-        if origin is not None:
-            rest = {key: text for key, text in origin.items() if key != "class"}
-            used = found.setdefault(origin["class"], {**rest, "used": []})["used"]
-            assert isinstance(used, list), "see above"
-            used.append(parameter)
-
+    named: list[tuple[str, Mapping[str, str] | None]] = []
     for node, table in nodes.items():
-        add(f"{node}.stage", STAGES.origin(kind_of(node, table.stage)))
+        kind = kind_of(node, table.stage)
+        if kind in STAGES:
+            named.append((f"{node}.stage", STAGES.origin(kind)))
         for name, row in type(table).rows().items():
-            for value in row.named.others(getattr(table, name)) if row.named else ():
-                assert row.named is not None, "see above"
-                add(f"{node}.{name}", row.named.registry.origin(value))
+            if row.named is not None:
+                others = row.named.others(getattr(table, name))
+                named += [(f"{node}.{name}", row.named.registry.origin(each)) for each in dict.fromkeys(others)]
+    used: dict[str, list[str]] = {}
+    found: dict[str, dict[str, object]] = {}
+    for parameter, origin in named:
+        if origin is not None:
+            own = used.setdefault(origin["class"], [])
+            own.append(parameter)
+            found[origin["class"]] = {key: text for key, text in origin.items() if key != "class"} | {"used": own}
     return found
 
 
