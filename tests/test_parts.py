@@ -491,7 +491,8 @@ from lathe_rc.cli import main
 from lathe_rc.view.report import write
 bag, folder = Path(sys.argv[1]), Path(sys.argv[2])
 codes = []
-for words in (["bag", "info", bag], ["bag", "check", bag], ["export", bag, "--npz", "-o", folder / "out"], ["resim", bag]):
+for words in (["bag", "info", bag], ["bag", "check", bag],
+              ["export", bag, "--npz", "-o", folder / "out"], ["resim", bag]):
     with contextlib.redirect_stdout(io.StringIO()):
         try:
             main([str(word) for word in words])
