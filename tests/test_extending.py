@@ -286,3 +286,23 @@ def test_the_contraction_that_a_law_tells_is_that_of_its_run(begin):
     factor = abs(law.contraction(drive.responses()["coarse/command"], np.array([2.0]), speed)[0])
     rms = harness.run(loaded).errors.rms
     assert rms[5] / rms[4] == pytest.approx(factor, rel=0.02)
+
+
+# --- the page
+
+
+def test_the_law_on_the_page_runs(begin):
+    page = (Path(__file__).parents[1] / "docs" / "extending.md").read_text(encoding="utf-8")
+    file = begin("law", "paged", "--plain")
+    Path("integral.py").write_text(page.partition("```python\n")[2].partition("```")[0])
+    result = harness.run(scenario.load(file, [SHORT, "paged.stage=integral:Integral", "paged.rate=1.0"]))
+    assert result.digest["/coarse/command"] != ""
+    assert np.ptp(result.recording.dense["/coarse/command"]["position"]) > 1e-6
+
+
+def test_the_reference_of_a_stage_of_others_is_printed(begin):
+    begin("law", "my_law")
+    told = lathe("reference", "my_law:MyLaw")
+    assert told.exit_code == 0
+    assert told.stdout.startswith("## my_law:MyLaw")
+    assert "| `lead_time` | double | `0.001425` |" in told.stdout
