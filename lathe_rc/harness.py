@@ -21,7 +21,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -80,6 +80,7 @@ class Result:
         recording: all signals.
         refused: messages of strangers that the nodes refused, by sender.
         not_reached: events that the run was too short for, by node.
+        unchecked: what the check before the start could not see, since laws or drives of others do not tell it.
 
     Example:
         >>> from pathlib import Path
@@ -106,6 +107,7 @@ class Result:
     recording: Recording
     refused: Mapping[str, int] = field(default_factory=dict)
     not_reached: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    unchecked: Sequence[str] = ()
 
     def __repr__(self) -> str:
         """What ran and what came of it, in a line."""
@@ -192,6 +194,7 @@ class Result:
                 for found in self.happened
             ],
             "not_reached": {node: list(events) for node, events in self.not_reached.items()},
+            "unchecked": list(self.unchecked),
             "error_um": {
                 "first": of(0),
                 "last": of(-1),
@@ -263,10 +266,13 @@ def run(
     if mode != "offline" and start == "fork":
         starting.server()  # it imports while the cell is checked
     cell = Cell(scenario.nodes)
-    cell.check()
+    unchecked = cell.check()
+    for what in unchecked:
+        watch({"event": "unchecked", "node": cell.master.name, "message": what})
     if bag is not None:
         refuse_existing(bag)
     result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace), start)
+    result = replace(result, unchecked=unchecked)
     if result.bag is not None:
         write_digests(result.bag, result.digest)
     return result
@@ -310,7 +316,7 @@ def _run(
         return Result(
             scenario=scenario,
             mode="grouped" if mode == "processes" and len(split) < len(complete.nodes) else mode,
-            samples=cell.master.samples,
+            samples=cell.samples,
             wall_s=(events["complete"]["monotonic_ns"] - events["block0"]["monotonic_ns"]) * 1e-9,
             bag=kept,
             snapshots=tuple(_bags_in(folder)),

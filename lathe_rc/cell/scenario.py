@@ -28,7 +28,7 @@ class _Tables(Mapping[str, type[NodeParameters]]):
 
     def allowed(self) -> str:
         """The kinds, in words."""
-        return f"{RECORDER}, {STAGES.allowed()}"
+        return f"{', '.join(self)}, or PACKAGE.MODULE:CLASS"
 
     def __iter__(self) -> Iterator[str]:
         yield from STAGES
