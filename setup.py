@@ -65,7 +65,7 @@ setup(
     data_files=shared_files(),
     python_requires=">=3.10",
     install_requires=requirements("runtime"),
-    extras_require={"view": requirements("view")},
+    extras_require={name: requirements(name) for name in ("notebook", "view")},
     entry_points={
         "console_scripts": [
             "lathe = lathe_rc.cli:main",

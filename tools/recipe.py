@@ -44,7 +44,8 @@ class Group(NamedTuple):
 
 
 GROUPS = {
-    "test": Group("test.in", "5 s, 200 MB", sourced=True),
+    "notebook": Group("notebook.in", "10 s, 300 MB", sourced=True),
+    "test": Group("test.in", "5 s, 300 MB", sourced=True),
     "view": Group("view.in", "10 s, 400 MB", sourced=False),
 }
 
@@ -134,7 +135,7 @@ class Recipe:
                 mend_cmake_paths()
 
     def _install_group(self, name: str, lock: int) -> None:
-        with Step(f"packages to {name}", GROUPS[name].usual, CHECK_NETWORK, lock) as step:
+        with Step(f"packages: {name}", GROUPS[name].usual, CHECK_NETWORK, lock) as step:
             self._install(step, GROUPS[name].list)
 
     def _install(self, step: Step, *lists: str) -> None:
