@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction, TimerAction
 from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
@@ -38,6 +38,7 @@ ARGUMENTS = {
     "namespace": ("/", "of the nodes; two cells in one domain need one each"),
 }  #: default and description
 OF_LAUNCH = {"emulate_tty", "launch-prefix", "launch-prefix-filter", "sigkill_timeout", "sigterm_timeout"}
+PATIENCE = 30.0  # [s] for a cell that has lost a member to end by itself
 MOST_NAMES = 3  # in the label of a process, which stands before each line that it writes
 
 
@@ -68,7 +69,8 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         file.write(complete.to_yaml())
     atexit.register(Path(file.name).unlink, missing_ok=True)
     groups = complete.processes()
-    ends = Ends(len(groups))
+    restartable = any(getattr(table, "restart_file", "") for table in complete.nodes.values())
+    ends = Ends(len(groups), replaced=restartable)
     return [
         Node(
             package="lathe_rc",
@@ -145,26 +147,40 @@ class Ends:
 
     Args:
         running: how many processes there are.
+        replaced: whether somebody may start another process of a node that was killed.
     """
 
-    def __init__(self, running: int) -> None:
-        self._running = running
+    def __init__(self, running: int, *, replaced: bool) -> None:
+        self._running, self._replaced = running, replaced
         self._failed: list[str] = []
 
-    def __call__(self, event: ProcessExited, context: LaunchContext) -> None:
-        """End the cell when one of its nodes has failed.
+    def __call__(self, event: ProcessExited, context: LaunchContext) -> list[LaunchDescriptionEntity] | None:
+        """End the cell when one of its nodes has failed; what ends because launch has told it to has not.
 
-        When one was killed the time master brings the cell to its safe state, and then fails itself.
+        When one was killed the time master brings the cell to its safe state, and then fails itself. Before the cell
+        has begun the others wait for the killed one: they get some time.
 
         Raises:
-            LatheError: the cell has failed. For launch that is the reason to end the others and to return 1; to a
-                `launch.actions.Shutdown` it would return 0.
+            LatheError: see `fail`.
         """
         self._running -= 1
-        if context.is_shutdown:
-            return
-        ended = {"node": event.process_name, "code": event.returncode}
-        if event.returncode:
-            self._failed.append(harness.how_it_ended(ended))
-        if event.returncode > 0 or (self._failed and not self._running):
-            raise LatheError("; ".join(self._failed))
+        if event.returncode and not context.is_shutdown:
+            self._failed.append(harness.how_it_ended({"node": event.process_name, "code": event.returncode}))
+            if event.returncode > 0:
+                self.fail()
+            if self._running and not self._replaced:
+                return [TimerAction(period=PATIENCE, actions=[OpaqueFunction(function=lambda _: self.fail())])]
+        if not self._running:
+            self.fail()
+        return None
+
+    def fail(self) -> None:
+        """Name those that have failed, once.
+
+        Raises:
+            LatheError: some have. For launch that is the reason to end the others and to return 1; with a
+                `launch.actions.Shutdown` it would return 0.
+        """
+        told, self._failed = "; ".join(self._failed), []
+        if told:
+            raise LatheError(told)
