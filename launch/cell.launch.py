@@ -2,9 +2,9 @@
 """Start every node of a scenario, the recorder included: ``ros2 launch lathe_rc cell.launch.py``.
 
 ``scenario`` names the ROS 2 parameter file, ``bag`` the folder to record to, ``namespace`` that of the nodes;
-``NODE.PARAM:=VALUE``, or ``PARAM:=VALUE`` for a shared parameter, replaces a value of the scenario. The run ends when its
-last block has been recorded; without a number of revolutions it goes on until Ctrl-C. A node that fails ends the others,
-and the launch fails.
+``NODE.PARAM:=VALUE``, or ``PARAM:=VALUE`` for a shared parameter, replaces a value of the scenario. The run ends when
+its last block has been recorded; without a number of revolutions it goes on until Ctrl-C. A node that fails ends the
+others, and the launch fails.
 """
 
 import atexit
@@ -116,8 +116,8 @@ def refuse_unknown(arguments: Iterable[str]) -> None:
         if not (name in ARGUMENTS or name in OF_LAUNCH or replaces(name)):
             shared = ", ".join(SharedParameters.model_fields)
             raise InputError(
-                f"no launch argument {name!r}; allowed: {', '.join(ARGUMENTS)}, NODE.PARAM for a value of the scenario, "
-                f"or a shared one: {shared}"
+                f"no launch argument {name!r}; allowed: {', '.join(ARGUMENTS)}, NODE.PARAM for a value of the "
+                f"scenario, or a shared one: {shared}"
             )
 
 

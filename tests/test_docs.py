@@ -311,7 +311,10 @@ class TestLaunch:
     @pytest.mark.parametrize(
         ("argument", "said"),
         [
-            ("revolutions", "no launch argument 'revolutions'; allowed: scenario, bag, namespace, NODE.PARAM .*nominal_rpm"),
+            (
+                "revolutions",
+                "no launch argument 'revolutions'; allowed: scenario, bag, namespace, NODE.PARAM .*nominal_rpm",
+            ),
             ("spindle.revolutions", "no node 'spindle' in the scenario; allowed: spindle_encoder, "),
             ("spindle_encoder.revolution", "spindle_encoder.revolution: unknown parameter; allowed: "),
             ("tool.feed", "tool.feed = 'far'; allowed: a finite number"),
@@ -351,7 +354,7 @@ class TestEndsUnderLaunch:
     def test_a_node_that_fails_is_named_at_once_and_those_that_are_ended_are_not(
         self, ended: Callable[..., Any]
     ) -> None:
-        with pytest.raises(LatheError, match="^tool-1 ended with exit code 2$"):
+        with pytest.raises(LatheError, match=r"^tool-1 ended with exit code 2$"):
             ended("tool-1", 2)
         assert not any(ended(name, code, told_to=True) for name, code in (("recorder-2", 1), ("spindle-3", -2)))
 
@@ -362,20 +365,22 @@ class TestEndsUnderLaunch:
         ended("tool-1", -9)
         if code == 0:
             assert not ended("recorder-2", 0)
-        with pytest.raises(LatheError, match="^tool-1 was killed by SIGKILL" + "; spindle-3 ended with exit code 1" * code):
+        with pytest.raises(
+            LatheError, match=r"^tool-1 was killed by SIGKILL" + "; spindle-3 ended with exit code 1" * code
+        ):
             ended("spindle-3", code)
 
     def test_a_killed_node_is_named_when_the_user_ends_the_others(self, ended: Callable[..., Any]) -> None:
         ended("tool-1", -11)
         ended("recorder-2", 0, told_to=True)
-        with pytest.raises(LatheError, match="^tool-1 was killed by SIGSEGV$"):
+        with pytest.raises(LatheError, match=r"^tool-1 was killed by SIGSEGV$"):
             ended("spindle-3", 0, told_to=True)
 
     def test_a_killed_node_is_not_waited_for_for_ever(self, ended: Callable[..., Any], launch_file: ModuleType) -> None:
         """The cell has not begun, and the others do not know that they wait in vain."""
         (timer,) = ended("tool-1", -9)
-        with pytest.raises(LatheError, match="^tool-1 was killed by SIGKILL$"):
+        with pytest.raises(LatheError, match=r"^tool-1 was killed by SIGKILL$"):
             timer.actions[0].function(None)
-        assert launch_file.Ends(3, replaced=True)(
-            SimpleNamespace(process_name="learning_controller-1", returncode=-9), SimpleNamespace(is_shutdown=False)
-        ) is None, "another one may come and go on from its restart_file"
+        killed = SimpleNamespace(process_name="learning_controller-1", returncode=-9)
+        answer = launch_file.Ends(3, replaced=True)(killed, SimpleNamespace(is_shutdown=False))
+        assert answer is None, "another one may come and go on from its restart_file"

@@ -481,8 +481,7 @@ print(lathe_rc.__file__)
         f'. "{workplace.INSTALL}/setup.bash"',
         f"python -c '{program}'",
         "lathe --version",
-        '"$(python -c "import ament_index_python.packages as p; print(p.get_package_prefix(\'lathe_rc\'))")"'
-        "/lib/lathe_rc/tool --help",
+        f'"{workplace.INSTALL}/lib/lathe_rc/tool" --help',
     ]
     clean = {"PATH": os.defpath, "HOME": os.environ["HOME"], "COLUMNS": "120"}
     command = ["bash", "--norc", "-c", " && ".join(commands)]
@@ -492,7 +491,9 @@ print(lathe_rc.__file__)
     prefixes = dict(line.split() for line in lines[:4])
     assert prefixes["lathe_rc"] == prefixes["lathe_rc_msgs"] == str(workplace.INSTALL)
     assert prefixes["std_msgs"] == prefixes["builtin_interfaces"] != str(workplace.INSTALL)
-    assert lines[4] == str(workplace.ROOT / "lathe_rc" / "__init__.py"), "one path of a module, one cache of its kernels"
+    assert lines[4] == str(workplace.ROOT / "lathe_rc" / "__init__.py"), (
+        "one path of a module, one cache of its kernels"
+    )
     assert re.fullmatch(r"\S+, version \d+\.\d+\.\d+", lines[5])
     assert lines[6].startswith("usage: ros2 run lathe_rc tool ")
 

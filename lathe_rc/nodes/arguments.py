@@ -70,8 +70,8 @@ def _show(program: str, name: str, table: type[Table]) -> None:
 
     print(
         f"usage: {program} [{ROS} --params-file FILE -p {name}:PARAM:=VALUE -r OLD:=NEW ...]\n\n"
-        "Of what is given twice ROS takes the last, so write -p behind --params-file. But -p PARAM:=VALUE, without the\n"
-        "node's name, counts where /** stands in the file, and loses if the node's own entry follows it.\n"
+        f"Write -p behind --params-file: what comes later wins. -p PARAM:=VALUE, without {name}:, is for /**; if the\n"
+        f"file has a /**, it takes that place, and an entry of {name} below wins. A -p that loses is refused.\n"
     )
     parameters = RichTable(title=f"parameters of {name}", title_justify="left", show_edge=False, header_style="bold")
     for column in ("name", "default", "allowed", "description"):
