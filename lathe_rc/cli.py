@@ -21,6 +21,7 @@ COMMANDS = {
     "export": "Export a recording as CSV, Parquet or NPZ.",
     "fit": "Fit models to measurements.",
     "measure": "Measure the part that a recorded run has turned.",
+    "new": "Begin a law, drive, stage or study of your own.",
     "node": "Run one node, or list its parameters.",
     "policy": "Make the SROS2 policy of a scenario.",
     "record": "Record any topics into a new bag.",

@@ -210,7 +210,11 @@ def search_path() -> str:
 
 @cache
 def source_hash(module: str) -> str:
-    """Hash of the source that a module stands in: of all files of its package, or of the file alone."""
+    """Hash of the source that a module stands in: of all files of its package, or of the file alone.
+
+    Raises:
+        InputError: it has no file.
+    """
     digest = hashlib.sha256()
     for path in _sources(module):
         digest.update(path.name.encode() + path.read_bytes())
@@ -221,7 +225,9 @@ def _sources(module: str) -> list[Path]:
     top = sys.modules[module.partition(".")[0]]
     if paths := [Path(each) for each in getattr(top, "__path__", ())]:
         return sorted(path for folder in paths for path in folder.rglob("*.py"))
-    return [Path(top.__file__)] if top.__file__ else []
+    if module == "__main__" or not top.__file__:
+        raise InputError(f"{module} is no module that other processes can import; put the class into a file of its own")
+    return [Path(top.__file__)]
 
 
 @cache

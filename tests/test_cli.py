@@ -24,7 +24,7 @@ CELL = """
 /tool: {ros__parameters: {}}
 """
 KEYS = ["scenario", "mode", "simulated_s", "wall_s", "real_time_factor", "revolutions", "blocks", "dropped"]
-KEYS += ["refused", "events", "not_reached", "error_um", "bag", "snapshots", "digest"]
+KEYS += ["refused", "events", "not_reached", "unchecked", "error_um", "bag", "snapshots", "digest"]
 PER_REVOLUTION = ["per_revolution_rms", "per_revolution_peak_to_valley", "per_revolution_ront"]
 
 
@@ -131,6 +131,13 @@ def test_more_events_than_fit_are_counted():
     assert "18 more of the kind" in out
 
 
+def test_the_run_is_drawn_where_it_is_asked_for(folder):
+    result = lathe("run", "cell.yaml", "--figure", "turned.png")
+    assert result.exit_code == 0
+    assert "figure: turned.png" in result.stdout
+    assert (folder / "turned.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_snapshots_without_a_bag_are_not_forgotten_in_silence():
     Path("cell.yaml").write_text(CELL + "/recorder: {ros__parameters: {mode: snapshot}}\n")
     assert "no snapshots: no --bag was given" in lathe("run", "cell.yaml").stdout
@@ -208,6 +215,16 @@ def test_bad_profile_is_refused_in_one_line(folder, form):
     (folder / "form.csv").write_text("angle_deg,radius_um\n" + FORMS[form])
     chosen = ["--set", "tool.profile=csv", "--set", "tool.profile_file=form.csv"]
     assert_refused(lathe("run", "cell.yaml", *chosen), str(folder / "form.csv"))
+
+
+@pytest.mark.parametrize(
+    ("place", "text"), [("a.svg", "a.svg; allowed: a file name that ends in .png"), ("no/a.png", "no such folder")]
+)
+def test_a_figure_that_cannot_be_written_is_refused_before_the_run(folder, place, text):
+    assert_refused(
+        lathe("run", "cell.yaml", "--bag", "bag", "--figure", place), f"--figure {place.split('/')[0]}", text
+    )
+    assert not (folder / "bag").exists()
 
 
 def test_bag_that_exists_is_refused(folder):

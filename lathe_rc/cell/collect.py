@@ -68,7 +68,8 @@ class Collector:
         self._sources = known if topics is None else {topic: known[topic] for topic in topics if topic in known}
         if missing := [topic for topic in topics or () if topic not in known]:
             raise InputError(f"no topic {missing[0]!r} in the cell; allowed: {', '.join(known)}")
-        self._framer = Framer("", "", cell.master.shared.step_ns)
+        self._step_ns = cell.master.shared.step_ns
+        self._framer = Framer("", "", self._step_ns)
         self._dense = {
             topic: messages.allocate(source.type, samples)
             for topic, source in self._sources.items()
@@ -96,4 +97,5 @@ class Collector:
                 framed = self._framer.sparse(message)
                 part.add(messages.stamp_ns(framed), framed)
         types = {f"/{topic}": source.type for topic, source in self._sources.items()}
-        return Recording(types, {f"/{topic}": signals for topic, signals in self._dense.items()}, sparse)
+        dense = {f"/{topic}": signals for topic, signals in self._dense.items()}
+        return Recording(types, dense, sparse, self._step_ns)

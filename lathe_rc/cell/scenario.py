@@ -28,7 +28,7 @@ class _Tables(Mapping[str, type[NodeParameters]]):
 
     def allowed(self) -> str:
         """The kinds, in words."""
-        return f"{RECORDER}, {STAGES.allowed()}"
+        return f"{', '.join(self)}, or PACKAGE.MODULE:CLASS"
 
     def __iter__(self) -> Iterator[str]:
         yield from STAGES
@@ -85,7 +85,7 @@ def _quoted(value: Value) -> object:
     return _Text(value) if isinstance(value, str) else value
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scenario:
     """A cell, described.
 
@@ -97,7 +97,17 @@ class Scenario:
 
     name: str
     nodes: dict[str, NodeParameters]
-    fingerprints: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
+    fingerprints: Mapping[str, str] = field(default_factory=dict, compare=False)
+
+    def __repr__(self) -> str:
+        """Its name and nodes, in a line."""
+        return f"<Scenario {self.name}: {', '.join(self.nodes)}>"
+
+    def _repr_html_(self) -> str:
+        """Its nodes and what is set in them, as a table, for notebooks."""
+        from lathe_rc.view import notebook
+
+        return notebook.scenario(self)
 
     @property
     def shared(self) -> SharedParameters:
@@ -143,6 +153,20 @@ class Scenario:
 
         Raises:
             InputError: one line for the first thing that is wrong.
+
+        Example:
+            >>> from pathlib import Path
+            >>> from lathe_rc import resources
+            >>> from lathe_rc.cell import scenario
+            >>> piston = scenario.load(resources.find(Path("piston.yaml")))
+            >>> shorter = piston.varied({"learning_controller.lead_time": 1.3e-3, "block_size": 128})
+            >>> piston.nodes["learning_controller"].lead_time, shorter.nodes["learning_controller"].lead_time
+            (0.001425, 0.0013)
+            >>> {table.block_size for table in shorter.nodes.values()}
+            {128}
+            >>> piston.varied({"learning_controller.lead_tim": 1.3e-3})
+            Traceback (most recent call last):
+            lathe_rc.errors.InputError: learning_controller.lead_tim: unknown parameter; allowed: ...
         """
         changes: dict[str, dict[str, Value]] = {}
         for target, value in values.items():
@@ -261,6 +285,20 @@ def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
 
     Raises:
         InputError: one line for the first thing that is wrong.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from lathe_rc import resources
+        >>> from lathe_rc.cell import scenario
+        >>> path = resources.find(Path("piston.yaml"))  # here, or among those that come with lathe_rc
+        >>> piston = scenario.load(path, ["spindle_encoder.revolutions=20", "block_size=128"])
+        >>> piston
+        <Scenario piston: spindle_encoder, learning_controller, electrodynamic_actuator, tool, recorder>
+        >>> piston.nodes["spindle_encoder"].revolutions, piston.shared.block_size
+        (20.0, 128)
+        >>> scenario.load(path, ["tol.feed=1.0"])
+        Traceback (most recent call last):
+        lathe_rc.errors.InputError: --set 'tol.feed=1.0': no node 'tol' in the scenario; allowed: spindle_encoder, ...
     """
     nodes = ros_yaml.read(path)
     for name, values in nodes.items():

@@ -4,7 +4,7 @@
 A stage's output depends on its parameters, its state and its declared inputs alone; the length of the blocks
 changes no bit. Hosts (the offline engine, a ROS node) feed it in order and know nothing of what it does.
 
-Most stages compute by a compiled step, which a program of many stages can call (`lathe_rc.cell.program`):
+Most stages compute by a step, which a program of many stages can call if it is compiled (`lathe_rc.cell.program`):
 
     reached, reason = step(memory, first, start, inputs, flags, outputs)
 
@@ -29,6 +29,7 @@ from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.native import Native, Step
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.jit import is_compiled, is_ours, kernel
 from lathe_rc.safety import faults
 from lathe_rc.safety.faults import Fault
 from lathe_rc.safety.injection import Injection, Port
@@ -120,7 +121,7 @@ class Stage(ABC):
         unheard: those of them that nobody reads; their messages need not be made.
         tells: events come about by themselves that only `process` knows of.
         own_inputs: number of inputs that `process` gets; one more may tell the spindle angle to the events.
-        step: compiled; None: the stage has its own `process`, in Python.
+        step: compiled, or in Python; None: the stage has its own `process`.
     """
 
     kind: ClassVar[str]
@@ -136,7 +137,7 @@ class Stage(ABC):
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        if not getattr(cls, "kind", ""):
+        if not hasattr(cls, "kind") and not is_ours(cls.__module__):
             cls.kind = cls.__name__
         if "process" in vars(cls) and "step" not in vars(cls):
             cls.step = None  # what it inherits computes something else
@@ -479,6 +480,21 @@ class Stage(ABC):
         """What the step works on, a NamedTuple of arrays and constants; another one may be given after each stop."""
         return ()
 
+    @property
+    def is_compiled(self) -> bool:
+        """Whether a program can call the step."""
+        return is_compiled(self.step)
+
+    def _advance(self, first: int, start: int, fields: Sequence[Any], samples: int) -> Reached:
+        """Call the step for the arrays of all fields, shape (samples,)."""
+        assert self.step is not None, "a stage without a step has its own `process`"
+        if self.is_compiled:
+            return self.native()(first, start, fields, samples)
+        inputs = sum(len(port.fields) for port in self.inputs[: self.own_inputs])
+        flags = tuple(field for field in fields[:inputs] if field.dtype != np.float64)
+        floats = tuple(field for field in fields[:inputs] if field.dtype == np.float64)
+        return self.step(self.memory, first, start, floats, flags, tuple(fields[inputs:]))
+
     def native(self) -> Native:
         """The step with the memory as it is now, as a function of addresses."""
         if self._native is None:
@@ -532,12 +548,18 @@ class Stage(ABC):
         sparse: list[Sparse] = []
         told = reached = 0
         while True:
-            reached, reason = self.native()(first, reached, fields, samples)
+            reached, reason = self._advance(first, reached, fields, samples)
             if reason == DONE:
                 return sparse + self.tell(first + told, first + samples)
             sparse += self.tell(first + told, first + reached)
             told = reached
             sparse += self.serve(reason, first, reached, inputs, outputs)
+
+
+def step_of(stage: type[Stage], loop: Step, *, compiled: bool) -> Step:
+    """Make a function that has been written for a class its step."""
+    loop.__module__, loop.__qualname__ = stage.__module__, f"{stage.__qualname__}.step"
+    return kernel(loop) if compiled else loop
 
 
 def cut(signals: Sequence[Signals], start: int, stop: int) -> list[Signals]:
@@ -549,7 +571,7 @@ def compile_kernels(stage: Stage) -> None:
     """Compile what the stage runs: the first block then takes no longer than the next."""
     if stage.shared.allow_faults:
         faults.prepare()
-    if stage.step is not None:
+    if stage.is_compiled:
         assert stage.native().address, "that compiles it"
         return
     inputs = [

@@ -2,7 +2,7 @@
 """The wired cell: stages in the order in which they compute, topics by name, and the checks before a start."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 
@@ -14,6 +14,7 @@ from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stage import Input, Stage
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.drive import Drive
+from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.profile import ProfileStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
@@ -136,14 +137,18 @@ class Cell:
         delays = [port.delay for stage in self.stages.values() for port in stage.inputs if port.delay]
         return min(delays, default=None)
 
-    def check(self) -> None:
+    def check(self) -> list[str]:
         """Refuse what cannot work, with the figures, before anything moves.
+
+        Returns:
+            What could not be checked, since a law or drive of others does not tell what is needed.
 
         Raises:
             InputError: a block longer than a feedback delay, a profile that a drive cannot follow, a tool that is not
                 brought out of the part, a memory that would be read before it is learned, a learning loop that does
                 not converge.
         """
+        unchecked: list[str] = []
         low, high = self.master.speed_range()
         if low <= 0.0:
             raise InputError(f"{self.master.name}: speed falls to {low:.4g} rad/s; allowed: above 0")
@@ -161,13 +166,13 @@ class Cell:
                 self._check_retraction(stage)
                 self._check_clearance(stage)
             if isinstance(stage, LearningController):
-                self._check_delay(stage, high)
                 self._check_preview(stage)
-                for response, drive in self._learned(stage):
-                    _check_convergence(stage, drive, response, low, high)
-                    self._check_reach(stage, drive)
+            if isinstance(stage, Learner):
+                unchecked += self._check_delay(stage, high)
+                unchecked += self._check_convergence(stage, stage.checked_speeds(low, high))
+        return unchecked
 
-    def _learned(self, stage: LearningController) -> list[tuple[Response, str]]:
+    def _learned(self, stage: Learner) -> list[tuple[Response, str]]:
         """Responses and names of the drives that a channel commands."""
         commands = {remapped(stage.shared, output.topic) for output in stage.outputs}
         return [
@@ -177,6 +182,27 @@ class Cell:
             for topic, response in drive.responses().items()
             if remapped(drive.shared, topic) in commands and any(port.topic == topic for port in drive.inputs)
         ]
+
+    def _check_convergence(self, stage: Learner, speeds: Collection[float]) -> list[str]:
+        """What cannot be checked of the learning loops of a channel."""
+        learned, unchecked = self._learned(stage), []
+        for response, drive in learned:
+            self._check_reach(stage, drive)
+            found = {speed: stage.worst(response, speed) for speed in speeds}
+            told = [(worst, speed) for speed, worst in found.items() if worst is not None]
+            if told:
+                _check_factor(stage, drive, *max(told))
+            else:
+                unchecked.append(f"{stage.name}: {stage.kind} tells no factor of a cycle: nobody knows if it converges")
+        if not learned:
+            command = remapped(stage.shared, stage.outputs[0].topic)
+            unchecked.append(f"{stage.name}: no drive tells its response to {command}: nobody knows if it converges")
+        if unchecked and not (stage.parameters.stop_ratio or stage.parameters.allow_unstable):
+            raise InputError(
+                f"{unchecked[0]}; allowed: {stage.name}.stop_ratio above 0 (2: twice the error of the first cycle ends "
+                "the run), or allow_unstable"
+            )
+        return unchecked
 
     def _check_obedience(self, stage: Supervisor) -> None:
         """Where a retraction can be asked for, somebody takes the tool out."""
@@ -222,7 +248,7 @@ class Cell:
                     f"stroke of {drive.name} ends at {limits.stroke:g} m; allowed: less than that"
                 )
 
-    def _check_reach(self, stage: LearningController, name: str) -> None:
+    def _check_reach(self, stage: Learner, name: str) -> None:
         """What it takes over, it takes over wherever the drive can be."""
         drive, parameters = self.stages[name], stage.parameters
         assert isinstance(drive, Drive), "it learns"
@@ -236,17 +262,20 @@ class Cell:
                     "wider bounds"
                 )
 
-    def _check_delay(self, stage: LearningController, speed: float) -> None:
+    def _check_delay(self, stage: Learner, speed: float) -> list[str]:
         encoder = self.master.parameters
         count = 2 * math.pi / encoder.counts_per_revolution if encoder.counts_per_revolution else 0.0
         acceleration = self.master.law.largest_acceleration()
         largest = stage.largest_delay(speed, acceleration, count, encoder.speed_window * encoder.step)
         delay = stage.parameters.feedback_delay
+        if largest is None:
+            return [f"{stage.name}: {stage.kind} tells no longest feedback_delay"]
         if delay > largest:
             raise InputError(
                 f"{stage.name}.feedback_delay = {delay} samples: at {speed:.4g} rad/s the cycle leaves {largest}; "
                 f"allowed: {stage.shared.block_size} up to {largest}"
             )
+        return []
 
     def _check_preview(self, stage: LearningController) -> None:
         if stage.parameters.lead_law != "exact_preview":
@@ -288,15 +317,11 @@ class Cell:
         return source if isinstance(source, ProfileStage) else None
 
 
-def _check_convergence(stage: LearningController, drive: str, response: Response, low: float, high: float) -> None:
-    loop, parameters = stage.loop(response), stage.parameters
-    if parameters.law == "time_periodic":
-        low = high = parameters.nominal_speed
-    (supremum, waves), speed = max((loop.worst(s), s) for s in {low, (low + high) / 2, high})
-    if supremum >= 1.0 and not parameters.allow_unstable:
+def _check_factor(stage: Learner, drive: str, worst: tuple[float, float], speed: float) -> None:
+    largest, waves = worst
+    where = f"{waves * speed:.5g} rad/s ({waves:.4g} waves at {speed:.4g} rad/s)"
+    if largest >= 1.0 and not stage.parameters.allow_unstable:
         raise InputError(
-            f"{stage.name}: learning diverges with {drive}: sup|Q - Z| = {supremum:.4g} at {waves * speed:.5g} rad/s "
-            f"({waves:.4g} waves at {speed:.4g} rad/s) with lead_time = {parameters.lead_time * 1e3:.4g} ms, q_time = "
-            f"{parameters.q_time * 1e6:.4g} µs; allowed: below 1 (widen Q, change the lead, damp the drive, or set "
-            "allow_unstable)"
+            f"{stage.name}: learning diverges with {drive}: {stage.factor} = {largest:.4g} at {where} with "
+            f"{stage.settings()}; allowed: below 1 ({stage.remedy}, damp the drive, or set allow_unstable)"
         )

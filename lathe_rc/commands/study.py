@@ -12,6 +12,7 @@ from rich.progress import Progress
 
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Row, Value
+from lathe_rc.commands import picture
 from lathe_rc.errors import InputError
 from lathe_rc.studies import STUDIES
 from lathe_rc.studies.study import Result, Study, StudyParameters
@@ -49,25 +50,12 @@ def read(study: Study[Any], overrides: Sequence[str]) -> StudyParameters:
     return table
 
 
-def _check_place(path: Path) -> None:
-    """Refuse before anything is computed."""
-    if path.suffix.lower() != ".png":
-        raise InputError(f"--figure {path}; allowed: a file name that ends in .png")
-    if path.is_dir() or not path.parent.is_dir():
-        raise InputError(f"--figure {path}: {'is a folder' if path.is_dir() else 'no such folder'}; name a file")
-
-
 def _save(study: Study[Any], result: Result, path: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=study.size, layout="constrained")
-    FigureCanvasAgg(figure)
     result.draw(figure)
-    try:
-        figure.savefig(path, dpi=130)
-    except OSError as error:
-        raise InputError(f"--figure {path}: cannot be written ({error.strerror})") from None
+    picture.save(figure, path)
 
 
 class _StudyCommand(click.Command):
@@ -102,7 +90,7 @@ class _StudyCommand(click.Command):
 
     def _run(self, overrides: tuple[str, ...], figure: Path, *, as_json: bool) -> None:
         parameters = read(self._subject, overrides)
-        _check_place(figure)
+        picture.check_place(figure)
         console = Console(stderr=True)
         with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
             result = self._subject.run(parameters, lambda items: progress.track(items, description=self._subject.name))

@@ -2,12 +2,16 @@
 """ROS parameters from parameter tables."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, ParameterType
 from rclpy.node import Node
 
+from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import NodeParameters, Row
+from lathe_rc.errors import InputError
+from lathe_rc.nodes import arguments
 
 _OWN_OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
 
@@ -49,6 +53,34 @@ def overrides(node: Node) -> dict[str, Any]:
             value = parameter.value
             given[name] = list(value) if hasattr(value, "typecode") or isinstance(value, list | tuple) else value
     return given
+
+
+def refuse_lost(node: Node, words: Sequence[str]) -> None:
+    """Refuse a ``-p`` for a node that something else has overruled, which ROS keeps quiet about.
+
+    Args:
+        node: as `overrides` wants it.
+        words: its command line.
+
+    Raises:
+        InputError: the node has another value.
+    """
+    given, name = overrides(node), node.get_name()
+    own = [rule for rule in arguments.rules(words) if rule.node in ("", name)]
+    for rule in own:
+        if rule.parameter.split(".")[0] in _OWN_OF_RCLPY:
+            continue
+        wanted = [ros_yaml.parse_value(each.value, name) for each in own if each.parameter == rule.parameter]
+        if repr(given.get(rule.parameter)) not in map(repr, wanted):
+            has = repr(given[rule.parameter]) if rule.parameter in given else "its default"
+            raise InputError(
+                f"-p {rule.text} does not reach {node.get_fully_qualified_name()}, which has {has}; "
+                + (
+                    f"write -p {name}:{rule.parameter}:=VALUE behind every --params-file"
+                    if node.get_namespace() == "/"
+                    else f"ROS has no -p {name}:PARAM in a namespace: write -p PARAM:=VALUE, or set it in the file"
+                )
+            )
 
 
 def declare(node: Node, table: type[NodeParameters]) -> NodeParameters:

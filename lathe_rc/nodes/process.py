@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from types import FrameType
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 import numpy as np
 import rclpy
@@ -29,7 +29,7 @@ from lathe_rc.cell.stage import compile_kernels
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes import dds
+from lathe_rc.nodes import arguments, dds, declare
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.recorder_node import RecorderNode
 from lathe_rc.nodes.report import THROUGHPUT, Reporter
@@ -156,12 +156,12 @@ def _tune(name: str) -> None:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -> int:
+def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
     """Run nodes in this process until they are done, fail or are told to stop.
 
     Args:
         members: name and kind of each node.
-        args: command line with ``--ros-args``; default: that of the process.
+        args: command line of ROS, from ``--ros-args`` on.
 
     Returns:
         The exit code: 0, or that of the first node that has failed, or whose cell went to its safe state.
@@ -173,7 +173,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
     dds.settle()
     np.seterr(over="ignore", invalid="ignore")  # each node names its own numbers that are not finite
     try:
-        rclpy.init(args=None if args is None else ["lathe", *args], signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=["lathe", *args], signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         print(f"lathe: --ros-args: {_words(error)}", file=sys.stderr)
         return InputError.exit_code
@@ -183,6 +183,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
     try:
         for name, kind in members:
             nodes.append(_make(name, kind, reporter, exchange))
+            declare.refuse_lost(nodes[-1], args)
         _start(nodes, exchange)
         gc.collect()
         gc.freeze()  # the collector skips existing objects: it would walk through them again and again between blocks
@@ -220,13 +221,20 @@ def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
                 compile_kernels(STAGES[kind](name, TABLES[kind].read(name, values)))
 
 
-def split(arguments: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:
-    """Names and kinds of the nodes NAME[:STAGE] before ``--ros-args``, and what follows."""
-    end = list(arguments).index("--ros-args") if "--ros-args" in arguments else len(arguments)
-    parts = [text.partition(":") for text in arguments[:end]]
-    return [(name, kind or name) for name, _, kind in parts], list(arguments[end:])
+def split(words: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:
+    """Names and kinds of the nodes NAME[:STAGE] before ``--ros-args``, and what follows.
+
+    Raises:
+        InputError: there are none, or something else stands before ``--ros-args``.
+    """
+    named, rest = arguments.split(words)
+    for text in named or [""]:
+        if not text or text.startswith("-") or ":=" in text:
+            raise InputError(f"no node {text!r}; allowed: {TABLES.allowed()}, or NAME:STAGE; then {arguments.ROS} ...")
+    parts = [text.partition(":") for text in named]
+    return [(name, kind or name) for name, _, kind in parts], rest
 
 
-def main(kind: str) -> None:
+def main(kind: str) -> NoReturn:
     """Entry point of the executable of one kind of node."""
-    sys.exit(run([(kind, kind)]))
+    arguments.executable(kind, TABLES[kind], lambda words: run([(kind, kind)], words))

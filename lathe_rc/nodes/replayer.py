@@ -2,10 +2,10 @@
 """Executable: the ``replayer``, which sends again what a bag holds, whoever made it, with /clock."""
 
 import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from lathe_rc.cell.replayer import KIND, ReplayerParameters
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes import alone
+from lathe_rc.nodes import alone, arguments
 from lathe_rc.nodes.ports import latched_qos, message_class
 
 _DEPTH = 512  # of the queues: so many may be under way before readers must have acknowledged
@@ -314,14 +314,14 @@ def _work(node: Node, parameters: ReplayerParameters) -> None:
     node.get_logger().info(f"{replayer.sent} messages sent")
 
 
-def run(values: Mapping[str, object], args: Sequence[str] | None = None) -> int:
+def run(values: Mapping[str, object], args: Sequence[str]) -> int:
     """Replay until the end, a failure, or Ctrl-C; see `alone.run`."""
     return alone.run(KIND, ReplayerParameters, _work, values, args)
 
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run({}))
+    arguments.executable(KIND, ReplayerParameters, partial(run, {}))
 
 
 if __name__ == "__main__":

@@ -123,10 +123,11 @@ class SpindleNode(StageNode):
         if all(member is not None and member.state == member.READY for member in known):
             # The same check as before an offline run, with the parameters that the members really have.
             cell = Cell(self.tables(self.member_names()))
-            cell.check()
+            for what in cell.check():
+                self.get_logger().warning(f"not checked: {what}")
             self._begin(cell)
 
-    def _begin(self, cell: Cell) -> None:
+    def _begin(self, cell: Cell | None = None) -> None:
         self._running = True
         self.get_logger().info(f"run {self.table.run_id or '(no id)'} begins with {len(self._member_names)} members")
         self._say(CellState.RUNNING, 0)

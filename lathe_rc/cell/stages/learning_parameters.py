@@ -7,8 +7,8 @@ from typing import Annotated, Literal, cast
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from lathe_rc.cell.parameters import ObedientParameters, RestartParameters, parameter
-from lathe_rc.cell.stages.retraction import BoundedParameters
+from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.stages.learner import LearnerParameters
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.lead import LeadLaw, Preview
@@ -27,7 +27,7 @@ Q_FILTERS: Registry[QFilter] = Registry(
 _CORRECTIONS = {law.name.lower(): law for law in CorrectionLaw}
 
 
-class LearningControllerParameters(SpeedLawParameters, ObedientParameters, BoundedParameters, RestartParameters):
+class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
     """Law, lead, Q and correction of a channel, and the drive model that its stability margin is computed from.
 
     The speed deviations are what ``exact_preview`` knows in advance; no other law uses them.
@@ -79,20 +79,10 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters, Bound
     cycle_revolutions: Annotated[int, Ge(1), Le(1024)] = parameter(
         1, "cycle angle θ; the whole part if it is as long", "rev"
     )
-    feedback_delay: Annotated[int, Ge(1), Le(2**24)] = parameter(
-        2048,
-        "samples from an error to when it is visible; at least a block, at most what the cycle leaves",
-        "sample",
-    )
     fall_back: Literal["frozen", "constant_lead"] = parameter(
         "frozen", "falling back: the memory frozen, or moreover read with the lead angle of the nominal speed"
     )
-    retract_position: float = parameter(0.0, "command when retracted", "m")
-    retract_time: Annotated[float, Gt(0)] = parameter(
-        1.0, "longest takeover: a command that is farther away begins where the way takes so long", "s"
-    )
     memory_file: str = parameter("", "file that the events save and load write and read", path=True)
-    allow_unstable: bool = parameter(default=False, doc="start although sup|Q - Z| is not below 1")
     publish_margin: bool = parameter(
         default=False, doc="publish the stability margin sample by sample as well, on coarse/margin, for a supervisor"
     )
