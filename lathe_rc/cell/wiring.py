@@ -280,7 +280,7 @@ class Cell:
     def _check_preview(self, stage: LearningController) -> None:
         if stage.parameters.lead_law != "exact_preview":
             return
-        told, true = stage.parameters.speed_law(), self.master.law
+        told, true = stage.parameters.speed_law(stage.name), self.master.law
         if not (np.array_equal(told.lines, true.lines) and np.array_equal(told.tachogram, true.tachogram)):
             raise InputError(
                 f"{stage.name}.lead_law = exact_preview, but it does not know the speed of {self.master.name}; give "

@@ -102,8 +102,8 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         """Grid points in a cycle."""
         return self.points_per_revolution * self.cycle_revolutions
 
-    def make_q(self) -> QFilter:
-        """The Q filter.
+    def make_q(self, node: str) -> QFilter:
+        """The Q filter of a node.
 
         Raises:
             InputError: it is wider than the memory can hold, its bands are out of order, or one of others is none.
@@ -116,7 +116,7 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         width = self.q_time * self.nominal_speed * per_point
         if self.q_filter in Q_FILTERS.own:
             return make(width, self.cycle_points)
-        with code_of_others(f"q_filter = {self.q_filter!r}"):
+        with code_of_others(f"{node}.q_filter = {self.q_filter!r}"):
             made = make(width, self.cycle_points)
             check(made)
             return made
@@ -145,8 +145,8 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         """Lead angle that does not depend on the speed [rad]: of Wk2, which has constant parameters in the angle."""
         return (self.lead_time - self.preview_time) * self.nominal_speed
 
-    def make_preview(self) -> Preview:
-        """The lead law.
+    def make_preview(self, node: str) -> Preview:
+        """The lead law of a node.
 
         Raises:
             InputError: the deviations do not fit together.
@@ -154,7 +154,7 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         return Preview(
             _LEAD_LAWS[self.lead_law],
             self.preview_time,
-            self.speed_law(),
+            self.speed_law(node),
             self.step,
             self.acceleration_window,
             self.constant_lead,

@@ -43,8 +43,8 @@ class SpeedLawParameters(NodeParameters):
         60.0, "end of its tachogram, not before the end of the run; an endless one goes on with the last deviation", "s"
     )
 
-    def speed_law(self) -> speed.SpeedLaw:
-        """The sum of all deviations.
+    def speed_law(self, node: str) -> speed.SpeedLaw:
+        """The sum of all deviations, for a node.
 
         Raises:
             InputError: lists of different lengths, a tachogram out of order, or a law of others that is none.
@@ -59,23 +59,23 @@ class SpeedLawParameters(NodeParameters):
                 np.array(phase),
                 self.deviation_start,
             )
-            + self._tachogram()
+            + self._tachogram(node)
             + speed.band_limited_random(
                 nominal, self.random_rms, self.random_low, self.random_high, self.random_lines, self.seed
             )
         )
 
-    def _tachogram(self) -> speed.SpeedLaw:
+    def _tachogram(self, node: str) -> speed.SpeedLaw:
         if not self.deviation_law:
             return speed.tachogram(
                 self.nominal_speed, np.array(self.tachogram_time), np.array(self.tachogram_deviation)
             )
         if self.tachogram_time:
             raise InputError(
-                f"deviation_law = {self.deviation_law!r} beside tachogram_time; allowed: one of them, since a law of "
-                "others becomes the tachogram"
+                f"{node}.deviation_law = {self.deviation_law!r} beside tachogram_time; allowed: one of them, since a "
+                "law of others becomes the tachogram"
             )
-        with code_of_others(f"deviation_law = {self.deviation_law!r}"):
+        with code_of_others(f"{node}.deviation_law = {self.deviation_law!r}"):
             make: Callable[..., DeviationLaw] = SPEED_LAWS[self.deviation_law]
             return tabulated(
                 self.nominal_speed, make(*self.deviation_values), self.deviation_law_step, self.deviation_law_end

@@ -71,8 +71,7 @@ class SpindleEncoder(Stage):
     def __init__(self, name: str, parameters: SpindleEncoderParameters) -> None:
         super().__init__(name, parameters)
         self.parameters = parameters
-        with self.named():
-            self.law = parameters.speed_law()
+        self.law = parameters.speed_law(name)
         self.samples = (
             self.law.samples_until(2 * np.pi * parameters.revolutions, parameters.step)
             if parameters.revolutions
