@@ -138,7 +138,10 @@ as volatile. Every node is a lifecycle node with the standard parameter and life
 
 def _allowed(row: Row) -> str:
     choices = ("true", "false") if row.type is bool else row.choices
-    return ", ".join(f"`{choice}`" for choice in choices) or row.limits or "any"
+    names = ", ".join(f"`{choice}`" for choice in choices if choice)
+    if row.named:
+        return f"{names}, or a class of others" if names else "a class of others"
+    return names or row.limits or "any"
 
 
 def _parameters(rows: Mapping[str, Row]) -> str:

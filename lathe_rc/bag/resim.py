@@ -58,6 +58,7 @@ class Resimulation:
             the recorded error is not in the bag but made from them; otherwise empty.
         positions: topics and fields of the bag that this position is; otherwise empty.
         drives: that were identified.
+        warnings: what has changed since the bag was made, of classes of others.
     """
 
     scenario: Scenario
@@ -71,6 +72,7 @@ class Resimulation:
     between_rms: Samples = field(repr=False)
     positions: list[tuple[str, str]]
     drives: list[Identified]
+    warnings: list[str]
 
     @property
     def different(self) -> list[str]:
@@ -189,6 +191,7 @@ def resimulate(
             chosen = story.scenario_of(source.about, Path(folder), overrides) if overrides else original
         if controller is not None:
             chosen = with_controller(chosen, controller)
+        warnings = story.changes(source.about) if original is not None else []
         _refuse_events(chosen, original)
         drives = identify.drives(recorded, chosen) if identified else []
         chosen = identify.with_identified(chosen, drives)
@@ -234,6 +237,7 @@ def resimulate(
         between_rms=compared.between_rms() if compared else np.empty(0),
         positions=compared.topics if compared else [],
         drives=drives,
+        warnings=warnings,
     )
 
 

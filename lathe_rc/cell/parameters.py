@@ -110,14 +110,16 @@ class Table(BaseModel):
             if first["type"] == "extra_forbidden":
                 known = ", ".join(sorted(cls.model_fields))
                 raise InputError(f"{shown(f'{node}.{name}')}: unknown parameter; allowed: {known}") from None
+            if why := str(first.get("ctx", {}).get("error", "")):  # there is such a name, but the class cannot be used
+                raise InputError(f"{node}.{name}: {why}") from None
             given = f"{values[name]!r:.200}"
             raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
 
 
 def names_others(table: type[Table], values: Mapping[str, object]) -> bool:
     """Whether one of the values names a class of another package."""
-    rows = ((row, values.get(name, row.default)) for name, row in table.rows().items())
-    return any(row.named and value not in row.choices for row, value in rows)
+    rows = ((row.named, values.get(name, row.default)) for name, row in table.rows().items())
+    return any(named and named.others(value) for named, value in rows)
 
 
 @cache

@@ -85,6 +85,10 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
         if key == story.SCENARIO:
             console.print("scenario:")
             console.print(Text("  " + text.strip().replace("\n", "\n  ")))
+        elif key == story.ORIGINS:
+            for origin in story.origins({key: text}):
+                of = f" of {origin.package}" if origin.package else ""
+                console.print(Text(f"{', '.join(origin.used)}: {origin.name}{of}, source {origin.source}"))
         elif key.startswith(story.FILE):
             console.print(Text(f"{key.removeprefix(story.FILE)}: a file, {len(text)} characters in base64"))
         else:

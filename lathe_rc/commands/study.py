@@ -61,7 +61,7 @@ def _save(study: Study[Any], result: Result, path: Path) -> None:
 class _StudyCommand(click.Command):
     """Runs a study; its help lists the parameters."""
 
-    def __init__(self, subject: Study[Any]) -> None:
+    def __init__(self, name: str, subject: Study[Any]) -> None:
         options = [
             click.Option(
                 ["--set", "overrides"], multiple=True, metavar="PARAM=VALUE", help="repeatable; lists as 1,2,3"
@@ -75,7 +75,7 @@ class _StudyCommand(click.Command):
             ),
             click.Option(["--json", "as_json"], is_flag=True, help="print one JSON object"),
         ]
-        super().__init__(subject.name, params=list(options), callback=self._run, help=subject.doc)
+        super().__init__(name, params=list(options), callback=self._run, help=subject.doc)
         self._subject = subject
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -104,15 +104,42 @@ class _StudyCommand(click.Command):
 
 
 class _Studies(click.Group):
-    """The studies; refuses an unknown one in one line."""
+    """The studies, ours and those of other packages; refuses an unknown one in one line."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """See `click.Group`."""
+        return list(STUDIES)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """See `click.Group`.
+
+        Raises:
+            InputError: a study of others cannot be imported, or is none.
+        """
+        return _StudyCommand(cmd_name, STUDIES[cmd_name]) if cmd_name in STUDIES else None
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """See `click.Group`."""
+        with formatter.section("Studies"):
+            formatter.write_dl([(name, _summary(name)) for name in STUDIES])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """See `click.Group`."""
-        if args[0] not in self.commands and not args[0].startswith("-") and not ctx.resilient_parsing:
-            raise InputError(f"no study {args[0]!r}; allowed: {', '.join(self.commands)}")
+        if args[0] not in STUDIES and not args[0].startswith("-") and not ctx.resilient_parsing:
+            raise InputError(f"no study {args[0]!r}; allowed: {', '.join(STUDIES)}, or PACKAGE.MODULE:STUDY")
         return super().resolve_command(ctx, args)
+
+
+def _summary(name: str) -> str:
+    """What a study is about, and who offers it if we do not; one that cannot be used does not keep the others away."""
+    by = STUDIES.offered_by(name)
+    try:
+        about = STUDIES[name].doc
+    except InputError as error:
+        return str(error)
+    return f"{about} ({by})" if by else about
 
 
 @click.group(cls=_Studies, invoke_without_command=True)
@@ -121,9 +148,5 @@ def study(ctx: click.Context) -> None:
     """Compute a table or figure of the papers; without a name, list the studies."""
     if ctx.invoked_subcommand is None:
         width = max(map(len, STUDIES))
-        for name, subject in STUDIES.items():
-            click.echo(f"{name:{width}}  {subject.doc}")
-
-
-for _subject in STUDIES.values():
-    study.add_command(_StudyCommand(_subject))
+        for name in STUDIES:
+            click.echo(f"{name:{width}}  {_summary(name)}")

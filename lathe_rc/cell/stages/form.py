@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The desired form of the part as parameters, and what evaluates it under the tool."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -13,8 +14,10 @@ from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import InputError
+from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel
 from lathe_rc.plants.tool import equal
+from lathe_rc.signals.part_profile import PartProfile, checked
 from lathe_rc.signals.profile import (
     Harmonics,
     Piston,
@@ -26,11 +29,18 @@ from lathe_rc.signals.profile import (
     tabulated,
 )
 
+_OWN = ("harmonics", "piston", "polygon", "csv")
+#: by name, those of other packages: ours have parameters of their own
+PROFILES: Registry[PartProfile] = Registry("profile", PartProfile, {}, "lathe_rc.profiles")
+
 
 class FormParameters(NodeParameters):
     """The desired form of the part and the feed along it."""
 
-    profile: Literal["harmonics", "piston", "polygon", "csv"] = parameter("harmonics", "kind of profile")
+    profile: Annotated[str, Named(PROFILES, _OWN)] = parameter("harmonics", "kind of profile")
+    profile_values: list[float] = parameter(
+        [], "profile of others: numbers that it is made of, in the order of its constructor"
+    )
     profile_file: str = parameter("", "csv: file with angle_deg, (height_mm,) radius_um", path=True)
     harmonic_order: list[Annotated[int, Ge(0), Le(2000)]] = parameter(
         [], "harmonics: waves per revolution; none at all: an oval of 225 µm (paper 000, Fig. 6)"
@@ -60,8 +70,15 @@ class FormParameters(NodeParameters):
         """The profile of a node.
 
         Raises:
-            InputError: lists of different lengths, sizes that do not fit, or a file that cannot be used.
+            InputError: lists of different lengths, sizes that do not fit, a file that cannot be used, or a profile of
+                others that is none.
         """
+        if self.profile not in _OWN:
+            make: Callable[..., PartProfile] = PROFILES[self.profile]
+            with code_of_others(f"{node}.profile = {self.profile!r}"):
+                made = make(*self.profile_values)
+                checked(made)
+                return made
         if self.profile == "csv":
             if not self.profile_file:
                 raise InputError(f"{node}.profile_file is empty; name the CSV file of the profile")

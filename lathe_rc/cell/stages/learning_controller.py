@@ -184,14 +184,15 @@ class LearningController(Learner):
     def __init__(self, name: str, parameters: LearningControllerParameters) -> None:
         self.parameters = parameters
         super().__init__(name, parameters)
-        self._q = parameters.make_q()
+        with self.named():
+            self._q, preview = parameters.make_q(), parameters.make_preview()
         self._controller = RepetitiveController(
             grid=parameters.points_per_revolution,
             revolutions=parameters.cycle_revolutions,
             q=self._q,
             gain=parameters.learning_gain,
             soft_start=parameters.soft_start,
-            preview=parameters.make_preview(),
+            preview=preview,
             correction=parameters.make_correction(),
             nominal=parameters.nominal_speed,
             delay=parameters.feedback_delay,

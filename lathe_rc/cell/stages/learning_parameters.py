@@ -2,7 +2,7 @@
 """Parameters of the learning controller, and the pieces of its law that they describe."""
 
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
@@ -12,14 +12,18 @@ from lathe_rc.cell.stages.learner import LearnerParameters
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.lead import LeadLaw, Preview
+from lathe_rc.control.q_check import check
 from lathe_rc.control.q_filter import Exponential, Gaussian, LowPass, MovingAverage, QFilter
+from lathe_rc.extensions import Named, Registry, code_of_others
 
 _LEAD_LAWS = {law.name.lower(): law for law in LeadLaw}
-_Q_FILTERS: dict[str, Callable[[float, int], QFilter]] = {
-    "exponential": Exponential,
-    "gaussian": Gaussian,
-    "moving_average": MovingAverage,
-}
+#: by name, ours and those of other packages; each is made of its width in grid points and the grid points of a cycle
+Q_FILTERS: Registry[QFilter] = Registry(
+    "Q filter",
+    QFilter,
+    {"exponential": Exponential, "gaussian": Gaussian, "moving_average": MovingAverage},
+    "lathe_rc.q_filters",
+)
 _CORRECTIONS = {law.name.lower(): law for law in CorrectionLaw}
 
 
@@ -51,7 +55,7 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
     )
     lead_lag_lead: Annotated[float, Ge(0), Le(1)] = parameter(0.0, "correction lead_lag: T1", "s")
     lead_lag_lag: Annotated[float, Ge(0), Le(1)] = parameter(0.0, "correction lead_lag: T2", "s")
-    q_filter: Literal["exponential", "gaussian", "moving_average", "fir"] = parameter(
+    q_filter: Annotated[str, Named(Q_FILTERS, ("fir",))] = parameter(
         "exponential", "kind of the zero-phase Q; fir: flat up to q_pass"
     )
     q_time: Annotated[float, Ge(0), Le(1)] = parameter(
@@ -102,13 +106,20 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         """The Q filter.
 
         Raises:
-            InputError: it is wider than the memory can hold, or its bands are out of order.
+            InputError: it is wider than the memory can hold, its bands are out of order, or one of others is none.
         """
         per_point = self.points_per_revolution / (2 * np.pi)  # grid points per radian
         if self.q_filter == "fir":
             edge = 1.0 / (self.nominal_speed * per_point)
             return LowPass(self.q_pass * edge, self.q_stop * edge, self.q_ripple, self.cycle_points)
-        return _Q_FILTERS[self.q_filter](self.q_time * self.nominal_speed * per_point, self.cycle_points)
+        make = cast("Callable[[float, int], QFilter]", Q_FILTERS[self.q_filter])
+        width = self.q_time * self.nominal_speed * per_point
+        if self.q_filter in Q_FILTERS.own:
+            return make(width, self.cycle_points)
+        with code_of_others(f"q_filter = {self.q_filter!r}"):
+            made = make(width, self.cycle_points)
+            check(made)
+            return made
 
     def make_correction(self) -> Correction:
         """The correction with its given model.

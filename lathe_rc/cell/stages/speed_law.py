@@ -1,13 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The spindle's speed law as parameters: of the spindle that follows it, and of whoever knows it in advance."""
 
+from collections.abc import Callable
 from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.errors import InputError
+from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.signals import speed
+from lathe_rc.signals.deviation_law import DeviationLaw, tabulated
+
+#: by name, those of other packages: ours are the parameters below
+SPEED_LAWS: Registry[DeviationLaw] = Registry("speed law", DeviationLaw, {}, "lathe_rc.speed_laws")
 
 
 class SpeedLawParameters(NodeParameters):
@@ -27,12 +34,20 @@ class SpeedLawParameters(NodeParameters):
     random_low: Annotated[float, Gt(0)] = parameter(1.0, "lower end of its band", "rad/s")
     random_high: Annotated[float, Gt(0)] = parameter(60.0, "upper end of its band", "rad/s")
     random_lines: Annotated[int, Ge(1), Le(1024)] = parameter(16, "spectral lines that it is made of")
+    deviation_law: Annotated[str, Named(SPEED_LAWS, ("",))] = parameter(
+        "", "a law of others in place of the tachogram, which is made of it; empty: none"
+    )
+    deviation_values: list[float] = parameter([], "numbers that it is made of, in the order of its constructor")
+    deviation_law_step: Annotated[float, Gt(0)] = parameter(1e-3, "step of its tachogram", "s")
+    deviation_law_end: Annotated[float, Gt(0)] = parameter(
+        60.0, "end of its tachogram, not before the end of the run; an endless one goes on with the last deviation", "s"
+    )
 
     def speed_law(self) -> speed.SpeedLaw:
         """The sum of all deviations.
 
         Raises:
-            InputError: lists of different lengths, or a tachogram out of order.
+            InputError: lists of different lengths, a tachogram out of order, or a law of others that is none.
         """
         nominal = self.nominal_speed
         phase = self.deviation_phase or [0.0] * len(self.deviation_amplitude)
@@ -44,8 +59,24 @@ class SpeedLawParameters(NodeParameters):
                 np.array(phase),
                 self.deviation_start,
             )
-            + speed.tachogram(nominal, np.array(self.tachogram_time), np.array(self.tachogram_deviation))
+            + self._tachogram()
             + speed.band_limited_random(
                 nominal, self.random_rms, self.random_low, self.random_high, self.random_lines, self.seed
             )
         )
+
+    def _tachogram(self) -> speed.SpeedLaw:
+        if not self.deviation_law:
+            return speed.tachogram(
+                self.nominal_speed, np.array(self.tachogram_time), np.array(self.tachogram_deviation)
+            )
+        if self.tachogram_time:
+            raise InputError(
+                f"deviation_law = {self.deviation_law!r} beside tachogram_time; allowed: one of them, since a law of "
+                "others becomes the tachogram"
+            )
+        with code_of_others(f"deviation_law = {self.deviation_law!r}"):
+            make: Callable[..., DeviationLaw] = SPEED_LAWS[self.deviation_law]
+            return tabulated(
+                self.nominal_speed, make(*self.deviation_values), self.deviation_law_step, self.deviation_law_end
+            )

@@ -11,6 +11,7 @@ from lathe_rc.cell.native import Step
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached, Stage, Trigger
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
+from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.signals.encoder import Encoder, EncoderTable, encode
 
@@ -70,15 +71,26 @@ class SpindleEncoder(Stage):
     def __init__(self, name: str, parameters: SpindleEncoderParameters) -> None:
         super().__init__(name, parameters)
         self.parameters = parameters
-        self.law = parameters.speed_law()
+        with self.named():
+            self.law = parameters.speed_law()
         self.samples = (
             self.law.samples_until(2 * np.pi * parameters.revolutions, parameters.step)
             if parameters.revolutions
             else None
         )
+        self._check_end()
         self._triggers = [self._by_sample(trigger) for trigger in self._triggers]
         self._encoder = Encoder(self.law, parameters.step, parameters.counts_per_revolution, parameters.speed_window)
         self.declare(outputs=[Output("encoder", messages.ENCODER, Joint("angle", "speed"))])
+
+    def _check_end(self) -> None:
+        """A law of others is known up to the end of its tachogram."""
+        parameters, seconds = self.parameters, (self.samples or 0) * self.shared.step
+        if parameters.deviation_law and seconds > parameters.deviation_law_end:
+            raise InputError(
+                f"{self.name}.deviation_law_end = {parameters.deviation_law_end:g} s: the run takes {seconds:.5g} s; "
+                "allowed: not before its end"
+            )
 
     def _by_sample(self, trigger: Trigger) -> Trigger:
         """The same trigger; who makes the angle knows when it comes."""
