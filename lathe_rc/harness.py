@@ -59,7 +59,7 @@ _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag c
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
 _MOST_RESTARTS = 8  # of a process
 _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
-_NO_SIGN_OF_LIFE = {"stall", "stranger", "stopped", "continued"}  # events that come while nothing goes on
+_NO_SIGN_OF_LIFE = {"stall", "stranger", "stopped", "continued", "waits"}  # events that come while nothing goes on
 _LOOK = 0.05  # [s] between looks at what a process has written
 
 

@@ -31,13 +31,31 @@ class Source:
     type: str
 
 
+@dataclass(frozen=True)
+class Unknown:
+    """A member whose stage or parameters nobody here knows: of it counts what it announces of its topics.
+
+    Attributes:
+        dense: message type by relative topic, of those that carry a block a block.
+        sparse: the same of those that carry messages at chosen samples.
+        reads: relative topics.
+    """
+
+    dense: Mapping[str, str]
+    sparse: Mapping[str, str]
+    reads: frozenset[str]
+
+
 class Cell:
     """All stages of a scenario, wired.
 
     Args:
         nodes: table of each node by name; nodes that are no stages are left out.
+        unknown: members that nobody here knows more of than their topics, by name.
 
     Attributes:
+        unknown: see above.
+        unchecked: what `check` could not check since it depends on them, one line each.
         stages: by node name, in the order of the forward edges.
         dense: publisher of each topic that carries a block a block, by relative topic.
         sparse: the same for topics that carry messages at chosen samples.
@@ -46,7 +64,8 @@ class Cell:
         InputError: a topic without or with two publishers, types that do not match, a loop without a delay.
     """
 
-    def __init__(self, nodes: Mapping[str, NodeParameters]) -> None:
+    def __init__(self, nodes: Mapping[str, NodeParameters], unknown: Mapping[str, Unknown] | None = None) -> None:
+        self.unknown, self.unchecked = unknown or {}, list[str]()
         made: dict[str, Stage] = {}
         for name, table in nodes.items():
             kind = kind_of(name, table.stage)
@@ -59,16 +78,23 @@ class Cell:
                 self._add(self.dense, remapped(stage.shared, output.topic), Source(name, output.type))
             for topic, msgtype in stage.sparse_topics.items():
                 self._add(self.sparse, remapped(stage.shared, topic), Source(name, msgtype))
+        self._add_unknown()
         order: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(made, ()))
         for name, stage in made.items():
             for port in stage.inputs:
                 source = self.source(stage, port)
-                if port.delay == 0:
+                if port.delay == 0 and source.node in made:
                     order.add(name, source.node)
         try:
             self.stages = {name: made[name] for name in order.static_order()}
         except CycleError as error:
             raise InputError(f"{' -> '.join(error.args[1])}: a loop without a feedback delay cannot start") from None
+
+    def _add_unknown(self) -> None:
+        for name, member in self.unknown.items():
+            for topics, published in ((self.dense, member.dense), (self.sparse, member.sparse)):
+                for topic, msgtype in published.items():
+                    self._add(topics, topic, Source(name, msgtype))
 
     def _add(self, topics: dict[str, Source], topic: str, source: Source) -> None:
         other = self.dense.get(topic) or self.sparse.get(topic)
@@ -89,6 +115,16 @@ class Cell:
         if source.type != port.type:
             raise InputError(f"{stage.name} reads {topic} as {port.type}, but {source.node} publishes {source.type}")
         return source
+
+    def _publisher(self, topic: str, question: str) -> Stage | None:
+        """The stage that publishes a topic; None if nobody here knows it: then the question stays open."""
+        name = self.dense[topic].node
+        if name in self.unknown:
+            self._leave_open(question, name)
+        return self.stages.get(name)
+
+    def _leave_open(self, question: str, name: str) -> None:
+        self.unchecked.append(f"not checked, since the parameters of {name} are not known here: {question}")
 
     @property
     def master(self) -> SpindleEncoder:
@@ -137,7 +173,7 @@ class Cell:
         return min(delays, default=None)
 
     def check(self) -> None:
-        """Refuse what cannot work, with the figures, before anything moves.
+        """Refuse what cannot work, with the figures, before anything moves; `unchecked` says what was left out.
 
         Raises:
             InputError: a block longer than a feedback delay, a profile that a drive cannot follow, a tool that is not
@@ -170,6 +206,8 @@ class Cell:
     def _learned(self, stage: LearningController) -> list[tuple[Response, str]]:
         """Responses and names of the drives that a channel commands."""
         commands = {remapped(stage.shared, output.topic) for output in stage.outputs}
+        for name in (name for name, member in self.unknown.items() if member.reads & commands):
+            self._leave_open(f"whether {stage.name} converges with {name}", name)
         return [
             (response, drive.name)
             for drive in self.stages.values()
@@ -185,6 +223,7 @@ class Cell:
         found = [self.dense.get(remapped(stage.shared, f"{drive}/{what}")) for what in ("command", "state")]
         nodes = [source.node for source in found if source]
         listening = {reader.name for reader in self.readers(safety)}
+        listening |= {name for name, member in self.unknown.items() if safety in member.reads}
         if asks and nodes and not listening & set(nodes):
             asked = f"monitor {asks.name} asks for {asks.reaction.name.lower()}"
             raise InputError(
@@ -196,10 +235,13 @@ class Cell:
         """The tool has to get as far out of the part as is asked for before it is safe."""
         drive, clear = stage.parameters.drives[0], stage.parameters.clear_position
         for topic, name in ((f"{drive}/command", "retract_position"), (f"{drive}/state", "command_stroke")):
-            outlet = self.dense.get(remapped(stage.shared, topic))
+            outlet_topic = remapped(stage.shared, topic)
+            outlet = self.dense.get(outlet_topic)
             if outlet is None:
                 continue  # a series drive passes commands on inside
-            source = self.stages[outlet.node]
+            source = self._publisher(outlet_topic, f"whether {outlet.node} gets beyond {stage.name}.clear_position")
+            if source is None:
+                continue
             reached = getattr(source.shared, name, None)
             counts = reached if name == "command_stroke" else getattr(source.shared, "reaction_delay", 0)
             if counts and reached is not None and reached <= clear:
@@ -212,7 +254,7 @@ class Cell:
         """A drive gets no farther than its stroke."""
         clear = stage.parameters.clear_position
         outlet = self.dense.get(remapped(stage.shared, f"{stage.parameters.drives[0]}/state"))
-        drive = self.stages[outlet.node] if outlet else None
+        drive = self.stages.get(outlet.node) if outlet else None  # what is unknown has been said of the retraction
         if not isinstance(drive, Drive):
             return
         for limits in drive.limits().values():
@@ -261,13 +303,14 @@ class Cell:
     def _check_profile(self, tool: Tool, speed: float) -> None:
         """The first drive carries the profile; the others what it leaves."""
         owner, drive = self._form(tool), tool.parameters.drives[0]
-        source = self.stages[self.dense[remapped(tool.shared, f"{drive}/state")].node]
+        topic = remapped(tool.shared, f"{drive}/state")
+        source = self._publisher(topic, f"whether {self.dense[topic].node} can follow the profile of {tool.name}")
         if owner is None or owner.form is None or not isinstance(source, Drive):
             return
         acceleration = self.master.law.largest_acceleration()
         demand = owner.form.profile.demand(speed, acceleration, owner.parameters.feed)
-        for topic, limits in source.limits().items():
-            if remapped(source.shared, topic) != remapped(tool.shared, f"{drive}/state"):
+        for of, limits in source.limits().items():
+            if remapped(source.shared, of) != topic:
                 continue
             for what, asked, allowed, unit in (
                 ("stroke", demand.stroke * 1e6, limits.stroke * 1e6, "µm"),
@@ -284,7 +327,9 @@ class Cell:
         """The stage that has the tool's desired form."""
         if tool.form is not None:
             return tool
-        source = self.stages[self.dense[remapped(tool.shared, "reference")].node]
+        source = self._publisher(
+            remapped(tool.shared, "reference"), f"whether a drive can follow what {tool.name} reads"
+        )
         return source if isinstance(source, ProfileStage) else None
 
 
