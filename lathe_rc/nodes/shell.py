@@ -681,12 +681,15 @@ class CellNode(LifecycleNode):
         """Members and topics that it waits for until it can begin; empty if it has begun, or waits for nobody."""
         if self.done or self.failure or (self._ready and self._cell not in (None, CellState.WAITING)):
             return []
+        if not self.active:
+            return ["its own activation"]
         if self.master is None:
             lonely = [topic for topic, inlet in self.inlets.items() if not inlet.get_publisher_count()]
             alone = any(member.stage == SpindleEncoder.kind for member in self.members.values())
             master = [] if alone or not lonely else ["a time master"]
             return [*master, *(f"a publisher of {topic}" for topic in lonely)]
-        states = {name: self.members[name].state if name in self.members else None for name in self.master.members}
+        others = [name for name in self.master.members if name != self.full_name]
+        states = {name: self.members[name].state if name in self.members else None for name in others}
         unheard = [name for name, state in states.items() if state is None]
         joining = [f"{name} to join" for name, state in states.items() if state == Member.JOINING]
         if unheard or joining:

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every transition of a node's lifecycle, and what a node says that waits."""
+
+import contextlib
+
+import pytest
+from cells import scenario
+
+pytest.importorskip("rclpy")
+
+import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+
+from lathe_rc import harness
+from lathe_rc.bag import reader
+from lathe_rc.errors import LatheError
+
+WALK = [  # transition, whether it is possible, and where the node is then
+    (Transition.TRANSITION_ACTIVATE, False, "active"),
+    (Transition.TRANSITION_CLEANUP, False, "active"),
+    (Transition.TRANSITION_DEACTIVATE, True, "inactive"),
+    (Transition.TRANSITION_CONFIGURE, False, "inactive"),
+    (Transition.TRANSITION_ACTIVATE, True, "active"),
+    (Transition.TRANSITION_DEACTIVATE, True, "inactive"),
+    (Transition.TRANSITION_CLEANUP, True, "unconfigured"),
+    (Transition.TRANSITION_ACTIVATE, False, "unconfigured"),
+    (Transition.TRANSITION_CONFIGURE, True, "inactive"),
+    (Transition.TRANSITION_CLEANUP, True, "unconfigured"),
+    (Transition.TRANSITION_CONFIGURE, True, "inactive"),
+    (Transition.TRANSITION_ACTIVATE, True, "active"),
+]
+LOGGED = [
+    *("unconfigured -> inactive", "inactive -> active", "active -> inactive", "inactive -> active"),
+    *("active -> inactive", "inactive -> unconfigured", "unconfigured -> inactive", "inactive -> unconfigured"),
+    *("unconfigured -> inactive", "inactive -> active"),
+]
+LAST = "electrodynamic_actuator"  # is told to start by the tests
+
+
+class Manager:
+    """Asks nodes for transitions, as ``ros2 lifecycle`` does."""
+
+    def __init__(self, ghost):
+        self._ghost, self._clients = ghost, {}
+
+    def _ask(self, service, kind, request):
+        if service not in self._clients:
+            self._clients[service] = self._ghost.create_client(kind, service)
+            assert self._clients[service].wait_for_service(60.0)
+        future = self._clients[service].call_async(request)
+        rclpy.spin_until_future_complete(self._ghost, future, timeout_sec=60.0)
+        assert future.done(), f"{service} does not answer"
+        return future.result()
+
+    def change(self, node, transition):
+        """Ask for a transition; returns whether it was made."""
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return self._ask(f"/{node}/change_state", ChangeState, request).success
+
+    def state(self, node):
+        return self._ask(f"/{node}/get_state", GetState, GetState.Request()).current_state.label
+
+
+@pytest.fixture
+def manager(ghost):
+    return Manager(ghost)
+
+
+@contextlib.contextmanager
+def waiting(manager, domain, cell, together=()):
+    """The processes of a cell that waits for its drive, and what lets that start."""
+    groups = [list(together), *([name] for name in cell.nodes if name not in together)]
+    with harness.Processes(cell, [group for group in groups if group], domain=domain) as processes:
+
+        def begin():
+            assert manager.change(LAST, Transition.TRANSITION_CONFIGURE)
+            assert manager.change(LAST, Transition.TRANSITION_ACTIVATE)
+
+        yield processes, begin
+
+
+@pytest.mark.parametrize(
+    ("node", "together"),
+    [
+        ("spindle_encoder", ()),
+        ("learning_controller", ()),
+        ("recorder", ()),
+        ("tool", ("spindle_encoder", "learning_controller", "tool")),
+    ],
+)
+def test_the_whole_state_machine_is_walked_and_the_cell_gives_its_bits(manager, domain, tmp_path, node, together):
+    """A node takes every transition before the run, stands still in its middle, and no bit of the run is changed."""
+    alone = scenario(spindle_encoder={"speed_factor": 0.1}, electrodynamic_actuator={"autostart": False})
+    cell = harness.with_recorder(alone, tmp_path / "bag", keep=True)
+    with waiting(manager, domain, cell, together) as (processes, begin):
+        processes.wait_for("active", node)
+        for transition, possible, then in WALK:
+            assert (manager.change(node, transition), manager.state(node)) == (possible, then)
+        begin()
+        processes.wait_for("progress")
+        assert manager.change(node, Transition.TRANSITION_DEACTIVATE)
+        if node != "spindle_encoder":
+            processes.wait_for("stall", member=f"/{node}")
+        assert (manager.change(node, Transition.TRANSITION_CLEANUP), manager.state(node)) == (False, "inactive")
+        assert manager.change(node, Transition.TRANSITION_ACTIVATE)
+        processes.wait_for_end()
+        said = [line for line in processes._log("+".join(together) or node) if f"[{node}]" in line]
+    found = [line.rpartition("]: ")[2] for line in said if " -> " in line]
+    assert found == [*LOGGED, "active -> inactive", "inactive -> active"]
+    assert reader.read(tmp_path / "bag").digests() == harness.run(alone).digest
+
+
+def test_who_waits_says_for_whom_and_for_which_topics(manager, domain, tmp_path):
+    """A node that waits names members that are missing, not active or shut down, and topics that nobody publishes."""
+    lonely = {"stage": "tool", "remap": ["coarse/state:=nobody/state"]}
+    nodes = scenario(electrodynamic_actuator={"autostart": False}, edge=lonely)
+    cell = harness.with_recorder(nodes, tmp_path / "bag", keep=True)
+    with waiting(manager, domain, cell) as (processes, begin):
+        assert f"/{LAST}" in processes.wait_for("waits", "spindle_encoder")["missing"]
+        begin()
+        missing = processes.wait_for("waits", "edge")["missing"]
+        while missing != ["/nobody/state, which no member publishes"]:
+            missing = processes.wait_for("waits", "edge")["missing"]
+        assert manager.change("tool", Transition.TRANSITION_DEACTIVATE)
+        while processes.wait_for("waits", "tool")["missing"] != ["its own activation"]:
+            pass
+        assert manager.change("tool", Transition.TRANSITION_INACTIVE_SHUTDOWN)
+        assert processes.wait_for("exit", "tool")["code"] == 0
+        while "/tool to join" not in processes.wait_for("waits")["missing"]:
+            pass
+        said = processes._log("edge")
+    assert any("waits for /nobody/state, which no member publishes" in line for line in said)
+
+
+def test_who_is_shut_down_in_the_middle_of_a_run_makes_the_cell_safe(manager, domain, tmp_path):
+    endless = scenario(spindle_encoder={"revolutions": 500.0, "speed_factor": 1.0})
+    cell = harness.with_recorder(endless, tmp_path / "bag", keep=True)
+    with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
+        processes.wait_for("cycle")
+        assert manager.change("tool", Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        with pytest.raises(LatheError, match=r"tool was shut down in the middle of a run: safe state from sample"):
+            processes.wait_for_end()
