@@ -46,11 +46,19 @@ class Manager:
 
     def _ask(self, service, kind, request):
         if service not in self._clients:
-            self._clients[service] = self._ghost.create_client(kind, service)
-            assert self._clients[service].wait_for_service(60.0)
-        future = self._clients[service].call_async(request)
-        rclpy.spin_until_future_complete(self._ghost, future, timeout_sec=60.0)
-        assert future.done(), f"{service} does not answer"
+            client = self._clients[service] = self._ghost.create_client(kind, service)
+            assert client.wait_for_service(60.0)
+            # A node that has not discovered yet who asks cannot answer: ask until it does what changes nothing.
+            nothing = GetState.Request() if kind is GetState else ChangeState.Request(transition=Transition(id=255))
+            while self._answer(client, nothing, 0.5) is None:
+                pass
+        answer = self._answer(self._clients[service], request, 8.0)
+        assert answer is not None, f"{service} does not answer"
+        return answer
+
+    def _answer(self, client, request, seconds):
+        future = client.call_async(request)
+        rclpy.spin_until_future_complete(self._ghost, future, timeout_sec=seconds)
         return future.result()
 
     def change(self, node, transition):
