@@ -3,6 +3,7 @@
 
 import contextlib
 import math
+import re
 import subprocess
 import sys
 from collections import deque
@@ -14,10 +15,19 @@ from cells import scenario
 
 pytest.importorskip("rclpy")
 
+from lathe_rc_msgs.msg import Member
+
 from lathe_rc import harness
 from lathe_rc.analysis.metrology import form_errors
 from lathe_rc.bag import reader
+from lathe_rc.cell import messages
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
+from lathe_rc.cell.wiring import Unknown
+from lathe_rc.errors import InputError
+from lathe_rc.nodes.exchange import Exchange
+from lathe_rc.nodes.report import Reporter
+from lathe_rc.nodes.stage_node import StageNode
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PROGRAMS = {"learning_controller": "controller.py", "electrodynamic_actuator": "drive.py", "listener": "listener.py"}
@@ -35,7 +45,7 @@ SAID = {
 
 
 @contextlib.contextmanager
-def cell(domain, bag, foreign, **nodes):
+def cell(domain, bag, foreign, together=(), **nodes):
     """The processes of the smallest whole cell, some of whose members are programs of examples/, and these."""
     whole = harness.with_recorder(scenario(**nodes), bag, keep=True)
     master = whole.nodes["spindle_encoder"]
@@ -43,7 +53,8 @@ def cell(domain, bag, foreign, **nodes):
     ours = {name: table for name, table in whole.nodes.items() if name not in foreign}
     ours["spindle_encoder"] = master.model_copy(update={"members": members})
     with contextlib.ExitStack() as stack:
-        processes = stack.enter_context(harness.Processes(Scenario("test", ours), [[n] for n in ours], domain=domain))
+        groups = Scenario("test", ours).processes([together])
+        processes = stack.enter_context(harness.Processes(Scenario("test", ours), groups, domain=domain))
         theirs = {}
         for name in foreign:
             command = [sys.executable, EXAMPLES / PROGRAMS[name], "--ros-args", "-p", "run_id:=test"]
@@ -62,7 +73,11 @@ def controlled(recording):
 
     zeros = np.zeros(DELAY)
     past, late = points(np.concatenate([zeros, encoder["angle"]])), np.concatenate([zeros, error])
-    ahead, memory, command = points(encoder["angle"] + 1.425e-3 * encoder["speed"]), np.zeros(1000), np.empty(error.size)
+    ahead, memory, command = (
+        points(encoder["angle"] + 1.425e-3 * encoder["speed"]),
+        np.zeros(1000),
+        np.empty(error.size),
+    )
     for n in range(error.size):
         if n and past[n] != past[n - 1]:
             memory[past[n]] += 0.3 * late[n]
@@ -83,7 +98,12 @@ def driven(recording):
 
 @pytest.mark.parametrize(
     "foreign",
-    [["listener"], ["learning_controller"], ["electrodynamic_actuator"], ["learning_controller", "electrodynamic_actuator"]],
+    [
+        ["listener"],
+        ["learning_controller"],
+        ["electrodynamic_actuator"],
+        ["learning_controller", "electrodynamic_actuator"],
+    ],
     ids="+".join,
 )
 def test_nodes_in_plain_rclpy_take_part_in_a_cell(domain, tmp_path, foreign):
@@ -109,3 +129,50 @@ def test_nodes_in_plain_rclpy_take_part_in_a_cell(domain, tmp_path, foreign):
         for error in errors.tolist():
             squares += error * error
         assert said["listener"] == f"{errors.size} samples, form error {math.sqrt(squares / errors.size)} m RMS\n"
+
+
+KNOWN = ElectrodynamicActuatorParameters(damping=0.5)
+DRIVE = "electrodynamic_actuator"
+
+
+@pytest.mark.parametrize(
+    ("stage", "parameters", "why"),
+    [
+        (DRIVE, KNOWN.model_dump_json(), None),
+        (DRIVE, KNOWN.model_dump_json(exclude={"damping"}), "its parameters do not say damping"),
+        (DRIVE, "{}", "its parameters do not say sample_rate and [0-9]+ others"),
+        ("my_drive", KNOWN.model_dump_json(), "there is no such stage here"),
+        ("", "{}", "there is no such stage here"),
+        ("nobody.has:Drive", "{}", "stage 'nobody.has:Drive' cannot be imported: ModuleNotFoundError: .*"),
+        ("os:getpid", "{}", "stage 'os:getpid' is .*; allowed: a class that derives from .*"),
+    ],
+)
+def test_a_member_is_known_if_its_stage_and_all_its_parameters_are(ghost, capfd, stage, parameters, why):
+    """Of others the topics count; why nobody knows them is said once."""
+    node = StageNode("tool", "tool", Reporter(), Exchange())
+    topics = {"publishes": ["/coarse/state", "/drive/events"], "types": [messages.STATE, messages.EVENT]}
+    member = Member(name="/drive", stage=stage, parameters=parameters, sparse=[False, True], **topics)
+    member.subscribes = ["/coarse/command"]
+    node.members = {"/drive": member}
+    for _ in range(2):
+        unknown = Unknown(
+            {"coarse/state": messages.STATE}, {"drive/events": messages.EVENT}, frozenset({"coarse/command"})
+        )
+        known = {"drive": KNOWN.model_copy(update={"stage": DRIVE})}
+        assert (node.tables(["/drive"]), node.unknown(["/drive"])) == (
+            (known, {}) if why is None else ({}, {"drive": unknown})
+        )
+    said = "".join(capfd.readouterr())
+    found = re.findall(rf"/drive, stage '{stage}', is known by its topics alone: (.*)$", said, re.MULTILINE)
+    assert len(found) == (why is not None)
+    assert all(re.fullmatch(why, text) for text in found)
+    node.destroy_node()
+
+
+def test_a_parameter_that_cannot_be_is_refused_with_the_name_of_its_member(ghost):
+    node = StageNode("tool", "tool", Reporter(), Exchange())
+    wrong = KNOWN.model_copy(update={"damping": -1.0}).model_dump_json()
+    node.members = {"/drive": Member(name="/drive", stage=DRIVE, parameters=wrong)}
+    with pytest.raises(InputError, match=r"^/drive.damping = -1.0; allowed: a finite number above 0"):
+        node.tables(["/drive"])
+    node.destroy_node()

@@ -108,7 +108,7 @@ def test_the_whole_state_machine_is_walked_and_the_cell_gives_its_bits(manager, 
         begin()
         processes.wait_for("progress")
         assert manager.change(node, Transition.TRANSITION_DEACTIVATE)
-        if node != "spindle_encoder":
+        if node != "spindle_encoder" and not together:
             processes.wait_for("stall", member=f"/{node}")
         assert (manager.change(node, Transition.TRANSITION_CLEANUP), manager.state(node)) == (False, "inactive")
         assert manager.change(node, Transition.TRANSITION_ACTIVATE)
