@@ -45,7 +45,7 @@ SAID = {
 
 
 @contextlib.contextmanager
-def cell(domain, bag, foreign, together=(), **nodes):
+def cell(domain, bag, foreign, together, **nodes):
     """The processes of the smallest whole cell, some of whose members are programs of examples/, and these."""
     whole = harness.with_recorder(scenario(**nodes), bag, keep=True)
     master = whole.nodes["spindle_encoder"]
@@ -96,19 +96,22 @@ def driven(recording):
     return position
 
 
+BOTH = ["learning_controller", "electrodynamic_actuator"]
+
+
 @pytest.mark.parametrize(
-    "foreign",
+    ("foreign", "together"),
     [
-        ["listener"],
-        ["learning_controller"],
-        ["electrodynamic_actuator"],
-        ["learning_controller", "electrodynamic_actuator"],
+        (["listener"], ["spindle_encoder", *BOTH, "tool", "recorder"]),
+        (["learning_controller"], ["spindle_encoder", "electrodynamic_actuator", "tool"]),
+        (["electrodynamic_actuator"], ["tool", "recorder"]),
+        (BOTH, ["spindle_encoder", "tool"]),
     ],
-    ids="+".join,
 )
-def test_nodes_in_plain_rclpy_take_part_in_a_cell(domain, tmp_path, foreign):
+def test_nodes_in_plain_rclpy_take_part_in_a_cell(domain, tmp_path, foreign, together):
     """The programs of examples/, alone and together, take part for 1000 blocks, and do what their law says."""
-    with cell(domain, tmp_path / "bag", foreign, spindle_encoder={"revolutions": 17.0}) as (processes, theirs):
+    long = {"revolutions": 17.0}
+    with cell(domain, tmp_path / "bag", foreign, together, spindle_encoder=long) as (processes, theirs):
         told = processes.wait_for_end()
         assert told["complete"]["blocks"] >= 1000
         said = {name: process.communicate()[0] for name, process in theirs.items()}

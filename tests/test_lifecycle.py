@@ -9,12 +9,17 @@ from cells import scenario
 pytest.importorskip("rclpy")
 
 import rclpy
+from lathe_rc_msgs.msg import CellState, Member
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.lifecycle import TransitionCallbackReturn
 
 from lathe_rc import harness
 from lathe_rc.bag import reader
+from lathe_rc.cell import messages
 from lathe_rc.errors import LatheError
+from lathe_rc.nodes.exchange import Exchange
+from lathe_rc.nodes.stage_node import StageNode
 
 WALK = [  # transition, whether it is possible, and where the node is then
     (Transition.TRANSITION_ACTIVATE, False, "active"),
@@ -52,7 +57,7 @@ class Manager:
             nothing = GetState.Request() if kind is GetState else ChangeState.Request(transition=Transition(id=255))
             while self._answer(client, nothing, 0.5) is None:
                 pass
-        answer = self._answer(self._clients[service], request, 8.0)
+        answer = self._answer(self._clients[service], request, 60.0)
         assert answer is not None, f"{service} does not answer"
         return answer
 
@@ -119,26 +124,66 @@ def test_the_whole_state_machine_is_walked_and_the_cell_gives_its_bits(manager, 
     assert reader.read(tmp_path / "bag").digests() == harness.run(alone).digest
 
 
-def test_who_waits_says_for_whom_and_for_which_topics(manager, domain, tmp_path):
-    """A node that waits names members that are missing, not active or shut down, and topics that nobody publishes."""
-    lonely = {"stage": "tool", "remap": ["coarse/state:=nobody/state"]}
-    nodes = scenario(electrodynamic_actuator={"autostart": False}, edge=lonely)
+def test_who_is_shut_down_before_the_run_leaves_and_the_others_say_for_whom_they_wait(manager, domain, tmp_path):
+    nodes = scenario(electrodynamic_actuator={"autostart": False})
     cell = harness.with_recorder(nodes, tmp_path / "bag", keep=True)
-    with waiting(manager, domain, cell) as (processes, begin):
+    with waiting(manager, domain, cell) as (processes, _):
         assert f"/{LAST}" in processes.wait_for("waits", "spindle_encoder")["missing"]
-        begin()
-        missing = processes.wait_for("waits", "edge")["missing"]
-        while missing != ["/nobody/state, which no member publishes"]:
-            missing = processes.wait_for("waits", "edge")["missing"]
-        assert manager.change("tool", Transition.TRANSITION_DEACTIVATE)
-        while processes.wait_for("waits", "tool")["missing"] != ["its own activation"]:
-            pass
-        assert manager.change("tool", Transition.TRANSITION_INACTIVE_SHUTDOWN)
+        assert manager.change("tool", Transition.TRANSITION_ACTIVE_SHUTDOWN)
         assert processes.wait_for("exit", "tool")["code"] == 0
-        while "/tool to join" not in processes.wait_for("waits")["missing"]:
-            pass
-        said = processes._log("edge")
-    assert any("waits for /nobody/state, which no member publishes" in line for line in said)
+        assert any(f"waits for /{LAST}" in line for line in processes._log("spindle_encoder"))
+
+
+@pytest.fixture
+def tool(ghost):
+    """A tool that has been activated in this process, and what it reports."""
+    told = []
+    node = StageNode("tool", "tool", lambda event, _, **values: told.append((event, values)), Exchange())
+    assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    yield node, told
+    node.destroy_node()
+
+
+def joins(node, name, state=Member.WIRED, **said):
+    """Let a member announce itself."""
+    node._on_member(Member(name=name, state=state, parameters="{}", **said))
+
+
+def test_who_waits_names_each_member_and_topic_that_is_missing(tool):
+    node, _ = tool
+    topics = ["/coarse/state", "/encoder"]
+    assert sorted(node.missing()) == ["a publisher of /coarse/state", "a publisher of /encoder", "a time master"]
+    joins(node, "/spindle", stage="spindle_encoder", members=["/spindle", "/drive", "/recorder", "/tool"])
+    assert node.missing() == ["/drive", "/recorder"]
+    joins(node, "/drive", Member.JOINING)
+    joins(node, "/recorder", Member.JOINING)
+    assert node.missing() == ["/drive to join", "/recorder to join"]
+    joins(node, "/drive", Member.READY, publishes=topics[:1], types=[messages.STATE], sparse=[False])
+    joins(node, "/recorder", subscribes=["/tool"])
+    joins(node, "/tool")
+    missing = ["/coarse/state from /drive", "/encoder, which no member publishes", "/tool to /recorder"]
+    assert sorted(node.missing()) == missing
+    node._ready = True
+    assert node.missing() == ["/spindle to be ready", "/recorder to be ready"]
+    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+    assert node.missing() == ["its own activation"]
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    node._on_cell_state(CellState(state=CellState.RUNNING))
+    assert node.missing() == []
+
+
+def test_what_is_missing_is_told_now_and_then_until_it_is_there(tool):
+    node, told = tool
+    begun = node._tell_due - 2.0
+    times = []
+    for second in range(101):
+        before = len(told)
+        node.tick(begun + second)
+        times += [second] * (len(told) - before)
+    assert times == [2, 10, 40, 70, 100]
+    node._cell, node._ready = CellState.RUNNING, True
+    node.tick(begun + 131.0)
+    assert [event for event, _ in told].count("waits") == 5
 
 
 def test_who_is_shut_down_in_the_middle_of_a_run_makes_the_cell_safe(manager, domain, tmp_path):
