@@ -6,7 +6,7 @@ few numbers and the samples. So for each length of block one message is encoded 
 numbers are found by changing them, and from then on only those places are written or read. Whatever
 does not match the layout is decoded by rosbags and learned anew: CDR itself is nowhere written by hand. CDR leaves open
 what stands in the padding, in which byte order, and how the encapsulation is padded, and whoever publishes may name a
-frame: such a block is encoded anew by rosbags, some 50 µs, and read like ours.
+frame: such a block is encoded anew by rosbags, 10 to 50 µs, and read like ours.
 """
 
 import struct
