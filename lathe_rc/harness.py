@@ -62,7 +62,7 @@ _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag c
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
 _MOST_RESTARTS = 8  # of a process
 _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
-_NO_SIGN_OF_LIFE = {"stall", "stranger", "stopped", "continued"}  # events that come while nothing goes on
+_NO_SIGN_OF_LIFE = {"stall", "stranger", "stopped", "continued", "waits"}  # events that come while nothing goes on
 _LOOK = 0.05  # [s] between looks at what a process has written
 
 
@@ -266,13 +266,13 @@ def run(
     if mode != "offline" and start == "fork":
         starting.server()  # it imports while the cell is checked
     cell = Cell(scenario.nodes)
-    unchecked = cell.check()
-    for what in unchecked:
+    cell.check()
+    for what in cell.unchecked:
         watch({"event": "unchecked", "node": cell.master.name, "message": what})
     if bag is not None:
         refuse_existing(bag)
     result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace), start)
-    result = replace(result, unchecked=unchecked)
+    result = replace(result, unchecked=cell.unchecked)
     if result.bag is not None:
         write_digests(result.bag, result.digest)
     return result

@@ -17,6 +17,8 @@ from typing import Any, NoReturn, cast
 
 import numpy as np
 import rclpy
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
@@ -114,6 +116,13 @@ def _work(nodes: Sequence[CellNode], stop: _Stop, until: float) -> None:
             return
 
 
+def _spin(executor: Executor, wait: float) -> None:
+    """Let the executor wait for the next event, up to so many seconds, and handle it."""
+    # EventsExecutor hands over events of what a node has destroyed since, when it was cleaned up.
+    with contextlib.suppress(InvalidHandle):
+        executor.spin_once(timeout_sec=wait)
+
+
 def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
     executor = EventsExecutor()
     for node in nodes:
@@ -134,13 +143,13 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
                     return
         due = _due(nodes, now)
         wait = 0.0 if any(node.due for node in nodes) else due - now
-        executor.spin_once(timeout_sec=min(max(wait, 0.0), _LONGEST_WAIT))
+        _spin(executor, min(max(wait, 0.0), _LONGEST_WAIT))
         # Take what else has arrived before computing: a burst in makes a burst out, and neighbours wake up once
         # for all of it. Waking them is the dearest part of a hop.
         # A flood must not keep anybody from signals and from its neighbours.
         handled, end = -1, time.monotonic() + _LONGEST_BURST
         while handled < (handled := sum(node.handled for node in nodes)) and not stop.signal:
-            executor.spin_once(timeout_sec=0.0)
+            _spin(executor, 0.0)
             if time.monotonic() >= end:
                 break
         _work(nodes, stop, due)
