@@ -45,7 +45,7 @@ def node(name: str, arguments: tuple[str, ...]) -> None:
     _, _, kind = name.partition(":")
     kind = kind or name
     if kind not in TABLES:
-        raise InputError(f"no node {kind!r}; allowed: {TABLES.allowed()}")
+        raise InputError(f"no node {kind!r}; {TABLES.instead(kind)}")
     if "--help" in arguments or "-h" in arguments:
         click.echo(f"usage: lathe node {name} [--ros-args -p PARAM:=VALUE --params-file FILE -r OLD:=NEW ...]\n")
         Console().print(_parameters(kind))

@@ -13,6 +13,7 @@ from rich.progress import Progress
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Row, Value
 from lathe_rc.errors import InputError
+from lathe_rc.names import instead
 from lathe_rc.studies import STUDIES
 from lathe_rc.studies.study import Result, Study, StudyParameters
 
@@ -42,7 +43,7 @@ def read(study: Study[Any], overrides: Sequence[str]) -> StudyParameters:
     for override in overrides:
         name, equals, text = override.partition("=")
         if not equals:
-            raise InputError(f"--set {override!r}; allowed: PARAM=VALUE with PARAM one of {', '.join(rows)}")
+            raise InputError(f"--set {override!r}; allowed: PARAM=VALUE; lathe study {study.name} --help lists PARAM")
         name = name.strip()
         values[name] = _value(rows[name], text) if name in rows else text
     table: StudyParameters = study.parameters.read(study.name, values)
@@ -123,7 +124,7 @@ class _Studies(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """See `click.Group`."""
         if args[0] not in self.commands and not args[0].startswith("-") and not ctx.resilient_parsing:
-            raise InputError(f"no study {args[0]!r}; allowed: {', '.join(self.commands)}")
+            raise InputError(f"no study {args[0]!r}; {instead(args[0], self.commands)}")
         return super().resolve_command(ctx, args)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from lathe_rc.cell.parameters import ObedientParameters, RestartParameters, parameter
+from lathe_rc.cell.parameters import ObedientParameters, RestartParameters, about, parameter
 from lathe_rc.cell.stages.retraction import BoundedParameters
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.control.correction import Correction, CorrectionLaw
@@ -108,8 +108,8 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters, Bound
         """Grid points in a cycle."""
         return self.points_per_revolution * self.cycle_revolutions
 
-    def make_q(self) -> QFilter:
-        """The Q filter.
+    def make_q(self, node: str) -> QFilter:
+        """The Q filter of a node.
 
         Raises:
             InputError: it is wider than the memory can hold, or its bands are out of order.
@@ -117,22 +117,25 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters, Bound
         per_point = self.points_per_revolution / (2 * np.pi)  # grid points per radian
         if self.q_filter == "fir":
             edge = 1.0 / (self.nominal_speed * per_point)
-            return LowPass(self.q_pass * edge, self.q_stop * edge, self.q_ripple, self.cycle_points)
-        return _Q_FILTERS[self.q_filter](self.q_time * self.nominal_speed * per_point, self.cycle_points)
+            with about(node, "q_pass", "q_stop", "q_ripple"):
+                return LowPass(self.q_pass * edge, self.q_stop * edge, self.q_ripple, self.cycle_points)
+        with about(node, "q_time"):
+            return _Q_FILTERS[self.q_filter](self.q_time * self.nominal_speed * per_point, self.cycle_points)
 
-    def make_correction(self) -> Correction:
-        """The correction with its given model.
+    def make_correction(self, node: str) -> Correction:
+        """The correction of a node with its given model.
 
         Raises:
             InputError: a lead-lag term without a lag.
         """
-        return Correction(
-            _CORRECTIONS[self.correction],
-            self.model_natural_frequency,
-            self.model_damping,
-            self.lead_lag_lead,
-            self.lead_lag_lag,
-        )
+        with about(node, "lead_lag_lag"):
+            return Correction(
+                _CORRECTIONS[self.correction],
+                self.model_natural_frequency,
+                self.model_damping,
+                self.lead_lag_lead,
+                self.lead_lag_lag,
+            )
 
     @property
     def preview_time(self) -> float:
@@ -144,8 +147,8 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters, Bound
         """Lead angle that does not depend on the speed [rad]: of Wk2, which has constant parameters in the angle."""
         return (self.lead_time - self.preview_time) * self.nominal_speed
 
-    def make_preview(self) -> Preview:
-        """The lead law.
+    def make_preview(self, node: str) -> Preview:
+        """The lead law of a node.
 
         Raises:
             InputError: the deviations do not fit together.
@@ -153,7 +156,7 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters, Bound
         return Preview(
             _LEAD_LAWS[self.lead_law],
             self.preview_time,
-            self.speed_law(),
+            self.speed_law(node),
             self.step,
             self.acceleration_window,
             self.constant_lead,

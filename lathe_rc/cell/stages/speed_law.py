@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.signals import speed
 
 
@@ -28,24 +28,26 @@ class SpeedLawParameters(NodeParameters):
     random_high: Annotated[float, Gt(0)] = parameter(60.0, "upper end of its band", "rad/s")
     random_lines: Annotated[int, Ge(1), Le(1024)] = parameter(16, "spectral lines that it is made of")
 
-    def speed_law(self) -> speed.SpeedLaw:
-        """The sum of all deviations.
+    def speed_law(self, node: str) -> speed.SpeedLaw:
+        """The sum of all deviations, for a node.
 
         Raises:
-            InputError: lists of different lengths, or a tachogram out of order.
+            InputError: lists of different lengths, a tachogram or a band out of order.
         """
         nominal = self.nominal_speed
         phase = self.deviation_phase or [0.0] * len(self.deviation_amplitude)
-        return (
-            speed.harmonic(
+        with about(node, "deviation_amplitude", "deviation_frequency", "deviation_phase"):
+            harmonic = speed.harmonic(
                 nominal,
                 np.array(self.deviation_amplitude),
                 np.array(self.deviation_frequency),
                 np.array(phase),
                 self.deviation_start,
             )
-            + speed.tachogram(nominal, np.array(self.tachogram_time), np.array(self.tachogram_deviation))
-            + speed.band_limited_random(
+        with about(node, "tachogram_time", "tachogram_deviation"):
+            tachogram = speed.tachogram(nominal, np.array(self.tachogram_time), np.array(self.tachogram_deviation))
+        with about(node, "random_low", "random_high"):
+            random = speed.band_limited_random(
                 nominal, self.random_rms, self.random_low, self.random_high, self.random_lines, self.seed
             )
-        )
+        return harmonic + tachogram + random
