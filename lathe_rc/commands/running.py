@@ -65,6 +65,8 @@ def run(
     for option, value in (("--domain", domain), ("--namespace", namespace), ("--start", start)):
         if value is not None and mode == "offline":
             raise InputError(f"{option} {value} with --mode offline; allowed: --mode processes or composed")
+    if profile and (profile.is_dir() or not profile.absolute().parent.is_dir()):
+        raise InputError(f"--profile {profile}: {'a folder' if profile.is_dir() else 'no such folder'}; name a file")
     result = _shown(
         loaded,
         mode=mode,
