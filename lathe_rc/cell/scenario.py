@@ -128,8 +128,9 @@ class Scenario:
             InputError: a node that there is not, or one that is named twice.
         """
         if groups is None:
-            named = [text for table in self.nodes.values() for text in getattr(table, "processes", [])]
-            groups = [text.split("+") for text in named]
+            named = [(node, text) for node, table in self.nodes.items() for text in getattr(table, "processes", [])]
+            what = f"{named[0][0]}.processes" if named else what
+            groups = [text.split("+") for _, text in named]
         split = [[name.strip() for name in group] for group in groups]
         seen: set[str] = set()
         for name in (name for group in split for name in group):
