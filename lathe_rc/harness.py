@@ -35,7 +35,7 @@ from lathe_rc.bag.record import OfflineRecorder, begin, begin_snapshots, recorde
 from lathe_rc.bag.writer import refuse_existing
 from lathe_rc.cell import messages
 from lathe_rc.cell.ahead import compile_ahead
-from lathe_rc.cell.collect import Collector, Finite
+from lathe_rc.cell.collect import Collector, Finite, check_room
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.recording import Recording
@@ -248,7 +248,8 @@ def run(
             their own.
 
     Raises:
-        InputError: the scenario cannot work, or the bag's folder exists.
+        InputError: the scenario cannot work, the run does not fit into memory, or the bag's folder exists or has no
+            folder to be made in.
         LatheError: a node failed or was killed; the bag, if one was asked for, is readable.
         LossyRunError: a free-running cell lost blocks.
 
@@ -267,6 +268,7 @@ def run(
         starting.server()  # it imports while the cell is checked
     cell = Cell(scenario.nodes)
     cell.check()
+    check_room(cell)
     for what in cell.unchecked:
         watch({"event": "unchecked", "node": cell.master.name, "message": what})
     if bag is not None:

@@ -102,7 +102,7 @@ def test_renamed_topic_changes_nothing_else():
 
 @pytest.mark.parametrize("rule", ["encoder", "encoder:=", ":=shaft", "encoder=shaft"])
 def test_malformed_remapping_is_refused(rule):
-    assert refusal(tool={"remap": [rule]}) == f"remap = {rule!r}; allowed: old:=new"
+    assert refusal(tool={"remap": [rule]}) == f"tool.remap = {rule!r}; allowed: old:=new"
 
 
 def test_second_spindle_is_refused():

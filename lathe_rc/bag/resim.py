@@ -38,6 +38,7 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+from lathe_rc.names import instead
 from lathe_rc.part import ErrorsByRevolution
 
 
@@ -124,7 +125,7 @@ def with_controller(scenario: Scenario, file: Path) -> Scenario:
         if name == "/**":
             continue
         if name not in nodes:
-            raise InputError(f"{file}: no node {name!r} in the bag's scenario; allowed: {', '.join(nodes)}")
+            raise InputError(f"{file}: no node {name!r} in the bag's scenario; {instead(name, nodes)}")
         own = {key: value for key, value in values.items() if key not in SharedParameters.model_fields}
         stage = own.get("stage") or nodes[name].stage
         kind = kind_of(name, stage)
@@ -184,7 +185,7 @@ def resimulate(
         recorded = Recorded(source, topics or {})
         original = None if scenario is not None else _of_bag(recorded, source, Path(folder))
         if scenario is not None:
-            chosen = scenarios.load(resources.find(scenario), overrides)
+            chosen = scenarios.load(resources.scenario(scenario), overrides)
         else:
             assert original is not None, "it is the other source of a scenario"
             _refuse_overrides(original, overrides)

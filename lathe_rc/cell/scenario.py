@@ -16,6 +16,7 @@ from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.errors import InputError, shown
+from lathe_rc.names import instead
 
 
 class _Tables(Mapping[str, type[NodeParameters]]):
@@ -29,6 +30,10 @@ class _Tables(Mapping[str, type[NodeParameters]]):
     def allowed(self) -> str:
         """The kinds, in words."""
         return f"{', '.join(self)}, or PACKAGE.MODULE:CLASS"
+
+    def instead(self, kind: str) -> str:
+        """The kinds that look like one that there is not, or all of them, in words."""
+        return f"{instead(kind, self)} (others: PACKAGE.MODULE:CLASS)"
 
     def __iter__(self) -> Iterator[str]:
         yield from STAGES
@@ -59,7 +64,7 @@ def kind_of(node: str, stage: object) -> str:
     """
     kind = str(stage or node)
     if kind not in TABLES:
-        raise InputError(f"{node}: no stage {kind!r}; allowed: {TABLES.allowed()} (set {node}.stage)")
+        raise InputError(f"{node}: no stage {shown(kind)!r}; {TABLES.instead(kind)}; set {node}.stage")
     return kind
 
 
@@ -133,13 +138,14 @@ class Scenario:
             InputError: a node that there is not, or one that is named twice.
         """
         if groups is None:
-            named = [text for table in self.nodes.values() for text in getattr(table, "processes", [])]
-            groups = [text.split("+") for text in named]
+            named = [(node, text) for node, table in self.nodes.items() for text in getattr(table, "processes", [])]
+            what = f"{named[0][0]}.processes" if named else what
+            groups = [text.split("+") for _, text in named]
         split = [[name.strip() for name in group] for group in groups]
         seen: set[str] = set()
         for name in (name for group in split for name in group):
             if name not in self.nodes:
-                raise InputError(f"{what}: no node {name!r} in the scenario; allowed: {', '.join(self.nodes)}")
+                raise InputError(f"{what}: no node {shown(name)!r} in the scenario; {instead(name, self.nodes)}")
             if name in seen:
                 raise InputError(f"{what}: {name} is named twice; allowed: each node in one process")
             seen.add(name)
@@ -170,7 +176,7 @@ class Scenario:
         """
         changes: dict[str, dict[str, Value]] = {}
         for target, value in values.items():
-            node, name = _target(target, self.nodes, target)
+            node, name = _target(target, {node: self.kind(node) for node in self.nodes}, target)
             for each in [node] if node != _EVERYONE else self.nodes:
                 changes.setdefault(each, {})[name] = _absolute(self.kind(each), name, value, Path())
         tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
@@ -191,8 +197,13 @@ class Scenario:
         return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=None)
 
 
-def _target(text: str, nodes: Iterable[str], what: str) -> tuple[str, str]:
-    """Node and parameter of ``NODE.PARAM`` or, for a shared parameter, ``PARAM``; ``what`` is said in messages.
+def _target(text: str, kinds: Mapping[str, str], what: str) -> tuple[str, str]:
+    """Node and parameter of ``NODE.PARAM`` or, for a shared parameter, ``PARAM``.
+
+    Args:
+        text: that names them.
+        kinds: of the nodes, by name.
+        what: is said in messages.
 
     Raises:
         InputError: there is no such node, or the parameter is not shared.
@@ -200,12 +211,13 @@ def _target(text: str, nodes: Iterable[str], what: str) -> tuple[str, str]:
     node, dot, name = text.strip().partition(".")
     if not dot:
         if node not in SharedParameters.model_fields:
-            shared = ", ".join(SharedParameters.model_fields)
-            raise InputError(f"{what}: {node!r} is not shared; allowed: {shared}, or NODE.PARAM=VALUE")
+            owners = [owner for owner, kind in kinds.items() if node in TABLES[kind].model_fields]
+            known = f"did you mean {' or '.join(f'{owner}.{node}' for owner in owners[:3])}?" if owners else ""
+            known = known or f"not NODE.PARAM=VALUE either; {instead(node, SharedParameters.model_fields)}"
+            raise InputError(f"{what}: {node!r} is not shared; {known}")
         return _EVERYONE, node
-    if node not in nodes or node == _EVERYONE:
-        present = ", ".join(name for name in nodes if name != _EVERYONE)
-        raise InputError(f"{what}: no node {node!r} in the scenario; allowed: {present}")
+    if node not in kinds:
+        raise InputError(f"{what}: no node {node!r} in the scenario; {instead(node, kinds)}")
     return node, name
 
 
@@ -214,14 +226,15 @@ def _override(text: str, nodes: dict[str, dict[str, Value]]) -> None:
     target, equals, value = text.partition("=")
     if not equals:
         raise InputError(f"--set {text!r}; allowed: NODE.PARAM=VALUE, or PARAM=VALUE for a shared parameter")
-    node, name = _target(target, nodes, f"--set {text!r}")
+    kinds = {name: kind_of(name, own.get("stage")) for name, own in nodes.items() if name != _EVERYONE}
+    node, name = _target(target, kinds, f"--set {text!r}")
     parsed = ros_yaml.parse_value(value, f"--set {shown(target)}")
     if node == _EVERYONE:
         for values in nodes.values():
             values.pop(name, None)
         nodes.setdefault(node, {})[name] = parsed
     else:
-        nodes[node][name] = _absolute(kind_of(node, nodes[node].get("stage")), name, parsed, Path())
+        nodes[node][name] = _absolute(kinds[node], name, parsed, Path())
 
 
 def _absolute(kind: str, name: str, value: Value, folder: Path) -> Value:
@@ -316,6 +329,7 @@ def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
     for name, values in nodes.items():
         for key in SharedParameters.model_fields:
             if key in values and key in shared and values[key] != shared[key]:
-                raise InputError(f"{name}.{key} = {values[key]}: {_EVERYONE} says {shared[key]}; keep one")
+                given = f"{name}.{key} = {values[key]}"
+                raise InputError(f"{given}: {_EVERYONE} says {shared[key]}; keep one ({key}=... sets all nodes)")
         tables[name] = TABLES[kind_of(name, values.get("stage"))].read(name, {**shared, **values})
     return _agreed(path.stem, tables, {name: _fingerprint(table) for name, table in tables.items()})

@@ -310,15 +310,19 @@ class Cell:
         if largest is None:
             self.unchecked.append(f"{stage.name}: {stage.kind} tells no longest feedback_delay")
         elif delay > largest:
+            least = stage.shared.block_size
+            allowed = f"allowed: {least} up to {largest}"
+            if largest < least:
+                allowed = f"not even a block of {least}; give more cycle_revolutions, less lead_time, or turn slower"
             raise InputError(
-                f"{stage.name}.feedback_delay = {delay} samples: at {speed:.4g} rad/s the cycle leaves {largest}; "
-                f"allowed: {stage.shared.block_size} up to {largest}"
+                f"{stage.name}.feedback_delay = {delay} samples: at {speed:.4g} rad/s the cycle leaves "
+                f"{max(largest, 0)}; {allowed}"
             )
 
     def _check_preview(self, stage: LearningController) -> None:
         if stage.parameters.lead_law != "exact_preview":
             return
-        told, true = stage.parameters.speed_law(), self.master.law
+        told, true = stage.parameters.speed_law(stage.name), self.master.law
         if not (np.array_equal(told.lines, true.lines) and np.array_equal(told.tachogram, true.tachogram)):
             raise InputError(
                 f"{stage.name}.lead_law = exact_preview, but it does not know the speed of {self.master.name}; give "

@@ -17,7 +17,6 @@ from lathe_rc.bag.check import check as check_bag
 from lathe_rc.bag.recover import recover as recover_bag
 from lathe_rc.bag.source import Source
 from lathe_rc.cell import messages
-from lathe_rc.errors import InputError, LatheError
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 _BAG = click.argument("path", metavar="BAG", type=click.Path(path_type=Path))
@@ -61,6 +60,7 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
             "span_s": span,
             "topics": topics,
             "about": dict(source.about),
+            "contradictions": source.contradictions,
         }
     told["error_um"] = _metrics(path, types) if metrics else None
     if as_json:
@@ -74,6 +74,8 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
         rate = f"{said['rate_hz']:.4g}" if said["rate_hz"] else ""
         table.add_row(Text(topic), Text(said["type"].rpartition("/")[2]), str(said["messages"]), rate)
     console.print(table)
+    for what in told["contradictions"]:
+        click.echo(what, err=True)
     console.print(f"span: {span:.6g} s from {told['start_s']:.6g} s on")
     if told["error_um"]:
         first, last = told["error_um"]["first"], told["error_um"]["last"]
@@ -100,13 +102,11 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
 @_JSON
 @click.pass_context
 def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
-    """Verify sequence, gaps, numbers, checksums and recorded digests; exit code 0: clean, 3: lossy, 1: wrong."""
-    if not path.exists():
-        raise InputError(f"{path}: no such bag")
-    try:
-        found = check_bag(path)
-    except InputError as error:
-        raise LatheError(str(error)) from None
+    """Verify sequence, gaps, numbers, checksums and recorded digests.
+
+    Exit code 0: clean, 3: lossy, 1: wrong, 2: no bag, or one that cannot be read.
+    """
+    found = check_bag(path)
     told = {
         "bag": str(path),
         "clean": not found.exit_code,

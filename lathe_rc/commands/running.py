@@ -68,6 +68,8 @@ def run(
             raise InputError(f"{option} {value} with --mode offline; allowed: --mode processes or composed")
     if figure:
         picture.check_place(figure)
+    if profile and (profile.is_dir() or not profile.absolute().parent.is_dir()):
+        raise InputError(f"--profile {profile}: {'a folder' if profile.is_dir() else 'no such folder'}; name a file")
     result = _shown(
         loaded,
         mode=mode,

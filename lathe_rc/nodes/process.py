@@ -50,7 +50,7 @@ _LONGEST_WAIT = 0.1  # [s] until signals and the harness are looked at again
 
 def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellNode:
     if kind not in TABLES:
-        raise InputError(f"{name}: no stage {kind!r}; allowed: {TABLES.allowed()}")
+        raise InputError(f"{name}: no stage {kind!r}; {TABLES.instead(kind)}")
     classes: dict[str, type[CellNode]] = {RECORDER: RecorderNode, SpindleEncoder.kind: SpindleNode}
     try:
         return classes.get(kind, StageNode)(name, kind, reporter, exchange)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, cast
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stages.learner import LearnerParameters
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.control.correction import Correction, CorrectionLaw
@@ -102,8 +102,8 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         """Grid points in a cycle."""
         return self.points_per_revolution * self.cycle_revolutions
 
-    def make_q(self) -> QFilter:
-        """The Q filter.
+    def make_q(self, node: str) -> QFilter:
+        """The Q filter of a node.
 
         Raises:
             InputError: it is wider than the memory can hold, its bands are out of order, or one of others is none.
@@ -111,29 +111,32 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         per_point = self.points_per_revolution / (2 * np.pi)  # grid points per radian
         if self.q_filter == "fir":
             edge = 1.0 / (self.nominal_speed * per_point)
-            return LowPass(self.q_pass * edge, self.q_stop * edge, self.q_ripple, self.cycle_points)
+            with about(node, "q_pass", "q_stop", "q_ripple"):
+                return LowPass(self.q_pass * edge, self.q_stop * edge, self.q_ripple, self.cycle_points)
         make = cast("Callable[[float, int], QFilter]", Q_FILTERS[self.q_filter])
         width = self.q_time * self.nominal_speed * per_point
         if self.q_filter in Q_FILTERS.own:
-            return make(width, self.cycle_points)
-        with code_of_others(f"q_filter = {self.q_filter!r}"):
+            with about(node, "q_time"):
+                return make(width, self.cycle_points)
+        with about(node, "q_filter"), code_of_others(repr(self.q_filter)):
             made = make(width, self.cycle_points)
             check(made)
             return made
 
-    def make_correction(self) -> Correction:
-        """The correction with its given model.
+    def make_correction(self, node: str) -> Correction:
+        """The correction of a node with its given model.
 
         Raises:
             InputError: a lead-lag term without a lag.
         """
-        return Correction(
-            _CORRECTIONS[self.correction],
-            self.model_natural_frequency,
-            self.model_damping,
-            self.lead_lag_lead,
-            self.lead_lag_lag,
-        )
+        with about(node, "lead_lag_lag"):
+            return Correction(
+                _CORRECTIONS[self.correction],
+                self.model_natural_frequency,
+                self.model_damping,
+                self.lead_lag_lead,
+                self.lead_lag_lag,
+            )
 
     @property
     def preview_time(self) -> float:
@@ -145,8 +148,8 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         """Lead angle that does not depend on the speed [rad]: of Wk2, which has constant parameters in the angle."""
         return (self.lead_time - self.preview_time) * self.nominal_speed
 
-    def make_preview(self) -> Preview:
-        """The lead law.
+    def make_preview(self, node: str) -> Preview:
+        """The lead law of a node.
 
         Raises:
             InputError: the deviations do not fit together.
@@ -154,7 +157,7 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         return Preview(
             _LEAD_LAWS[self.lead_law],
             self.preview_time,
-            self.speed_law(),
+            self.speed_law(node),
             self.step,
             self.acceleration_window,
             self.constant_lead,

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.signals import speed
@@ -43,39 +43,40 @@ class SpeedLawParameters(NodeParameters):
         60.0, "end of its tachogram, not before the end of the run; an endless one goes on with the last deviation", "s"
     )
 
-    def speed_law(self) -> speed.SpeedLaw:
-        """The sum of all deviations.
+    def speed_law(self, node: str) -> speed.SpeedLaw:
+        """The sum of all deviations, for a node.
 
         Raises:
-            InputError: lists of different lengths, a tachogram out of order, or a law of others that is none.
+            InputError: lists of different lengths, a tachogram or a band out of order, or a law of others that is none.
         """
         nominal = self.nominal_speed
         phase = self.deviation_phase or [0.0] * len(self.deviation_amplitude)
-        return (
-            speed.harmonic(
+        with about(node, "deviation_amplitude", "deviation_frequency", "deviation_phase"):
+            harmonic = speed.harmonic(
                 nominal,
                 np.array(self.deviation_amplitude),
                 np.array(self.deviation_frequency),
                 np.array(phase),
                 self.deviation_start,
             )
-            + self._tachogram()
-            + speed.band_limited_random(
+        with about(node, "random_low", "random_high"):
+            random = speed.band_limited_random(
                 nominal, self.random_rms, self.random_low, self.random_high, self.random_lines, self.seed
             )
-        )
+        return harmonic + self._tachogram(node) + random
 
-    def _tachogram(self) -> speed.SpeedLaw:
+    def _tachogram(self, node: str) -> speed.SpeedLaw:
         if not self.deviation_law:
-            return speed.tachogram(
-                self.nominal_speed, np.array(self.tachogram_time), np.array(self.tachogram_deviation)
-            )
+            with about(node, "tachogram_time", "tachogram_deviation"):
+                return speed.tachogram(
+                    self.nominal_speed, np.array(self.tachogram_time), np.array(self.tachogram_deviation)
+                )
         if self.tachogram_time:
             raise InputError(
-                f"deviation_law = {self.deviation_law!r} beside tachogram_time; allowed: one of them, since a law of "
-                "others becomes the tachogram"
+                f"{node}.deviation_law = {self.deviation_law!r} beside tachogram_time; allowed: one of them, since a "
+                "law of others becomes the tachogram"
             )
-        with code_of_others(f"deviation_law = {self.deviation_law!r}"):
+        with about(node, "deviation_law"), code_of_others(repr(self.deviation_law)):
             make: Callable[..., DeviationLaw] = SPEED_LAWS[self.deviation_law]
             return tabulated(
                 self.nominal_speed, make(*self.deviation_values), self.deviation_law_step, self.deviation_law_end

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spindle and encoder: where time, angle and the run itself begin and end."""
 
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -8,7 +9,7 @@ from annotated_types import Ge, Le
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.native import Step
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached, Stage, Trigger
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.errors import InputError
@@ -71,13 +72,11 @@ class SpindleEncoder(Stage):
     def __init__(self, name: str, parameters: SpindleEncoderParameters) -> None:
         super().__init__(name, parameters)
         self.parameters = parameters
-        with self.named():
-            self.law = parameters.speed_law()
-        self.samples = (
-            self.law.samples_until(2 * np.pi * parameters.revolutions, parameters.step)
-            if parameters.revolutions
-            else None
-        )
+        self.law = parameters.speed_law(name)
+        self.samples: int | None = None
+        if parameters.revolutions:
+            with about(name, f"revolutions = {parameters.revolutions:g}"):
+                self.samples = self.law.samples_until(2 * np.pi * parameters.revolutions, parameters.step)
         self._check_end()
         self._triggers = [self._by_sample(trigger) for trigger in self._triggers]
         self._encoder = Encoder(self.law, parameters.step, parameters.counts_per_revolution, parameters.speed_window)
@@ -96,8 +95,9 @@ class SpindleEncoder(Stage):
         """The same trigger; who makes the angle knows when it comes."""
         if trigger.kind != "revolution":
             return trigger
-        sample = self.law.samples_until(2.0 * np.pi * trigger.value, self.parameters.step)
-        return Trigger("sample", float(sample), trigger.action)
+        with about(self.name, f"{trigger.parameter} = {trigger.text!r}"):
+            sample = self.law.samples_until(2.0 * np.pi * trigger.value, self.parameters.step)
+        return replace(trigger, kind="sample", value=float(sample))
 
     def speed_range(self) -> tuple[float, float]:
         """Lowest and highest spindle speed in the run [rad/s]."""
