@@ -26,7 +26,7 @@ from lathe_rc.bag.snapshot import first_sample
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.stream import feed
 from lathe_rc.bag.writer import refuse_existing
-from lathe_rc.cell import messages, ros_yaml
+from lathe_rc.cell import messages, models, ros_yaml
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.collect import Finite
 from lathe_rc.cell.engine import Engine, Sink
@@ -127,7 +127,7 @@ def with_controller(scenario: Scenario, file: Path) -> Scenario:
         stage = own.get("stage") or nodes[name].stage
         kind = kind_of(name, stage)
         nodes[name] = TABLES[kind].read(name, {**shared, "remap": nodes[name].remap, **own, "stage": stage})
-    return Scenario(scenario.name, nodes)
+    return Scenario(scenario.name, models.resolved(nodes))
 
 
 def _refuse_part(source: Source) -> None:

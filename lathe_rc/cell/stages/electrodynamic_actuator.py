@@ -36,6 +36,11 @@ class ElectrodynamicActuatorParameters(LimitedParameters, RetractionParameters):
     noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
     resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
 
+    def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
+        """See `NodeParameters`."""
+        known = {"natural_frequency": self.natural_frequency, "damping": self.damping, "delay": self.delay}
+        return {"coarse/command": known}
+
 
 class Memory(NamedTuple):
     """What the step works on."""
