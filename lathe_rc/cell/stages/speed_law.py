@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The spindle's speed law as parameters: of the spindle that follows it, and of whoever knows it in advance."""
 
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
+from lathe_rc import resources
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.signals import speed
+from lathe_rc.errors import InputError
+from lathe_rc.signals import speed, tachogram
 
 
 class SpeedLawParameters(NodeParameters):
@@ -23,6 +26,9 @@ class SpeedLawParameters(NodeParameters):
     tachogram_deviation: list[float] = parameter(
         [], "deviation there relative to the nominal speed, held before the first and after the last", "1"
     )
+    tachogram_file: str = parameter(
+        "", "CSV file with time_s,rpm instead of both: the speed itself, the other deviations add to it", path=True
+    )
     random_rms: Annotated[float, Ge(0)] = parameter(0.0, "random deviation: RMS relative to the nominal speed", "1")
     random_low: Annotated[float, Gt(0)] = parameter(1.0, "lower end of its band", "rad/s")
     random_high: Annotated[float, Gt(0)] = parameter(60.0, "upper end of its band", "rad/s")
@@ -32,7 +38,7 @@ class SpeedLawParameters(NodeParameters):
         """The sum of all deviations.
 
         Raises:
-            InputError: lists of different lengths, or a tachogram out of order.
+            InputError: lists of different lengths, a tachogram out of order, twice, or in a file that cannot be used.
         """
         nominal = self.nominal_speed
         phase = self.deviation_phase or [0.0] * len(self.deviation_amplitude)
@@ -44,8 +50,21 @@ class SpeedLawParameters(NodeParameters):
                 np.array(phase),
                 self.deviation_start,
             )
-            + speed.tachogram(nominal, np.array(self.tachogram_time), np.array(self.tachogram_deviation))
+            + self._tachogram()
             + speed.band_limited_random(
                 nominal, self.random_rms, self.random_low, self.random_high, self.random_lines, self.seed
             )
         )
+
+    def _tachogram(self) -> speed.SpeedLaw:
+        if not self.tachogram_file:
+            return speed.tachogram(
+                self.nominal_speed, np.array(self.tachogram_time), np.array(self.tachogram_deviation)
+            )
+        if self.tachogram_time or self.tachogram_deviation:
+            raise InputError(
+                f"tachogram_file = {self.tachogram_file} beside tachogram_time and tachogram_deviation; allowed: the "
+                "file or both lists"
+            )
+        time, rpm = tachogram.read(resources.find(Path(self.tachogram_file)))
+        return speed.tachogram(self.nominal_speed, time, rpm / self.nominal_rpm - 1.0)
