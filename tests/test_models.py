@@ -61,7 +61,8 @@ def test_values_that_are_varied_move_the_model_as_in_the_file():
     assert model(varied)["natural_frequency"] == 900.0
     assert varied == load(CONFIG / "piston.yaml", sets("electrodynamic_actuator")[:1])
     assert varied.varied({"electrodynamic_actuator.natural_frequency": 1038.0}) == piston
-    assert model(piston.varied({"learning_controller.model_natural_frequency": 1038.0}).varied(changed)) == model(piston)
+    kept = piston.varied({"learning_controller.model_natural_frequency": 1038.0})
+    assert model(kept.varied(changed)) == model(piston)
 
 
 def test_the_written_file_holds_the_numbers(tmp_path):

@@ -35,7 +35,6 @@ from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.part import ErrorsByRevolution
@@ -254,7 +253,7 @@ _HAPPENED = (
 
 
 def _refuse_overrides(original: Scenario, overrides: Sequence[str]) -> None:
-    spindle = original.of_kind(SpindleEncoder.kind)[0]
+    spindle = original.masters[0]
     for text in overrides:
         name = text.partition("=")[0].strip()
         if name.endswith((".events", ".faults")):

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a controller takes for its drive: given once, with the drive, unless the model shall be another.
 
-A parameter that `lathe_rc.cell.parameters.parameter` marks with a quantity of the drive, and that nobody has given, gets
-the value of the drive that reads what the controller commands. Quantities with the same word before a dot belong
+A parameter that `lathe_rc.cell.parameters.parameter` marks with a quantity of the drive, and that nobody has given,
+gets the value of the drive that reads what the controller commands. Quantities with the same word before a dot belong
 together: who gives one of them gives all.
 """
 
 from collections.abc import Iterator, Mapping
 from functools import cache
+from typing import cast
 
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.errors import InputError
@@ -55,7 +56,7 @@ def _model(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters
                 )
             of.setdefault(name, drive)
     rows = type(table).rows()
-    return {name: values.get(name, rows[name].default) for name in missing}
+    return {name: values.get(name, cast("Quantity", rows[name].default)) for name in missing}
 
 
 def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:

@@ -14,7 +14,7 @@ from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Value
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
-from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.errors import InputError, shown
 
 
@@ -111,6 +111,11 @@ class Scenario:
     def of_kind(self, kind: str) -> list[str]:
         """Names of the nodes of a kind."""
         return [name for name in self.nodes if self.kind(name) == kind]
+
+    @property
+    def masters(self) -> list[str]:
+        """Names of the nodes that give the cell its time: one, in a cell that can work."""
+        return [name for name in self.nodes if self.kind(name) in MASTERS]
 
     def processes(self, groups: Iterable[Iterable[str]] | None = None, what: str = "processes") -> list[list[str]]:
         """Names of the nodes in each process.

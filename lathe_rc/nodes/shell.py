@@ -22,7 +22,7 @@ from std_msgs.msg import Empty
 from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.stages import MASTERS
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.nodes import declare
 from lathe_rc.nodes.exchange import Exchange
@@ -410,8 +410,8 @@ class CellNode(LifecycleNode):
         why = ""
         if self.table.run_id and member.run_id != self.table.run_id:
             why = f"expected run {self.table.run_id!r}"
-        elif member.members and member.stage != SpindleEncoder.kind:
-            why = f"a time master is a {SpindleEncoder.kind}"
+        elif member.members and member.stage not in MASTERS:
+            why = f"a time master is a {' or '.join(MASTERS)}"
         elif member.members and self.master is not None and member.name != self.master.name:
             why = f"the time master is {self.master.name}"
         elif not len(member.publishes) == len(member.types) == len(member.sparse):

@@ -103,9 +103,7 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters, Bound
         1038.0, "drive model: ωn", "rad/s", drive="natural_frequency"
     )
     model_damping: Annotated[float, Gt(0)] = parameter(0.804, "drive model: ζ", drive="damping")
-    model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(
-        0.36e-3, "drive model: delay", "s", drive="delay"
-    )
+    model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s", drive="delay")
 
     @property
     def commanded_topic(self) -> str:
