@@ -14,7 +14,7 @@ from lathe_rc import __version__
 from lathe_rc.errors import LatheError, shown
 
 COMMANDS = {
-    "bag": "Ask bags what is in them; check and recover them.",
+    "bag": "Ask bags what is in them; check and recover them; take a tachogram out.",
     "bench": "Measure how fast lathe_rc is here.",
     "container": "Run several nodes in one process.",
     "demo": "Turn a piston with ROS 2 processes and draw it.",

@@ -72,14 +72,14 @@ def check_room(cell: Cell) -> None:
         InputError: says what they take, what there is, and how long a run may be.
     """
     fields = [messages.sample_fields(source.type).values() for source in cell.dense.values()]
-    needed = cell.samples * sum(np.dtype(kind).itemsize for kinds in fields for kind in kinds)
+    needed = cell.expected_samples * sum(np.dtype(kind).itemsize for kinds in fields for kind in kinds)
     free, master = _free_memory(), cell.master
     if needed > free:
         turns = master.parameters.revolutions
         most = turns * free / needed
         most_said = f"{most:,.0f}" if most > 10.0 else f"{most:.2g}"
         raise InputError(
-            f"{master.name}.revolutions = {turns:g}: {cell.samples:.4g} samples of all signals take "
+            f"{master.name}.revolutions = {turns:g}: {cell.expected_samples:.4g} samples of all signals take "
             f"{needed / 2**30:,.1f} GiB of memory, {free / 2**30:,.1f} GiB are free; allowed: up to "
             f"{most_said} here (nodes that lathe node or launch starts keep no signals)"
         )

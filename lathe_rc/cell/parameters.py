@@ -26,12 +26,16 @@ T = TypeVar("T", bound="Table")
 _NAMES = {bool: "true or false", int: "an integer", float: "a finite number", str: "a text"}
 
 
-def parameter(default: Any, doc: str, unit: str = "1", *, path: bool = False) -> Any:
+def parameter(default: Any, doc: str, unit: str = "1", *, path: bool = False, drive: str = "") -> Any:
     """A field of a table, with its unit; ``path`` marks a file, taken relative to the scenario's folder.
+
+    ``drive`` marks what a controller takes for a quantity of the drive that it commands, by the name of the quantity in
+    `NodeParameters.drive_models`: where a scenario does not give it, it is the drive's (`lathe_rc.cell.models`).
 
     Ranges stand in the annotation, e.g. ``Annotated[float, Gt(0)]``.
     """
-    return Field(default=default, description=doc, json_schema_extra={"unit": unit, "path": path})
+    doc = f"{doc}; not given in a scenario: that of the drive" if drive else doc
+    return Field(default=default, description=doc, json_schema_extra={"unit": unit, "path": path, "drive": drive})
 
 
 class Row:
@@ -45,13 +49,14 @@ class Row:
         named: what else may be named, classes of other packages; None: nothing.
         low, high: range of a number, ends allowed or not as ``limits`` says; infinite where there is none.
         limits: the range in words, empty where there is none.
+        drive: quantity of the commanded drive that it stands for, see `parameter`; empty: none.
     """
 
     def __init__(self, name: str, info: FieldInfo) -> None:
         extra = cast("dict[str, Any]", info.json_schema_extra)
         self.name, self.doc = name, info.description or ""
         self.default: Value = info.get_default(call_default_factory=True)
-        self.unit, self.is_path = str(extra["unit"]), bool(extra["path"])
+        self.unit, self.is_path, self.drive = str(extra["unit"]), bool(extra["path"]), str(extra["drive"])
         annotation: Any = info.annotation
         metadata = list(info.metadata)
         self.is_list = get_origin(annotation) is list
@@ -223,6 +228,15 @@ class NodeParameters(SharedParameters):
         for rule in self.remap:
             if not all(rule.partition(":=")):
                 raise InputError(f"remap = {rule!r}; allowed: old:=new")
+
+    @property
+    def commanded_topic(self) -> str:
+        """Topic, before remapping, on which it commands the drive that its model is of; empty: it has no model."""
+        return ""
+
+    def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
+        """Of a drive: what controllers may know of it, by command topic before remapping and by quantity."""
+        return {}
 
 
 class ObedientParameters(NodeParameters):

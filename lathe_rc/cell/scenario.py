@@ -10,11 +10,11 @@ from pathlib import Path
 import yaml
 
 from lathe_rc import files
-from lathe_rc.cell import ros_yaml
+from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Value
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
-from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.errors import InputError, shown
 from lathe_rc.names import instead
 
@@ -127,6 +127,11 @@ class Scenario:
         """Names of the nodes of a kind."""
         return [name for name in self.nodes if self.kind(name) == kind]
 
+    @property
+    def masters(self) -> list[str]:
+        """Names of the nodes that give the cell its time: one, in a cell that can work."""
+        return [name for name in self.nodes if self.kind(name) in MASTERS]
+
     def processes(self, groups: Iterable[Iterable[str]] | None = None, what: str = "processes") -> list[list[str]]:
         """Names of the nodes in each process.
 
@@ -182,8 +187,10 @@ class Scenario:
         tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
         given = "run_id" in values or self.shared.run_id != _identity(fingerprints)
         for node, changed in changes.items():
-            tables[node] = TABLES[self.kind(node)].read(node, {**self.nodes[node].model_dump(), **changed})
-            fingerprints[node] = _fingerprint(tables[node])
+            before = self.nodes[node].model_dump(exclude_unset=True)
+            tables[node] = TABLES[self.kind(node)].read(node, {**before, **changed})
+        tables = models.resolved(tables)
+        fingerprints |= {node: _fingerprint(table) for node, table in tables.items() if table is not self.nodes[node]}
         if not given:
             tables = {node: table.model_copy(update={"run_id": ""}) for node, table in tables.items()}
         return _agreed(self.name, tables, fingerprints)
@@ -289,12 +296,14 @@ def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mappi
     return Scenario(name, named, fingerprints)
 
 
-def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
+def load(path: Path, overrides: Iterable[str] = (), *, complete: bool = False) -> Scenario:
     """Read a scenario.
 
     Args:
         path: ROS 2 parameter file.
         overrides: ``NODE.PARAM=VALUE``, or ``PARAM=VALUE`` for shared parameters, applied in order.
+        complete: what the file leaves out has its default, as in those of `Scenario.to_yaml`; otherwise models of
+            drives that are not given are those of the drives, see `lathe_rc.cell.models`.
 
     Raises:
         InputError: one line for the first thing that is wrong.
@@ -332,4 +341,5 @@ def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
                 given = f"{name}.{key} = {values[key]}"
                 raise InputError(f"{given}: {_EVERYONE} says {shared[key]}; keep one ({key}=... sets all nodes)")
         tables[name] = TABLES[kind_of(name, values.get("stage"))].read(name, {**shared, **values})
+    tables = tables if complete else models.resolved(tables)
     return _agreed(path.stem, tables, {name: _fingerprint(table) for name, table in tables.items()})

@@ -121,6 +121,7 @@ class Stage(ABC):
         inputs, outputs: the ports; the arrays handed to `advance` stand in their order.
         sparse_topics: relative name and type of every topic that carries `Sparse` messages.
         unheard: those of them that nobody reads; their messages need not be made.
+        foreign: type of each topic that its node hears from outside the cell, by name before remapping.
         tells: events come about by themselves that only `process` knows of.
         own_inputs: number of inputs that `process` gets; one more may tell the spindle angle to the events.
         step: compiled, or in Python; None: the stage has its own `process`.
@@ -149,6 +150,7 @@ class Stage(ABC):
         self.shared = parameters
         self.sparse_topics: dict[str, str] = {}
         self.unheard: Collection[str] = ()
+        self.foreign: dict[str, str] = {}
         self._triggers = [self._trigger("events", text) for text in parameters.events]
         self._triggers += [trigger for text in parameters.faults for trigger in self._break_down(text)]
         self._injection: Injection | None = None

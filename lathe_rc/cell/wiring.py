@@ -12,13 +12,13 @@ from lathe_rc.analysis.learning import Response
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stage import Input, Stage
-from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.profile import ProfileStage
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.supervisor import Supervisor
+from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError
 from lathe_rc.safety.state_machine import Reaction
@@ -129,15 +129,15 @@ class Cell:
         self.unchecked.append(f"the parameters of {name} are not known here: {question}")
 
     @property
-    def master(self) -> SpindleEncoder:
+    def master(self) -> TimeMaster:
         """The time master.
 
         Raises:
             InputError: there is none, or more than one.
         """
-        found = [stage for stage in self.stages.values() if isinstance(stage, SpindleEncoder)]
+        found = [stage for stage in self.stages.values() if isinstance(stage, TimeMaster)]
         if len(found) != 1:
-            raise InputError(f"{len(found)} spindle_encoder nodes in the scenario; allowed: 1")
+            raise InputError(f"{len(found)} time masters in the scenario; allowed: 1, a {' or '.join(MASTERS)}")
         return found[0]
 
     @property
@@ -145,11 +145,27 @@ class Cell:
         """Length of a run.
 
         Raises:
+            InputError: it has no end, or nobody knows it before, or there is no time master.
+        """
+        expected = self.expected_samples
+        if self.master.samples is None:
+            raise InputError(
+                f"{self.master.name} follows a device, which a node hears; allowed: --mode composed or processes, or a "
+                "file of its counts"
+            )
+        return expected
+
+    @property
+    def expected_samples(self) -> int:
+        """Length of a run, as far as it can be known before.
+
+        Raises:
             InputError: it has no end, or there is no time master.
         """
-        if self.master.samples is None:
+        expected = self.master.expected_samples
+        if expected is None:
             raise InputError(f"{self.master.name}.revolutions = 0; this run needs an end: allowed above 0")
-        return self.master.samples
+        return expected
 
     def readers(self, topic: str) -> list[Stage]:
         """Stages that read a relative topic."""
@@ -304,7 +320,7 @@ class Cell:
     def _check_delay(self, stage: Learner, speed: float) -> None:
         encoder = self.master.parameters
         count = 2 * math.pi / encoder.counts_per_revolution if encoder.counts_per_revolution else 0.0
-        acceleration = self.master.law.largest_acceleration()
+        acceleration = self.master.largest_acceleration()
         largest = stage.largest_delay(speed, acceleration, count, encoder.speed_window * encoder.step)
         delay = stage.parameters.feedback_delay
         if largest is None:
@@ -323,6 +339,11 @@ class Cell:
         if stage.parameters.lead_law != "exact_preview":
             return
         told, true = stage.parameters.speed_law(stage.name), self.master.law
+        if true is None:
+            raise InputError(
+                f"{stage.name}.lead_law = exact_preview, but nobody knows the speed of {self.master.name} in advance; "
+                "allowed: another lead law"
+            )
         if not (np.array_equal(told.lines, true.lines) and np.array_equal(told.tachogram, true.tachogram)):
             raise InputError(
                 f"{stage.name}.lead_law = exact_preview, but it does not know the speed of {self.master.name}; give "
@@ -336,7 +357,7 @@ class Cell:
         source = self._publisher(topic, f"whether {self.dense[topic].node} can follow the profile of {tool.name}")
         if owner is None or owner.form is None or not isinstance(source, Drive):
             return
-        acceleration = self.master.law.largest_acceleration()
+        acceleration = self.master.largest_acceleration()
         demand = owner.form.profile.demand(speed, acceleration, owner.parameters.feed)
         for of, limits in source.limits().items():
             if remapped(source.shared, of) != topic:

@@ -29,9 +29,11 @@ from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stage import compile_kernels
 from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.stages.encoder_device import EncoderDevice
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import arguments, dds, declare
+from lathe_rc.nodes.encoder_node import EncoderNode
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.recorder_node import RecorderNode
 from lathe_rc.nodes.report import THROUGHPUT, Reporter
@@ -51,7 +53,11 @@ _LONGEST_WAIT = 0.1  # [s] until signals and the harness are looked at again
 def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellNode:
     if kind not in TABLES:
         raise InputError(f"{name}: no stage {kind!r}; {TABLES.instead(kind)}")
-    classes: dict[str, type[CellNode]] = {RECORDER: RecorderNode, SpindleEncoder.kind: SpindleNode}
+    classes: dict[str, type[CellNode]] = {
+        RECORDER: RecorderNode,
+        SpindleEncoder.kind: SpindleNode,
+        EncoderDevice.kind: EncoderNode,
+    }
     try:
         return classes.get(kind, StageNode)(name, kind, reporter, exchange)
     except RuntimeError as error:

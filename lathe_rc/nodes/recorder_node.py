@@ -22,7 +22,7 @@ from lathe_rc.bag.writer import FLUSH_PERIOD, Output, offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wire import Block, Decoder, Encoder
 from lathe_rc.errors import LatheError, LossyRunError
 from lathe_rc.nodes.exchange import Run
@@ -143,7 +143,7 @@ class RecorderNode(CellNode):
             if self._merger is not None and self.members[name].pid != pid:
                 self._processes[name] = self.members[name].pid
                 self._merger.restarted(name)
-        alone = any(member.stage == SpindleEncoder.kind and not member.members for member in self.members.values())
+        alone = any(member.stage in MASTERS and not member.members for member in self.members.values())
         if not alone and (self._queues or not self.complete):
             return
         before = len(self._queues) + len(self._sparse)

@@ -25,7 +25,7 @@ from lathe_rc.bag.source import Source
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.replayer import KIND, ReplayerParameters
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.names import instead
@@ -186,7 +186,7 @@ class Replayer:
                     name=f"/{name}",
                     stage=stage.kind,
                     state=Member.READY,
-                    members=everybody if isinstance(stage, SpindleEncoder) else [],
+                    members=everybody if isinstance(stage, TimeMaster) else [],
                     publishes=[f"/{topic}" for topic in (*dense, *sparse)],
                     types=[*dense.values(), *sparse.values()],
                     sparse=[*(False for _ in dense), *(True for _ in sparse)],

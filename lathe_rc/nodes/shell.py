@@ -25,7 +25,7 @@ from lathe_rc.bag.record import signal_depth
 from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wiring import Unknown
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.nodes import declare
@@ -552,8 +552,8 @@ class CellNode(LifecycleNode):
         why = ""
         if self.table.run_id and member.run_id != self.table.run_id:
             why = f"expected run {self.table.run_id!r}"
-        elif member.members and member.stage != SpindleEncoder.kind:
-            why = f"a time master is a {SpindleEncoder.kind}"
+        elif member.members and member.stage not in MASTERS:
+            why = f"a time master is a {' or '.join(MASTERS)}"
         elif member.members and self.master is not None and member.name != self.master.name:
             why = f"the time master is {self.master.name}"
         elif not len(member.publishes) == len(member.types) == len(member.sparse):
@@ -685,7 +685,7 @@ class CellNode(LifecycleNode):
             return ["its own activation"]
         if self.master is None:
             lonely = [topic for topic, inlet in self.inlets.items() if not inlet.get_publisher_count()]
-            alone = any(member.stage == SpindleEncoder.kind for member in self.members.values())
+            alone = any(member.stage in MASTERS for member in self.members.values())
             master = [] if alone or not lonely else ["a time master"]
             return [*master, *(f"a publisher of {topic}" for topic in lonely)]
         others = [name for name in self.master.members if name != self.full_name]

@@ -25,8 +25,12 @@ class DecouplerParameters(NodeParameters):
         [], "force over the longitudinal command [N], falling powers of p; empty: that of the preset"
     )
     w1_denominator: list[float] = parameter([], "its denominator; empty: that of the preset")
-    w2_numerator: list[float] = parameter([], "position over the cross command [m]; empty: that of the preset")
-    w2_denominator: list[float] = parameter([], "its denominator; empty: that of the preset")
+    w2_numerator: list[float] = parameter(
+        [], "position over the cross command [m]; empty: that of the preset", drive="transfer.numerator"
+    )
+    w2_denominator: list[float] = parameter(
+        [], "its denominator; empty: that of the preset", drive="transfer.denominator"
+    )
     w3_numerator: list[float] = parameter([], "deflection over force [m/N]; empty: that of the preset")
     w3_denominator: list[float] = parameter([], "its denominator; empty: that of the preset")
     w4_numerator: list[float] = parameter([], "force over position [N/m]; empty: that of the preset")
@@ -35,6 +39,11 @@ class DecouplerParameters(NodeParameters):
     k2: bool = parameter(default=True, doc="takes the effect of the longitudinal command off the position")
     inverse_lag: Annotated[float, Gt(0)] = parameter(LAG, "lag for each order that an inverse is missing", "s")
     leak: Annotated[float, Ge(0)] = parameter(LEAK, "of the integrators in K1 and K2; 0: none", "rad/s")
+
+    @property
+    def commanded_topic(self) -> str:
+        """See `NodeParameters`; W1, W3 and W4 are of the cutting process as well, and no drive's alone."""
+        return "cross/command"
 
     def channels(self, node: str) -> Channels:
         """The model of the plant.

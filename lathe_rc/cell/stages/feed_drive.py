@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feed drive of a slide: cross or longitudinal."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -93,6 +93,16 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
         if self.model == "sampled":
             return feed.sampled(self.sampled_gain, self.sampled_lag)
         return feed.dc_screw(self.velocity_gain, self.lags or [0.045], self.zero)
+
+    def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
+        """See `NodeParameters`."""
+        known: dict[str, float | list[float]] = {}
+        if self.model == "sampled":
+            known |= {"gain": self.sampled_gain, "lag": self.sampled_lag}
+        whole = self.transfer()
+        for part in ("numerator", "denominator"):
+            known[f"transfer.{part}"] = np.trim_zeros(np.array(getattr(whole, part), float), "f").tolist()
+        return {f"{self.axis}/command": known}
 
 
 class Memory(NamedTuple):

@@ -93,9 +93,16 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
     identification_forgetting: Annotated[float, Ge(0), Lt(1)] = parameter(
         0.5, "weight that a cycle's measurements keep after the next"
     )
-    model_natural_frequency: Annotated[float, Gt(0)] = parameter(1038.0, "drive model: ωn", "rad/s")
-    model_damping: Annotated[float, Gt(0)] = parameter(0.804, "drive model: ζ")
-    model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s")
+    model_natural_frequency: Annotated[float, Gt(0)] = parameter(
+        1038.0, "drive model: ωn", "rad/s", drive="natural_frequency"
+    )
+    model_damping: Annotated[float, Gt(0)] = parameter(0.804, "drive model: ζ", drive="damping")
+    model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s", drive="delay")
+
+    @property
+    def commanded_topic(self) -> str:
+        """See `NodeParameters`."""
+        return "coarse/command"
 
     @property
     def cycle_points(self) -> int:

@@ -106,6 +106,11 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
             proportional,
         )
 
+    def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
+        """See `NodeParameters`; the amplifier's lag is left out."""
+        known = {"natural_frequency": self.natural_frequency, "damping": self.damping, "delay": 0.0}
+        return {"fine/command": known}
+
     def stack(self, node: str, prefix: str = "") -> Stack:
         """Amplifier and ceramics of a node, at rest; ``prefix`` begins the parameters where they are part of a table.
 

@@ -51,8 +51,8 @@ class PositionControllerParameters(ServoParameters):
     link: Literal["ripple_free", "paper"] = parameter(
         "ripple_free", "sampled_link: ripple_free, or the paper's, which rings between the samples"
     )
-    link_gain: Annotated[float, Gt(0)] = parameter(6.25, "sampled_link: K of the drive", "1/s")
-    link_lag: Annotated[float, Gt(0)] = parameter(0.08, "sampled_link: T1 of the drive", "s")
+    link_gain: Annotated[float, Gt(0)] = parameter(6.25, "sampled_link: K of the drive", "1/s", drive="gain")
+    link_lag: Annotated[float, Gt(0)] = parameter(0.08, "sampled_link: T1 of the drive", "s", drive="lag")
     link_knows_delay: bool = parameter(
         default=True, doc="sampled_link: the ripple-free link is made for the feedback delay"
     )
@@ -71,6 +71,11 @@ class PositionControllerParameters(ServoParameters):
         "s",
     )
     anti_windup: bool = parameter(default=True, doc="periodic_hyperstable: false: the published switch alone")
+
+    @property
+    def commanded_topic(self) -> str:
+        """See `NodeParameters`."""
+        return f"{self.axis}/command"
 
 
 _NO_PATH = PathTable(np.empty(0), np.empty(0), np.zeros(1, np.int64))

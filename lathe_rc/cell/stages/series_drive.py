@@ -59,6 +59,10 @@ class SeriesParameters(NodeParameters):
         """The table of the fine drive."""
         return self._half(_FINE, PiezoActuatorParameters)
 
+    def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
+        """See `NodeParameters`; each drive by itself, without what one does to the other."""
+        return {**self.coarse.drive_models(), **self.fine.drive_models()}
+
 
 def _prefixed(prefix: str, table: type[NodeParameters]) -> dict[str, Any]:
     fields = table.model_fields
