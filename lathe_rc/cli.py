@@ -11,10 +11,10 @@ from typing import Any, cast
 import click
 
 from lathe_rc import __version__
-from lathe_rc.errors import LatheError
+from lathe_rc.errors import LatheError, shown
 
 COMMANDS = {
-    "bag": "Ask bags what is in them; check and recover them.",
+    "bag": "Ask bags what is in them; check and recover them; take a tachogram out.",
     "bench": "Measure how fast lathe_rc is here.",
     "container": "Run several nodes in one process.",
     "demo": "Turn a piston with ROS 2 processes and draw it.",
@@ -60,6 +60,9 @@ class _Group(click.Group):
         except LatheError as error:
             click.echo(f"lathe: {error}", err=True)
             ctx.exit(error.exit_code)
+        except MemoryError as error:
+            click.echo(f"lathe: not enough memory ({shown(error)})", err=True)
+            ctx.exit(LatheError.exit_code)
 
 
 @click.group(

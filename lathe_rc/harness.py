@@ -21,7 +21,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -35,13 +35,13 @@ from lathe_rc.bag.record import OfflineRecorder, begin, begin_snapshots, recorde
 from lathe_rc.bag.writer import refuse_existing
 from lathe_rc.cell import messages
 from lathe_rc.cell.ahead import compile_ahead
-from lathe_rc.cell.collect import Collector, Finite
+from lathe_rc.cell.collect import Collector, Finite, check_room
+from lathe_rc.cell.durations import Lateness
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.extensions import search_path
@@ -62,7 +62,7 @@ _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag c
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
 _MOST_RESTARTS = 8  # of a process
 _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
-_NO_SIGN_OF_LIFE = {"stall", "stranger", "stopped", "continued"}  # events that come while nothing goes on
+_NO_SIGN_OF_LIFE = {"stall", "stranger", "stopped", "continued", "waits"}  # events that come while nothing goes on
 _LOOK = 0.05  # [s] between looks at what a process has written
 
 
@@ -81,6 +81,7 @@ class Result:
         refused: messages of strangers that the nodes refused, by sender.
         not_reached: events that the run was too short for, by node.
         unchecked: what the check before the start could not see, since laws or drives of others do not tell it.
+        lateness: of the blocks; None if there was no pace to keep, as offline or with a ``speed_factor`` of 0.
 
     Example:
         >>> from pathlib import Path
@@ -108,6 +109,7 @@ class Result:
     refused: Mapping[str, int] = field(default_factory=dict)
     not_reached: Mapping[str, Sequence[str]] = field(default_factory=dict)
     unchecked: Sequence[str] = ()
+    lateness: Lateness | None = None
 
     def __repr__(self) -> str:
         """What ran and what came of it, in a line."""
@@ -188,6 +190,7 @@ class Result:
             "revolutions": int(errors.rms.size),
             "blocks": self.blocks,
             "dropped": self.dropped,
+            "lateness_s": asdict(self.lateness) if self.lateness else None,
             "refused": dict(self.refused),
             "events": [
                 {"sample": found.sample, "time": found.sample * step, "topic": found.topic, "text": found.text}
@@ -248,7 +251,8 @@ def run(
             their own.
 
     Raises:
-        InputError: the scenario cannot work, or the bag's folder exists.
+        InputError: the scenario cannot work, the run does not fit into memory, or the bag's folder exists or has no
+            folder to be made in.
         LatheError: a node failed or was killed; the bag, if one was asked for, is readable.
         LossyRunError: a free-running cell lost blocks.
 
@@ -266,13 +270,14 @@ def run(
     if mode != "offline" and start == "fork":
         starting.server()  # it imports while the cell is checked
     cell = Cell(scenario.nodes)
-    unchecked = cell.check()
-    for what in unchecked:
+    cell.check()
+    check_room(cell)
+    for what in cell.unchecked:
         watch({"event": "unchecked", "node": cell.master.name, "message": what})
     if bag is not None:
         refuse_existing(bag)
     result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace), start)
-    result = replace(result, unchecked=unchecked)
+    result = replace(result, unchecked=cell.unchecked)
     if result.bag is not None:
         write_digests(result.bag, result.digest)
     return result
@@ -289,7 +294,8 @@ def _run(
     namespace: str,
     start: Start,
 ) -> Result:
-    watch({"event": "checked", "node": cell.master.name, "samples": cell.samples, "step": scenario.shared.step})
+    samples = cell.samples if mode == "offline" else cell.expected_samples
+    watch({"event": "checked", "node": cell.master.name, "samples": samples, "step": scenario.shared.step})
     for left in compile_ahead(cell.stages.values()):
         watch({"event": "compiling", "node": left[0], "nodes": left})
     if mode == "offline":
@@ -313,17 +319,28 @@ def _run(
             for path in ([kept] if kept else []) + _bags_in(folder):
                 recover.mend(path)
             raise
+        recording = reader.read(place)
         return Result(
             scenario=scenario,
             mode="grouped" if mode == "processes" and len(split) < len(complete.nodes) else mode,
-            samples=cell.samples,
+            samples=cell.master.samples or recording.of_type(messages.ENCODER)["angle"].size,
             wall_s=(events["complete"]["monotonic_ns"] - events["block0"]["monotonic_ns"]) * 1e-9,
             bag=kept,
             snapshots=tuple(_bags_in(folder)),
-            recording=reader.read(place),
+            recording=recording,
             refused=processes.refused,
             not_reached=processes.not_reached,
+            lateness=_lateness(events),
         )
+
+
+def _lateness(events: Mapping[str, Event]) -> Lateness | None:
+    """What the time master has told of its pace."""
+    if "pace" not in events:
+        return None
+    told = events["pace"]
+    within = {int(percent): seconds for percent, seconds in told["within"].items()}  # JSON has no other keys than texts
+    return Lateness(told["blocks"], told["late"], told["worst"], within, told["slipped"])
 
 
 def _whole(scenario: Scenario, bag: Path | None) -> Path | None:
@@ -392,7 +409,7 @@ def with_recorder(scenario: Scenario, bag: Path, *, keep: bool, snapshots: Path 
     elif snapshots is not None:
         changes |= {"mode": "both", "snapshots": str(snapshots.resolve())}
     nodes[name] = table.model_copy(update=changes)
-    for master in scenario.of_kind(SpindleEncoder.kind):
+    for master in scenario.masters:
         others = [node for node in nodes if node != master]
         nodes[master] = nodes[master].model_copy(update={"members": others})
     return Scenario(scenario.name, nodes)
@@ -584,14 +601,14 @@ class Processes:
 
     def _goes_on(self, name: str) -> bool:
         """Whether the cell does something about the end of a node or process: it waits, and goes to its safe state."""
-        masters = set(self._scenario.of_kind(SpindleEncoder.kind))
+        masters = set(self._scenario.masters)
         waits = all(self._scenario.nodes[master].window for master in masters)
         return waits and "block0" in self._newest and not self._complete and not masters & set(name.split("+"))
 
     @property
     def _waits(self) -> bool:
         """Whether the cell waits for who stands still, however long."""
-        masters = (self._scenario.nodes[name] for name in self._scenario.of_kind(SpindleEncoder.kind))
+        masters = (self._scenario.nodes[name] for name in self._scenario.masters)
         return all(getattr(master, "stall_reaction", "") == "wait" for master in masters)
 
     @property

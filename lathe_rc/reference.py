@@ -17,7 +17,7 @@ from lathe_rc.cell.rerun_bridge import KIND as RERUN_BRIDGE
 from lathe_rc.cell.rerun_bridge import RerunBridgeParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stage import Input, Stage
-from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.topic_recorder import KIND as TOPIC_RECORDER
 from lathe_rc.cell.topic_recorder import TopicRecorderParameters
 
@@ -55,7 +55,7 @@ class HostTopic:
 
 
 _ALL = tuple(TABLES.own)
-_SPINDLE = ("spindle_encoder",)
+_SPINDLE = MASTERS
 HOST_TOPICS = (
     HostTopic(
         name="members",
@@ -203,6 +203,8 @@ def _ports(stage: Stage) -> Iterator[str]:
             ["input", "type", "fields", "edge"],
             [[f"`{port.topic}`", f"`{port.type}`", ", ".join(port.fields), _edge(port)] for port in stage.inputs],
         )
+    for topic, msgtype in stage.foreign.items():
+        yield f"From outside the cell it reads `{topic}` (`{msgtype}`)."
     outputs = [[f"`{port.topic}`", f"`{port.type}`", "every block"] for port in stage.outputs]
     outputs += [[f"`{topic}`", f"`{kind}`", _WHEN[kind]] for topic, kind in stage.sparse_topics.items()]
     yield _table(["output", "type", "when"], outputs)

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from lathe_rc import harness
 from lathe_rc.cell.messages import ALIVE
+from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.replayer import KIND as REPLAYER
 from lathe_rc.cell.rerun_bridge import KIND as RERUN_BRIDGE
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.topic_recorder import KIND as TOPIC_RECORDER
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.namespace import absolute, checked
@@ -94,8 +94,9 @@ class _Maker:
             services.append("schedule")
         told = {topic.name for topic in HOST_TOPICS if kind in topic.publishers}
         heard = {topic.name for topic in HOST_TOPICS if kind in topic.subscribers}
-        masters = set(self._scenario.of_kind(SpindleEncoder.kind))
+        masters = set(self._scenario.masters)
         watched = set(self._scenario.nodes) - masters if name in masters else masters
+        heard |= {remapped(stage.shared, topic) for topic in stage.foreign} if stage else set()
         heard |= {f"{other}/{ALIVE}" for other in watched - set(group)}
         profile = self._node(
             name,

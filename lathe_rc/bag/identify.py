@@ -13,7 +13,7 @@ from lathe_rc.analysis import drive_fit, profile_csv
 from lathe_rc.analysis.drive_fit import DriveFit
 from lathe_rc.analysis.metrology import evenly
 from lathe_rc.bag.recorded import Recorded
-from lathe_rc.cell import messages
+from lathe_rc.cell import messages, models
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters
@@ -114,7 +114,7 @@ def with_identified(scenario: Scenario, found: Sequence[Identified]) -> Scenario
     for drive in found:
         table = nodes[drive.node]
         nodes[drive.node] = type(table).read(drive.node, {**table.model_dump(), **drive.fit.values})
-    return Scenario(scenario.name, nodes)
+    return Scenario(scenario.name, models.resolved(nodes))
 
 
 def write_parameters(path: Path, scenario: Scenario | None, found: Sequence[Identified]) -> None:

@@ -16,7 +16,7 @@ from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import DONE, Fields, Reached
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
@@ -50,20 +50,31 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     return n, DONE
 
 
-class _PlayedSpindle(SpindleEncoder):
+class _PlayedSpindle(TimeMaster):
     """The spindle as it was recorded."""
 
     step = staticmethod(step)
 
-    def __init__(self, made: SpindleEncoder, tape: Tape, samples: int, said: Spindle | None = None) -> None:
+    def __init__(self, made: TimeMaster, tape: Tape, samples: int, said: Spindle | None = None) -> None:
         super().__init__(made.name, made.parameters)
+        self._made, self.law = made, made.law
         self._tape, self.samples, self._said = tape, samples, said
+        self.place_triggers()
+        self.declare(outputs=made.outputs)
         self._ready = messages.allocate(messages.ENCODER, messages.MAX_BLOCK)
         self._span = np.zeros(2, np.int64)
 
     def speed_range(self) -> tuple[float, float]:
         """Of the law, which the bag's scenario has; without one, as recorded [rad/s]."""
-        return self._said.speed if self._said else super().speed_range()
+        return self._said.speed if self._said else self._made.speed_range()
+
+    def largest_acceleration(self) -> float:
+        """Of the scenario's."""
+        return self._made.largest_acceleration()
+
+    def sample_at(self, angle: float) -> int:
+        """Of the scenario's."""
+        return self._made.sample_at(angle)
 
     @property
     def memory(self) -> Memory:

@@ -26,7 +26,7 @@ from lathe_rc.bag.snapshot import first_sample
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.stream import feed
 from lathe_rc.bag.writer import refuse_existing
-from lathe_rc.cell import messages, ros_yaml
+from lathe_rc.cell import messages, models, ros_yaml
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.collect import Finite
 from lathe_rc.cell.engine import Engine, Sink
@@ -35,9 +35,9 @@ from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+from lathe_rc.names import instead
 from lathe_rc.part import ErrorsByRevolution
 
 
@@ -124,12 +124,12 @@ def with_controller(scenario: Scenario, file: Path) -> Scenario:
         if name == "/**":
             continue
         if name not in nodes:
-            raise InputError(f"{file}: no node {name!r} in the bag's scenario; allowed: {', '.join(nodes)}")
+            raise InputError(f"{file}: no node {name!r} in the bag's scenario; {instead(name, nodes)}")
         own = {key: value for key, value in values.items() if key not in SharedParameters.model_fields}
         stage = own.get("stage") or nodes[name].stage
         kind = kind_of(name, stage)
         nodes[name] = TABLES[kind].read(name, {**shared, "remap": nodes[name].remap, **own, "stage": stage})
-    return Scenario(scenario.name, nodes)
+    return Scenario(scenario.name, models.resolved(nodes))
 
 
 def _refuse_part(source: Source) -> None:
@@ -184,7 +184,7 @@ def resimulate(
         recorded = Recorded(source, topics or {})
         original = None if scenario is not None else _of_bag(recorded, source, Path(folder))
         if scenario is not None:
-            chosen = scenarios.load(resources.find(scenario), overrides)
+            chosen = scenarios.load(resources.scenario(scenario), overrides)
         else:
             assert original is not None, "it is the other source of a scenario"
             _refuse_overrides(original, overrides)
@@ -258,7 +258,7 @@ _HAPPENED = (
 
 
 def _refuse_overrides(original: Scenario, overrides: Sequence[str]) -> None:
-    spindle = original.of_kind(SpindleEncoder.kind)[0]
+    spindle = original.masters[0]
     for text in overrides:
         name = text.partition("=")[0].strip()
         if name.endswith((".events", ".faults")):

@@ -212,8 +212,8 @@ def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str]
                 f"{key[:80]!r} of the bag is not base64; recover the bag, or set {node[:80]!r} anew"
             ) from None
         sets.append(f"{node}.{name}={place}")
-    sets += _copied(scenarios.load(file, sets), folder)
-    loaded = scenarios.load(file, [*sets, *overrides])
+    sets += _copied(scenarios.load(file, sets, complete=True), folder)
+    loaded = scenarios.load(file, [*sets, *overrides], complete=True)
     return Scenario(about.get(NAME, "") or loaded.name, loaded.nodes)
 
 

@@ -5,9 +5,10 @@ ROS descriptors, validation, help and the documentation are made from these tabl
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
-from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -16,6 +17,7 @@ from pydantic.fields import FieldInfo
 from lathe_rc.cell.messages import MAX_BLOCK
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import Named
+from lathe_rc.names import instead
 
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
 
@@ -24,12 +26,16 @@ T = TypeVar("T", bound="Table")
 _NAMES = {bool: "true or false", int: "an integer", float: "a finite number", str: "a text"}
 
 
-def parameter(default: Any, doc: str, unit: str = "1", *, path: bool = False) -> Any:
+def parameter(default: Any, doc: str, unit: str = "1", *, path: bool = False, drive: str = "") -> Any:
     """A field of a table, with its unit; ``path`` marks a file, taken relative to the scenario's folder.
+
+    ``drive`` marks what a controller takes for a quantity of the drive that it commands, by the name of the quantity in
+    `NodeParameters.drive_models`: where a scenario does not give it, it is the drive's (`lathe_rc.cell.models`).
 
     Ranges stand in the annotation, e.g. ``Annotated[float, Gt(0)]``.
     """
-    return Field(default=default, description=doc, json_schema_extra={"unit": unit, "path": path})
+    doc = f"{doc}; not given in a scenario: that of the drive" if drive else doc
+    return Field(default=default, description=doc, json_schema_extra={"unit": unit, "path": path, "drive": drive})
 
 
 class Row:
@@ -43,13 +49,14 @@ class Row:
         named: what else may be named, classes of other packages; None: nothing.
         low, high: range of a number, ends allowed or not as ``limits`` says; infinite where there is none.
         limits: the range in words, empty where there is none.
+        drive: quantity of the commanded drive that it stands for, see `parameter`; empty: none.
     """
 
     def __init__(self, name: str, info: FieldInfo) -> None:
         extra = cast("dict[str, Any]", info.json_schema_extra)
         self.name, self.doc = name, info.description or ""
         self.default: Value = info.get_default(call_default_factory=True)
-        self.unit, self.is_path = str(extra["unit"]), bool(extra["path"])
+        self.unit, self.is_path, self.drive = str(extra["unit"]), bool(extra["path"]), str(extra["drive"])
         annotation: Any = info.annotation
         metadata = list(info.metadata)
         self.is_list = get_origin(annotation) is list
@@ -86,7 +93,13 @@ class Row:
 
 
 class Table(BaseModel):
-    """A set of parameters; immutable, refuses unknown names, wrong types and values out of range."""
+    """A set of parameters; immutable, refuses unknown names, wrong types and values out of range.
+
+    Attributes:
+        listing: the command that lists the parameters of a kind of node or a study; empty if there is none.
+    """
+
+    listing: ClassVar[str] = ""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True)
 
@@ -104,16 +117,34 @@ class Table(BaseModel):
         """
         try:
             return cls(**values)
+        except InputError as error:  # of a `model_post_init`, whose messages begin with a parameter, or of a class
+            dot = "." if str(error).partition(" ")[0] in cls.model_fields else ": "
+            raise InputError(f"{node}{dot}{error}") from None
         except ValidationError as error:
             first = error.errors()[0]
             name = str(first["loc"][0])
             if first["type"] == "extra_forbidden":
-                known = ", ".join(sorted(cls.model_fields))
-                raise InputError(f"{shown(f'{node}.{name}')}: unknown parameter; allowed: {known}") from None
+                listing = cls.listing.format(shown(values.get("stage") or node))
+                known = instead(name, sorted(cls.model_fields), listing=listing)
+                raise InputError(f"{shown(f'{node}.{name}')}: unknown parameter; {known}") from None
             if why := str(first.get("ctx", {}).get("error", "")):  # there is such a name, but the class cannot be used
                 raise InputError(f"{node}.{name}: {why}") from None
             given = f"{values[name]!r:.200}"
             raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
+
+
+@contextmanager
+def about(node: str, *names: str) -> Iterator[None]:
+    """Let a refusal of what is made of some parameters name them: ``node.a, b: ...``; one that does stays as it is.
+
+    Physics and control know nothing of parameters; who makes them of a table does.
+    """
+    try:
+        yield
+    except InputError as error:
+        if not str(error).startswith(f"{node}."):
+            error.args = (f"{node}.{', '.join(names)}: {str(error).removeprefix(f'{node}: ')}",)
+        raise
 
 
 def names_others(table: type[Table], values: Mapping[str, object]) -> bool:
@@ -174,6 +205,8 @@ class SharedParameters(Table):
 class NodeParameters(SharedParameters):
     """What every node has."""
 
+    listing: ClassVar[str] = "lathe node {} --help"
+
     stage: str = parameter("", "what the node is; empty: its name says it")
     remap: list[str] = parameter([], "topic names to replace, as old:=new")
     events: list[str] = parameter(
@@ -188,6 +221,22 @@ class NodeParameters(SharedParameters):
         "input topics whose publisher keeps no messages for those who come late (a device with default QoS)",
     )
     autostart: bool = parameter(default=True, doc="configure and activate by itself")
+
+    def model_post_init(self, context: Any, /) -> None:
+        """Refuse a rule that replaces nothing."""
+        super().model_post_init(context)
+        for rule in self.remap:
+            if not all(rule.partition(":=")):
+                raise InputError(f"remap = {rule!r}; allowed: old:=new")
+
+    @property
+    def commanded_topic(self) -> str:
+        """Topic, before remapping, on which it commands the drive that its model is of; empty: it has no model."""
+        return ""
+
+    def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
+        """Of a drive: what controllers may know of it, by command topic before remapping and by quantity."""
+        return {}
 
 
 class ObedientParameters(NodeParameters):
@@ -207,15 +256,9 @@ class RestartParameters(NodeParameters):
 
 
 def remapped(table: NodeParameters, topic: str) -> str:
-    """The relative name of a topic after the node's ``remap`` rules.
-
-    Raises:
-        InputError: a rule is not of the form old:=new.
-    """
+    """The relative name of a topic after the node's ``remap`` rules."""
     for rule in table.remap:
-        old, arrow, new = rule.partition(":=")
-        if not arrow or not old or not new:
-            raise InputError(f"remap = {rule!r}; allowed: old:=new")
+        old, _, new = rule.partition(":=")
         if old == topic:
             return new
     return topic

@@ -10,12 +10,13 @@ from pathlib import Path
 import yaml
 
 from lathe_rc import files
-from lathe_rc.cell import ros_yaml
+from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Value
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
-from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.errors import InputError, shown
+from lathe_rc.names import instead
 
 
 class _Tables(Mapping[str, type[NodeParameters]]):
@@ -29,6 +30,10 @@ class _Tables(Mapping[str, type[NodeParameters]]):
     def allowed(self) -> str:
         """The kinds, in words."""
         return f"{', '.join(self)}, or PACKAGE.MODULE:CLASS"
+
+    def instead(self, kind: str) -> str:
+        """The kinds that look like one that there is not, or all of them, in words."""
+        return f"{instead(kind, self)} (others: PACKAGE.MODULE:CLASS)"
 
     def __iter__(self) -> Iterator[str]:
         yield from STAGES
@@ -59,7 +64,7 @@ def kind_of(node: str, stage: object) -> str:
     """
     kind = str(stage or node)
     if kind not in TABLES:
-        raise InputError(f"{node}: no stage {kind!r}; allowed: {TABLES.allowed()} (set {node}.stage)")
+        raise InputError(f"{node}: no stage {shown(kind)!r}; {TABLES.instead(kind)}; set {node}.stage")
     return kind
 
 
@@ -122,6 +127,11 @@ class Scenario:
         """Names of the nodes of a kind."""
         return [name for name in self.nodes if self.kind(name) == kind]
 
+    @property
+    def masters(self) -> list[str]:
+        """Names of the nodes that give the cell its time: one, in a cell that can work."""
+        return [name for name in self.nodes if self.kind(name) in MASTERS]
+
     def processes(self, groups: Iterable[Iterable[str]] | None = None, what: str = "processes") -> list[list[str]]:
         """Names of the nodes in each process.
 
@@ -133,13 +143,14 @@ class Scenario:
             InputError: a node that there is not, or one that is named twice.
         """
         if groups is None:
-            named = [text for table in self.nodes.values() for text in getattr(table, "processes", [])]
-            groups = [text.split("+") for text in named]
+            named = [(node, text) for node, table in self.nodes.items() for text in getattr(table, "processes", [])]
+            what = f"{named[0][0]}.processes" if named else what
+            groups = [text.split("+") for _, text in named]
         split = [[name.strip() for name in group] for group in groups]
         seen: set[str] = set()
         for name in (name for group in split for name in group):
             if name not in self.nodes:
-                raise InputError(f"{what}: no node {name!r} in the scenario; allowed: {', '.join(self.nodes)}")
+                raise InputError(f"{what}: no node {shown(name)!r} in the scenario; {instead(name, self.nodes)}")
             if name in seen:
                 raise InputError(f"{what}: {name} is named twice; allowed: each node in one process")
             seen.add(name)
@@ -170,14 +181,16 @@ class Scenario:
         """
         changes: dict[str, dict[str, Value]] = {}
         for target, value in values.items():
-            node, name = _target(target, self.nodes, target)
+            node, name = _target(target, {node: self.kind(node) for node in self.nodes}, target)
             for each in [node] if node != _EVERYONE else self.nodes:
                 changes.setdefault(each, {})[name] = _absolute(self.kind(each), name, value, Path())
         tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
         given = "run_id" in values or self.shared.run_id != _identity(fingerprints)
         for node, changed in changes.items():
-            tables[node] = TABLES[self.kind(node)].read(node, {**self.nodes[node].model_dump(), **changed})
-            fingerprints[node] = _fingerprint(tables[node])
+            before = self.nodes[node].model_dump(exclude_unset=True)
+            tables[node] = TABLES[self.kind(node)].read(node, {**before, **changed})
+        tables = models.resolved(tables)
+        fingerprints |= {node: _fingerprint(table) for node, table in tables.items() if table is not self.nodes[node]}
         if not given:
             tables = {node: table.model_copy(update={"run_id": ""}) for node, table in tables.items()}
         return _agreed(self.name, tables, fingerprints)
@@ -191,8 +204,13 @@ class Scenario:
         return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=None)
 
 
-def _target(text: str, nodes: Iterable[str], what: str) -> tuple[str, str]:
-    """Node and parameter of ``NODE.PARAM`` or, for a shared parameter, ``PARAM``; ``what`` is said in messages.
+def _target(text: str, kinds: Mapping[str, str], what: str) -> tuple[str, str]:
+    """Node and parameter of ``NODE.PARAM`` or, for a shared parameter, ``PARAM``.
+
+    Args:
+        text: that names them.
+        kinds: of the nodes, by name.
+        what: is said in messages.
 
     Raises:
         InputError: there is no such node, or the parameter is not shared.
@@ -200,12 +218,13 @@ def _target(text: str, nodes: Iterable[str], what: str) -> tuple[str, str]:
     node, dot, name = text.strip().partition(".")
     if not dot:
         if node not in SharedParameters.model_fields:
-            shared = ", ".join(SharedParameters.model_fields)
-            raise InputError(f"{what}: {node!r} is not shared; allowed: {shared}, or NODE.PARAM=VALUE")
+            owners = [owner for owner, kind in kinds.items() if node in TABLES[kind].model_fields]
+            known = f"did you mean {' or '.join(f'{owner}.{node}' for owner in owners[:3])}?" if owners else ""
+            known = known or f"not NODE.PARAM=VALUE either; {instead(node, SharedParameters.model_fields)}"
+            raise InputError(f"{what}: {node!r} is not shared; {known}")
         return _EVERYONE, node
-    if node not in nodes or node == _EVERYONE:
-        present = ", ".join(name for name in nodes if name != _EVERYONE)
-        raise InputError(f"{what}: no node {node!r} in the scenario; allowed: {present}")
+    if node not in kinds:
+        raise InputError(f"{what}: no node {node!r} in the scenario; {instead(node, kinds)}")
     return node, name
 
 
@@ -214,14 +233,15 @@ def _override(text: str, nodes: dict[str, dict[str, Value]]) -> None:
     target, equals, value = text.partition("=")
     if not equals:
         raise InputError(f"--set {text!r}; allowed: NODE.PARAM=VALUE, or PARAM=VALUE for a shared parameter")
-    node, name = _target(target, nodes, f"--set {text!r}")
+    kinds = {name: kind_of(name, own.get("stage")) for name, own in nodes.items() if name != _EVERYONE}
+    node, name = _target(target, kinds, f"--set {text!r}")
     parsed = ros_yaml.parse_value(value, f"--set {shown(target)}")
     if node == _EVERYONE:
         for values in nodes.values():
             values.pop(name, None)
         nodes.setdefault(node, {})[name] = parsed
     else:
-        nodes[node][name] = _absolute(kind_of(node, nodes[node].get("stage")), name, parsed, Path())
+        nodes[node][name] = _absolute(kinds[node], name, parsed, Path())
 
 
 def _absolute(kind: str, name: str, value: Value, folder: Path) -> Value:
@@ -276,12 +296,14 @@ def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mappi
     return Scenario(name, named, fingerprints)
 
 
-def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
+def load(path: Path, overrides: Iterable[str] = (), *, complete: bool = False) -> Scenario:
     """Read a scenario.
 
     Args:
         path: ROS 2 parameter file.
         overrides: ``NODE.PARAM=VALUE``, or ``PARAM=VALUE`` for shared parameters, applied in order.
+        complete: what the file leaves out has its default, as in those of `Scenario.to_yaml`; otherwise models of
+            drives that are not given are those of the drives, see `lathe_rc.cell.models`.
 
     Raises:
         InputError: one line for the first thing that is wrong.
@@ -316,6 +338,8 @@ def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
     for name, values in nodes.items():
         for key in SharedParameters.model_fields:
             if key in values and key in shared and values[key] != shared[key]:
-                raise InputError(f"{name}.{key} = {values[key]}: {_EVERYONE} says {shared[key]}; keep one")
+                given = f"{name}.{key} = {values[key]}"
+                raise InputError(f"{given}: {_EVERYONE} says {shared[key]}; keep one ({key}=... sets all nodes)")
         tables[name] = TABLES[kind_of(name, values.get("stage"))].read(name, {**shared, **values})
+    tables = tables if complete else models.resolved(tables)
     return _agreed(path.stem, tables, {name: _fingerprint(table) for name, table in tables.items()})

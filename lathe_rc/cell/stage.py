@@ -14,7 +14,6 @@ Inputs are the arrays of float64 of all fields of all input ports in their order
 one if there are none, and outputs are the arrays of all fields of all output ports.
 """
 
-import math
 import re
 from abc import ABC
 from collections.abc import Collection, Iterator, Sequence
@@ -27,9 +26,10 @@ import numpy as np
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.native import Native, Step
-from lathe_rc.cell.parameters import NodeParameters, remapped
+from lathe_rc.cell.parameters import NodeParameters, about, remapped
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.jit import is_compiled, is_ours, kernel
+from lathe_rc.names import instead
 from lathe_rc.safety import faults
 from lathe_rc.safety.faults import Fault
 from lathe_rc.safety.injection import Injection, Port
@@ -87,6 +87,7 @@ class Trigger:
     kind: str  # revolution, second or sample
     value: float
     action: str
+    parameter: str  # that lists it: events or faults
     ends: bool = False  # a fault that has begun
 
     @property
@@ -101,6 +102,7 @@ DONE, PYTHON = 0, -1  #: why a step, or a program of steps, has stopped
 NEVER = np.iinfo(np.int64).max  #: no sample at all
 
 _NOTHING = np.empty(0)
+_MOST_SAMPLES = 2**53  # that a double counts
 
 _EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)(?:\s+to\s+([0-9.eE+-]+))?\s*:\s*(\S.*?)\s*")
 _FAULT, _REPAIR = "fault", "repair"  # verbs of the events that all stages know: fault FAULT, repair FAULT or TARGET
@@ -119,6 +121,7 @@ class Stage(ABC):
         inputs, outputs: the ports; the arrays handed to `advance` stand in their order.
         sparse_topics: relative name and type of every topic that carries `Sparse` messages.
         unheard: those of them that nobody reads; their messages need not be made.
+        foreign: type of each topic that its node hears from outside the cell, by name before remapping.
         tells: events come about by themselves that only `process` knows of.
         own_inputs: number of inputs that `process` gets; one more may tell the spindle angle to the events.
         step: compiled, or in Python; None: the stage has its own `process`.
@@ -147,6 +150,7 @@ class Stage(ABC):
         self.shared = parameters
         self.sparse_topics: dict[str, str] = {}
         self.unheard: Collection[str] = ()
+        self.foreign: dict[str, str] = {}
         self._triggers = [self._trigger("events", text) for text in parameters.events]
         self._triggers += [trigger for text in parameters.faults for trigger in self._break_down(text)]
         self._injection: Injection | None = None
@@ -189,7 +193,8 @@ class Stage(ABC):
                 step=self.shared.step,
             )
         for trigger in self._triggers:
-            self.check_action(trigger.action)
+            with about(self.name, trigger.parameter):
+                self.check_action(trigger.action)
 
     @property
     def takes_events(self) -> bool:
@@ -199,13 +204,14 @@ class Stage(ABC):
     def _trigger(self, what: str, text: str, *, ends: bool = False) -> Trigger:
         match = _EVENT.fullmatch(text)
         try:
-            trigger = Trigger(match[1], float(match[2]), match[4], ends) if match and not match[3] else None
+            trigger = Trigger(match[1], float(match[2]), match[4], what, ends) if match and not match[3] else None
         except ValueError:
             trigger = None
-        if trigger is None or not 0 <= trigger.value < math.inf:
+        per_unit = self.shared.sample_rate if trigger and trigger.kind == "second" else 1
+        if trigger is None or not 0 <= trigger.value * per_unit < _MOST_SAMPLES:
             raise InputError(
                 f"{self.name}.{what} = {text!r}; allowed: 'revolution R: ACTION', 'second T: ACTION' or "
-                "'sample N: ACTION'"
+                f"'sample N: ACTION', before sample {_MOST_SAMPLES}"
             )
         return trigger
 
@@ -244,8 +250,8 @@ class Stage(ABC):
                 self._injection.check_target(rest)
             return
         if action not in self.actions:
-            known = ", ".join(self.actions) or f"none ({self.kind} has no events)"
-            raise InputError(f"{self.name}: event {action!r}; allowed: {known}")
+            known = instead(action, self.actions) if self.actions else f"allowed: none ({self.kind} has no events)"
+            raise InputError(f"{self.name}: event {action!r}; {known}")
 
     def _check_allowed(self, what: str) -> None:
         if not self.shared.allow_faults:
@@ -355,7 +361,8 @@ class Stage(ABC):
         try:
             yield
         except LatheError as error:
-            error.args = (f"{self.name}: {error}",)
+            if not str(error).startswith((f"{self.name}.", f"{self.name}: ")):
+                error.args = (f"{self.name}: {error}",)
             raise
 
     def compute(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:

@@ -12,13 +12,13 @@ from lathe_rc.analysis.learning import Response
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stage import Input, Stage
-from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.profile import ProfileStage
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.supervisor import Supervisor
+from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError
 from lathe_rc.safety.state_machine import Reaction
@@ -32,13 +32,32 @@ class Source:
     type: str
 
 
+@dataclass(frozen=True)
+class Unknown:
+    """A member whose stage or parameters nobody here knows: of it counts what it announces of its topics.
+
+    Attributes:
+        dense: message type by relative topic, of those that carry a block a block.
+        sparse: the same of those that carry messages at chosen samples.
+        reads: relative topics.
+    """
+
+    dense: Mapping[str, str]
+    sparse: Mapping[str, str]
+    reads: frozenset[str]
+
+
 class Cell:
     """All stages of a scenario, wired.
 
     Args:
         nodes: table of each node by name; nodes that are no stages are left out.
+        unknown: members that nobody here knows more of than their topics, by name.
 
     Attributes:
+        unknown: see above.
+        unchecked: what `check` could not check since it depends on them, or since a law or drive of others does not
+            tell what is needed; one line each.
         stages: by node name, in the order of the forward edges.
         dense: publisher of each topic that carries a block a block, by relative topic.
         sparse: the same for topics that carry messages at chosen samples.
@@ -47,7 +66,8 @@ class Cell:
         InputError: a topic without or with two publishers, types that do not match, a loop without a delay.
     """
 
-    def __init__(self, nodes: Mapping[str, NodeParameters]) -> None:
+    def __init__(self, nodes: Mapping[str, NodeParameters], unknown: Mapping[str, Unknown] | None = None) -> None:
+        self.unknown, self.unchecked = unknown or {}, list[str]()
         made: dict[str, Stage] = {}
         for name, table in nodes.items():
             kind = kind_of(name, table.stage)
@@ -60,16 +80,23 @@ class Cell:
                 self._add(self.dense, remapped(stage.shared, output.topic), Source(name, output.type))
             for topic, msgtype in stage.sparse_topics.items():
                 self._add(self.sparse, remapped(stage.shared, topic), Source(name, msgtype))
+        self._add_unknown()
         order: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(made, ()))
         for name, stage in made.items():
             for port in stage.inputs:
                 source = self.source(stage, port)
-                if port.delay == 0:
+                if port.delay == 0 and source.node in made:
                     order.add(name, source.node)
         try:
             self.stages = {name: made[name] for name in order.static_order()}
         except CycleError as error:
             raise InputError(f"{' -> '.join(error.args[1])}: a loop without a feedback delay cannot start") from None
+
+    def _add_unknown(self) -> None:
+        for name, member in self.unknown.items():
+            for topics, published in ((self.dense, member.dense), (self.sparse, member.sparse)):
+                for topic, msgtype in published.items():
+                    self._add(topics, topic, Source(name, msgtype))
 
     def _add(self, topics: dict[str, Source], topic: str, source: Source) -> None:
         other = self.dense.get(topic) or self.sparse.get(topic)
@@ -91,16 +118,26 @@ class Cell:
             raise InputError(f"{stage.name} reads {topic} as {port.type}, but {source.node} publishes {source.type}")
         return source
 
+    def _publisher(self, topic: str, question: str) -> Stage | None:
+        """The stage that publishes a topic; None if nobody here knows it: then the question stays open."""
+        name = self.dense[topic].node
+        if name in self.unknown:
+            self._leave_open(question, name)
+        return self.stages.get(name)
+
+    def _leave_open(self, question: str, name: str) -> None:
+        self.unchecked.append(f"the parameters of {name} are not known here: {question}")
+
     @property
-    def master(self) -> SpindleEncoder:
+    def master(self) -> TimeMaster:
         """The time master.
 
         Raises:
             InputError: there is none, or more than one.
         """
-        found = [stage for stage in self.stages.values() if isinstance(stage, SpindleEncoder)]
+        found = [stage for stage in self.stages.values() if isinstance(stage, TimeMaster)]
         if len(found) != 1:
-            raise InputError(f"{len(found)} spindle_encoder nodes in the scenario; allowed: 1")
+            raise InputError(f"{len(found)} time masters in the scenario; allowed: 1, a {' or '.join(MASTERS)}")
         return found[0]
 
     @property
@@ -108,11 +145,27 @@ class Cell:
         """Length of a run.
 
         Raises:
+            InputError: it has no end, or nobody knows it before, or there is no time master.
+        """
+        expected = self.expected_samples
+        if self.master.samples is None:
+            raise InputError(
+                f"{self.master.name} follows a device, which a node hears; allowed: --mode composed or processes, or a "
+                "file of its counts"
+            )
+        return expected
+
+    @property
+    def expected_samples(self) -> int:
+        """Length of a run, as far as it can be known before.
+
+        Raises:
             InputError: it has no end, or there is no time master.
         """
-        if self.master.samples is None:
+        expected = self.master.expected_samples
+        if expected is None:
             raise InputError(f"{self.master.name}.revolutions = 0; this run needs an end: allowed above 0")
-        return self.master.samples
+        return expected
 
     def readers(self, topic: str) -> list[Stage]:
         """Stages that read a relative topic."""
@@ -137,18 +190,15 @@ class Cell:
         delays = [port.delay for stage in self.stages.values() for port in stage.inputs if port.delay]
         return min(delays, default=None)
 
-    def check(self) -> list[str]:
-        """Refuse what cannot work, with the figures, before anything moves.
-
-        Returns:
-            What could not be checked, since a law or drive of others does not tell what is needed.
+    def check(self) -> None:
+        """Refuse what cannot work, with the figures, before anything moves; `unchecked` says what was left out.
 
         Raises:
             InputError: a block longer than a feedback delay, a profile that a drive cannot follow, a tool that is not
                 brought out of the part, a memory that would be read before it is learned, a learning loop that does
                 not converge.
         """
-        unchecked: list[str] = []
+        self.unchecked.clear()
         low, high = self.master.speed_range()
         if low <= 0.0:
             raise InputError(f"{self.master.name}: speed falls to {low:.4g} rad/s; allowed: above 0")
@@ -168,9 +218,8 @@ class Cell:
             if isinstance(stage, LearningController):
                 self._check_preview(stage)
             if isinstance(stage, Learner):
-                unchecked += self._check_delay(stage, high)
-                unchecked += self._check_convergence(stage, stage.checked_speeds(low, high))
-        return unchecked
+                self._check_delay(stage, high)
+                self._check_convergence(stage, stage.checked_speeds(low, high))
 
     def _learned(self, stage: Learner) -> list[tuple[Response, str]]:
         """Responses and names of the drives that a channel commands."""
@@ -183,9 +232,12 @@ class Cell:
             if remapped(drive.shared, topic) in commands and any(port.topic == topic for port in drive.inputs)
         ]
 
-    def _check_convergence(self, stage: Learner, speeds: Collection[float]) -> list[str]:
-        """What cannot be checked of the learning loops of a channel."""
-        learned, unchecked = self._learned(stage), []
+    def _check_convergence(self, stage: Learner, speeds: Collection[float]) -> None:
+        command = remapped(stage.shared, stage.outputs[0].topic)
+        unknown = [name for name, member in self.unknown.items() if command in member.reads]
+        for name in unknown:
+            self._leave_open(f"whether {stage.name} converges with {name}", name)
+        learned, untold = self._learned(stage), list[str]()
         for response, drive in learned:
             self._check_reach(stage, drive)
             found = {speed: stage.worst(response, speed) for speed in speeds}
@@ -193,16 +245,15 @@ class Cell:
             if told:
                 _check_factor(stage, drive, *max(told))
             else:
-                unchecked.append(f"{stage.name}: {stage.kind} tells no factor of a cycle: nobody knows if it converges")
-        if not learned:
-            command = remapped(stage.shared, stage.outputs[0].topic)
-            unchecked.append(f"{stage.name}: no drive tells its response to {command}: nobody knows if it converges")
-        if unchecked and not (stage.parameters.stop_ratio or stage.parameters.allow_unstable):
+                untold.append(f"{stage.name}: {stage.kind} tells no factor of a cycle: nobody knows if it converges")
+        if not learned and not unknown:
+            untold.append(f"{stage.name}: no drive tells its response to {command}: nobody knows if it converges")
+        if untold and not (stage.parameters.stop_ratio or stage.parameters.allow_unstable):
             raise InputError(
-                f"{unchecked[0]}; allowed: {stage.name}.stop_ratio above 0 (2: twice the error of the first cycle ends "
+                f"{untold[0]}; allowed: {stage.name}.stop_ratio above 0 (2: twice the error of the first cycle ends "
                 "the run), or allow_unstable"
             )
-        return unchecked
+        self.unchecked += untold
 
     def _check_obedience(self, stage: Supervisor) -> None:
         """Where a retraction can be asked for, somebody takes the tool out."""
@@ -211,6 +262,7 @@ class Cell:
         found = [self.dense.get(remapped(stage.shared, f"{drive}/{what}")) for what in ("command", "state")]
         nodes = [source.node for source in found if source]
         listening = {reader.name for reader in self.readers(safety)}
+        listening |= {name for name, member in self.unknown.items() if safety in member.reads}
         if asks and nodes and not listening & set(nodes):
             asked = f"monitor {asks.name} asks for {asks.reaction.name.lower()}"
             raise InputError(
@@ -222,10 +274,13 @@ class Cell:
         """The tool has to get as far out of the part as is asked for before it is safe."""
         drive, clear = stage.parameters.drives[0], stage.parameters.clear_position
         for topic, name in ((f"{drive}/command", "retract_position"), (f"{drive}/state", "command_stroke")):
-            outlet = self.dense.get(remapped(stage.shared, topic))
+            outlet_topic = remapped(stage.shared, topic)
+            outlet = self.dense.get(outlet_topic)
             if outlet is None:
                 continue  # a series drive passes commands on inside
-            source = self.stages[outlet.node]
+            source = self._publisher(outlet_topic, f"whether {outlet.node} gets beyond {stage.name}.clear_position")
+            if source is None:
+                continue
             reached = getattr(source.shared, name, None)
             counts = reached if name == "command_stroke" else getattr(source.shared, "reaction_delay", 0)
             if counts and reached is not None and reached <= clear:
@@ -238,7 +293,7 @@ class Cell:
         """A drive gets no farther than its stroke."""
         clear = stage.parameters.clear_position
         outlet = self.dense.get(remapped(stage.shared, f"{stage.parameters.drives[0]}/state"))
-        drive = self.stages[outlet.node] if outlet else None
+        drive = self.stages.get(outlet.node) if outlet else None  # what is unknown has been said of the retraction
         if not isinstance(drive, Drive):
             return
         for limits in drive.limits().values():
@@ -262,25 +317,33 @@ class Cell:
                     "wider bounds"
                 )
 
-    def _check_delay(self, stage: Learner, speed: float) -> list[str]:
+    def _check_delay(self, stage: Learner, speed: float) -> None:
         encoder = self.master.parameters
         count = 2 * math.pi / encoder.counts_per_revolution if encoder.counts_per_revolution else 0.0
-        acceleration = self.master.law.largest_acceleration()
+        acceleration = self.master.largest_acceleration()
         largest = stage.largest_delay(speed, acceleration, count, encoder.speed_window * encoder.step)
         delay = stage.parameters.feedback_delay
         if largest is None:
-            return [f"{stage.name}: {stage.kind} tells no longest feedback_delay"]
-        if delay > largest:
+            self.unchecked.append(f"{stage.name}: {stage.kind} tells no longest feedback_delay")
+        elif delay > largest:
+            least = stage.shared.block_size
+            allowed = f"allowed: {least} up to {largest}"
+            if largest < least:
+                allowed = f"not even a block of {least}; give more cycle_revolutions, less lead_time, or turn slower"
             raise InputError(
-                f"{stage.name}.feedback_delay = {delay} samples: at {speed:.4g} rad/s the cycle leaves {largest}; "
-                f"allowed: {stage.shared.block_size} up to {largest}"
+                f"{stage.name}.feedback_delay = {delay} samples: at {speed:.4g} rad/s the cycle leaves "
+                f"{max(largest, 0)}; {allowed}"
             )
-        return []
 
     def _check_preview(self, stage: LearningController) -> None:
         if stage.parameters.lead_law != "exact_preview":
             return
         told, true = stage.parameters.speed_law(stage.name), self.master.law
+        if true is None:
+            raise InputError(
+                f"{stage.name}.lead_law = exact_preview, but nobody knows the speed of {self.master.name} in advance; "
+                "allowed: another lead law"
+            )
         if not (np.array_equal(told.lines, true.lines) and np.array_equal(told.tachogram, true.tachogram)):
             raise InputError(
                 f"{stage.name}.lead_law = exact_preview, but it does not know the speed of {self.master.name}; give "
@@ -290,13 +353,14 @@ class Cell:
     def _check_profile(self, tool: Tool, speed: float) -> None:
         """The first drive carries the profile; the others what it leaves."""
         owner, drive = self._form(tool), tool.parameters.drives[0]
-        source = self.stages[self.dense[remapped(tool.shared, f"{drive}/state")].node]
+        topic = remapped(tool.shared, f"{drive}/state")
+        source = self._publisher(topic, f"whether {self.dense[topic].node} can follow the profile of {tool.name}")
         if owner is None or owner.form is None or not isinstance(source, Drive):
             return
-        acceleration = self.master.law.largest_acceleration()
+        acceleration = self.master.largest_acceleration()
         demand = owner.form.profile.demand(speed, acceleration, owner.parameters.feed)
-        for topic, limits in source.limits().items():
-            if remapped(source.shared, topic) != remapped(tool.shared, f"{drive}/state"):
+        for of, limits in source.limits().items():
+            if remapped(source.shared, of) != topic:
                 continue
             for what, asked, allowed, unit in (
                 ("stroke", demand.stroke * 1e6, limits.stroke * 1e6, "µm"),
@@ -313,7 +377,9 @@ class Cell:
         """The stage that has the tool's desired form."""
         if tool.form is not None:
             return tool
-        source = self.stages[self.dense[remapped(tool.shared, "reference")].node]
+        source = self._publisher(
+            remapped(tool.shared, "reference"), f"whether a drive can follow what {tool.name} reads"
+        )
         return source if isinstance(source, ProfileStage) else None
 
 

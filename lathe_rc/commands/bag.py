@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command group ``lathe bag``: what a bag holds, whether it is whole, and making it whole."""
+"""The command group ``lathe bag``: what a bag holds, whether it is whole, making it whole, its tachogram."""
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from lathe_rc.bag import story, stream
 from lathe_rc.bag.check import check as check_bag
 from lathe_rc.bag.recover import recover as recover_bag
 from lathe_rc.bag.source import Source
+from lathe_rc.bag.tachogram import make as make_tachogram
 from lathe_rc.cell import messages
-from lathe_rc.errors import InputError, LatheError
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 _BAG = click.argument("path", metavar="BAG", type=click.Path(path_type=Path))
@@ -26,7 +27,7 @@ _LOSSY = 3  # exit code where something is missing
 
 @click.group()
 def bag() -> None:
-    """Ask bags: what is in them, are they whole, and save what is left of a broken one."""
+    """Ask bags: what is in them, are they whole; save what is left of a broken one; take the tachogram out."""
 
 
 def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
@@ -61,6 +62,7 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
             "span_s": span,
             "topics": topics,
             "about": dict(source.about),
+            "contradictions": source.contradictions,
         }
     told["error_um"] = _metrics(path, types) if metrics else None
     if as_json:
@@ -74,6 +76,8 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
         rate = f"{said['rate_hz']:.4g}" if said["rate_hz"] else ""
         table.add_row(Text(topic), Text(said["type"].rpartition("/")[2]), str(said["messages"]), rate)
     console.print(table)
+    for what in told["contradictions"]:
+        click.echo(what, err=True)
     console.print(f"span: {span:.6g} s from {told['start_s']:.6g} s on")
     if told["error_um"]:
         first, last = told["error_um"]["first"], told["error_um"]["last"]
@@ -100,13 +104,11 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
 @_JSON
 @click.pass_context
 def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
-    """Verify sequence, gaps, numbers, checksums and recorded digests; exit code 0: clean, 3: lossy, 1: wrong."""
-    if not path.exists():
-        raise InputError(f"{path}: no such bag")
-    try:
-        found = check_bag(path)
-    except InputError as error:
-        raise LatheError(str(error)) from None
+    """Verify sequence, gaps, numbers, checksums and recorded digests.
+
+    Exit code 0: clean, 3: lossy, 1: wrong, 2: no bag, or one that cannot be read.
+    """
+    found = check_bag(path)
     told = {
         "bag": str(path),
         "clean": not found.exit_code,
@@ -153,3 +155,26 @@ def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: boo
         click.echo(f"{found.saved} messages saved, {found.skipped} skipped, {found.lost_bytes} B lost")
         click.echo(f"bag: {target}")
     ctx.exit(_LOSSY if found.lossy else 0)
+
+
+@bag.command()
+@_BAG
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="CSV file; default: BAG-tachogram.csv, here")
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(min=0, min_open=True),
+    default=0.1,
+    show_default=True,
+    help="greatest distance of the file's lines from a recorded speed [rpm]",
+)
+@click.option("--topic", default="", help="of the encoder; default: the only one")
+@_JSON
+def tachogram(path: Path, output: Path | None, tolerance: float, topic: str, *, as_json: bool) -> None:
+    """Write the recorded spindle speed as a CSV file for tachogram_file, with as few rows as the tolerance allows."""
+    target = output or Path(f"{path.resolve().name.removesuffix('.mcap')}-tachogram.csv")
+    made = make_tachogram(path, target, tolerance, topic)
+    if as_json:
+        click.echo(json.dumps({"bag": str(path), "output": str(target), **asdict(made)}))
+        return
+    held = f"{made.points} rows for {made.samples} samples of {made.field}"
+    click.echo(f"{held}, within {made.largest:.4g} rpm: {target}")

@@ -32,7 +32,7 @@ def node(name: str, arguments: tuple[str, ...]) -> None:
     own, _, kind = name.partition(":")
     kind = kind or own
     if kind not in TABLES:
-        raise InputError(f"no node {kind!r}; allowed: {TABLES.allowed()}")
+        raise InputError(f"no node {kind!r}; {TABLES.instead(kind)}")
     if not help_or_refusal(f"lathe node {name}", own, TABLES[kind], arguments):
         sys.exit(_nodes([name, *arguments]))
 

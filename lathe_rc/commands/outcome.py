@@ -10,6 +10,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from lathe_rc import harness, part
+from lathe_rc.cell.durations import Lateness
 
 _MOST_EVENTS = 12  # that are told of a run
 _ALIKE = 4  # of them that follow one another: those in between are left out
@@ -49,7 +50,17 @@ def facts(result: harness.Result) -> list[str]:
     return [
         f"{result.blocks} blocks sent, {result.dropped} lost; {result.errors.rms.size} revolutions",
         f"{result.simulated_s:.2f} s simulated in {result.wall_s:.2f} s: {result.real_time_factor:.1f}x real time",
+        *(_lateness(result.lateness) if result.lateness else []),
         *refused,
+    ]
+
+
+def _lateness(told: Lateness) -> list[str]:
+    """How well the pace was kept, in words."""
+    within = ", ".join(f"{percent} % within {seconds * 1e3:.3g} ms" for percent, seconds in told.within.items())
+    return [
+        f"{told.late} of {told.blocks} blocks late; the schedule slipped by {told.slipped:.3g} s",
+        f"lateness: {within}, worst {told.worst * 1e3:.3g} ms",
     ]
 
 

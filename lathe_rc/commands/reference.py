@@ -14,5 +14,5 @@ def reference(stages: tuple[str, ...]) -> None:
     """Print the reference of nodes, topics, messages and parameters as Markdown, or that of some STAGES alone."""
     for kind in stages:
         if kind not in TABLES:
-            raise InputError(f"no stage {kind!r}; allowed: {TABLES.allowed()}")
+            raise InputError(f"no stage {kind!r}; {TABLES.instead(kind)}")
     click.echo("\n\n".join(map(pages.node, stages)) if stages else pages.page(), nl=bool(stages))

@@ -10,7 +10,6 @@ from rich.console import Console
 from lathe_rc import harness, part
 from lathe_rc.bag.record import recorder_of
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.commands import outcome, picture
 from lathe_rc.commands import scenario as scenarios
 from lathe_rc.commands.progress import Watch
@@ -57,7 +56,7 @@ def run(
     loaded = scenarios.load(scenario, overrides)
     asked = {"revolutions": revolutions, "speed_factor": speed_factor}
     given = {name: value for name, value in asked.items() if value is not None}
-    changes = [f"{node}.{n}={v!r}" for node in loaded.of_kind(SpindleEncoder.kind) for n, v in given.items()]
+    changes = [f"{node}.{n}={v!r}" for node in loaded.masters for n, v in given.items()]
     if changes:
         loaded = scenarios.load(scenario, [*overrides, *changes])
     split = scenarios.split(loaded, groups)
@@ -68,6 +67,8 @@ def run(
             raise InputError(f"{option} {value} with --mode offline; allowed: --mode processes or composed")
     if figure:
         picture.check_place(figure)
+    if profile and (profile.is_dir() or not profile.absolute().parent.is_dir()):
+        raise InputError(f"--profile {profile}: {'a folder' if profile.is_dir() else 'no such folder'}; name a file")
     result = _shown(
         loaded,
         mode=mode,

@@ -14,6 +14,7 @@ from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Row, Value
 from lathe_rc.commands import picture
 from lathe_rc.errors import InputError
+from lathe_rc.names import instead
 from lathe_rc.studies import STUDIES
 from lathe_rc.studies.study import Result, Study, StudyParameters
 
@@ -43,7 +44,7 @@ def read(study: Study[Any], overrides: Sequence[str]) -> StudyParameters:
     for override in overrides:
         name, equals, text = override.partition("=")
         if not equals:
-            raise InputError(f"--set {override!r}; allowed: PARAM=VALUE with PARAM one of {', '.join(rows)}")
+            raise InputError(f"--set {override!r}; allowed: PARAM=VALUE; lathe study {study.name} --help lists PARAM")
         name = name.strip()
         values[name] = _value(rows[name], text) if name in rows else text
     table: StudyParameters = study.parameters.read(study.name, values)
@@ -128,7 +129,7 @@ class _Studies(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """See `click.Group`."""
         if args[0] not in STUDIES and not args[0].startswith("-") and not ctx.resilient_parsing:
-            raise InputError(f"no study {args[0]!r}; allowed: {', '.join(STUDIES)}, or PACKAGE.MODULE:STUDY")
+            raise InputError(f"no study {args[0]!r}; {instead(args[0], STUDIES)}, or PACKAGE.MODULE:STUDY")
         return super().resolve_command(ctx, args)
 
 

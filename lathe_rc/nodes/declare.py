@@ -84,7 +84,7 @@ def refuse_lost(node: Node, words: Sequence[str]) -> None:
 
 
 def declare(node: Node, table: type[NodeParameters]) -> NodeParameters:
-    """Validate what the node was given and declare every parameter of its table.
+    """Validate what the node was given and declare every parameter of its table; once declared, they stay.
 
     Raises:
         InputError: an unknown parameter, a wrong type or a value out of range.
@@ -92,7 +92,9 @@ def declare(node: Node, table: type[NodeParameters]) -> NodeParameters:
     given = overrides(node)
     values = table.read(node.get_name(), {name: value for name, value in given.items() if value is not None})
     for name in given:
-        node.undeclare_parameter(name)
+        if not node.describe_parameter(name).read_only:  # it was given, and is not declared yet
+            node.undeclare_parameter(name)
     for name, row in table.rows().items():
-        node.declare_parameter(name, getattr(values, name), descriptor(row), ignore_override=True)
+        if not node.has_parameter(name):
+            node.declare_parameter(name, getattr(values, name), descriptor(row), ignore_override=True)
     return values

@@ -17,6 +17,8 @@ from typing import Any, NoReturn, cast
 
 import numpy as np
 import rclpy
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
@@ -27,9 +29,11 @@ from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stage import compile_kernels
 from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.stages.encoder_device import EncoderDevice
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import arguments, dds, declare
+from lathe_rc.nodes.encoder_node import EncoderNode
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.recorder_node import RecorderNode
 from lathe_rc.nodes.report import THROUGHPUT, Reporter
@@ -48,8 +52,12 @@ _LONGEST_WAIT = 0.1  # [s] until signals and the harness are looked at again
 
 def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellNode:
     if kind not in TABLES:
-        raise InputError(f"{name}: no stage {kind!r}; allowed: {TABLES.allowed()}")
-    classes: dict[str, type[CellNode]] = {RECORDER: RecorderNode, SpindleEncoder.kind: SpindleNode}
+        raise InputError(f"{name}: no stage {kind!r}; {TABLES.instead(kind)}")
+    classes: dict[str, type[CellNode]] = {
+        RECORDER: RecorderNode,
+        SpindleEncoder.kind: SpindleNode,
+        EncoderDevice.kind: EncoderNode,
+    }
     try:
         return classes.get(kind, StageNode)(name, kind, reporter, exchange)
     except RuntimeError as error:
@@ -114,6 +122,13 @@ def _work(nodes: Sequence[CellNode], stop: _Stop, until: float) -> None:
             return
 
 
+def _spin(executor: Executor, wait: float) -> None:
+    """Let the executor wait for the next event, up to so many seconds, and handle it."""
+    # EventsExecutor hands over events of what a node has destroyed since, when it was cleaned up.
+    with contextlib.suppress(InvalidHandle):
+        executor.spin_once(timeout_sec=wait)
+
+
 def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
     executor = EventsExecutor()
     for node in nodes:
@@ -134,13 +149,13 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
                     return
         due = _due(nodes, now)
         wait = 0.0 if any(node.due for node in nodes) else due - now
-        executor.spin_once(timeout_sec=min(max(wait, 0.0), _LONGEST_WAIT))
+        _spin(executor, min(max(wait, 0.0), _LONGEST_WAIT))
         # Take what else has arrived before computing: a burst in makes a burst out, and neighbours wake up once
         # for all of it. Waking them is the dearest part of a hop.
         # A flood must not keep anybody from signals and from its neighbours.
         handled, end = -1, time.monotonic() + _LONGEST_BURST
         while handled < (handled := sum(node.handled for node in nodes)) and not stop.signal:
-            executor.spin_once(timeout_sec=0.0)
+            _spin(executor, 0.0)
             if time.monotonic() >= end:
                 break
         _work(nodes, stop, due)

@@ -2,6 +2,7 @@
 """The recorder: every signal topic of the cell into one bag, sorted, complete, and closed whatever happens."""
 
 import json
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from lathe_rc.bag.writer import FLUSH_PERIOD, Output, offered_qos
 from lathe_rc.cell import messages
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wire import Block, Decoder, Encoder
 from lathe_rc.errors import LatheError, LossyRunError
 from lathe_rc.nodes.exchange import Run
@@ -80,6 +81,13 @@ class RecorderNode(CellNode):
             self._open.add_topic(full, self._type_name(kind), offered_qos(qos.depth, "volatile"))
             self.create_subscription(kind, full, self.guarded(partial(self._on_host, kind, full)), qos, raw=True)
 
+    def clean_up_part(self) -> None:
+        """See `CellNode`; a bag without a block, of a cell that did not begin, is nothing to keep."""
+        self.finish()
+        if not self._blocks and self._path.is_dir():
+            shutil.rmtree(self._path)
+            self.get_logger().info(f"bag {self._path} removed: no block has come")
+
     @staticmethod
     def _type_name(kind: Any) -> str:
         return f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
@@ -135,7 +143,7 @@ class RecorderNode(CellNode):
             if self._merger is not None and self.members[name].pid != pid:
                 self._processes[name] = self.members[name].pid
                 self._merger.restarted(name)
-        alone = any(member.stage == SpindleEncoder.kind and not member.members for member in self.members.values())
+        alone = any(member.stage in MASTERS and not member.members for member in self.members.values())
         if not alone and (self._queues or not self.complete):
             return
         before = len(self._queues) + len(self._sparse)
@@ -302,7 +310,7 @@ class RecorderNode(CellNode):
         block = queue.add(data)
         if block is None:
             return
-        self._newest[queue.topic] = data
+        self._newest[queue.topic] = data = queue.message
         queue.blocks.clear()
         if self._merger is None:
             self._write_unsorted(queue, block, data)

@@ -25,9 +25,10 @@ from lathe_rc.bag.source import Source
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.replayer import KIND, ReplayerParameters
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.names import instead
 from lathe_rc.nodes import alone, arguments
 from lathe_rc.nodes.ports import latched_qos, message_class
 
@@ -76,11 +77,16 @@ class Replayer:
         self._source = Source(Path(parameters.bag))
         self._topics = set(parameters.topics) or set(self._source.topics) - {_CLOCK}
         if unknown := sorted(self._topics - set(self._source.topics)):
-            raise InputError(
-                f"{KIND}.topics: {', '.join(unknown)}; the bag has {', '.join(sorted(self._source.topics))}"
-            )
+            known = instead(unknown[0], sorted(self._source.topics), listing=f"lathe bag info {parameters.bag}")
+            raise InputError(f"{KIND}.topics: {unknown[0]} is not in the bag; {known}")
         if _CLOCK in self._topics:
             raise InputError(f"{KIND}.topics: {_CLOCK} is the replayer's own and tells the log times of the bag")
+        start, end, span_ns = parameters.start, parameters.end, self._source.last_ns - self._source.first_ns
+        if round(start * 1e9) > span_ns or 0.0 < end <= start:
+            raise InputError(
+                f"{KIND}.start = {start:g} s, end = {end:g} s: nothing to send; allowed: a start up to "
+                f"{span_ns * 1e-9:g} s, where the bag's last message is, and an end after it, or 0"
+            )
         if not 0 <= self._source.first_ns <= self._source.last_ns < _CLOCK_END:
             raise InputError(f"{parameters.bag}: log times up to {self._source.last_ns} ns; {_CLOCK} ends in 2038")
         self._classes = {topic: self._class(topic) for topic in sorted(self._topics)}
@@ -131,6 +137,8 @@ class Replayer:
         else:
             for topic in sorted(self._topics):
                 self._publish(self._node, topic)
+        for what in self._source.contradictions:
+            self._node.get_logger().warning(what)
         if _CLOCK in self._source.topics:
             self._node.get_logger().info(f"{_CLOCK} of the bag is left out: the replayer's tells the log times")
         while lonely := [topic for topic in sorted(self._topics) if self._readers(topic) < self._parameters.wait]:
@@ -178,7 +186,7 @@ class Replayer:
                     name=f"/{name}",
                     stage=stage.kind,
                     state=Member.READY,
-                    members=everybody if isinstance(stage, SpindleEncoder) else [],
+                    members=everybody if isinstance(stage, TimeMaster) else [],
                     publishes=[f"/{topic}" for topic in (*dense, *sparse)],
                     types=[*dense.values(), *sparse.values()],
                     sparse=[*(False for _ in dense), *(True for _ in sparse)],
@@ -228,7 +236,7 @@ class Replayer:
 
     def _chosen(self) -> Iterator[tuple[str, int, bytes]]:
         first = self._source.first_ns
-        start = first + round(self._parameters.start * 1e9)
+        start = first + round(self._parameters.start * 1e9) if self._parameters.start else None
         stop = first + round(self._parameters.end * 1e9) if self._parameters.end else None
         return self._source.messages(self._topics, start_ns=start, stop_ns=stop)
 

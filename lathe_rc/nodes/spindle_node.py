@@ -11,8 +11,8 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderParameters
+from lathe_rc.cell.durations import LATENCY, LATENESS, PERCENT, Durations, Percentiles
+from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes.chain import form
@@ -35,12 +35,12 @@ class SpindleNode(StageNode):
         slipped: seconds that the schedule has slipped because members were slow.
     """
 
-    stage: SpindleEncoder
+    stage: TimeMaster
 
     def configure_part(self) -> None:
         """See `StageNode`."""
         super().configure_part()
-        assert isinstance(self.table, SpindleEncoderParameters)
+        assert isinstance(self.table, TimeMasterParameters)
         self._pace = self.table
         if self.table.members and not self.table.window and not self.table.speed_factor:
             raise InputError(
@@ -50,7 +50,7 @@ class SpindleNode(StageNode):
         namespace = self.get_namespace().rstrip("/")
         self._member_names = [name if name.startswith("/") else f"{namespace}/{name}" for name in self.table.members]
         self._completed = dict.fromkeys(self._member_names, 0)
-        self._blocks_in_run = None if self.stage.samples is None else -(-self.stage.samples // self.table.block_size)
+        self._blocks_in_run: int | None = None
         self._told: deque[Progress] = deque()
         self._running = False
         self._schedule = 0.0  # monotonic time at which sample 0 would have been, were there no slips
@@ -59,12 +59,20 @@ class SpindleNode(StageNode):
         self._stalled: frozenset[str] = frozenset()
         self._dead: dict[str, float] = {}  # monotonic time until which a member may be restarted
         self._unsafe: set[str] = set()  # members that have not yet heard that others are lost
-        self._end = self.stage.samples
+        self._end: int | None = None
+        self._know_end()
         self._why = ""
         self._report_due = 0.0
         self.slipped = 0.0
         self._released: deque[float] = deque()  # monotonic times at which the blocks in flight were let go
         self._lateness, self._latency = Durations(), Durations()
+        self._percentiles, self._late = Percentiles(), 0
+
+    def _know_end(self) -> None:
+        """Take the end of the run from the stage, once that knows it, unless a safe state has another."""
+        if self._end is None and self.stage.samples is not None:
+            self._end = self.stage.samples
+            self._blocks_in_run = -(-self._end // self.table.block_size)
 
     def activate_part(self) -> None:
         """See `StageNode`."""
@@ -117,13 +125,14 @@ class SpindleNode(StageNode):
         if self._unsafe:
             self._unsafe -= {name for name in self._unsafe if self.members[name].state == Member.SAFE}
             self.release()
-        if self._running or not self._member_names:
+        if self._running or not self._member_names or not self.active:
             return
         known = [self.members.get(name) for name in self.member_names()]
         if all(member is not None and member.state == member.READY for member in known):
             # The same check as before an offline run, with the parameters that the members really have.
-            cell = Cell(self.tables(self.member_names()))
-            for what in cell.check():
+            cell = Cell(self.tables(self.member_names()), self.unknown(self.member_names()))
+            cell.check()
+            for what in cell.unchecked:
                 self.get_logger().warning(f"not checked: {what}")
             self._begin(cell)
 
@@ -179,10 +188,13 @@ class SpindleNode(StageNode):
             return 1
         return self.table.window - (self.blocks - self._least)
 
+    def _at_once(self) -> int:
+        """Blocks to let go at once, at most."""
+        return 1 if self._pace.speed_factor else min(self._credit(), self.together)
+
     def _possible(self) -> int:
         """Samples to let go at once; 0 while others in its chain wait for an input."""
-        blocks = 1 if self._pace.speed_factor else min(self._credit(), self.together)
-        samples = self.table.block_size * blocks
+        samples = self.table.block_size * self._at_once()
         ready = self.chain.ready() if self.chain is not None else (samples, False)
         return min(samples, ready[0]) if ready else 0
 
@@ -194,7 +206,7 @@ class SpindleNode(StageNode):
 
     def release(self) -> None:
         """Let go every block that credit and pace allow."""
-        if not self._running or self.failure or self.done or self._unsafe:
+        if not (self._running and self.active) or self.failure or self.done or self._unsafe:
             return
         factor = self._pace.speed_factor
         size, step = self.table.block_size, self.table.step
@@ -204,19 +216,9 @@ class SpindleNode(StageNode):
                 return
             if time.monotonic() - begun > _LOOK:
                 break  # DDS waits a while for a reader that has died: that shall be noticed
-            if factor:
-                now = time.monotonic()
-                due = self._schedule + (self.blocks + 1) * size * step / factor
-                if now < due:
-                    self.next_tick = min(self.next_tick, due)
-                    return
-                late = now - due
-                self._lateness.add(late)
-                if late > max(1, self.table.window // 2) * size * step / factor:
-                    # Less is made up by the next blocks. The schedule slips by more: no long burst to catch up.
-                    self._schedule += late
-                    self.slipped += late
             if not (samples := self._possible()):
+                return
+            if factor and not self._is_due(size * step / factor, -(-samples // size)):
                 return
             last = self._end is not None and self._end - self.samples <= samples
             if last:
@@ -225,6 +227,28 @@ class SpindleNode(StageNode):
                 self._released.extend([time.monotonic()] * -(-samples // size))
             self._let_go(samples, last=last)
         self.next_tick = time.monotonic()
+
+    def _is_due(self, block: float, blocks: int) -> bool:
+        """Whether the next blocks may go, each taking so much wall time [s]; counts how late they are."""
+        now = time.monotonic()
+        due = self._schedule + (self.blocks + 1) * block
+        if now < due:
+            self.next_tick = min(self.next_tick, due)
+            return False
+        late = now - due
+        for number in range(blocks):
+            behind = max(late - number * block, 0.0)
+            self._lateness.add(behind)
+            self._percentiles.add(behind)
+            self._late += behind > block
+        if late > max(1, self.table.window // 2) * block:
+            self._fall_behind(late)
+        return True
+
+    def _fall_behind(self, late: float) -> None:
+        """Slip, for less would be made up by the next blocks: no long burst to catch up."""
+        self._schedule += late
+        self.slipped += late
 
     def lead(self) -> None:
         """See `StageNode`: as far as credit and pace allow."""
@@ -240,7 +264,21 @@ class SpindleNode(StageNode):
         if not self._completed:
             self._finish_run()
 
+    def _report_pace(self) -> None:
+        """Say how late the blocks were, if they were due at some time."""
+        if self._percentiles.count:
+            self.reporter(
+                "pace",
+                self.get_name(),
+                blocks=self._percentiles.count,
+                late=self._late,
+                worst=self._percentiles.worst,
+                within={percent: self._percentiles.within(percent) for percent in PERCENT},
+                slipped=self.slipped,
+            )
+
     def _finish_run(self) -> None:
+        self._report_pace()
         self._say(CellState.ENDED, self.samples, self._why)
         self.get_logger().info(f"run ended: {self.blocks} blocks, {self.samples} samples")
         self.end([*self.outlets.values(), self._state])

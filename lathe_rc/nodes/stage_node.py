@@ -16,8 +16,7 @@ from lathe_rc.cell import messages, state_file
 from lathe_rc.cell.framing import Framer
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.stage import Input, Sparse, Stage, compile_kernels
-from lathe_rc.cell.stages import STAGES
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wire import Block, Encoder, Pool
 from lathe_rc.errors import InputError, LatheError, LossyRunError
@@ -113,6 +112,13 @@ class StageNode(CellNode):
         self.create_service(Schedule, "~/schedule", self._on_schedule)
         self.exchange.stages.append(self)
 
+    def clean_up_part(self) -> None:
+        """See `CellNode`."""
+        if self.chain is not None:
+            self.chain.leave()
+        if self in self.exchange.stages:
+            self.exchange.stages.remove(self)
+
     def tick(self, now: float) -> None:
         """See `CellNode`."""
         super().tick(now)
@@ -145,7 +151,7 @@ class StageNode(CellNode):
 
     def members_changed(self) -> None:
         """Learn whose blocks to accept, before the first of them."""
-        if self._waits and any(m.stage == SpindleEncoder.kind and not m.members for m in self.members.values()):
+        if self._waits and any(m.stage in MASTERS and not m.members for m in self.members.values()):
             self._waits = False  # alone with a spindle, it joins where it can
         if self._waits:
             return

@@ -7,7 +7,7 @@ from annotated_types import Ge, Gt
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Stage
 from lathe_rc.control.decoupler import LAG, LEAK, PRESETS, Channels, Decoupler, compensators, decouple_along
 from lathe_rc.errors import InputError
@@ -25,8 +25,12 @@ class DecouplerParameters(NodeParameters):
         [], "force over the longitudinal command [N], falling powers of p; empty: that of the preset"
     )
     w1_denominator: list[float] = parameter([], "its denominator; empty: that of the preset")
-    w2_numerator: list[float] = parameter([], "position over the cross command [m]; empty: that of the preset")
-    w2_denominator: list[float] = parameter([], "its denominator; empty: that of the preset")
+    w2_numerator: list[float] = parameter(
+        [], "position over the cross command [m]; empty: that of the preset", drive="transfer.numerator"
+    )
+    w2_denominator: list[float] = parameter(
+        [], "its denominator; empty: that of the preset", drive="transfer.denominator"
+    )
     w3_numerator: list[float] = parameter([], "deflection over force [m/N]; empty: that of the preset")
     w3_denominator: list[float] = parameter([], "its denominator; empty: that of the preset")
     w4_numerator: list[float] = parameter([], "force over position [N/m]; empty: that of the preset")
@@ -35,6 +39,11 @@ class DecouplerParameters(NodeParameters):
     k2: bool = parameter(default=True, doc="takes the effect of the longitudinal command off the position")
     inverse_lag: Annotated[float, Gt(0)] = parameter(LAG, "lag for each order that an inverse is missing", "s")
     leak: Annotated[float, Ge(0)] = parameter(LEAK, "of the integrators in K1 and K2; 0: none", "rad/s")
+
+    @property
+    def commanded_topic(self) -> str:
+        """See `NodeParameters`; W1, W3 and W4 are of the cutting process as well, and no drive's alone."""
+        return "cross/command"
 
     def channels(self, node: str) -> Channels:
         """The model of the plant.
@@ -47,7 +56,8 @@ class DecouplerParameters(NodeParameters):
             top, bottom = getattr(self, f"{name}_numerator"), getattr(self, f"{name}_denominator")
             if bool(top) != bool(bottom):
                 raise InputError(f"{node}.{name}_numerator and {name}_denominator; give both or none")
-            made[name] = TransferFunction(tuple(top), tuple(bottom)) if top else getattr(preset, name)
+            with about(node, f"{name}_numerator", f"{name}_denominator"):
+                made[name] = TransferFunction(tuple(top), tuple(bottom)) if top else getattr(preset, name)
         return Channels(**made)
 
 
@@ -84,7 +94,9 @@ class DecouplerStage(Stage):
     def __init__(self, name: str, parameters: DecouplerParameters) -> None:
         super().__init__(name, parameters)
         self.parameters = parameters
-        k1, k2 = compensators(parameters.channels(name), parameters.inverse_lag, parameters.leak)
+        channels = parameters.channels(name)
+        with about(name, "w1_numerator", "w2_numerator", "inverse_lag"):  # what is inverted, and by which lag
+            k1, k2 = compensators(channels, parameters.inverse_lag, parameters.leak)
         self._decoupler = Decoupler(k1 if parameters.k1 else None, k2 if parameters.k2 else None, parameters.step)
         fields = ("command", "set_point", "error")
         self.declare(

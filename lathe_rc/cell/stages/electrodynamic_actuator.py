@@ -28,6 +28,11 @@ class ElectrodynamicActuatorParameters(PlantParameters):
     moving_mass: Annotated[float, Gt(0)] = parameter(1.2, "carriage, coil and tool", "kg")
     force_constant: Annotated[float, Gt(0)] = parameter(30.0, "force of the coil per current", "N/A")
 
+    def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
+        """See `NodeParameters`."""
+        known = {"natural_frequency": self.natural_frequency, "damping": self.damping, "delay": self.delay}
+        return {"coarse/command": known}
+
 
 @kernel
 def step(memory: PlantMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:

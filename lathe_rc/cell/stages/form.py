@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc import resources
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
@@ -82,7 +82,8 @@ class FormParameters(NodeParameters):
         if self.profile == "csv":
             if not self.profile_file:
                 raise InputError(f"{node}.profile_file is empty; name the CSV file of the profile")
-            return read_csv(resources.find(Path(self.profile_file)))
+            with about(node, "profile_file"):
+                return read_csv(resources.find(Path(self.profile_file)))
         if self.profile == "piston":
             return Piston(
                 self.piston_ovality,
@@ -92,12 +93,14 @@ class FormParameters(NodeParameters):
                 self.piston_widest,
             )
         if self.profile == "polygon":
-            return Polygon(self.polygon_sides, self.polygon_inscribed_radius, self.polygon_corner_radius)
+            with about(node, "polygon_corner_radius"):
+                return Polygon(self.polygon_sides, self.polygon_inscribed_radius, self.polygon_corner_radius)
         order, amplitude = self.harmonic_order, self.harmonic_amplitude
         if not order and not amplitude:
             order, amplitude = [2], [225e-6]
         phase = self.harmonic_phase or [0.0] * len(order)
-        return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
+        with about(node, "harmonic_order", "harmonic_amplitude", "harmonic_phase"):
+            return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
 
 
 class FormTable(NamedTuple):

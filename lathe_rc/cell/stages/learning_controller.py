@@ -14,6 +14,7 @@ import numpy.typing as npt
 from lathe_rc.analysis.learning import LearningLoop, Response
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import MAX_BLOCK, Samples, Signals
+from lathe_rc.cell.parameters import about
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
 from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
@@ -192,7 +193,7 @@ class LearningController(Learner):
             gain=parameters.learning_gain,
             soft_start=parameters.soft_start,
             preview=parameters.make_preview(name),
-            correction=parameters.make_correction(),
+            correction=parameters.make_correction(name),
             nominal=parameters.nominal_speed,
             delay=parameters.feedback_delay,
             join_below=parameters.join_below or np.inf,
@@ -313,7 +314,8 @@ class LearningController(Learner):
     def _read_memory(self) -> np.ndarray:
         parameters = self.parameters
         path = Path(parameters.memory_file)
-        return memory_file.load(path, parameters.cycle_points, parameters.points_per_revolution)
+        with about(self.name, "memory_file"):
+            return memory_file.load(path, parameters.cycle_points, parameters.points_per_revolution)
 
     def perform(self, action: str) -> None:
         """See `Stage`."""

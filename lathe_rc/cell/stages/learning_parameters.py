@@ -7,7 +7,7 @@ from typing import Annotated, Literal, cast
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stages.learner import LearnerParameters
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.control.correction import Correction, CorrectionLaw
@@ -93,9 +93,16 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
     identification_forgetting: Annotated[float, Ge(0), Lt(1)] = parameter(
         0.5, "weight that a cycle's measurements keep after the next"
     )
-    model_natural_frequency: Annotated[float, Gt(0)] = parameter(1038.0, "drive model: ωn", "rad/s")
-    model_damping: Annotated[float, Gt(0)] = parameter(0.804, "drive model: ζ")
-    model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s")
+    model_natural_frequency: Annotated[float, Gt(0)] = parameter(
+        1038.0, "drive model: ωn", "rad/s", drive="natural_frequency"
+    )
+    model_damping: Annotated[float, Gt(0)] = parameter(0.804, "drive model: ζ", drive="damping")
+    model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s", drive="delay")
+
+    @property
+    def commanded_topic(self) -> str:
+        """See `NodeParameters`."""
+        return "coarse/command"
 
     @property
     def cycle_points(self) -> int:
@@ -111,29 +118,32 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         per_point = self.points_per_revolution / (2 * np.pi)  # grid points per radian
         if self.q_filter == "fir":
             edge = 1.0 / (self.nominal_speed * per_point)
-            return LowPass(self.q_pass * edge, self.q_stop * edge, self.q_ripple, self.cycle_points)
+            with about(node, "q_pass", "q_stop", "q_ripple"):
+                return LowPass(self.q_pass * edge, self.q_stop * edge, self.q_ripple, self.cycle_points)
         make = cast("Callable[[float, int], QFilter]", Q_FILTERS[self.q_filter])
         width = self.q_time * self.nominal_speed * per_point
         if self.q_filter in Q_FILTERS.own:
-            return make(width, self.cycle_points)
-        with code_of_others(f"{node}.q_filter = {self.q_filter!r}"):
+            with about(node, "q_time"):
+                return make(width, self.cycle_points)
+        with about(node, "q_filter"), code_of_others(repr(self.q_filter)):
             made = make(width, self.cycle_points)
             check(made)
             return made
 
-    def make_correction(self) -> Correction:
-        """The correction with its given model.
+    def make_correction(self, node: str) -> Correction:
+        """The correction of a node with its given model.
 
         Raises:
             InputError: a lead-lag term without a lag.
         """
-        return Correction(
-            _CORRECTIONS[self.correction],
-            self.model_natural_frequency,
-            self.model_damping,
-            self.lead_lag_lead,
-            self.lead_lag_lag,
-        )
+        with about(node, "lead_lag_lag"):
+            return Correction(
+                _CORRECTIONS[self.correction],
+                self.model_natural_frequency,
+                self.model_damping,
+                self.lead_lag_lead,
+                self.lead_lag_lag,
+            )
 
     @property
     def preview_time(self) -> float:

@@ -2,15 +2,17 @@
 """The spindle's speed law as parameters: of the spindle that follows it, and of whoever knows it in advance."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc import resources
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
-from lathe_rc.signals import speed
+from lathe_rc.signals import speed, tachogram
 from lathe_rc.signals.deviation_law import DeviationLaw, tabulated
 
 #: by name, those of other packages: ours are the parameters below
@@ -30,6 +32,9 @@ class SpeedLawParameters(NodeParameters):
     tachogram_deviation: list[float] = parameter(
         [], "deviation there relative to the nominal speed, held before the first and after the last", "1"
     )
+    tachogram_file: str = parameter(
+        "", "CSV file with time_s,rpm instead of both: the speed itself, the other deviations add to it", path=True
+    )
     random_rms: Annotated[float, Ge(0)] = parameter(0.0, "random deviation: RMS relative to the nominal speed", "1")
     random_low: Annotated[float, Gt(0)] = parameter(1.0, "lower end of its band", "rad/s")
     random_high: Annotated[float, Gt(0)] = parameter(60.0, "upper end of its band", "rad/s")
@@ -47,36 +52,45 @@ class SpeedLawParameters(NodeParameters):
         """The sum of all deviations, for a node.
 
         Raises:
-            InputError: lists of different lengths, a tachogram out of order, or a law of others that is none.
+            InputError: lists of different lengths, a tachogram or a band out of order, a file or law of others that
+                cannot be used, or more than one tachogram.
         """
         nominal = self.nominal_speed
         phase = self.deviation_phase or [0.0] * len(self.deviation_amplitude)
-        return (
-            speed.harmonic(
+        with about(node, "deviation_amplitude", "deviation_frequency", "deviation_phase"):
+            harmonic = speed.harmonic(
                 nominal,
                 np.array(self.deviation_amplitude),
                 np.array(self.deviation_frequency),
                 np.array(phase),
                 self.deviation_start,
             )
-            + self._tachogram(node)
-            + speed.band_limited_random(
+        with about(node, "random_low", "random_high"):
+            random = speed.band_limited_random(
                 nominal, self.random_rms, self.random_low, self.random_high, self.random_lines, self.seed
             )
-        )
+        return harmonic + self._tachogram(node) + random
 
     def _tachogram(self, node: str) -> speed.SpeedLaw:
-        if not self.deviation_law:
-            return speed.tachogram(
-                self.nominal_speed, np.array(self.tachogram_time), np.array(self.tachogram_deviation)
-            )
-        if self.tachogram_time:
+        """The one of the lists, of the file, or of a law of others."""
+        lists = bool(self.tachogram_time or self.tachogram_deviation)
+        given = {"deviation_law": self.deviation_law, "tachogram_file": self.tachogram_file, "tachogram_time": lists}
+        named = [name for name, value in given.items() if value]
+        if len(named) > 1:
             raise InputError(
-                f"{node}.deviation_law = {self.deviation_law!r} beside tachogram_time; allowed: one of them, since a "
-                "law of others becomes the tachogram"
+                f"{node}.{named[0]} = {given[named[0]]} beside {named[1]}; allowed: one of them, since each gives the "
+                "tachogram"
             )
-        with code_of_others(f"{node}.deviation_law = {self.deviation_law!r}"):
-            make: Callable[..., DeviationLaw] = SPEED_LAWS[self.deviation_law]
-            return tabulated(
-                self.nominal_speed, make(*self.deviation_values), self.deviation_law_step, self.deviation_law_end
-            )
+        if self.deviation_law:
+            with about(node, "deviation_law"), code_of_others(repr(self.deviation_law)):
+                make: Callable[..., DeviationLaw] = SPEED_LAWS[self.deviation_law]
+                return tabulated(
+                    self.nominal_speed, make(*self.deviation_values), self.deviation_law_step, self.deviation_law_end
+                )
+        time, deviation = np.array(self.tachogram_time), np.array(self.tachogram_deviation)
+        if self.tachogram_file:
+            with about(node, "tachogram_file"):
+                time, rpm = tachogram.read(resources.find(Path(self.tachogram_file)))
+                deviation = rpm / self.nominal_rpm - 1.0
+        with about(node, "tachogram_time", "tachogram_deviation"):
+            return speed.tachogram(self.nominal_speed, time, deviation)

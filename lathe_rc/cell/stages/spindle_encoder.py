@@ -1,50 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spindle and encoder: where time, angle and the run itself begin and end."""
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
-from annotated_types import Ge, Le
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.native import Step
-from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached, Stage, Trigger
+from lathe_rc.cell.parameters import about
+from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
+from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.signals.encoder import Encoder, EncoderTable, encode
+from lathe_rc.signals.speed import SpeedLaw
 
 
-class SpindleEncoderParameters(SpeedLawParameters):
+class SpindleEncoderParameters(TimeMasterParameters, SpeedLawParameters):
     """Speed law, encoder, and, for the time master of a cell, length and pace of the run."""
-
-    counts_per_revolution: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
-        0, "encoder counts per revolution after quadrature; 0: an ideal encoder"
-    )
-    speed_window: Annotated[int, Ge(1), Le(65536)] = parameter(
-        64,
-        "the measured speed is the angle's difference over so many samples; not used by an ideal encoder",
-        "sample",
-    )
-    revolutions: Annotated[float, Ge(0)] = parameter(0.0, "length of the run; 0: until stopped", "rev")
-    speed_factor: Annotated[float, Ge(0)] = parameter(
-        1.0, "pace of the run against real time; 0: as fast as the members follow", "1"
-    )
-    stall_reaction: Literal["wait", "safe"] = parameter(
-        "wait", "what a member leads to that is silent; one whose process has died leads to the safe state"
-    )
-    stall_time: Annotated[float, Ge(0), Le(3600)] = parameter(
-        0.1, "wall time of silence after which the safe state is declared, if that is the reaction", "s"
-    )
-    safe_time: Annotated[float, Ge(0), Le(10)] = parameter(0.2, "how long a run goes on in the safe state", "s")
-    restart_time: Annotated[float, Ge(0), Le(3600)] = parameter(
-        30.0, "wall time in which a member that can be restarted has to be back", "s"
-    )
-    members: list[str] = parameter([], "nodes that must be ready before block 0; empty: start alone")
-    processes: list[str] = parameter(
-        [], "nodes that share a process, as 'coarse+tool', for harness and launch; those not named have one each"
-    )
 
 
 @kernel
@@ -55,30 +29,28 @@ def step(memory: EncoderTable, first: int, start: int, inputs: Fields, flags: Fi
     return angle.size, DONE
 
 
-class SpindleEncoder(Stage):
+class SpindleEncoder(TimeMaster):
     """See `lathe_rc.signals.speed` and `lathe_rc.signals.encoder`.
 
     Attributes:
         parameters: its table.
         law: the speed law.
-        samples: length of the run [sample]; None: endless.
     """
 
     kind = "spindle_encoder"
     Parameters = SpindleEncoderParameters
+    parameters: SpindleEncoderParameters
+    law: SpeedLaw
     step: ClassVar[Step | None] = staticmethod(step)
 
     def __init__(self, name: str, parameters: SpindleEncoderParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         self.law = parameters.speed_law(name)
-        self.samples = (
-            self.law.samples_until(2 * np.pi * parameters.revolutions, parameters.step)
-            if parameters.revolutions
-            else None
-        )
+        if parameters.revolutions:
+            with about(name, f"revolutions = {parameters.revolutions:g}"):
+                self.samples = self.law.samples_until(2 * np.pi * parameters.revolutions, parameters.step)
         self._check_end()
-        self._triggers = [self._by_sample(trigger) for trigger in self._triggers]
+        self.place_triggers()
         self._encoder = Encoder(self.law, parameters.step, parameters.counts_per_revolution, parameters.speed_window)
         self.declare(outputs=[Output("encoder", messages.ENCODER, Joint("angle", "speed"))])
 
@@ -91,16 +63,17 @@ class SpindleEncoder(Stage):
                 "allowed: not before its end"
             )
 
-    def _by_sample(self, trigger: Trigger) -> Trigger:
-        """The same trigger; who makes the angle knows when it comes."""
-        if trigger.kind != "revolution":
-            return trigger
-        sample = self.law.samples_until(2.0 * np.pi * trigger.value, self.parameters.step)
-        return Trigger("sample", float(sample), trigger.action)
+    def sample_at(self, angle: float) -> int:
+        """See `TimeMaster`."""
+        return self.law.samples_until(angle, self.parameters.step)
 
     def speed_range(self) -> tuple[float, float]:
-        """Lowest and highest spindle speed in the run [rad/s]."""
+        """See `TimeMaster`."""
         return self.law.speed_range(np.inf if self.samples is None else self.samples * self.shared.step)
+
+    def largest_acceleration(self) -> float:
+        """See `TimeMaster`."""
+        return self.law.largest_acceleration()
 
     @property
     def memory(self) -> tuple[Any, ...]:

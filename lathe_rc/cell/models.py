@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a controller takes for its drive: given once, with the drive, unless the model shall be another.
+
+A parameter that `lathe_rc.cell.parameters.parameter` marks with a quantity of the drive, and that nobody has given,
+gets the value of the drive that reads what the controller commands. Quantities with the same word before a dot belong
+together: who gives one of them gives all.
+"""
+
+from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import cast
+
+from lathe_rc.cell.parameters import NodeParameters, remapped
+from lathe_rc.errors import InputError
+
+Quantity = float | list[float]
+
+
+@cache
+def _marked(table: type[NodeParameters]) -> Mapping[str, str]:
+    """Quantity of the drive by parameter."""
+    return {name: row.drive for name, row in table.rows().items() if row.drive}
+
+
+def _together(quantity: str) -> str:
+    """What a quantity is part of; itself, if of nothing."""
+    return quantity.partition(".")[0]
+
+
+def _not_given(table: NodeParameters) -> Mapping[str, str]:
+    """Quantity of the drive by parameter, of those that nobody has given."""
+    marked = _marked(type(table))
+    given = {_together(quantity) for name, quantity in marked.items() if name in table.model_fields_set}
+    return {name: quantity for name, quantity in marked.items() if _together(quantity) not in given}
+
+
+def _drives(tables: Mapping[str, NodeParameters], topic: str) -> Iterator[tuple[str, Mapping[str, Quantity]]]:
+    """Names and quantities of the drives that read a topic."""
+    for node, table in tables.items():
+        for command, known in table.drive_models().items():
+            if remapped(table, command) == topic:
+                yield node, known
+
+
+def _model(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters]) -> dict[str, Quantity]:
+    """The values of the parameters that nobody has given."""
+    values: dict[str, Quantity] = {}
+    of: dict[str, str] = {}
+    missing = _not_given(table)
+    for drive, known in _drives(tables, remapped(table, table.commanded_topic)) if missing else ():
+        for name, quantity in missing.items():
+            if quantity in known and values.setdefault(name, known[quantity]) != known[quantity]:
+                raise InputError(
+                    f"{node}.{name} is not given, and the drives that {node} commands differ: {of[name]} has "
+                    f"{values[name]}, {drive} {known[quantity]}; allowed: to give it"
+                )
+            of.setdefault(name, drive)
+    rows = type(table).rows()
+    return {name: values.get(name, cast("Quantity", rows[name].default)) for name in missing}
+
+
+def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
+    """The tables of a cell by node, with the models that nobody has given; they count as not given still.
+
+    Raises:
+        InputError: several drives are commanded, and a model that is not given cannot be that of all.
+    """
+    made = dict(tables)
+    for node, table in tables.items():
+        values = _model(node, table, tables)
+        if any(getattr(table, name) != value for name, value in values.items()):
+            made[node] = table.model_copy(update=values)
+            made[node].model_fields_set.difference_update(values)
+    return made

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A real encoder as time master: its counts, as they come or from a file, say how the spindle has turned."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
+
+from lathe_rc import resources
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.stage import Joint, Output, Sparse
+from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.signals.counts import CountedAngle, CsvReader
+
+TOO_FAST, TOO_SLOW, LATE = "too fast", "too slow", "late"  #: events that come about by themselves
+
+_TURN = 2.0 * np.pi
+_RPM = 30.0 / np.pi  # for 1 rad/s
+
+
+class EncoderDeviceParameters(TimeMasterParameters):
+    """A real encoder in place of the spindle: where its counts come from, and length and pace of the run.
+
+    The angle is linear between readings; what is called true is what was measured. A topic or a line sets the pace
+    itself: `speed_factor` is for a file alone.
+    """
+
+    counts_per_revolution: Annotated[int, Ge(1), Le(2**31 - 1)] = parameter(
+        4096, "encoder counts per revolution after quadrature"
+    )
+    source: Literal["topic", "line", "file"] = parameter(
+        "topic", "sensor_msgs/JointState on a topic; lines of text from a serial line, pipe or file; or a CSV file"
+    )
+    topic: str = parameter("spindle/joint_states", "topic: its name; nobody else in the cell reads it")
+    joint: str = parameter("", "topic: name of the joint; empty: the first one")
+    position: Literal["angle", "counts"] = parameter("angle", "topic: what its position is, in rad or counts")
+    device: str = parameter("", "line: path of the terminal, pipe or file, with lines of time_ns,counts")
+    baud_rate: Annotated[int, Ge(50)] = parameter(115200, "line: speed of a terminal, in baud", "1/s")
+    counts_file: str = parameter("", "file: CSV file with time_ns,counts or time_s,counts", path=True)
+    counter_range: Annotated[int, Ge(0)] = parameter(0, "the counter begins anew after so many counts; 0: never")
+    inverted: bool = parameter(default=False, doc="the counter counts down while the spindle turns forward")
+    max_reverse: Annotated[float, Ge(0)] = parameter(
+        2.0, "counts that the counter may go back by; the angle stands still meanwhile"
+    )
+    max_gap: Annotated[float, Gt(0)] = parameter(
+        0.01, "longest time between two readings; a longer one is an error", "s"
+    )
+    max_silence: Annotated[float, Gt(0)] = parameter(
+        1.0, "topic, line: longest wall time without a reading; longer is an error", "s"
+    )
+    max_lag: Annotated[float, Gt(0)] = parameter(
+        0.5, "topic, line: how far the cell may fall behind the readings; farther is an error", "s"
+    )
+    max_deviation: Annotated[float, Gt(0), Lt(1)] = parameter(
+        0.2, "the checks before the start count on speeds this near to the nominal one; events tell of others", "1"
+    )
+    max_acceleration: Annotated[float, Ge(0)] = parameter(
+        200.0, "the checks before the start count on no greater acceleration of the spindle", "rad/s^2"
+    )
+
+
+class EncoderDevice(TimeMaster):
+    """See `lathe_rc.signals.counts`.
+
+    Attributes:
+        parameters: its table.
+        counted: the angle.
+    """
+
+    kind = "encoder_device"
+    Parameters = EncoderDeviceParameters
+    parameters: EncoderDeviceParameters
+    announces = (TOO_FAST, TOO_SLOW, LATE)
+
+    def __init__(self, name: str, parameters: EncoderDeviceParameters) -> None:
+        super().__init__(name, parameters)
+        self.live = parameters.source != "file"
+        self.counted = CountedAngle(
+            counts=parameters.counts_per_revolution,
+            step_ns=parameters.step_ns,
+            wraps=parameters.counter_range,
+            inverted=parameters.inverted,
+            max_reverse=parameters.max_reverse,
+            max_gap=parameters.max_gap,
+        )
+        self._before: Samples | None = None  # the last angles, for the speed
+        self._revolution = -1.0
+        self._told: set[str] = set()
+        self._told_late = 0
+        self._check()
+        if not self.live:
+            self._read(resources.find(Path(parameters.counts_file)))
+        self.place_triggers()
+        if parameters.source == "topic":
+            self.foreign = {parameters.topic: messages.JOINTS}
+        self.declare(outputs=[Output("encoder", messages.ENCODER, Joint("angle", "speed"))], tells=True)
+
+    def _check(self) -> None:
+        parameters, source = self.parameters, self.parameters.source
+        needed = {"topic": "topic", "line": "device", "file": "counts_file"}[source]
+        if not getattr(parameters, needed):
+            raise InputError(f"{self.name}.{needed} is empty with source = {source}; allowed: a name")
+        if self.live and parameters.speed_factor != 1.0:
+            raise InputError(
+                f"{self.name}.speed_factor = {parameters.speed_factor:g} with source = {source}; allowed: 1, since the "
+                "encoder sets the pace"
+            )
+
+    def _read(self, path: Path) -> None:
+        try:
+            for time_ns, count in CsvReader(path).read():
+                self.counted.add(time_ns, count)
+        except InputError:
+            raise
+        except LatheError as error:
+            raise InputError(f"{path}: {error}") from None
+        if self.counted.late:
+            raise InputError(
+                f"{path}: {self.counted.late} readings are not later than those before them; allowed: times that rise"
+            )
+        self.end()
+        if self.samples is None:
+            raise InputError(self._too_short(str(path)))
+
+    def _too_short(self, what: str) -> str:
+        return (
+            f"{what} ends at {self.counted.time:.6g} s, after {self.counted.angle / _TURN:.6g} revolutions; "
+            f"{self.name}.revolutions = {self.parameters.revolutions:g}, allowed: up to that, or 0 for all there is"
+        )
+
+    # ---- readings -----------------------------------------------------------------------------------
+
+    def hear(self, time_ns: int, count: float) -> None:
+        """Take a reading: its time [ns] and the counter.
+
+        Raises:
+            LatheError: it cannot be; names the node.
+        """
+        with self.named():
+            self.counted.add(time_ns, count)
+        self._look_for_the_end()
+
+    def end(self) -> None:
+        """No reading will come any more.
+
+        Raises:
+            LatheError: the run was to be longer.
+        """
+        self._look_for_the_end()
+        if self.samples is None and not self.parameters.revolutions:
+            self.samples = self.counted.available
+        if self.samples is None and self.live:
+            raise LatheError(self._too_short(f"{self.name}: the line"))
+
+    def _look_for_the_end(self) -> None:
+        wanted = _TURN * self.parameters.revolutions
+        if wanted and self.samples is None and self.counted.angle >= wanted:
+            self.samples = self.counted.reached(wanted)
+
+    @property
+    def available(self) -> int:
+        """Samples that can be computed."""
+        return self.counted.available if self.samples is None else self.samples
+
+    # ---- for the checks before a start --------------------------------------------------------------
+
+    def sample_at(self, angle: float) -> int:
+        """See `TimeMaster`; readings that are still to come tell nothing."""
+        found = None if self.live else self.counted.reached(angle)
+        if found is None:
+            where = f"{angle / _TURN:g} revolutions"
+            if self.live:
+                raise InputError(
+                    f"{self.name}: nobody knows when {where} will be reached; allowed with source = "
+                    f"{self.parameters.source}: events by second or sample"
+                )
+            raise InputError(f"{self.name}: an event at {where}; allowed: up to {self.counted.angle / _TURN:.6g}")
+        return found
+
+    def speed_range(self) -> tuple[float, float]:
+        """See `TimeMaster`."""
+        nominal, deviation = self.shared.nominal_speed, self.parameters.max_deviation
+        return nominal * (1.0 - deviation), nominal * (1.0 + deviation)
+
+    def largest_acceleration(self) -> float:
+        """See `TimeMaster`."""
+        return self.parameters.max_acceleration
+
+    # ---- samples ------------------------------------------------------------------------------------
+
+    def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
+        """See `Stage`."""
+        out = outputs[0]
+        if not out["angle"].size:
+            return []
+        angle = self.counted.take(first, out["angle"].size)
+        window, step = self.parameters.speed_window, self.shared.step
+        if self._before is None:
+            self._before = angle[0] + self.shared.nominal_speed * step * np.arange(-window, 0)
+        whole = np.concatenate((self._before, angle))
+        out["angle"][:] = out["angle_true"][:] = angle
+        out["speed"][:] = out["speed_true"][:] = (angle - whole[: angle.size]) / (window * step)
+        self._before = whole[-window:].copy()
+        turns = np.floor(angle / _TURN)
+        out["index_pulse"][:] = turns > np.concatenate(([self._revolution], turns[:-1]))
+        self._revolution = float(turns[-1])
+        return self._say(first, out["speed"])
+
+    def _say(self, first: int, speed: Samples) -> list[Sparse]:
+        """What is to be told of these samples; of the speed once."""
+        low, high = self.speed_range()
+        said = []
+        for what, outside in ((TOO_FAST, speed > high), (TOO_SLOW, speed < low)):
+            if what not in self._told and outside.any():
+                self._told.add(what)
+                place = int(np.argmax(outside))
+                said.append((first + place, f"{what}: {speed[place] * _RPM:.5g} rpm"))
+        if (late := self.counted.late) > self._told_late:
+            said.append((first, f"{LATE}: {late - self._told_late} readings after younger ones, left out"))
+            self._told_late = late
+        topic = f"{self.name}/events"
+        return [Sparse(topic, messages.EVENT, index, {"action": text}) for index, text in said]

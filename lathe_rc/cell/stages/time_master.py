@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What gives the cell its time and angle: a spindle that is emulated, a real encoder, or one that was recorded."""
+
+from abc import abstractmethod
+from dataclasses import replace
+from typing import Annotated, Literal
+
+import numpy as np
+from annotated_types import Ge, Le
+
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
+from lathe_rc.cell.stage import Stage, Trigger
+from lathe_rc.signals.speed import SpeedLaw
+
+
+class TimeMasterParameters(NodeParameters):
+    """The measured speed, and length and pace of the run."""
+
+    counts_per_revolution: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
+        0, "encoder counts per revolution after quadrature; 0: an ideal encoder"
+    )
+    speed_window: Annotated[int, Ge(1), Le(65536)] = parameter(
+        64,
+        "the measured speed is the angle's difference over so many samples; not used by an ideal encoder",
+        "sample",
+    )
+    revolutions: Annotated[float, Ge(0)] = parameter(0.0, "length of the run; 0: until stopped", "rev")
+    speed_factor: Annotated[float, Ge(0)] = parameter(
+        1.0, "pace of the run against real time; 0: as fast as the members follow", "1"
+    )
+    stall_reaction: Literal["wait", "safe"] = parameter(
+        "wait", "what a member leads to that is silent; one whose process has died leads to the safe state"
+    )
+    stall_time: Annotated[float, Ge(0), Le(3600)] = parameter(
+        0.1, "wall time of silence after which the safe state is declared, if that is the reaction", "s"
+    )
+    safe_time: Annotated[float, Ge(0), Le(10)] = parameter(0.2, "how long a run goes on in the safe state", "s")
+    restart_time: Annotated[float, Ge(0), Le(3600)] = parameter(
+        30.0, "wall time in which a member that can be restarted has to be back", "s"
+    )
+    members: list[str] = parameter([], "nodes that must be ready before block 0; empty: start alone")
+    processes: list[str] = parameter(
+        [], "nodes that share a process, as 'coarse+tool', for harness and launch; those not named have one each"
+    )
+
+
+class TimeMaster(Stage):
+    """The stage that all others follow; it reads no other.
+
+    Attributes:
+        parameters: its table.
+        samples: length of the run [sample]; None: endless, or not known yet.
+        live: readings come while the cell runs, in real time: it cannot run offline.
+        law: the speed law that it follows; None: nobody knows it in advance.
+    """
+
+    live = False
+    law: SpeedLaw | None = None
+
+    def __init__(self, name: str, parameters: TimeMasterParameters) -> None:
+        super().__init__(name, parameters)
+        self.parameters = parameters
+        self.samples: int | None = None
+
+    @abstractmethod
+    def sample_at(self, angle: float) -> int:
+        """First sample at which the true angle has reached ``angle`` [rad].
+
+        Raises:
+            InputError: it never does, or nobody can know.
+        """
+
+    @abstractmethod
+    def speed_range(self) -> tuple[float, float]:
+        """Lowest and highest spindle speed in the run [rad/s]."""
+
+    @abstractmethod
+    def largest_acceleration(self) -> float:
+        """Upper bound of the magnitude of dΩ/dt in the run [rad/s²]."""
+
+    @property
+    def expected_samples(self) -> int | None:
+        """Length of the run [sample], at the nominal speed where it is not known yet; None: endless."""
+        if self.samples is not None or not self.parameters.revolutions:
+            return self.samples
+        return round(self.parameters.revolutions * 2.0 * np.pi / self.shared.nominal_speed / self.shared.step)
+
+    def place_triggers(self) -> None:
+        """Who makes the angle knows when events by revolutions come."""
+        self._triggers = [self._by_sample(trigger) for trigger in self._triggers]
+
+    def _by_sample(self, trigger: Trigger) -> Trigger:
+        if trigger.kind != "revolution":
+            return trigger
+        with about(self.name, f"{trigger.parameter} = {trigger.text!r}"):
+            sample = self.sample_at(2.0 * np.pi * trigger.value)
+        return replace(trigger, kind="sample", value=float(sample))

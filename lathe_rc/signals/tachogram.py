@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tachograms: spindle speed over time as a CSV file with the columns time_s and rpm, linear between its rows."""
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import InputError
+from lathe_rc.files import replacing
+from lathe_rc.signals.table import read_table
+
+Array = npt.NDArray[np.float64]
+
+_COLUMNS = ("time_s", "rpm")
+_ROOM = 1e-6  # share of the tolerance that is kept for the rounding of the file
+_FIRST_LOOK = 256  # points that are looked at together; twice as many after each look that finds no end
+
+
+def read(path: Path) -> tuple[Array, Array]:
+    """Times [s] and speeds [1/min] of a file, shape (n,) each.
+
+    Raises:
+        InputError: the file is missing or malformed, times do not rise, or a speed is not above 0.
+    """
+    _, rows = read_table(path, [_COLUMNS], "tachogram")
+    time, rpm = rows[:, 0].copy(), rows[:, 1].copy()
+    if not time.size:
+        raise InputError(f"{path}: no row; allowed: one or more of {','.join(_COLUMNS)}")
+    wrong = np.flatnonzero(np.diff(time, prepend=-np.inf) <= 0.0)
+    if time[0] < 0.0 or wrong.size:
+        place = 0 if time[0] < 0.0 else int(wrong[0])
+        raise InputError(
+            f"{path}: time_s = {time[place]:.10g} in row {place + 1}; allowed: from 0 on, each later than the last"
+        )
+    slow = np.flatnonzero(rpm <= 0.0)
+    if slow.size:
+        raise InputError(f"{path}: rpm = {rpm[slow[0]]:.10g} at {time[slow[0]]:.10g} s; allowed: above 0")
+    return time, rpm
+
+
+def write(path: Path, time: Array, rpm: Array, comment: str) -> None:
+    """Write a file that `read` takes.
+
+    Args:
+        path: of the file; an existing one is replaced.
+        time: of its rows [s], shape (n,).
+        rpm: speed [1/min], shape (n,).
+        comment: a line at the top.
+
+    Raises:
+        InputError: a place that cannot be written to.
+    """
+    header = f"# {' '.join(comment.split())}\n{','.join(_COLUMNS)}"
+    try:
+        with replacing(path) as file:
+            rows = np.stack((time, rpm), axis=1)
+            np.savetxt(file, rows, fmt="%.15g", delimiter=",", header=header, comments="", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+
+
+class Thinner:
+    """Picks points of a long record, piece by piece, between which straight lines stay near to all others.
+
+    From the point that was picked last it goes as far as one line can: the next is the last point that a line reaches
+    which passes all points in between within the tolerance.
+
+    Args:
+        tolerance: greatest distance of the lines from any point, in the unit of the values; above 0.
+    """
+
+    def __init__(self, tolerance: float) -> None:
+        self._tolerance = tolerance * (1.0 - _ROOM)
+        self._picked: list[tuple[float, float]] = []
+        self._reached: tuple[float, float] | None = None  # the last point that a line reaches from the picked one
+        self._time, self._value = np.empty(0), np.empty(0)  # after that, or after the picked one
+        self._open()
+
+    def add(self, time: Array, value: Array) -> None:
+        """Take further points, shape (n,); their times rise."""
+        self._time, self._value = np.append(self._time, time), np.append(self._value, value)
+        if not self._picked and self._time.size:
+            self._picked.append((float(self._time[0]), float(self._value[0])))
+            self._drop(1)
+        self._look()
+
+    def finish(self) -> tuple[Array, Array]:
+        """Times and values of the points that were picked, the first and the last one among them; shape (m,) each."""
+        while self._reached is not None:
+            self._pick()
+            self._look()
+        found = np.array(self._picked).reshape(-1, 2)
+        return found[:, 0], found[:, 1]
+
+    def _open(self) -> None:
+        """Any slope will do, as long as no point after the picked one has been looked at."""
+        self._seen, self._low, self._high = 0, -np.inf, np.inf
+
+    def _drop(self, count: int) -> None:
+        self._time, self._value = self._time[count:], self._value[count:]
+
+    def _pick(self) -> None:
+        assert self._reached is not None, "the first point after the picked one can be reached"
+        self._picked.append(self._reached)
+        self._reached = None
+        self._open()
+
+    def _look(self) -> None:
+        """Go through the points that have not been looked at, as far as they allow a line, and on from there."""
+        count = _FIRST_LOOK
+        while self._seen < self._time.size:
+            time, value = self._time[self._seen :][:count], self._value[self._seen :][:count]
+            since, rise = time - self._picked[-1][0], value - self._picked[-1][1]
+            low = np.maximum(np.maximum.accumulate((rise - self._tolerance) / since), self._low)
+            high = np.minimum(np.minimum.accumulate((rise + self._tolerance) / since), self._high)
+            closed = np.flatnonzero(low > high)
+            end = int(closed[0]) if closed.size else since.size
+            slope = rise[:end] / since[:end]
+            fits = np.flatnonzero((low[:end] <= slope) & (slope <= high[:end]))
+            self._seen += end
+            if end:
+                self._low, self._high = float(low[end - 1]), float(high[end - 1])
+            if fits.size:
+                place = int(fits[-1])
+                self._reached = float(time[place]), float(value[place])
+                left = end - place - 1
+                self._drop(self._seen - left)
+                self._seen = left
+            if closed.size:
+                self._pick()
+                count = _FIRST_LOOK
+            else:
+                count *= 2

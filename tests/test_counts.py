@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Counts of a real encoder: reading them, the angle between them, and a cell that follows a file of them, offline."""
+
+import io
+import itertools
+import os
+import pty
+
+import numpy as np
+import pytest
+from cells import encoder, scenario
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from lathe_rc import harness
+from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.signals import speed
+from lathe_rc.signals.counts import CountedAngle, CsvReader, LineReader
+
+STEP_NS, COUNTS = 15_625, 1000
+TURN = 2 * np.pi
+LAW = speed.harmonic(104.72, np.array([0.05]), np.array([60.0]), np.array([0.0]))
+
+
+def counted(**changed):
+    given_ = {"counts": COUNTS, "step_ns": STEP_NS, "wraps": 0, "inverted": False, "max_reverse": 2.0, "max_gap": 0.01}
+    return CountedAngle(**{**given_, **changed})
+
+
+def filled(times, counts, **changed):
+    angle = counted(**changed)
+    for time, count in zip(times, counts, strict=True):
+        angle.add(int(time), float(count))
+    return angle
+
+
+# --- readers
+
+
+def read(text):
+    return list(LineReader(io.BytesIO(text), "line").read())
+
+
+def test_lines_are_readings_whatever_parts_them():
+    text = b"time_ns,counts\n# a comment\n\n1700000000000000001,5\n1700000000000000002; 6.5\r\n+3 \t -7\n4,8"
+    assert read(text) == [(1700000000000000001, 5.0), (1700000000000000002, 6.5), (3, -7.0), (4, 8.0)]
+
+
+@pytest.mark.parametrize("line", [b"5", b"1,2,3", b"a,b", b"1.5,2", b"1,--2", b"\xff\xfe,1", b"1,nan"])
+def test_a_line_that_is_no_reading_is_refused_by_name(line):
+    with pytest.raises(InputError, match=r"^line: '.*'; allowed: a time and a counter, as time_ns,counts$"):
+        read(b"1,2\n" + line + b"\n")
+
+
+def test_what_has_no_lines_is_refused():
+    with pytest.raises(InputError, match="1000 bytes without an end of line; allowed: lines of text"):
+        list(LineReader(_Ready([b"x" * 1000]), "line").read())
+
+
+class _Ready:
+    """A stream with nothing behind what has come."""
+
+    def __init__(self, pieces):
+        self.pieces = pieces
+
+    def read(self, size):
+        return self.pieces.pop(0) if self.pieces else None
+
+
+@given(st.lists(st.integers(1, 9), min_size=1, max_size=40))
+def test_lines_come_in_any_pieces(cuts):
+    text = b"".join(b"%d,%d\n" % (n, 2 * n) for n in range(20))
+    ends = np.unique(np.minimum(np.cumsum(cuts), len(text)))
+    pieces = [text[a:b] for a, b in zip([0, *ends], [*ends, len(text)], strict=True) if b > a]
+    stream = _Ready(pieces)
+    reader, found = LineReader(stream, "line"), []
+    while stream.pieces:
+        found += reader.read()
+    assert found == [(n, 2.0 * n) for n in range(20)]
+    assert not reader.ended
+
+
+def test_a_terminal_is_read_raw_and_its_first_line_may_lack_its_beginning():
+    """Nothing is waited for; when the other end has gone the line has ended."""
+    ours, theirs = pty.openpty()
+    reader = LineReader.open(os.ttyname(theirs), 115200)
+    os.close(theirs)
+    assert list(reader.read()) == []
+    os.write(ours, b"00,7\n1,2\n3,")
+    assert list(reader.read()) == [(1, 2.0)]
+    os.write(ours, b"4\n")
+    assert list(reader.read()) == [(3, 4.0)]
+    os.close(ours)
+    assert list(reader.read()) == []
+    assert reader.ended
+    reader.close()
+
+
+def test_a_pipe_has_not_ended_before_somebody_writes_to_it(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    reader = LineReader.open(tmp_path / "pipe", 115200)
+    assert list(reader.read()) == []
+    with (tmp_path / "pipe").open("wb") as writer:
+        writer.write(b"1,2\n3,4")
+    assert list(reader.read()) == [(1, 2.0), (3, 4.0)]
+    assert reader.ended
+    reader.close()
+
+
+def test_a_speed_that_a_terminal_has_not_is_refused():
+    ours, theirs = pty.openpty()
+    try:
+        with pytest.raises(InputError, match=r"12345 baud; allowed: .*9600.*115200"):
+            LineReader.open(os.ttyname(theirs), 12345)
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("# made by hand\ntime_ns,counts\n10,1\n\n20,2\n", [(10, 1.0), (20, 2.0)]),
+        ("time_s, counts\n1700000000.000000001,1\n1.5,2\n", [(1700000000000000001, 1.0), (1_500_000_000, 2.0)]),
+    ],
+)  # fmt: skip
+def test_a_file_says_its_unit_of_time_and_loses_no_nanosecond(tmp_path, text, found):
+    path = tmp_path / "counts.csv"
+    path.write_text(text)
+    reader = CsvReader(path)
+    assert list(reader.read()) == found
+    assert reader.ended
+    assert list(reader.read()) == []
+
+
+def test_a_file_with_another_header_or_line_is_refused(tmp_path):
+    path = tmp_path / "counts.csv"
+    path.write_text("time,counts\n1,2\n")
+    with pytest.raises(InputError, match="header 'time,counts'; allowed: time_ns,counts or time_s,counts"):
+        CsvReader(path)
+    path.write_text("time_ns,counts\n1,2\n1,x\n")
+    with pytest.raises(InputError, match=r"counts.csv:3: '1,x'; allowed"):
+        list(CsvReader(path).read())
+
+
+# --- the angle
+
+
+def test_angle_is_linear_between_readings_and_begins_within_a_revolution():
+    angle = filled([10**9, 10**9 + 4 * STEP_NS, 10**9 + 8 * STEP_NS], [3250, 3254, 3262])
+    assert angle.available == 9
+    assert_allclose(angle.take(0, 9) * COUNTS / TURN, [250, 251, 252, 253, 254, 256, 258, 260, 262])
+
+
+@given(st.lists(st.integers(1, 50), min_size=1, max_size=30), st.integers(0, 2**32 - 1))
+def test_pieces_change_no_bit_of_the_angle(cuts, seed):
+    random = np.random.default_rng(seed)
+    times = np.cumsum(random.integers(1, 200_000, 60))
+    counts = np.cumsum(random.integers(0, 9, 60))
+    whole = filled(times, counts)
+    expected = whole.take(0, whole.available)
+    angle, found = counted(), []
+    for time, count, cut in zip(times, counts, itertools.cycle(cuts), strict=False):
+        angle.add(int(time), float(count))
+        size = min(cut, angle.available - sum(map(len, found)))
+        found.append(angle.take(sum(map(len, found)), size))
+    found.append(angle.take(sum(map(len, found)), angle.available - sum(map(len, found))))
+    assert np.array_equal(np.concatenate(found), expected)
+    assert np.all(np.diff(expected) >= 0.0)
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+@pytest.mark.parametrize("wraps", [COUNTS, 2**16])
+def test_a_counter_that_begins_anew_goes_on(inverted, wraps):
+    times, counts = np.arange(300) * 1_000_000, 70_000 + 37 * np.arange(300)
+    plain = filled(times, counts)
+    sent = (-counts if inverted else counts) % wraps
+    wrapped = filled(times, sent, wraps=wraps, inverted=inverted)
+    size = plain.available
+    difference = (wrapped.take(0, size) - plain.take(0, size)) / TURN
+    assert_allclose(difference, difference[0], atol=1e-9)
+
+
+def test_a_gap_is_an_error_that_names_the_time():
+    angle = filled([0, 5_000_000], [0, 1])
+    with pytest.raises(LatheError) as refused:
+        angle.add(20_500_000, 9.0)
+    assert str(refused.value) == "no counts from 0.005 to 0.0205 s, for 15.5 ms; allowed: up to max_gap = 10 ms"
+
+
+def test_the_angle_stands_while_the_counter_trembles_and_a_spindle_that_turns_back_is_an_error():
+    angle = filled(np.arange(5) * STEP_NS, [10, 12, 11, 10, 13])
+    assert_allclose(angle.take(0, 5) * COUNTS / TURN, [10, 12, 12, 12, 13])
+    with pytest.raises(LatheError, match=r"gone back by 3 counts at 7.8125e-05 s; allowed: up to max_reverse = 2"):
+        angle.add(5 * STEP_NS, 10.0)
+
+
+def test_a_reading_that_comes_after_a_younger_one_is_left_out_and_counted():
+    angle = filled([0, 4 * STEP_NS, 2 * STEP_NS, 4 * STEP_NS, 6 * STEP_NS], [0, 4, 100, 100, 6])
+    assert angle.late == 2
+    assert_allclose(angle.take(0, 7) * COUNTS / TURN, np.arange(7))
+
+
+@given(st.floats(0.0, 1.5 * TURN), st.integers(0, 2**32 - 1))
+def test_the_end_is_the_first_sample_that_has_reached_the_angle(wanted, seed):
+    random = np.random.default_rng(seed)
+    angle = filled(np.cumsum(random.integers(1, 100_000, 200)), np.cumsum(random.integers(0, 12, 200)))
+    found, whole = angle.reached(wanted), angle.take(0, angle.available)
+    past = np.flatnonzero(whole >= wanted)
+    assert found == (int(past[0]) if past.size else None)
+
+
+# --- a cell that follows a file
+
+
+def write_counts(path, seconds=0.4, every=5e-4, law=LAW, first=7 * 10**17):
+    """What a real encoder of `COUNTS` counts would have given."""
+    times = np.arange(0.0, seconds, every)
+    counts = np.floor(law.at(times)[0] * COUNTS / TURN)
+    rows = [f"{first + round(time * 1e9)},{count:.0f}" for time, count in zip(times, counts, strict=True)]
+    path.write_text("\n".join(["time_ns,counts", *rows]))
+    return times[-1]
+
+
+def follower(path, **changed):
+    """The smallest cell with an encoder in the place of the spindle."""
+    device = {
+        "source": "file",
+        "counts_file": str(path),
+        "counts_per_revolution": COUNTS,
+        "revolutions": 5.0,
+        **changed,
+    }
+    nodes = dict(scenario(encoder_device=device, learning_controller={"feedback_delay": 2048}).nodes)
+    del nodes["spindle_encoder"]
+    return Scenario("device", nodes)
+
+
+def test_a_cell_learns_by_a_file_of_counts(tmp_path):
+    path = tmp_path / "counts.csv"
+    write_counts(path)
+    result = harness.run(follower(path))
+    signals = encoder(result)
+    true = LAW.at(np.arange(result.samples) * STEP_NS * 1e-9)
+    assert np.abs(signals["angle"] - true[0]).max() < 2.1 * TURN / COUNTS
+    assert signals["angle"][-1] < 5 * TURN <= signals["angle"][-1] + 2 * TURN / COUNTS
+    assert np.flatnonzero(signals["index_pulse"]).size == 5
+    window = 64 * STEP_NS * 1e-9
+    behind = (signals["angle"][64:] - signals["angle"][:-64]) / window
+    assert np.array_equal(signals["speed"][64:], behind)
+    assert np.abs(signals["speed"] - true[1]).max() < 2.2 * TURN / COUNTS / window
+    assert result.errors.rms[-1] < 0.1 * result.errors.rms[0]
+
+
+def test_block_size_changes_no_bit_of_what_follows_a_file(tmp_path):
+    path = tmp_path / "counts.csv"
+    write_counts(path, 0.2)
+    runs = [follower(path, revolutions=2.0), follower(path, revolutions=2.0)]
+    other = Scenario("device", {n: t.model_copy(update={"block_size": 37}) for n, t in runs[1].nodes.items()})
+    assert harness.run(runs[0]).digest == harness.run(other).digest
+
+
+def test_without_revolutions_a_run_is_as_long_as_its_file(tmp_path):
+    path = tmp_path / "counts.csv"
+    last = write_counts(path, 0.1)
+    assert harness.run(follower(path, revolutions=0.0)).samples == round(last * 1e9) // STEP_NS + 1
+
+
+def test_events_tell_of_speeds_that_the_checks_did_not_count_on(tmp_path):
+    path = tmp_path / "counts.csv"
+    write_counts(path, 0.2)
+    result = harness.run(follower(path, revolutions=2.0, max_deviation=0.02))
+    said = [found.text.partition(":")[0] for found in result.happened if found.topic == "/encoder_device/events"]
+    assert sorted(said) == ["too fast", "too slow"]
+    with pytest.raises(InputError, match="at 199 rad/s the cycle leaves"):
+        harness.run(follower(path, revolutions=2.0, max_deviation=0.9))
+
+
+def test_a_file_of_counts_is_part_of_the_scenario(tmp_path):
+    path = tmp_path / "counts.csv"
+    write_counts(path, 0.1)
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(
+        "/encoder_device: {ros__parameters: {source: file, counts_file: counts.csv, counts_per_revolution: 1000}}"
+    )
+    loaded = scenarios.load(cell)
+    assert harness.run(loaded).samples > 6000
+    write_counts(path, 0.09)
+    assert scenarios.load(cell).shared.run_id != loaded.shared.run_id
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (
+            {"revolutions": 50.0},
+            r"ends at 0.0995 s, after 1\.6\d+ revolutions; encoder_device.revolutions = 50, allowed",
+        ),
+        ({"max_gap": 1e-4}, r"counts.csv: no counts from 0 to 0.0005 s, for 0.5 ms; allowed: up to max_gap = 0.1 ms"),
+        ({"inverted": True}, r"counts.csv: the encoder has gone back by"),
+        ({"counts_file": ""}, r"encoder_device.counts_file is empty with source = file; allowed: a name"),
+        ({"source": "line"}, r"encoder_device.device is empty with source = line; allowed: a name"),
+        ({"source": "topic", "speed_factor": 0.0}, r"speed_factor = 0 with source = topic; allowed: 1"),
+        ({"source": "topic"}, r"follows a device, which a node hears; allowed: --mode composed or processes"),
+        ({"source": "topic", "revolutions": 0.0}, r"encoder_device.revolutions = 0; this run needs an end"),
+        (
+            {"source": "topic", "allow_faults": True, "events": ["revolution 1: repair encoder"]},
+            r"nobody knows when 1 rev",
+        ),
+    ],
+)
+def test_what_cannot_work_is_refused_in_one_line(tmp_path, changed, message):
+    path = tmp_path / "counts.csv"
+    write_counts(path, 0.1)
+    with pytest.raises(InputError, match=message) as refused:
+        harness.run(follower(path, **{"revolutions": 1.0, **changed}))
+    assert "\n" not in str(refused.value)
+
+
+def test_a_file_whose_times_do_not_rise_is_refused(tmp_path):
+    path = tmp_path / "counts.csv"
+    path.write_text("time_ns,counts\n0,0\n1000000,2\n1000000,3\n2000000,5\n")
+    with pytest.raises(InputError, match="1 readings are not later than those before them; allowed: times that rise"):
+        harness.run(follower(path, revolutions=0.0))
+
+
+def test_a_lead_law_that_must_know_the_speed_in_advance_is_refused(tmp_path):
+    path = tmp_path / "counts.csv"
+    write_counts(path, 0.2)
+    nodes = dict(follower(path, revolutions=2.0).nodes)
+    nodes["learning_controller"] = nodes["learning_controller"].model_copy(update={"lead_law": "exact_preview"})
+    with pytest.raises(InputError, match="exact_preview, but nobody knows the speed of encoder_device in advance"):
+        harness.run(Scenario("device", nodes))

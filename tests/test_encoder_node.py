@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A real encoder as time master of a cell of nodes: by a serial line, by a topic, by a file at a pace."""
+
+import contextlib
+import os
+import pty
+import threading
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from test_counts import COUNTS, TURN, follower, write_counts
+
+from lathe_rc import harness
+from lathe_rc.bag.resim import resimulate
+from lathe_rc.errors import LatheError
+
+pytest.importorskip("rclpy")
+
+from sensor_msgs.msg import JointState
+
+PATIENT = {"max_lag": 60.0, "max_silence": 60.0}  # no test may depend on the wall clock
+
+
+def device(**changed):
+    """The smallest cell with a live encoder."""
+    return follower("", **{"source": "line", "counts_file": "", "revolutions": 2.0, **PATIENT, **changed})
+
+
+def readings(path):
+    return [tuple(map(int, line.split(","))) for line in path.read_text().splitlines()[1:]]
+
+
+@contextmanager
+def serial_line(text):
+    """A terminal on which text comes when the cell has begun: its path, and what watches the cell."""
+    ours, theirs = pty.openpty()
+    begun, told = threading.Event(), []
+
+    def watch(event):
+        told.append(event)
+        if event["event"] == "block0":
+            begun.set()
+
+    def write():
+        begun.wait()
+        rest = text.encode()
+        while rest:
+            rest = rest[os.write(ours, rest[:512]) :]
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    yield os.ttyname(theirs), watch, told
+    begun.set()
+    os.close(theirs)
+    writer.join(10.0)
+    os.close(ours)
+
+
+def lines(path):
+    """As an encoder that has been sending all the time: the first line is not whole."""
+    return "23,4\n" + "".join(f"{time},{count}\n" for time, count in readings(path))
+
+
+@pytest.mark.parametrize("mode", ["composed", "processes"])
+def test_a_serial_line_leads_a_cell_and_gives_the_bits_of_a_file_of_its_counts(tmp_path, mode):
+    """What came is in the bag: run again from that, every bit comes out."""
+    path = tmp_path / "counts.csv"
+    write_counts(path, 0.2)
+    with serial_line(lines(path)) as (line, watch, _):
+        live = harness.run(device(device=line), mode=mode, bag=tmp_path / "bag", watch=watch)
+    of_file = harness.run(follower(path, revolutions=2.0))
+    assert live.digest == of_file.digest
+    assert live.samples == of_file.samples
+    assert live.lateness.blocks == live.blocks
+    assert not resimulate(tmp_path / "bag").different
+
+
+def test_a_topic_leads_a_cell(tmp_path, ghost, domain):
+    """An angle within a revolution of the second joint; it tells them by name."""
+    path = tmp_path / "counts.csv"
+    write_counts(path, 0.2)
+    publisher = ghost.create_publisher(JointState, "/lathe/joints", 1000)
+
+    def publish():
+        begun.wait()
+        while not publisher.get_subscription_count():
+            pass
+        for time, count in readings(path):
+            joints = JointState(name=["x", "spindle"], position=[0.0, TURN * (count % COUNTS) / COUNTS])
+            joints.header.stamp.sec, joints.header.stamp.nanosec = divmod(time, 10**9)
+            publisher.publish(joints)
+
+    begun = threading.Event()
+    writer = threading.Thread(target=publish, daemon=True)
+    writer.start()
+
+    def watch(event):
+        if event["event"] == "block0":
+            begun.set()
+
+    given = {"topic": "/lathe/joints", "joint": "spindle", "counter_range": COUNTS, "device": "", "source": "topic"}
+    live = harness.run(device(**given), mode="composed", watch=watch, domain=domain)
+    of_file = harness.run(follower(path, revolutions=2.0))
+    assert live.samples == of_file.samples
+    angle, expected = (run.recording.dense["/encoder"]["angle"] for run in (live, of_file))
+    assert np.abs(angle - expected).max() < 1e-9
+    assert live.errors.rms[-1] == pytest.approx(of_file.errors.rms[-1], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("cut", "changed", "message"),
+    [
+        (0.1, {}, "the line ends at 0.0995 s, after 1.6"),
+        (0.2, {"max_gap": 2e-4}, "encoder_device: no counts from 0 to 0.0005 s, for 0.5 ms; allowed: up to max_gap"),
+        (0.2, {"max_lag": 1e-9}, "behind the encoder at sample"),
+    ],
+)  # fmt: skip
+def test_what_is_missing_or_late_is_said_and_ends_the_cell(tmp_path, cut, changed, message):
+    path, pipe = tmp_path / "counts.csv", tmp_path / "pipe"
+    write_counts(path, cut)
+    os.mkfifo(pipe)
+    begun = threading.Event()
+
+    def write():
+        begun.wait()
+        with pipe.open("w") as writer, contextlib.suppress(BrokenPipeError):
+            writer.write(lines(path).partition("\n")[2])
+
+    threading.Thread(target=write, daemon=True).start()
+
+    def watch(event):
+        if event["event"] == "block0":
+            begun.set()
+
+    with pytest.raises(LatheError, match=message):
+        harness.run(device(device=str(pipe), **changed), mode="composed", watch=watch)
+
+
+def test_silence_is_an_error_and_names_the_topic_that_nobody_publishes():
+    cell = device(source="topic", device="", max_silence=0.2)
+    with pytest.raises(
+        LatheError, match=r"no counts for .* max_silence = 0.2 s; nobody publishes /spindle/joint_states"
+    ):
+        harness.run(cell, mode="composed")
+
+
+def test_a_line_that_cannot_be_opened_is_refused_before_the_cell_begins():
+    with pytest.raises(
+        LatheError, match=r"/dev/no_such: cannot be opened \(No such file or directory\); check the path"
+    ):
+        harness.run(device(device="/dev/no_such"), mode="composed")
+
+
+def test_a_file_keeps_a_pace_among_nodes_and_how_well_is_told(tmp_path):
+    path = tmp_path / "counts.csv"
+    write_counts(path, 0.1)
+    paced = harness.run(follower(path, revolutions=1.0, speed_factor=1.0), mode="composed")
+    assert paced.digest == harness.run(follower(path, revolutions=1.0)).digest
+    assert paced.lateness.blocks == paced.blocks

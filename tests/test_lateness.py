@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How late the blocks of a paced run were let go, as it is told at its end."""
+
+import json
+
+import numpy as np
+import pytest
+from cells import scenario
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lathe_rc import harness
+from lathe_rc.cell.durations import Lateness, Percentiles
+from lathe_rc.cli import main
+from lathe_rc.commands import outcome
+
+
+@given(st.lists(st.floats(0.0, 1e4), min_size=1, max_size=300), st.sampled_from([1, 50, 95, 99, 100]))
+def test_percentiles_are_never_too_small_and_too_large_by_3_percent_or_a_microsecond(seconds, percent):
+    kept = Percentiles()
+    for each in seconds:
+        kept.add(each)
+    exact = np.percentile(seconds, percent, method="inverted_cdf")
+    assert exact <= kept.within(percent) * (1 + 1e-12)
+    assert kept.within(percent) <= exact * 1.032 + 1e-6
+    assert kept.worst == max(seconds)
+    assert kept.count == len(seconds)
+
+
+def test_no_duration_at_all_has_no_percentiles():
+    assert Percentiles().within(99) == 0.0
+
+
+def test_a_paced_run_tells_its_lateness_at_its_end():
+    """What is told is whole and in order; what it is depends on the machine."""
+    result = harness.run(scenario(spindle_encoder={"revolutions": 1.0, "speed_factor": 1.0}), mode="composed")
+    told = result.lateness
+    assert told.blocks == result.blocks
+    assert 0 <= told.late <= told.blocks
+    within = list(told.within.values())
+    assert list(told.within) == [50, 95, 99]
+    assert 0.0 <= within[0] <= within[1] <= within[2] <= told.worst
+    assert told.slipped >= 0.0
+
+
+def test_without_a_pace_nothing_is_late():
+    free = scenario(spindle_encoder={"revolutions": 0.5, "speed_factor": 0.0})
+    assert harness.run(free, mode="composed").lateness is None
+    assert harness.run(scenario(spindle_encoder={"revolutions": 0.5})).summary()["lateness_s"] is None
+
+
+def test_lateness_is_told_in_words_and_as_json(tmp_path):
+    found = harness.run(scenario(spindle_encoder={"revolutions": 0.5}))
+    late = Lateness(60, 2, 0.0123, {50: 61e-6, 95: 0.5e-3, 99: 2e-3}, 0.004)
+    whole = harness.Result(**{**vars(found), "lateness": late})
+    assert outcome.facts(whole)[2:4] == [
+        "2 of 60 blocks late; the schedule slipped by 0.004 s",
+        "lateness: 50 % within 0.061 ms, 95 % within 0.5 ms, 99 % within 2 ms, worst 12.3 ms",
+    ]
+    cell = tmp_path / "cell.yaml"
+    cell.write_text("/spindle_encoder: {ros__parameters: {revolutions: 0.5}}")
+    words = ["run", str(cell), "--mode", "composed", "--speed-factor", "1", "--json"]
+    said = CliRunner().invoke(main, words, catch_exceptions=False)
+    told = json.loads(said.stdout)["lateness_s"]
+    assert told.keys() == {"blocks", "late", "worst", "within", "slipped"}
+    assert told["within"].keys() == {"50", "95", "99"}
+    assert told["blocks"] == pytest.approx(30, abs=1)
