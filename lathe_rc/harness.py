@@ -261,7 +261,7 @@ def _run(
         return Result(
             scenario=scenario,
             mode="grouped" if mode == "processes" and len(split) < len(complete.nodes) else mode,
-            samples=cell.master.samples,
+            samples=cell.samples,
             wall_s=(events["complete"]["monotonic_ns"] - events["block0"]["monotonic_ns"]) * 1e-9,
             bag=kept,
             snapshots=tuple(_bags_in(folder)),
