@@ -286,7 +286,7 @@ def test_what_is_no_such_part_is_refused_with_its_node_and_parameter(parameter, 
 
 def test_a_law_beside_a_tachogram_is_refused():
     told = refusal("spindle_encoder", tachogram_time=[0.0], tachogram_deviation=[0.1])
-    assert told.startswith("spindle_encoder: deviation_law = 'parts:Chirp' beside tachogram_time; allowed: one of them")
+    assert told.startswith("spindle_encoder.deviation_law = 'parts:Chirp' beside tachogram_time; allowed: one of them")
 
 
 def test_a_run_beyond_the_end_of_a_law_is_refused():
