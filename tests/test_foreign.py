@@ -3,7 +3,9 @@
 
 import contextlib
 import math
+import os
 import re
+import signal
 import subprocess
 import sys
 from collections import deque
@@ -24,7 +26,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.cell.wiring import Unknown
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.report import Reporter
 from lathe_rc.nodes.stage_node import StageNode
@@ -96,6 +98,15 @@ def driven(recording):
     return position
 
 
+def test_the_examples_use_nothing_of_lathe_rc_but_its_messages():
+    """Who has no Python package lathe_rc can run them, and each fits on a screen or two."""
+    for path in EXAMPLES.glob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        used = {name.partition(".")[0] for name in re.findall(r"^(?:from|import) (\S+)", text, re.MULTILINE)}
+        assert used - sys.stdlib_module_names <= {"rclpy", "lathe_rc_msgs", "std_msgs", "cell_member"}, path
+        assert len(text.splitlines()) < (100 if path.name == "cell_member.py" else 80), path
+
+
 BOTH = ["learning_controller", "electrodynamic_actuator"]
 
 
@@ -132,6 +143,24 @@ def test_nodes_in_plain_rclpy_take_part_in_a_cell(domain, tmp_path, foreign, tog
         for error in errors.tolist():
             squares += error * error
         assert said["listener"] == f"{errors.size} samples, form error {math.sqrt(squares / errors.size)} m RMS\n"
+
+
+@pytest.mark.parametrize("killed", ["learning_controller", "tool"])
+def test_a_cell_that_loses_one_of_ours_or_of_theirs_goes_to_its_safe_state(domain, tmp_path, killed):
+    """The death of a foreign member is noticed, and a foreign member answers when one of ours has died."""
+    endless = {"revolutions": 1000.0, "speed_factor": 1.0}
+    foreign = ["learning_controller"]
+    with cell(domain, tmp_path / "bag", foreign, ["electrodynamic_actuator", "recorder"], spindle_encoder=endless) as (
+        processes,
+        theirs,
+    ):
+        processes.wait_for("progress")
+        (controller,) = theirs.values()
+        os.kill(processes.pids.get(killed, controller.pid), signal.SIGKILL)
+        with pytest.raises(LatheError, match=f"{killed} died: safe state from sample"):
+            processes.wait_for_end()
+        controller.communicate()
+        assert controller.returncode == (1 if killed == "tool" else -signal.SIGKILL)
 
 
 KNOWN = ElectrodynamicActuatorParameters(damping=0.5)
