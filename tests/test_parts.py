@@ -252,7 +252,7 @@ class Careless(PartProfile):
         ("q_filter", "parts:Ham", "Q filter 'parts:Ham': parts has no 'Ham'"),
         ("q_filter", "parts:Chirp", "allowed: a class that derives from lathe_rc.control.q_filter.QFilter"),
         ("q_filter", "hann", "= 'hann'; allowed: one of fir, exponential, gaussian, moving_average, or PACKAGE.MODULE"),
-        ("q_filter", "test_parts:Leaky", "q_filter = 'test_parts:Leaky': Q(0) = 0.9; allowed: 1"),
+        ("q_filter", "test_parts:Leaky", "learning_controller.q_filter: 'test_parts:Leaky': Q(0) = 0.9; allowed: 1"),
         ("q_filter", "test_parts:Late", "smooth differs from response by "),
         ("q_filter", "test_parts:Misled", "it derives from Exponential, which is computed elsewhere; allowed: derive"),
         ("q_filter", "test_parts:Complex", "response(radians) gives complex128 of shape (7,)"),
@@ -286,7 +286,7 @@ def test_what_is_no_such_part_is_refused_with_its_node_and_parameter(parameter, 
 
 def test_a_law_beside_a_tachogram_is_refused():
     told = refusal("spindle_encoder", tachogram_time=[0.0], tachogram_deviation=[0.1])
-    assert told.startswith("spindle_encoder.deviation_law = 'parts:Chirp' beside tachogram_time; allowed: one of them")
+    assert told.startswith("spindle_encoder.deviation_law = parts:Chirp beside tachogram_time; allowed: one of them")
 
 
 def test_a_run_beyond_the_end_of_a_law_is_refused():
