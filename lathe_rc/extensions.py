@@ -6,6 +6,7 @@ installation, by where it stands: ``package.module:Class``. A module is looked f
 in the current folder.
 """
 
+import ast
 import hashlib
 import importlib
 import importlib.metadata
@@ -204,30 +205,57 @@ def _distribution(dist: importlib.metadata.Distribution | None) -> str:
 
 
 def search_path() -> str:
-    """Where Python looks for modules here, for the ``PYTHONPATH`` of another interpreter."""
-    return os.pathsep.join(str(Path(folder).absolute()) for folder in sys.path)
+    """Where Python looks for modules here, for the ``PYTHONPATH`` of another interpreter, after what that says itself."""
+    given = filter(None, [os.environ.get("PYTHONPATH")])
+    return os.pathsep.join([*given, *(str(Path(folder).absolute()) for folder in sys.path)])
 
 
 @cache
 def source_hash(module: str) -> str:
-    """Hash of the source that a module stands in: of all files of its package, or of the file alone.
+    """Hash of the source that a module stands in, and of all that it imports beside lathe_rc and what that needs.
+
+    Of a package all files count, of a module that stands alone its file.
 
     Raises:
         InputError: it has no file.
     """
-    digest = hashlib.sha256()
-    for path in _sources(module):
-        digest.update(path.name.encode() + path.read_bytes())
+    if module == "__main__":
+        raise InputError("__main__ is no module that other processes can import; put the class into a file of its own")
+    digest, seen = hashlib.sha256(), set[str]()
+    waiting = [module.partition(".")[0]]
+    while waiting:
+        top = waiting.pop()
+        if top in seen or top in _NOT_HASHED or top not in sys.modules:
+            continue
+        seen.add(top)
+        for path in _files(top):
+            text = path.read_bytes()
+            digest.update(path.name.encode() + text)
+            waiting += sorted(_imports(text))
     return digest.hexdigest()
 
 
-def _sources(module: str) -> list[Path]:
-    top = sys.modules[module.partition(".")[0]]
-    if paths := [Path(each) for each in getattr(top, "__path__", ())]:
+#: whose versions do not change within a set-up; the first has its own hash
+_NOT_HASHED = {"lathe_rc", "numpy", "scipy", "numba", "annotated_types", "pydantic", *sys.stdlib_module_names}
+
+
+def _files(top: str) -> list[Path]:
+    """The source of a package or module."""
+    module = sys.modules[top]
+    if paths := [Path(each) for each in getattr(module, "__path__", ())]:
         return sorted(path for folder in paths for path in folder.rglob("*.py"))
-    if module == "__main__" or not top.__file__:
-        raise InputError(f"{module} is no module that other processes can import; put the class into a file of its own")
-    return [Path(top.__file__)]
+    return [Path(module.__file__)] if module.__file__ and module.__file__.endswith(".py") else []
+
+
+def _imports(text: bytes) -> set[str]:
+    """Packages that a source imports."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            found.update(alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found.add(node.module.partition(".")[0])
+    return found
 
 
 @cache

@@ -62,6 +62,27 @@ def placed(value: tuple[Any, ...]) -> Placed:
     return _placed(*_sort(value))
 
 
+def unfit(value: object, name: str = "") -> str:
+    """Which member of a NamedTuple cannot be placed, and why; empty if all can.
+
+    Args:
+        value: see `placed`.
+        name: of it, for the members of others.
+    """
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        members = (unfit(part, f"{name}.{each}".lstrip(".")) for each, part in zip(value._fields, value, strict=True))
+        return next(filter(None, members), "")
+    if isinstance(value, np.ndarray):
+        if value.dtype not in _KINDS:
+            return f"{name} is an array of {value.dtype}; allowed: float64, int64 or uint8"
+        if not value.flags.c_contiguous:
+            return f"{name} is an array with gaps or in Fortran's order; allowed: np.ascontiguousarray of it"
+        return ""
+    if isinstance(value, bool | int | float | np.bool_ | np.integer):
+        return ""
+    return f"{name or 'the memory'} is a {type(value).__name__}; allowed: arrays, int, float, bool and NamedTuples"
+
+
 def _sort(part: Any) -> Any:
     """What the type of a member depends on: types of NamedTuples are made once for all that are alike."""
     if isinstance(part, tuple):

@@ -131,11 +131,11 @@ class Raising(Halving):
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_an_exception_in_a_step_is_not_lost():
     cell, _ = program(made(Raising))
-    with pytest.raises(RuntimeError, match="halving: the step has raised an exception"):
+    with pytest.raises(LatheError, match="halving: the step has raised an exception"):
         cell.run(1000)
     assert cell.reached == 300
     alone = made(Raising)
-    with pytest.raises(RuntimeError, match="has raised an exception"):
+    with pytest.raises(LatheError, match="has raised an exception"):
         Stage.process(alone, 300, [{"angle": np.zeros(10)}], [{"position": np.zeros(10)}])
 
 

@@ -32,6 +32,9 @@ def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[floa
     """
     waves = np.linspace(0.0, highest, _COARSE)
     size = np.abs(operator(waves))
+    if not np.isfinite(size).all():
+        place = int(np.argmin(np.isfinite(size)))
+        return float("nan"), float(waves[place])
     inner = np.flatnonzero((size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:])) + 1
     peaks = np.append(inner, (0, _COARSE - 1))
     peaks = peaks[np.argsort(size[peaks])[-_PEAKS:]]

@@ -18,8 +18,11 @@ from lathe_rc.cell import native
 from lathe_rc.cell.scenario import TABLES, kind_of
 from lathe_rc.cell.stage import Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
-from lathe_rc.errors import LatheError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.extensions import search_path
+
+
+_REFUSED = "refused: "  # begins what a process says of a stage whose step cannot be compiled
 
 
 def uncompiled(stages: Iterable[Stage]) -> list[Stage]:
@@ -39,6 +42,7 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
         The names of the stages that are left, before the first and after each but the last.
 
     Raises:
+        InputError: a step cannot be compiled.
         LatheError: a process that compiles has ended.
     """
     left = uncompiled(stages)
@@ -50,6 +54,8 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
         while names:
             yield list(names)
             name = done.get()
+            if name.startswith(_REFUSED):
+                raise InputError(name.removeprefix(_REFUSED))
             if not name:
                 raise LatheError("a process that compiles the steps of stages has ended: see what it has written")
             names.remove(name)
@@ -82,7 +88,12 @@ def _start(stages: Sequence[Stage], done: "queue.SimpleQueue[str]") -> "subproce
 def main() -> None:
     """Compile what the standard input names."""
     for name, (kind, values) in json.load(sys.stdin).items():
-        compile_kernels(STAGES[kind](name, TABLES[kind].read(name, values)))
+        stage = STAGES[kind](name, TABLES[kind].read(name, values))
+        try:
+            with stage.named():
+                compile_kernels(stage)
+        except InputError as error:
+            name = f"{_REFUSED}{error}"
         print(name, flush=True)
 
 

@@ -8,15 +8,19 @@ the ports are made, not on what is in them.
 
 import hashlib
 import importlib.util
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, cached_property
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numba.core.errors import NumbaError
 
+from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.extensions import source_hash
 from lathe_rc.files import replacing
 from lathe_rc.jit import cache_folder, is_ours, kernel
@@ -53,12 +57,17 @@ def enter(memory, first, start, samples, fields, reached):
 '''
 
 
+_PLACE = re.compile(r'File "([^"]+)", line (\d+)')
+_WRONG = ("Unknown attribute", "No implementation", "Cannot unify", "Cannot", "Untyped global", "Invalid use", "Use of")
 BROKEN = -2  #: where a step has come to that has raised an exception: Numba prints it, and the function returns 0
 
 
-def broken(name: str) -> RuntimeError:
+def broken(name: str) -> LatheError:
     """The error of a step that has raised an exception."""
-    return RuntimeError(f"{name}: the step has raised an exception, which Numba has printed on the error stream")
+    return LatheError(
+        f"{name}: the step has raised an exception, which Numba has printed on the error stream of its process (without "
+        "@kernel Python says where)"
+    )
 
 
 class Native:
@@ -89,8 +98,15 @@ class Native:
 
     @cached_property
     def address(self) -> int:
-        """Of the function, which is compiled if it never was."""
-        return int(_module(self.name, self._text, self._words.kind).enter.address)
+        """Of the function, which is compiled if it never was.
+
+        Raises:
+            InputError: it cannot be compiled.
+        """
+        try:
+            return int(_module(self.name, self._text, self._words.kind).enter.address)
+        except NumbaError as error:
+            raise InputError(_cause(str(error))) from error
 
     def update(self, memory: tuple[Any, ...]) -> None:
         """See `Words`."""
@@ -107,6 +123,15 @@ class Native:
         if self._reached[0] == BROKEN:
             raise broken(self.name)
         return int(self._reached[0]), reason
+
+
+def _cause(told: str) -> str:
+    """What Numba says of code that it cannot compile, in a line: the innermost place, and what is wrong there."""
+    places = _PLACE.findall(told)
+    words = [line.strip() for line in told.splitlines()]
+    why = next((line for line in reversed(words) if line.startswith(_WRONG)), next(filter(None, words), "no reason"))
+    where = f" at {Path(places[-1][0]).name}, line {places[-1][1]}" if places else ""
+    return f"a step cannot be compiled{where}: {shown(why)}"
 
 
 @kernel

@@ -53,6 +53,10 @@ class Row:
     """
 
     def __init__(self, name: str, info: FieldInfo) -> None:
+        if not isinstance(info.json_schema_extra, dict) or "unit" not in info.json_schema_extra:
+            raise InputError(
+                f"the table's {name} is no parameter; allowed: {name}: TYPE = parameter(DEFAULT, DOC, UNIT)"
+            )
         extra = cast("dict[str, Any]", info.json_schema_extra)
         self.name, self.doc = name, info.description or ""
         self.default: Value = info.get_default(call_default_factory=True)
@@ -70,6 +74,8 @@ class Row:
         if self.named is not None:
             self.choices = self.named.choices
         self.type: type = str if self.choices else annotation
+        if self.type not in _NAMES:
+            raise InputError(f"the table's {name} is a {annotation}; allowed: bool, int, float, str, or a list of one")
         self.low, self.high, words = -math.inf, math.inf, []
         for limit in metadata:
             if isinstance(limit, Ge | Gt):
@@ -129,7 +135,7 @@ class Table(BaseModel):
                 raise InputError(f"{shown(f'{node}.{name}')}: unknown parameter; {known}") from None
             if why := str(first.get("ctx", {}).get("error", "")):  # there is such a name, but the class cannot be used
                 raise InputError(f"{node}.{name}: {why}") from None
-            given = f"{values[name]!r:.200}"
+            given = f"{values.get(name, cls.model_fields[name].default)!r:.200}"
             raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
 
 

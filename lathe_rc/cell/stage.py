@@ -30,6 +30,7 @@ from lathe_rc.cell.parameters import NodeParameters, about, remapped
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.jit import is_compiled, is_ours, kernel
 from lathe_rc.names import instead
+from lathe_rc.placed import unfit
 from lathe_rc.safety import faults
 from lathe_rc.safety.faults import Fault
 from lathe_rc.safety.injection import Injection, Port
@@ -506,6 +507,8 @@ class Stage(ABC):
         """The step with the memory as it is now, as a function of addresses."""
         if self._native is None:
             assert self.step is not None, "a stage without a step has its own `process`"
+            if not is_ours(type(self).__module__) and (why := unfit(self.memory)):
+                raise InputError(f"{self.name}: memory of a compiled step: {why}")
             read = [messages.sample_fields(p.type)[n] for p in self.inputs[: self.own_inputs] for n in p.fields]
             written = [kind for port in self.outputs for kind in messages.sample_fields(port.type).values()]
             self._native = Native(self.step, self.memory, read, written)

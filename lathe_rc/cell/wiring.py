@@ -242,6 +242,12 @@ class Cell:
             self._check_reach(stage, drive)
             found = {speed: stage.worst(response, speed) for speed in speeds}
             told = [(worst, speed) for speed, worst in found.items() if worst is not None]
+            if broken := next(((worst, speed) for worst, speed in told if math.isnan(worst[0])), None):
+                (_, waves), speed = broken
+                raise InputError(
+                    f"{stage.name}: {stage.factor} with {drive} is not a number at {waves:.4g} waves and {speed:.4g} "
+                    "rad/s; allowed: finite numbers; see contraction of the law and response of the drive"
+                )
             if told:
                 _check_factor(stage, drive, *max(told))
             else:

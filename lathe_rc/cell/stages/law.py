@@ -32,7 +32,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, step_of
-from lathe_rc.cell.stages.learner import Learner, LearnerParameters
+from lathe_rc.cell.stages.learner import Learner, LearnerParameters, checked
 from lathe_rc.cell.stages.obedience import (
     NOBODY,
     OBEY,
@@ -44,6 +44,8 @@ from lathe_rc.cell.stages.obedience import (
     may_learn,
     piece,
 )
+from lathe_rc.errors import InputError
+from lathe_rc.extensions import code_of_others
 from lathe_rc.jit import inlined, is_compiled
 from lathe_rc.safety.state_machine import Reaction
 
@@ -198,8 +200,11 @@ class Law(Learner):
 
     def __init__(self, name: str, parameters: LawParameters) -> None:
         super().__init__(name, parameters)
+        if self.step is None:
+            raise InputError(f"{name}: {type(self).__name__} has no formula; allowed: sample = staticmethod(FUNCTION)")
         self.parameters = parameters
-        self.law = self.start()
+        with code_of_others(f"{name}: start"):
+            self.law = self.start()
         delay = parameters.feedback_delay
         self._guard = GuardTable(parameters.stop_ratio**2, np.zeros(5), np.zeros(2, np.int64))
         self._learns = np.ones(1, np.int64)
@@ -237,14 +242,16 @@ class Law(Learner):
 
     def worst(self, drive: Response, speed: float) -> tuple[float, float] | None:
         """See `Learner`."""
-        if self.contraction(drive, np.zeros(1), speed) is None:
-            return None
-        return supremum(lambda waves: self._told(drive, waves, speed), self.highest_waves(speed))
+        with code_of_others(f"{self.name}: contraction"):
+            if self.contraction(drive, np.zeros(1), speed) is None:
+                return None
+            highest = float(self.highest_waves(speed))
+        if not 0.0 < highest < np.inf:
+            raise InputError(f"{self.name}: highest_waves gives {highest:g} at {speed:.4g} rad/s; allowed: above 0")
+        return supremum(lambda waves: self._told(drive, waves, speed), highest)
 
     def _told(self, drive: Response, waves: Array, speed: float) -> Complex:
-        factor = self.contraction(drive, waves, speed)
-        assert factor is not None, "it has told one before"
-        return factor
+        return checked(f"{self.name}: contraction", lambda: self.contraction(drive, waves, speed), waves)
 
     def perform(self, action: str) -> None:
         """See `Stage`."""

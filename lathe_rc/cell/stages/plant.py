@@ -31,9 +31,12 @@ from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse, step_of
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
 from lathe_rc.cell.stages.drive import Drive, Limits
+from lathe_rc.cell.stages.learner import checked
 from lathe_rc.cell.stages.retraction import OwnRetraction, RetractionParameters, followed
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import LimiterTable
+from lathe_rc.errors import InputError
+from lathe_rc.extensions import code_of_others
 from lathe_rc.jit import is_compiled
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
@@ -158,9 +161,12 @@ class Plant(SingleDrive):
             cls.step = staticmethod(step_of(cls, _loop(cls.sample), compiled=is_compiled(cls.sample)))
 
     def __init__(self, name: str, parameters: PlantParameters) -> None:
+        if self.step is None:
+            raise InputError(f"{name}: {type(self).__name__} has no equation; allowed: sample = staticmethod(FUNCTION)")
         self.parameters = parameters
         super().__init__(name, parameters)
-        self.plant = self.start()
+        with code_of_others(f"{name}: start"):
+            self.plant = self.start()
 
     @abstractmethod
     def start(self) -> Any:
@@ -181,11 +187,10 @@ class Plant(SingleDrive):
 
     def responses(self) -> Mapping[str, Response]:
         """See `Drive`."""
-        if self.response(_NO_FREQUENCY) is None:
-            return {}
+        with code_of_others(f"{self.name}: response"):
+            if self.response(_NO_FREQUENCY) is None:
+                return {}
         return {"coarse/command": self._told}
 
     def _told(self, frequency: Array) -> Complex:
-        response = self.response(frequency)
-        assert response is not None, "it has told one before"
-        return response
+        return checked(f"{self.name}: response", lambda: self.response(frequency), frequency)
