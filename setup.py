@@ -53,11 +53,20 @@ setup(
     license="Apache-2.0",
     packages=find_packages(include=["lathe_rc", "lathe_rc.*"]),
     # lathe_rc/msg_defs is a link to msg_defs: importlib.resources finds the messages in every installation
-    package_data={"lathe_rc": ["py.typed", "nodes/*.xml", "msg_defs/msg/*.msg", "msg_defs/srv/*.srv", "view/*.j2"]},
+    package_data={
+        "lathe_rc": [
+            "py.typed",
+            "nodes/*.xml",
+            "msg_defs/msg/*.msg",
+            "msg_defs/srv/*.srv",
+            "view/*.j2",
+            "templates/*/*.j2",
+        ]
+    },
     data_files=shared_files(),
     python_requires=">=3.10",
     install_requires=requirements("runtime"),
-    extras_require={"view": requirements("view")},
+    extras_require={name: requirements(name) for name in ("notebook", "view")},
     entry_points={
         "console_scripts": [
             "lathe = lathe_rc.cli:main",

@@ -13,6 +13,7 @@ stands, and ``recorded_real_time_factor`` that of ``harness.run`` with a bag, fr
 closed, on one core, also of the scenario as it stands.
 """
 
+import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.commands.new import begin
 from lathe_rc.errors import LatheError
 
 Say = Callable[[str], None]
@@ -107,7 +109,11 @@ def _engine(made: Cell) -> float:
 
 
 def _unchanged(name: str, revolutions: float) -> float:
-    return _engine(Cell(loaded(name, revolutions).nodes))
+    return _engine_of(loaded(name, revolutions))
+
+
+def _engine_of(chosen: Scenario) -> float:
+    return _engine(Cell(chosen.nodes))
 
 
 def plain(name: str, revolutions: float, *flags: str) -> Callable[[], float]:
@@ -194,6 +200,25 @@ def paces(say: Say, *, quick: bool) -> dict[str, dict[str, Any]]:
     return found
 
 
+def own(*, quick: bool) -> dict[str, dict[str, Any]]:
+    """A law and a drive of ``lathe new``, each in the place of ours; a ratio above 1 is faster than ours."""
+    revolutions, rounds = (50.0, 5) if quick else (400.0, 15)
+    with tempfile.TemporaryDirectory(prefix="lathe-bench-") as folder:
+        for kind in ("law", "plant"):
+            begin(kind, f"own_{kind}", Path(folder), compiled=True)
+            sys.path.append(f"{folder}/own_{kind}")
+        length = f"spindle_encoder.revolutions={revolutions}"
+        files = {kind: Path(folder) / f"own_{kind}" / f"own_{kind}.yaml" for kind in ("law", "plant")}
+        with_law = scenario.load(files["law"], [length])
+        with_drive = scenario.load(files["plant"], [length, "learning_controller.identify=false"])
+        ours_drive = with_law.nodes["electrodynamic_actuator"].model_copy(update={"stage": "electrodynamic_actuator"})
+        ours = Scenario("ours", with_drive.nodes | {"own_plant": ours_drive})
+        chosen = {"law": with_law, "drive": with_drive, "ours": ours}
+        turns = {name: partial(_engine_of, each) for name, each in chosen.items()}
+        found = _asked(turns, rounds)
+    return {name: {"ratio_to_ours": ratio(found["ours"], found[name])} for name in ("law", "drive")}
+
+
 def measure(*, quick: bool, say: Say) -> dict[str, Any]:
     """See the module; the two-channel cell first, the full cell and those of which only the pace counts as groups."""
     say("engine two_channel")
@@ -207,4 +232,5 @@ def measure(*, quick: bool, say: Say) -> dict[str, Any]:
     whole["target_recorded_real_time_factor"] = _PACE
     for factors in pace.values():
         factors |= {f"target_{key}": _PACE for key in tuple(factors)}
-    return {**found, "full_cell": whole, **pace}
+    say("engine with stages of one's own")
+    return {**found, "full_cell": whole, **pace, "own": own(quick=quick)}

@@ -11,7 +11,7 @@ from typing import Any, cast
 import click
 
 from lathe_rc import __version__
-from lathe_rc.errors import LatheError
+from lathe_rc.errors import LatheError, shown
 
 COMMANDS = {
     "bag": "Ask bags what is in them; check and recover them; take a tachogram out.",
@@ -21,6 +21,7 @@ COMMANDS = {
     "export": "Export a recording as CSV, Parquet or NPZ.",
     "fit": "Fit models to measurements.",
     "measure": "Measure the part that a recorded run has turned.",
+    "new": "Begin a law, drive, stage or study of your own.",
     "node": "Run one node, or list its parameters.",
     "policy": "Make the SROS2 policy of a scenario.",
     "record": "Record any topics into a new bag.",
@@ -59,6 +60,9 @@ class _Group(click.Group):
         except LatheError as error:
             click.echo(f"lathe: {error}", err=True)
             ctx.exit(error.exit_code)
+        except MemoryError as error:
+            click.echo(f"lathe: not enough memory ({shown(error)})", err=True)
+            ctx.exit(LatheError.exit_code)
 
 
 @click.group(

@@ -11,26 +11,29 @@ import importlib
 import importlib.metadata
 import os
 import sys
+import traceback
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from pydantic_core import core_schema
 
-from lathe_rc.errors import InputError, shown
+from lathe_rc.errors import InputError, LatheError, shown
 
 T = TypeVar("T")
+V = TypeVar("V")
 
 
-class Registry(Mapping[str, type[T]], Generic[T]):
-    """Classes of one sort by name.
+class Offers(Mapping[str, V], Generic[V]):
+    """What we and others offer of one sort, by name.
 
-    Iteration gives our names and those that installed packages offer; any ``package.module:Class`` is found as well.
+    Iteration gives our names and those that installed packages offer; any ``package.module:Name`` is found as well.
 
     Args:
         what: one of them, in words.
-        base: class that all of them derive from.
         own: ours.
         group: of the entry points.
 
@@ -39,9 +42,9 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         own: see above.
     """
 
-    def __init__(self, what: str, base: type[T], own: Mapping[str, type[T]], group: str) -> None:
-        self._what, self._base, self.own, self.group = what, base, own, group
-        self._found: dict[str, type[T]] = {}
+    def __init__(self, what: str, own: Mapping[str, V], group: str) -> None:
+        self._what, self.own, self.group = what, own, group
+        self._found: dict[str, V] = {}
 
     def __iter__(self) -> Iterator[str]:
         yield from self.own
@@ -50,8 +53,8 @@ class Registry(Mapping[str, type[T]], Generic[T]):
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
-    def __getitem__(self, name: str) -> type[T]:
-        """The class of a name.
+    def __getitem__(self, name: str) -> V:
+        """What has this name.
 
         Raises:
             KeyError: nobody offers it.
@@ -70,11 +73,54 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         point = _offered(self.group)[name]
         return _attribute(point.module, point.attr, f"{self._what} {name!r} of {_distribution(point.dist)}")
 
-    def _checked(self, name: str, found: Any) -> type[T]:
-        if not (isinstance(found, type) and issubclass(found, self._base)):
-            wanted = f"a class that derives from {self._base.__module__}.{self._base.__name__}"
-            raise InputError(f"{self._what} {shown(name)!r} is {shown(repr(found))}; allowed: {wanted}")
+    @abstractmethod
+    def _checked(self, name: str, found: Any) -> V:
+        """What was imported, if it is one of these."""
+
+    def _refused(self, name: str, found: Any, wanted: str) -> InputError:
+        return InputError(f"{self._what} {shown(name)!r} is {shown(repr(found))}; allowed: {wanted}")
+
+    def offered_by(self, name: str) -> str:
+        """Distribution and version of what an installed package offers; empty: nobody does, or it is ours."""
+        if name in self.own or name not in _offered(self.group):
+            return ""
+        return _distribution(_offered(self.group)[name].dist)
+
+
+class Objects(Offers[V]):
+    """Objects of one class, by name; see `Offers`.
+
+    Args:
+        what, own, group: see `Offers`.
+        kind: their class.
+    """
+
+    def __init__(self, what: str, kind: type[V], own: Mapping[str, V], group: str) -> None:
+        super().__init__(what, own, group)
+        self._kind = kind
+
+    def _checked(self, name: str, found: Any) -> V:
+        if not isinstance(found, self._kind):
+            raise self._refused(name, found, f"a {self._kind.__module__}.{self._kind.__name__}")
         return found
+
+
+class Registry(Offers[type[T]], Generic[T]):
+    """Classes of one sort by name; see `Offers`.
+
+    Args:
+        what, own, group: see `Offers`.
+        base: class that all of them derive from.
+    """
+
+    def __init__(self, what: str, base: Any, own: Mapping[str, type[T]], group: str) -> None:
+        super().__init__(what, own, group)
+        self._base = base
+
+    def _checked(self, name: str, found: Any) -> type[T]:
+        if isinstance(found, type) and issubclass(found, self._base):
+            return found
+        raise self._refused(name, found, f"a class that derives from {self._base.__module__}.{self._base.__name__}")
 
     def allowed(self) -> str:
         """The names, in words."""
@@ -85,7 +131,41 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         if name in self.own:
             return None
         module = self[name].__module__
-        return {"class": f"{module}:{self[name].__qualname__}", **_origin(module)}
+        return {"class": f"{module}:{self[name].__qualname__}", **origin(module)}
+
+
+def find(name: str, what: str) -> Any:
+    """What stands at ``package.module:Name``.
+
+    Args:
+        name: see above.
+        what: in words, for errors.
+
+    Raises:
+        InputError: it cannot be imported.
+    """
+    module, _, attribute = name.partition(":")
+    return _attribute(module, attribute, what)
+
+
+@contextmanager
+def code_of_others(what: str) -> Iterator[None]:
+    """Make one line of whatever code of others raises.
+
+    Args:
+        what: it is for, in words.
+
+    Raises:
+        InputError: says what was raised, and in which line of which file.
+    """
+    try:
+        yield
+    except LatheError as error:
+        raise InputError(f"{what}: {error}") from error
+    except Exception as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(last.filename).name}, line {last.lineno}"
+        raise InputError(f"{what}: {type(error).__name__} in {where}: {shown(error)}") from error
 
 
 def _attribute(module: str, attribute: str, what: str) -> Any:
@@ -130,7 +210,11 @@ def search_path() -> str:
 
 @cache
 def source_hash(module: str) -> str:
-    """Hash of the source that a module stands in: of all files of its package, or of the file alone."""
+    """Hash of the source that a module stands in: of all files of its package, or of the file alone.
+
+    Raises:
+        InputError: it has no file.
+    """
     digest = hashlib.sha256()
     for path in _sources(module):
         digest.update(path.name.encode() + path.read_bytes())
@@ -141,11 +225,20 @@ def _sources(module: str) -> list[Path]:
     top = sys.modules[module.partition(".")[0]]
     if paths := [Path(each) for each in getattr(top, "__path__", ())]:
         return sorted(path for folder in paths for path in folder.rglob("*.py"))
-    return [Path(top.__file__)] if top.__file__ else []
+    if module == "__main__" or not top.__file__:
+        raise InputError(f"{module} is no module that other processes can import; put the class into a file of its own")
+    return [Path(top.__file__)]
 
 
-def _origin(module: str) -> Mapping[str, str]:
-    names = importlib.metadata.packages_distributions().get(module.partition(".")[0], [])
+@cache
+def _packages() -> Mapping[str, list[str]]:
+    """Distributions by package; to look through all of them takes half a second."""
+    return importlib.metadata.packages_distributions()
+
+
+def origin(module: str) -> Mapping[str, str]:
+    """Where a module that has been imported comes from: distribution and version, if it has one; hash of its source."""
+    names = _packages().get(module.partition(".")[0], [])
     dist = importlib.metadata.distribution(names[0]) if names else None
     told = {"distribution": dist.name, "version": dist.version} if dist else {}
     return {**told, "source": source_hash(module)}
@@ -169,13 +262,23 @@ class Named(Generic[T]):
 
     def allowed(self) -> str:
         """What the parameter accepts, in words."""
-        return f"one of {', '.join((*self.special, self.registry.allowed()))}"
+        names = [*(name or "''" for name in self.special), *self.registry]
+        return f"one of {', '.join(names)}, or PACKAGE.MODULE:CLASS" if names else "PACKAGE.MODULE:CLASS"
+
+    def others(self, value: object) -> list[str]:
+        """The names of classes of other packages in a parameter's value, a name or a list of some."""
+        names = value if isinstance(value, list) else [value]
+        return [str(name) for name in names if name not in self.choices]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
         """Check the name where a value is read."""
         return core_schema.no_info_after_validator_function(self._check, handler(source))
 
     def _check(self, name: str) -> str:
-        if name not in self.special and name not in self.registry:
-            raise ValueError(name)
+        try:
+            known = name in self.special or name in self.registry
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        if not known:
+            raise ValueError
         return name

@@ -28,17 +28,11 @@ class Happening:
     text: str
 
 
-def listed(recording: Recording, step: float) -> list[Happening]:
-    """All that happened in a run with a sampling step [s], in order."""
-    found = []
-    for topic, said in recording.sparse.items():
-        kind = recording.types[topic]
-        if kind not in HAPPENED:
-            continue
-        for place, stamp in enumerate(said.stamps):
-            values = {name: column[place] for name, column in said.values.items()}
-            sample = round((stamp - messages.START_NS) * 1e-9 / step)
-            found.append(Happening(sample, topic, text(Sparse(topic, kind, sample, values))))
+def listed(recording: Recording) -> list[Happening]:
+    """All that happened in a run, in order."""
+    topics = [topic for topic in recording.sparse if recording.types[topic] in HAPPENED]
+    said = [message for topic in topics for message in recording.messages(topic)]
+    found = [Happening(message.index, message.topic, text(message)) for message in said]
     return sorted(found, key=lambda happening: happening.sample)
 
 

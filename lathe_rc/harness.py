@@ -21,21 +21,21 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from lathe_rc import part, starting
-from lathe_rc.analysis.metrology import FormErrors, Measurement, form_errors
+from lathe_rc.analysis.metrology import FormErrors, Measurement
 from lathe_rc.bag import reader, recover
 from lathe_rc.bag.check import write_digests
 from lathe_rc.bag.record import OfflineRecorder, begin, begin_snapshots, recorder_of
 from lathe_rc.bag.writer import refuse_existing
 from lathe_rc.cell import messages
 from lathe_rc.cell.ahead import compile_ahead
-from lathe_rc.cell.collect import Collector, Finite
+from lathe_rc.cell.collect import Collector, Finite, check_room
 from lathe_rc.cell.durations import Lateness
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.messages import Signals
@@ -51,6 +51,9 @@ from lathe_rc.nodes import leftovers
 from lathe_rc.nodes.report import THROUGHPUT
 from lathe_rc.starting import Child, Start
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Mode = Literal["offline", "composed", "processes"]
 Event = Mapping[str, Any]
 
@@ -59,11 +62,11 @@ _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag c
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
 _MOST_RESTARTS = 8  # of a process
 _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
-_NO_SIGN_OF_LIFE = {"stall", "stranger", "stopped", "continued"}  # events that come while nothing goes on
+_NO_SIGN_OF_LIFE = {"stall", "stranger", "stopped", "continued", "waits"}  # events that come while nothing goes on
 _LOOK = 0.05  # [s] between looks at what a process has written
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """What a run gave.
 
@@ -77,7 +80,23 @@ class Result:
         recording: all signals.
         refused: messages of strangers that the nodes refused, by sender.
         not_reached: events that the run was too short for, by node.
+        unchecked: what the check before the start could not see, since laws or drives of others do not tell it.
         lateness: of the blocks; None if there was no pace to keep, as offline or with a ``speed_factor`` of 0.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from lathe_rc import harness, resources
+        >>> from lathe_rc.cell import scenario
+        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=20"])
+        >>> result = harness.run(piston)
+        >>> result
+        <Result of piston: offline, 20 revolutions, form error 150.8 to 0.5639 µm RMS, no bag>
+        >>> print(f"at most {result.errors.largest[-1] * 1e6:.3f} µm in the last revolution")
+        at most 0.992 µm in the last revolution
+        >>> result.digest["/tool"] == result.recording.digests()["/tool"]
+        True
+        >>> error = result.frame("/tool")["error"]  # [m], of each sample
+        >>> result.plot().savefig("piston.png")
     """
 
     scenario: Scenario
@@ -86,10 +105,34 @@ class Result:
     wall_s: float
     bag: Path | None
     snapshots: tuple[Path, ...]
-    recording: Recording = field(repr=False)
+    recording: Recording
     refused: Mapping[str, int] = field(default_factory=dict)
     not_reached: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    unchecked: Sequence[str] = ()
     lateness: Lateness | None = None
+
+    def __repr__(self) -> str:
+        """What ran and what came of it, in a line."""
+        bag = f"bag {self.bag}" if self.bag else "no bag"
+        return f"<Result of {self.scenario.name}: {', '.join([self.mode, *self.errors.told(), bag])}>"
+
+    def _repr_html_(self) -> str:
+        """The same as a table with the form error by revolution, for notebooks."""
+        from lathe_rc.view import notebook
+
+        return notebook.result(self)
+
+    def frame(self, topic: str) -> Any:
+        """A topic as a table: a row a sample, or a message; see `lathe_rc.frames.frame`."""
+        return self.recording.frame(topic)
+
+    def plot(self, title: str | None = None) -> "Figure":
+        """Desired form, form error over angle, form error by revolution; see `lathe_rc.view.figure.draw`.
+
+        Args:
+            title: of the figure; None: the scenario's name.
+        """
+        return self.recording.plot(self.scenario.name if title is None else title)
 
     @property
     def blocks(self) -> int:
@@ -111,13 +154,10 @@ class Result:
         """Simulated over wall time."""
         return self.simulated_s / self.wall_s
 
-    @cached_property
+    @property
     def errors(self) -> FormErrors:
         """Form error by revolution; of no revolution if the scenario has no tool."""
-        angle = self.recording.of_type(messages.ENCODER)["angle_true"]
-        if messages.TOOL not in self.recording.types.values():
-            return form_errors(angle[:0], angle[:0])
-        return form_errors(angle, self.recording.of_type(messages.TOOL)["error"])
+        return self.recording.errors
 
     @cached_property
     def part(self) -> Measurement:
@@ -132,7 +172,7 @@ class Result:
     @cached_property
     def happened(self) -> list[Happening]:
         """Events, alarms and reactions, in order."""
-        return listed(self.recording, self.scenario.shared.step)
+        return listed(self.recording)
 
     def summary(self) -> dict[str, object]:
         """What ``lathe run --json`` prints."""
@@ -157,6 +197,7 @@ class Result:
                 for found in self.happened
             ],
             "not_reached": {node: list(events) for node, events in self.not_reached.items()},
+            "unchecked": list(self.unchecked),
             "error_um": {
                 "first": of(0),
                 "last": of(-1),
@@ -210,17 +251,33 @@ def run(
             their own.
 
     Raises:
-        InputError: the scenario cannot work, or the bag's folder exists.
+        InputError: the scenario cannot work, the run does not fit into memory, or the bag's folder exists or has no
+            folder to be made in.
         LatheError: a node failed or was killed; the bag, if one was asked for, is readable.
         LossyRunError: a free-running cell lost blocks.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from lathe_rc import harness, resources
+        >>> from lathe_rc.cell import scenario
+        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=3"])
+        >>> harness.run(piston, bag=Path("piston_bag"))
+        <Result of piston: offline, 3 revolutions, form error 150.8 to 1.166 µm RMS, bag piston_bag>
+        >>> harness.run(piston, bag=Path("piston_bag"))
+        Traceback (most recent call last):
+        lathe_rc.errors.InputError: piston_bag exists; a bag is never overwritten...
     """
     if mode != "offline" and start == "fork":
         starting.server()  # it imports while the cell is checked
     cell = Cell(scenario.nodes)
     cell.check()
+    check_room(cell)
+    for what in cell.unchecked:
+        watch({"event": "unchecked", "node": cell.master.name, "message": what})
     if bag is not None:
         refuse_existing(bag)
     result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace), start)
+    result = replace(result, unchecked=cell.unchecked)
     if result.bag is not None:
         write_digests(result.bag, result.digest)
     return result

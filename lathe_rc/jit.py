@@ -51,6 +51,19 @@ def cache_folder() -> Path:
     return Path(os.environ.get("NUMBA_CACHE_DIR") or getattr(numba.config, "CACHE_DIR"))  # noqa: B009 - see above
 
 
+def is_ours(module: str) -> bool:
+    """Whether the folder of the cache changes with the source of a module.
+
+    That of others is not looked at; what is kept of their steps is, see `lathe_rc.cell.native`.
+    """
+    return module.startswith(f"{_PACKAGE.name}.")
+
+
+def is_compiled(function: object) -> bool:
+    """Whether a function is a kernel."""
+    return hasattr(function, "py_func")
+
+
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function of scalars and arrays; compiled code is kept between runs.
 
@@ -58,7 +71,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     same bits whatever the length of the block. Division by zero gives inf or NaN as in NumPy. Other threads have the
     interpreter meanwhile.
     """
-    compiled = numba.njit(cache=True, error_model="numpy", nogil=True)(function)
+    compiled = numba.njit(cache=is_ours(function.__module__), error_model="numpy", nogil=True)(function)
     return cast("Callable[P, R]", compiled)
 
 
@@ -67,5 +80,5 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
 
     For what is called once a sample: to hand over an array costs as much as ten operations.
     """
-    compiled = numba.njit(cache=True, error_model="numpy", forceinline=True)(function)
+    compiled = numba.njit(cache=is_ours(function.__module__), error_model="numpy", forceinline=True)(function)
     return cast("Callable[P, R]", compiled)

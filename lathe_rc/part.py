@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.analysis import profile_csv
-from lathe_rc.analysis.metrology import FormErrors, Measurement, form_errors, measure
+from lathe_rc.analysis.metrology import FormErrors, Measurement, form_errors, measure, turns_before
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals, full
 from lathe_rc.cell.recording import Recording
@@ -34,7 +34,7 @@ def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
     angle, error = (
         recording.of_type(kind)[field] for kind, field in ((messages.ENCODER, "angle_true"), (messages.TOOL, "error"))
     )
-    found = measure(angle - _turned(angle), error, roundness_cutoff=cutoff, roughness_cutoff=cutoff)
+    found = measure(angle - 2.0 * np.pi * turns_before(angle), error, roundness_cutoff=cutoff, roughness_cutoff=cutoff)
     if not found.form.rms.size:
         raise InputError("nothing to measure: the recording has no complete revolution; let it run longer")
     return found
@@ -59,11 +59,6 @@ def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
         "largest_upr": {"upr": largest, "amplitude": float(waves[largest]) * 1e6},
         "ra": um(found.roughness.ra),
     }
-
-
-def _turned(angle: np.ndarray) -> float:
-    """Angle of the first complete revolution of a snapshot [rad]; 0 of a run, which begins in its first turn."""
-    return 2.0 * np.pi * float(np.ceil(angle[0] / (2.0 * np.pi))) if angle.size and angle[0] >= 2.0 * np.pi else 0.0
 
 
 def _encoder_and_tool(types: Mapping[str, str]) -> list[str | None]:
@@ -93,7 +88,7 @@ class ErrorsByRevolution:
             return
         named = {full(topic): signals for topic, signals in dense.items()}
         if not self._angle:
-            self._done = round(_turned(named[encoder]["angle_true"]) / (2.0 * np.pi))
+            self._done = turns_before(named[encoder]["angle_true"])
         self._angle.append(named[encoder]["angle_true"].copy())
         self._error.append(named[tool]["error"].copy())
         if self._angle[-1][-1] - self._angle[0][0] > _TOGETHER * 2.0 * np.pi:
@@ -136,8 +131,8 @@ class FirstAndLast:
         named = {full(topic): signals for topic, signals in dense.items()}
         piece = np.stack([named[self._encoder]["angle_true"], named[self._tool]["error"]])
         if not self._tail.size:
-            self._start = _turned(piece[0])
-            self._before = round(self._start / (2.0 * np.pi))
+            self._before = turns_before(piece[0])
+            self._start = 2.0 * np.pi * self._before
         if self._head.size == 0 or np.ptp(self._head[0]) < _TOGETHER * 2.0 * np.pi:
             self._head = np.concatenate([self._head, piece], axis=1)
         self._tail = np.concatenate([self._tail, piece], axis=1)

@@ -114,7 +114,7 @@ BESIDE: dict[str, type[Table]] = {
 
 def page() -> str:
     """The whole page."""
-    parts = [_introduction(), _shared(), *map(_node, TABLES.own), *map(_beside, BESIDE), _host(), _messages()]
+    parts = [_introduction(), _shared(), *map(node, TABLES.own), *map(_beside, BESIDE), _host(), _messages()]
     return "\n\n".join(parts) + "\n"
 
 
@@ -138,7 +138,10 @@ as volatile. Every node is a lifecycle node with the standard parameter and life
 
 def _allowed(row: Row) -> str:
     choices = ("true", "false") if row.type is bool else row.choices
-    return ", ".join(f"`{choice}`" for choice in choices) or row.limits or "any"
+    names = ", ".join(f"`{choice}`" for choice in choices if choice)
+    if row.named:
+        return f"{names}, or a class of others" if names else "a class of others"
+    return names or row.limits or "any"
 
 
 def _parameters(rows: Mapping[str, Row]) -> str:
@@ -175,7 +178,8 @@ Own: each node has its own value.
 {_parameters(_only(NodeParameters, SharedParameters))}"""
 
 
-def _node(kind: str) -> str:
+def node(kind: str) -> str:
+    """The section of a kind of node, also one of another package."""
     table = TABLES[kind]
     stage = STAGES[kind](kind, table()) if kind in STAGES else None
     parts = [f"## {kind}", inspect.getdoc(table) or ""]

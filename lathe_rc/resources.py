@@ -5,12 +5,30 @@ import os
 import sys
 from pathlib import Path
 
+from lathe_rc.errors import InputError
+from lathe_rc.names import instead
+
 
 def config_folders() -> list[Path]:
     """Folders with configuration, the nearest first: a checkout, ament prefixes, the Python environment."""
     prefixes = [prefix for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
     shared = [Path(prefix) / "share" / "lathe_rc" / "config" for prefix in [*prefixes, sys.prefix]]
     return [folder for folder in [Path(__file__).parents[1] / "config", *shared] if folder.is_dir()]
+
+
+def scenario(path: Path) -> Path:
+    """The file of a scenario: `find` of ``path``, or of the same name with ``.yaml``.
+
+    Raises:
+        InputError: there is none; says which have names like that.
+    """
+    if not path.exists() and not path.suffix:
+        path = path.with_suffix(".yaml")
+    found, folders = find(path), config_folders()
+    if found.exists() or path.name != str(path) or not folders:
+        return found  # who reads it says what is wrong
+    known = sorted(file.stem for file in folders[0].glob("*.yaml"))
+    raise InputError(f"{path}: no such file or scenario; {instead(path.stem, known, listing=f'ls {folders[0]}')}")
 
 
 def find(path: Path) -> Path:

@@ -16,8 +16,10 @@ from hypothesis import strategies as st
 
 from lathe_rc import harness
 from lathe_rc.cell import messages
+from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.wire import Encoder
+from lathe_rc.cell.wiring import Cell, Unknown
 
 Values = Mapping[str, Any]
 
@@ -33,6 +35,19 @@ def scenario(shared: Values | None = None, **nodes: Values) -> Scenario:
     values["spindle_encoder"].setdefault("revolutions", 3.0)
     tables = {name: TABLES[part.get("stage", name)].read(name, part) for name, part in values.items()}
     return Scenario("test", tables)
+
+
+def announced(cell: Scenario, *names: str) -> Cell:
+    """The cell as its nodes know it where nobody has the parameters of some: they have announced their topics."""
+    whole = Cell(cell.nodes)
+    unknown = {}
+    for name in names:
+        stage = whole.stages[name]
+        dense = {remapped(stage.shared, port.topic): port.type for port in stage.outputs}
+        sparse = {remapped(stage.shared, topic): kind for topic, kind in stage.sparse_topics.items()}
+        reads = frozenset(remapped(stage.shared, port.topic) for port in stage.inputs)
+        unknown[name] = Unknown(dense, sparse, reads)
+    return Cell({name: table for name, table in cell.nodes.items() if name not in names}, unknown)
 
 
 def run(shared: Values | None = None, **nodes: Values) -> harness.Result:

@@ -206,9 +206,11 @@ def test_folder_that_cannot_be_made_is_refused(tmp_path):
         record(tmp_path / "file" / "bag")
 
 
-def test_folders_above_are_made(tmp_path):
-    record(tmp_path / "new" / "folder" / "bag")
-    assert file_of(tmp_path / "new" / "folder" / "bag").exists()
+def test_folders_above_are_not_made(tmp_path):
+    """A slip in a path makes no new place."""
+    with pytest.raises(InputError, match=rf"bag: there is no folder {tmp_path}/new/folder; make it"):
+        record(tmp_path / "new" / "folder" / "bag")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("make", ["nothing", "file", "folder", "empty file", "junk"])

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cells import announced
 
 from lathe_rc import harness, resources
 from lathe_rc.bag import reader
@@ -38,6 +39,28 @@ def full_cell(*overrides, revolutions=3):
 )
 def test_what_comes_back_without_a_delay_cuts_a_chain(here, groups):
     found = _groups(Cell(full_cell().nodes), dict.fromkeys(here))
+    assert list(map(sorted, found)) == list(map(sorted, groups))
+
+
+@pytest.mark.parametrize(
+    ("unknown", "here", "groups"),
+    [
+        (
+            ["learning_controller"],
+            ["spindle_encoder", "electrodynamic_actuator", "tool"],
+            [["spindle_encoder"], ["electrodynamic_actuator", "tool"]],
+        ),
+        (["tool"], LAWS, [LAWS]),  # what they read of it is late
+        (
+            ["electrodynamic_actuator"],
+            ["spindle_encoder", "learning_controller", "tool"],
+            [["spindle_encoder", "learning_controller"], ["tool"]],
+        ),
+    ],
+)
+def test_what_is_read_of_a_member_that_nobody_knows_cuts_a_chain(unknown, here, groups):
+    """A member may need in each block what the chain has computed of that block."""
+    found = _groups(announced(full_cell(), *unknown), dict.fromkeys(here))
     assert list(map(sorted, found)) == list(map(sorted, groups))
 
 

@@ -24,7 +24,7 @@ CELL = """
 /tool: {ros__parameters: {}}
 """
 KEYS = ["scenario", "mode", "simulated_s", "wall_s", "real_time_factor", "revolutions", "blocks", "dropped"]
-KEYS += ["lateness_s", "refused", "events", "not_reached", "error_um", "bag", "snapshots", "digest"]
+KEYS += ["lateness_s", "refused", "events", "not_reached", "unchecked", "error_um", "bag", "snapshots", "digest"]
 PER_REVOLUTION = ["per_revolution_rms", "per_revolution_peak_to_valley", "per_revolution_ront"]
 
 
@@ -131,6 +131,13 @@ def test_more_events_than_fit_are_counted():
     assert "18 more of the kind" in out
 
 
+def test_the_run_is_drawn_where_it_is_asked_for(folder):
+    result = lathe("run", "cell.yaml", "--figure", "turned.png")
+    assert result.exit_code == 0
+    assert "figure: turned.png" in result.stdout
+    assert (folder / "turned.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_snapshots_without_a_bag_are_not_forgotten_in_silence():
     Path("cell.yaml").write_text(CELL + "/recorder: {ros__parameters: {mode: snapshot}}\n")
     assert "no snapshots: no --bag was given" in lathe("run", "cell.yaml").stdout
@@ -210,14 +217,66 @@ def test_bad_profile_is_refused_in_one_line(folder, form):
     assert_refused(lathe("run", "cell.yaml", *chosen), str(folder / "form.csv"))
 
 
+@pytest.mark.parametrize(
+    ("place", "text"), [("a.svg", "a.svg; allowed: a file name that ends in .png"), ("no/a.png", "no such folder")]
+)
+def test_a_figure_that_cannot_be_written_is_refused_before_the_run(folder, place, text):
+    assert_refused(
+        lathe("run", "cell.yaml", "--bag", "bag", "--figure", place), f"--figure {place.split('/')[0]}", text
+    )
+    assert not (folder / "bag").exists()
+
+
 def test_bag_that_exists_is_refused(folder):
     (folder / "bag").mkdir()
     assert_refused(lathe("run", "cell.yaml", "--bag", "bag"), "bag exists; a bag is never overwritten")
 
 
-@pytest.mark.parametrize("name", ["no.yaml", "no", "."])
-def test_missing_scenario_is_refused(name):
-    assert_refused(lathe("run", name), "cannot be read")
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("no.yaml", "no.yaml: no such file or scenario; ls "),
+        ("pistn", "pistn.yaml: no such file or scenario; did you mean piston? (ls "),
+        ("two_chanel.yaml", "did you mean two_channel, one_channel or"),
+        ("here/no.yaml", "cannot be read"),
+        (".", "cannot be read"),
+    ],
+)
+def test_missing_scenario_is_refused_with_those_of_like_names(name, said):
+    assert_refused(lathe("run", name), said)
+
+
+def test_a_run_that_no_memory_holds_is_refused_with_what_it_takes(folder):
+    """And nothing of it is begun, whatever the host."""
+    said = "spindle_encoder.revolutions = 1e+09: 3.84e+12 samples"
+    for mode in ("offline", "processes"):
+        refused = lathe("run", "cell.yaml", "--revolutions", "1e9", "--mode", mode, "--bag", "bag")
+        assert_refused(refused, "GiB of memory, ", "GiB are free; allowed: up to ", said)
+    assert not (folder / "bag").exists()
+    for revolutions in ("1e13", "1e300"):
+        refused = lathe("run", "cell.yaml", "--revolutions", revolutions)
+        assert_refused(refused, "spindle_encoder.revolutions = ", "samples; allowed: below 9007199254740992")
+
+
+def test_a_place_for_the_profile_is_looked_at_before_the_run(folder):
+    refused = lathe("run", "cell.yaml", "--profile", "new/form.csv", "--bag", "bag")
+    assert_refused(refused, "--profile new/form.csv: no such folder")
+    assert not (folder / "bag").exists()
+
+
+def test_a_command_that_memory_does_not_suffice_for_says_so(monkeypatch):
+    def read(path):
+        raise MemoryError("Unable to allocate 29.1 TiB")
+
+    monkeypatch.setattr("lathe_rc.bag.reader.read", read)
+    failed = lathe("measure", "bag")
+    assert failed.exit_code == 1
+    assert failed.stderr == "lathe: not enough memory (Unable to allocate 29.1 TiB)\n"
+
+
+def test_a_folder_is_made_in_one_that_is_there(folder):
+    assert_refused(lathe("run", "cell.yaml", "--bag", "new/folder/x"), "new/folder/x: there is no folder new/folder;")
+    assert not (folder / "new").exists()
 
 
 def test_malformed_scenario_is_refused(folder):

@@ -14,7 +14,7 @@ SIGNALS = {"angle": np.array([0.0, 0.1, 0.2]), "index_pulse": np.array([1, 0, 0]
 
 
 def digest(signals):
-    return Recording({}, {"/encoder": signals}, {}).digests()["/encoder"]
+    return Recording({}, {"/encoder": signals}, {}, 1).digests()["/encoder"]
 
 
 def event(index, action):
@@ -26,7 +26,7 @@ def digest_of_events(*events):
     topic = SparseTopic()
     for message in events:
         topic.add(messages.stamp_ns(message), message)
-    return Recording({}, {}, {"/events": topic}).digests()["/events"]
+    return Recording({}, {}, {"/events": topic}, 1).digests()["/events"]
 
 
 def combined(*fields):

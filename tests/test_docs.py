@@ -21,7 +21,7 @@ from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.commands.run import run
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
@@ -205,13 +205,13 @@ class Action(SimpleNamespace):
 
 
 class Configuration:
-    """Stands in for LaunchConfiguration; the context is a dict."""
+    """Stands in for LaunchConfiguration."""
 
     def __init__(self, key: str) -> None:
         self._key = key
 
-    def perform(self, context: dict[str, str]) -> str:
-        return context[self._key]
+    def perform(self, context: SimpleNamespace) -> str:
+        return str(context.launch_configurations[self._key])
 
 
 @pytest.fixture
@@ -219,7 +219,7 @@ def launch_file(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The launch file, imported with stand-ins for launch and launch_ros."""
     contents = {
         "launch": ("LaunchContext", "LaunchDescription", "LaunchDescriptionEntity"),
-        "launch.actions": ("DeclareLaunchArgument", "OpaqueFunction", "Shutdown"),
+        "launch.actions": ("DeclareLaunchArgument", "IncludeLaunchDescription", "OpaqueFunction", "TimerAction"),
         "launch.events": (),
         "launch.events.process": ("ProcessExited",),
         "launch.substitutions": ("LaunchConfiguration",),
@@ -244,14 +244,23 @@ def launch_file(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 class TestLaunch:
     @pytest.fixture
     def start(self, launch_file: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-        """What `ros2 launch` does with the description: the actions that it makes, for given arguments."""
+        """What `ros2 launch` does with the description: the actions that it makes, for given arguments.
+
+        ``including``: a file that it was given instead, which includes ours and sets the arguments.
+        """
         monkeypatch.chdir(tmp_path)
 
-        def run(**given: str) -> list[Any]:
+        def run(including: str = "", **given: str) -> list[Any]:
             *declared, last = launch_file.generate_launch_description().args[0]
-            context = {argument.args[0]: argument.default_value for argument in declared}
-            assert set(given) <= set(context)
-            return last.function({**context, **given})
+            source = SimpleNamespace(location=including or str(LAUNCH))
+            include = launch_file.IncludeLaunchDescription(
+                launch_description_source=source, launch_arguments=tuple(given.items())
+            )
+            event = SimpleNamespace(launch_description=SimpleNamespace(entities=[include]))
+            configurations = {argument.args[0]: argument.default_value for argument in declared}
+            return last.function(
+                SimpleNamespace(launch_configurations=configurations | given, locals=SimpleNamespace(event=event))
+            )
 
         return run
 
@@ -292,9 +301,86 @@ class TestLaunch:
         with pytest.raises(InputError, match="exists"):
             start(bag=str(tmp_path))
 
-    @pytest.mark.parametrize(("code", "ends"), [(0, False), (1, True), (-9, False)])
-    def test_a_failed_node_ends_the_others_and_a_killed_one_none(
-        self, start: Callable[..., Any], code: int, *, ends: bool
+    def test_replaces_values_of_the_scenario(self, start: Callable[..., Any]) -> None:
+        given = {"block_size": "32", "learning_controller.events": "['revolution 2: freeze']"}
+        for including in ("", "/mine.launch.py"):
+            loaded = scenario.load(Path(start(including, **given)[0].parameters[0]))
+            assert loaded.shared.block_size == 32
+            assert loaded.nodes["learning_controller"].events == ["revolution 2: freeze"]
+
+    @pytest.mark.parametrize(
+        ("argument", "said"),
+        [
+            (
+                "revolutions",
+                "no launch argument 'revolutions'; allowed: scenario, bag, namespace, NODE.PARAM .*nominal_rpm",
+            ),
+            ("spindle.revolutions", "no node 'spindle' in the scenario; allowed: spindle_encoder, "),
+            ("spindle_encoder.revolution", "spindle_encoder.revolution: unknown parameter; allowed: "),
+            ("tool.feed", "tool.feed = 'far'; allowed: a finite number"),
+        ],
+    )
+    def test_refuses_an_argument_that_there_is_not(self, start: Callable[..., Any], argument: str, said: str) -> None:
+        with pytest.raises(InputError, match=said):
+            start(**{argument: "far"})
+
+    def test_leaves_arguments_of_a_file_that_includes_it_alone(self, start: Callable[..., Any]) -> None:
+        assert len(start("/mine.launch.py", turns="2", sigterm_timeout="9")) == 5
+        assert len(start(sigterm_timeout="9")) == 5
+
+    def test_calls_processes_by_their_nodes(self, start: Callable[..., Any]) -> None:
+        assert {node.exec_name for node in start()} == FIVE
+        (together,) = start(scenario="full_cell.yaml")
+        assert together.exec_name == "spindle_encoder+learning_controller+11_more"
+
+
+class TestEndsUnderLaunch:
+    """What launch makes of it: an error means that it ends the others and returns 1."""
+
+    @pytest.fixture
+    def ended(self, launch_file: ModuleType) -> Callable[..., Any]:
+        """Says that a process of a cell of three has ended."""
+        reacts = launch_file.Ends(3, replaced=False)
+
+        def say(name: str, code: int, *, told_to: bool = False) -> Any:
+            event = SimpleNamespace(process_name=name, returncode=code)
+            return reacts(event, SimpleNamespace(is_shutdown=told_to))
+
+        return say
+
+    def test_a_cell_that_ends_in_order_has_not_failed(self, ended: Callable[..., Any]) -> None:
+        assert not any(ended(name, 0) for name in ("tool-1", "recorder-2", "spindle-3"))
+
+    def test_a_node_that_fails_is_named_at_once_and_those_that_are_ended_are_not(
+        self, ended: Callable[..., Any]
     ) -> None:
-        react = start()[0].on_exit
-        assert bool(react(SimpleNamespace(returncode=code, process_name="tool-1"), None)) == ends
+        with pytest.raises(LatheError, match=r"^tool-1 ended with exit code 2$"):
+            ended("tool-1", 2)
+        assert not any(ended(name, code, told_to=True) for name, code in (("recorder-2", 1), ("spindle-3", -2)))
+
+    @pytest.mark.parametrize("code", [0, 1])
+    def test_a_killed_node_is_named_when_the_others_have_come_to_the_safe_state(
+        self, ended: Callable[..., Any], code: int
+    ) -> None:
+        ended("tool-1", -9)
+        if code == 0:
+            assert not ended("recorder-2", 0)
+        with pytest.raises(
+            LatheError, match=r"^tool-1 was killed by SIGKILL" + "; spindle-3 ended with exit code 1" * code
+        ):
+            ended("spindle-3", code)
+
+    def test_a_killed_node_is_named_when_the_user_ends_the_others(self, ended: Callable[..., Any]) -> None:
+        ended("tool-1", -11)
+        ended("recorder-2", 0, told_to=True)
+        with pytest.raises(LatheError, match=r"^tool-1 was killed by SIGSEGV$"):
+            ended("spindle-3", 0, told_to=True)
+
+    def test_a_killed_node_is_not_waited_for_for_ever(self, ended: Callable[..., Any], launch_file: ModuleType) -> None:
+        """The cell has not begun, and the others do not know that they wait in vain."""
+        (timer,) = ended("tool-1", -9)
+        with pytest.raises(LatheError, match=r"^tool-1 was killed by SIGKILL$"):
+            timer.actions[0].function(None)
+        killed = SimpleNamespace(process_name="learning_controller-1", returncode=-9)
+        answer = launch_file.Ends(3, replaced=True)(killed, SimpleNamespace(is_shutdown=False))
+        assert answer is None, "another one may come and go on from its restart_file"

@@ -315,6 +315,11 @@ def test_the_command_closes_its_bag_on_a_signal(number, tmp_path):
         ("learning_controller", ["-p", "events:=['soon: freeze']"], "learning_controller.events = 'soon: freeze'"),
         ("tool", ["--params-file", "/nowhere.yaml"], "Couldn't parse params file: '--params-file /nowhere.yaml'"),
         ("recorder", ["-p", "bag:=/"], "/ exists; a bag is never overwritten"),
+        (
+            "tool",
+            ["-p", "tool:profile:=polygon", "--params-file", str(PISTON)],
+            "does not reach /tool, which has 'csv'",
+        ),
     ],
 )
 def test_a_node_alone_refuses_bad_parameters_in_one_line(node, arguments, expected, domain, tmp_path):

@@ -230,8 +230,8 @@ def test_faults_are_refused_unless_they_are_allowed():
     found = CliRunner().invoke(main, ["run", "one_channel", "--set", fault])
     assert found.exit_code == 2
     assert found.stderr == (
-        "lathe: electrodynamic_actuator: 'fault coarse/state.position off' is refused; set allow_faults = true under "
-        "/** to let things break\n"
+        "lathe: electrodynamic_actuator.faults: 'fault coarse/state.position off' is refused; set allow_faults = true "
+        "under /** to let things break\n"
     )
 
 

@@ -201,7 +201,7 @@ def test_slow_controllers_compute_at_multiples_of_their_divisor():
     ("changes", "told"),
     [
         (["position_controller.trajectory=csv"], "trajectory_file is empty"),
-        (["position_controller.set_point=[1.0, 2.0]"], "2 values of set_point and 1 of set_point_time"),
+        (["position_controller.set_point=[1.0, 2.0]"], "set_point, set_point_time: 2 values and 1 times"),
         (
             ["position_controller.set_point_time=[1.0, 1.0]", "position_controller.set_point=[1.0, 2.0]"],
             "each later than",
@@ -222,7 +222,7 @@ def test_bad_servos_are_refused_in_one_line(changes, told):
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        (["cutting_process.gap_start=[1.0]"], "1 gap_start and 0 gap_width"),
+        (["cutting_process.gap_start=[1.0]"], "gap_start, gap_width: 1 and 0"),
         (["cutting_process.hard_spot_start=[1.0]"], "hard_spot_"),
         (["cutting_process.moved_by=['longitudinal', 'longitudinal']"], "each once"),
         (["cutting_process.allowance_rate=1e-6"], "allowance_rms and allowance_rate"),

@@ -201,6 +201,14 @@ def test_delay_beyond_what_the_cycle_leaves_is_refused_with_the_figures(lead_law
         run(spindle_encoder=spindle, learning_controller={**controller, "feedback_delay": largest + 1})
 
 
+def test_where_no_delay_fits_the_refusal_says_what_to_change():
+    cell = Cell(scenario(learning_controller={"lead_time": 0.9}).nodes)
+    with pytest.raises(InputError) as refusal:
+        cell.check()
+    leaves = "at 104.7 rad/s the cycle leaves 0; not even a block of 64; give more cycle_revolutions, less lead_time,"
+    assert leaves in str(refusal.value)
+
+
 @pytest.mark.parametrize("rpm", [300.0, 1000.0, 1900.0])
 @pytest.mark.parametrize("counts", [0, 360, 4096])
 def test_largest_delay_runs(rpm, counts):

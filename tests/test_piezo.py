@@ -280,16 +280,25 @@ def test_stage_reads_what_it_is_asked_for(values, expected):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"use_command": False}, "^piezo has no set point; choose the command, the reference, or a displacement"),
-        ({"compensates": ["a", "b", "a"]}, "^piezo: compensates a, b, a; allowed: each displacement once"),
-        ({"play_thresholds": [0.1, 0.2]}, "^piezo: plays: 2 thresholds and 10 weights"),
-        ({"play_thresholds": [0.2, 0.1], "play_weights": [0.1, 0.1]}, "^piezo: play thresholds"),
-        ({"play_proportional": 0.1, "play_weights": [-0.02] * 10}, "^piezo: play weights: slope .* after 5 plays"),
-        ({"hysteresis": "bouc_wen", "bouc_wen_a": 0.8}, "^piezo: Bouc-Wen A = 0.8"),
-        ({"identified_thresholds": [0.1]}, "^piezo: identified_weights = "),
-        ({"identified_weights": [0.1]}, "^piezo: plays: 10 thresholds and 1 weights"),
-        ({"amplifier_lag": 1e-12}, "^piezo: lag of 1e-12 s"),
-        ({"events": ["revolution 3: freeze"]}, "piezo: event 'freeze'"),
+        (
+            {"use_command": False},
+            "^piezo.use_command, use_reference, compensates: there is no set point; allowed: one of them or more",
+        ),
+        ({"compensates": ["a", "b", "a"]}, r"^piezo.compensates = \['a', 'b', 'a'\]; allowed: each displacement once"),
+        (
+            {"play_thresholds": [0.1, 0.2]},
+            "^piezo.play_thresholds, play_weights, play_proportional: plays: 2 thresholds and 10 weights",
+        ),
+        ({"play_thresholds": [0.2, 0.1], "play_weights": [0.1, 0.1]}, ": play thresholds"),
+        ({"play_proportional": 0.1, "play_weights": [-0.02] * 10}, ": play weights: slope .* after 5 plays"),
+        (
+            {"hysteresis": "bouc_wen", "bouc_wen_a": 0.8},
+            "^piezo.bouc_wen_a, bouc_wen_beta, bouc_wen_gamma: Bouc-Wen A = 0.8",
+        ),
+        ({"identified_thresholds": [0.1]}, "^piezo.identified_weights: empty"),
+        ({"identified_weights": [0.1]}, "^piezo.identified_thresholds, .*: plays: 10 thresholds and 1 weights"),
+        ({"amplifier_lag": 1e-12}, "^piezo.amplifier_lag, creep_shortest: lag of 1e-12 s"),
+        ({"events": ["revolution 3: freeze"]}, "^piezo.events: event 'freeze'"),
     ],
 )
 def test_stage_refuses_what_cannot_work(values, message):

@@ -34,6 +34,13 @@ def block(first, *, run_id="run", source="/spindle", step_ns=15_625, angle=None,
     return Encoder(messages.ENCODER, run_id, source, step_ns).encode(first, signals, last=False, companions=0)[1]
 
 
+def late(data) -> bytes:
+    """The same block, stamped a nanosecond later."""
+    made = messages.decode(messages.ENCODER, data)
+    made.header.stamp.nanosec += 1
+    return messages.encode(messages.ENCODER, made)
+
+
 def run_of(first, count, *, last=False) -> Run:
     """Blocks in one piece, the last of them shorter if the run ends with it."""
     samples = count * SIZE - (1 if last else 0)
@@ -85,6 +92,7 @@ def test_blocks_in_order_are_taken():
         (block(4), "/spindle begins at sample 4; expected 0|goes from sample 0 to 4: 4 samples are missing"),
         (block(0, size=5), "/spindle sends 5 samples in a block; expected 4 at most"),
         (block(0, step_ns=20_000), "/spindle has a step of 20000 ns; expected 15625"),
+        (late(block(0)), "/spindle stamps the block from sample 0 on with 1000046876 ns; expected 1000046875 ns"),
     ],
 )
 def test_a_block_that_its_source_should_not_send_is_an_error(data, words):

@@ -251,3 +251,32 @@ def test_file_that_is_far_too_large_is_refused_unread(tmp_path):
         file.truncate(2**40)
     with pytest.raises(InputError, match="larger than 64 MiB"):
         read_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        (
+            "0,0\n1.571,10\n3.142,0\n4.712,-10\n",
+            "angle_deg spans 0 to 4.712, which looks like radians; allowed: degrees",
+        ),
+        ("0,0\n0.25,10\n0.5,0\n0.75,-10\n", "angle_deg spans 0 to 0.75, which looks like revolutions"),
+        (
+            "0,0\n90,225e-6\n180,0\n270,-225e-6\n",
+            "radius_um is 0.00045 µm from peak to valley, which looks like metres",
+        ),
+        ("0,0\n90,0.0001\n180,0\n270,0\n", "allowed: micrometres, 0 or 0.01 and above"),
+        (
+            "0,50000\n90,50225\n180,50000\n270,49775\n",
+            "radius_um is 4.978e+04 µm or more everywhere, which looks like ra",
+        ),
+    ],
+)
+def test_columns_in_another_unit_are_refused_with_a_guess(tmp_path, rows, said):
+    with pytest.raises(InputError) as refused:
+        read_csv(write(tmp_path, HEAD + rows))
+    assert said in str(refused.value)
+
+
+def test_a_part_without_form_is_in_no_other_unit(tmp_path):
+    assert not read_csv(write(tmp_path, HEAD + "0,0\n90,0\n180,0\n")).radius.any()

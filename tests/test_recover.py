@@ -8,6 +8,7 @@ import struct
 
 import numpy as np
 import pytest
+import yaml
 import zstandard
 from cells import files_up_to, scenario
 from click.testing import CliRunner
@@ -144,7 +145,7 @@ def test_a_broken_chunk_in_the_middle_costs_that_chunk_alone(turned, tmp_path):
     ends = chunk_ends(bytes(data))
     data[(ends[4][0] + ends[5][0]) // 2] ^= 0x10
     mcap_of(bag).write_bytes(data)
-    assert lathe("bag", "check", bag).exit_code == 1
+    assert lathe("bag", "check", bag).exit_code == 2
     found = lathe("bag", "recover", bag, "-o", tmp_path / "new", "--json")
     assert found.exit_code == 3
     assert json.loads(found.stdout)["saved"] == ends[-1][1] - (ends[5][1] - ends[4][1])
@@ -270,7 +271,7 @@ def test_hostile_files_are_refused_in_a_line(tmp_path, records):
     file = tmp_path / "hostile.mcap"
     file.write_bytes(mcap(*records))
     checked = lathe("bag", "check", file)
-    assert checked.exit_code == 1
+    assert checked.exit_code == 2
     assert checked.stderr.startswith(f"lathe: {file}: not a readable bag (")
     assert checked.stderr.count("\n") == 1
     recovered = lathe("bag", "recover", file, "-o", tmp_path / "new")
@@ -285,14 +286,104 @@ def test_random_damage_never_crashes(turned, tmp_path, seed):
     for place in random.integers(8, len(data), 30):
         data[place] = random.integers(0, 256)
     (tmp_path / "bad.mcap").write_bytes(data)
-    assert lathe("bag", "check", tmp_path / "bad.mcap").exit_code in (0, 1, 3)
+    assert lathe("bag", "check", tmp_path / "bad.mcap").exit_code in (0, 1, 2, 3)
     assert lathe("bag", "recover", tmp_path / "bad.mcap").exit_code in (0, 3)
+
+
+HINT = "; lathe bag recover saves the rest"
+
+
+def unreadable(path, make):
+    """What is no readable bag, in a way."""
+    if make in ("nothing there", "empty folder"):
+        if make == "empty folder":
+            path.mkdir()
+        return path
+    strange_bag(path, StoragePlugin.MCAP if "MCAP" in make else StoragePlugin.SQLITE3, CompressionMode.NONE)
+    file, metadata = next(file for file in path.iterdir() if file.suffix != ".yaml"), path / "metadata.yaml"
+    if "no metadata" in make:
+        metadata.unlink()
+    elif "cut" in make:
+        file.write_bytes(file.read_bytes()[:20000])
+    elif "broken metadata" in make:
+        metadata.write_text("}")
+    return file if "alone" in make else path
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        ("nothing there", "(there is no such folder or file)"),
+        ("empty folder", "(no metadata.yaml in that folder, nor a .mcap or .db3 file)"),
+        ("SQLite, no metadata", f"(no metadata.yaml in that folder){HINT}"),
+        ("MCAP, no metadata", f"(no metadata.yaml in that folder){HINT}"),
+        ("SQLite, broken metadata", f"(metadata.yaml: not YAML in line 1){HINT}"),
+        ("MCAP, cut", f"(bag.mcap: cut off at byte 43){HINT}"),
+        ("SQLite, cut", f"(database disk image is malformed){HINT}"),
+        ("SQLite, cut, alone", f"(database disk image is malformed){HINT}"),
+    ],
+)
+def test_what_cannot_be_read_is_the_same_fault_for_all_with_a_hint_where_recover_helps(tmp_path, make, said):
+    bag = unreadable(tmp_path / "bag", make)
+    for command in (("bag", "info"), ("bag", "check"), ("measure",)):
+        refused = lathe(*command, bag)
+        assert refused.stderr.startswith(f"lathe: {bag}: not a readable bag (")
+        assert refused.stderr.endswith(f"{said}\n")
+        assert refused.exit_code == 2
+    recovered = lathe("bag", "recover", bag, "-o", tmp_path / "new")
+    assert recovered.exit_code == (2 if HINT not in said else 3 if "MCAP, cut" in make else 0), recovered.stderr
+
+
+def reserialized(path, plugin):
+    """A bag with a topic that is not serialized as ROS does by default."""
+    sent = strange_bag(path, plugin, CompressionMode.NONE)
+    if plugin == StoragePlugin.SQLITE3:
+        with sqlite3.connect(next(path.glob("*.db3"))) as database:
+            database.execute("UPDATE topics SET serialization_format = 'xdr' WHERE name = '/said'")
+    else:
+        file = mcap_of(path)
+        file.write_bytes(file.read_bytes().replace(b"/said\x03\0\0\0cdr", b"/said\x03\0\0\0xdr"))
+    return [message for message in sent if message[0] != "/said"]
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_what_is_serialized_in_another_way_is_not_said_to_be_cdr(tmp_path, plugin):
+    others = reserialized(tmp_path / "bag", plugin)
+    found = lathe("bag", "recover", tmp_path / "bag", "-o", tmp_path / "new")
+    assert "/said: serialization format 'xdr' is not known\n400 messages saved, 200 skipped" in found.stdout
+    assert found.exit_code == 3
+    assert read_by_others(tmp_path / "new") == others
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_the_files_count_where_the_metadata_contradict_them(tmp_path, plugin):
+    """And it is told: by `info` on stderr, by `check` as wrong."""
+    path = tmp_path / "bag"
+    sent = strange_bag(path, plugin, CompressionMode.NONE)
+    metadata = yaml.safe_load((path / "metadata.yaml").read_text())
+    told = metadata["rosbag2_bagfile_information"]
+    told["starting_time"]["nanoseconds_since_epoch"] += 100_000
+    told["topics_with_message_count"][1]["message_count"] = 20
+    (path / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    with Source(path) as source:
+        assert list(source.messages()) == sent
+        assert (source.first_ns, source.last_ns) == (sent[0][1], sent[-1][1])
+        assert source.topics["/said"].count == 200
+    said = [
+        "metadata.yaml says first message at 1000100000 ns; the files: 1000000000",
+        "metadata.yaml says last message at 1000699000 ns; the files: 1000599000",
+        "metadata.yaml says 20 messages of /said; the files: 200",
+    ]
+    assert lathe("bag", "info", path).stderr.splitlines() == said
+    assert json.loads(lathe("bag", "info", path, "--json").stdout)["contradictions"] == said
+    checked = lathe("bag", "check", path)
+    assert checked.stdout.splitlines()[:3] == said
+    assert checked.exit_code == 1
 
 
 def test_where_there_is_no_bag_it_says_so(tmp_path):
     with pytest.raises(InputError, match="no bag; allowed"):
         recover(tmp_path, tmp_path / "new")
-    assert lathe("bag", "check", tmp_path / "none").exit_code == 2
     assert not list(tmp_path.iterdir())
 
 

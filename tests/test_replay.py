@@ -2,12 +2,14 @@
 """Replay over real DDS: what was recorded comes again, in order and complete, and can be recorded again."""
 
 import os
+import shutil
 import subprocess
 import sys
 import threading
 
 import pytest
 import rclpy
+import yaml
 from cells import scenario, started
 from geometry_msgs.msg import Point
 from rclpy.executors import SingleThreadedExecutor
@@ -147,6 +149,20 @@ def test_every_message_comes_in_order_with_the_clock(strange, listener):
     assert sorted(set(listener.clock)) == [5 * 10**9 + number * 10**6 for number in range(COUNT)]
 
 
+def test_what_comes_before_the_start_that_the_metadata_give_is_sent_too(strange, listener, tmp_path):
+    """What comes before the start that the metadata give is sent too, and the disagreement is told."""
+    shutil.copytree(strange, tmp_path / "bag")
+    metadata = yaml.safe_load((strange / "metadata.yaml").read_text())
+    metadata["rosbag2_bagfile_information"]["starting_time"]["nanoseconds_since_epoch"] += 5 * 10**8
+    (tmp_path / "bag" / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    ended = refused(tmp_path / "bag", "--rate", "0", "--wait", "1")
+    assert ended.returncode == 0
+    assert "metadata.yaml says first message at 5500000000 ns; the files: 5000000000" in ended.stderr
+    assert f"{COUNT} messages sent" in ended.stderr
+    listener.wait_for(lambda: sum(map(len, listener.heard.values())) >= COUNT)
+    assert listener.clock[0] == 5 * 10**9
+
+
 def test_a_part_of_some_topics(strange, listener):
     """A part of some topics is sent, if that is what is asked for."""
     options = ["--topics", "/b", "--start", "0.5", "--end", "0.6", "--rate", "0", "--loop"]
@@ -159,8 +175,10 @@ def test_a_part_of_some_topics(strange, listener):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--topics", "/c"], "replayer.topics: /c; the bag has /a, /b"),
-        (["--topics", "/clock"], "replayer.topics: /clock; the bag has /a, /b"),
+        (["--topics", "/c"], "replayer.topics: /c is not in the bag; allowed: /a, /b"),
+        (["--topics", "/clock"], "replayer.topics: /clock is not in the bag; allowed: /a, /b"),
+        (["--start", "2"], "replayer.start = 2 s, end = 0 s: nothing to send; allowed: a start up to 1.499 s"),
+        (["--start", "1", "--end", "1"], "replayer.start = 1 s, end = 1 s: nothing to send"),
         (["--as-cell"], "the bag holds no scenario"),
         (["--as-cell", "--loop"], "a cell is replayed whole and once"),
         (["--rate", "-1"], "-1"),

@@ -385,10 +385,16 @@ def test_stage_reads_what_it_is_asked_for(values, expected):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"fine_use_command": False}, "^series has no set point"),
-        ({"fine_compensates": ["a", "a"]}, "^series: compensates a, a; allowed: each displacement once"),
-        ({"fine_play_thresholds": [0.1]}, "^series: plays: 1 thresholds and 10 weights"),
-        ({**DIRECT, "mass_ratio": 1.0, "sample_rate": 4000}, "^series: series drive: at a step of"),
+        (
+            {"fine_use_command": False},
+            "^series.fine_use_command, fine_use_reference, fine_compensates: there is no set point",
+        ),
+        ({"fine_compensates": ["a", "a"]}, r"^series.fine_compensates = \['a', 'a'\]; allowed: each displacement once"),
+        ({"fine_play_thresholds": [0.1]}, "^series.fine_play_thresholds, .*: plays: 1 thresholds and 10 weights"),
+        (
+            {**DIRECT, "mass_ratio": 1.0, "sample_rate": 4000},
+            "^series.mass_ratio, sample_rate: series drive: at a step of",
+        ),
     ],
 )
 def test_stage_refuses_what_cannot_work(values, message):

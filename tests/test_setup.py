@@ -4,6 +4,7 @@
 import fcntl
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -309,7 +310,7 @@ def test_a_command_says_what_it_needs(arguments, groups):
 
 
 def test_setup_of_an_unknown_group_is_refused(copy):
-    assert_refused(lathe(copy, "setup", "viewer"), copy, "setup viewer; allowed: test, view, or nothing more")
+    assert_refused(lathe(copy, "setup", "viewer"), copy, "setup viewer; allowed: notebook, test, view, or nothing more")
 
 
 def test_what_is_set_for_pip_holds_for_uv_and_the_environment_comes_first():
@@ -444,7 +445,7 @@ def test_run_environment_adds_to_the_users_own():
     assert result == {
         "PATH": "/home/x/.lathe/venv/bin:/usr/bin",
         "AMENT_PREFIX_PATH": "/home/x/.lathe/install",
-        "PYTHONPATH": f"{workplace.ROOT}:/mine",
+        "PYTHONPATH": "/mine",
         "EDITOR": "vi",
         "GUARD": "1",
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -454,6 +455,47 @@ def test_run_environment_adds_to_the_users_own():
 def test_users_discovery_range_stays():
     result = environment.run_environment(environment.changes({}), {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"})
     assert result["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SUBNET"
+
+
+@pytest.mark.parametrize("shell", ["sh", "bash"])
+def test_lines_for_a_shell_make_the_same_changes_and_once(shell, tmp_path):
+    wanted = environment.Changes(prepend={"PATH": ["/a b/bin", "/c"], "NEW_PATH": ["/d*"]}, assign={"GUARD": "it's"})
+    script = tmp_path / "lines"
+    script.write_text(environment.shell_lines(wanted) * 2)
+    said = subprocess.run(
+        [shell, "-euc", '. "$0"; printf "%s\\n" "$PATH" "$NEW_PATH" "$GUARD"', script],
+        env={"PATH": "/usr/bin:/bin"}, capture_output=True, text=True, check=True,
+    ).stdout.splitlines()  # fmt: skip
+    assert said == ["/a b/bin:/c:/usr/bin:/bin", "/d*", "it's"]
+
+
+def test_a_clean_shell_that_sources_setup_bash_can_do_what_lathe_can(tmp_path):
+    """Packages of the wheels are in the ament index, the nodes start, programs import lathe_rc and lathe is there."""
+    program = """
+import sys, ament_index_python.packages as found, sensor_msgs.msg, lathe_rc_msgs.msg, lathe_rc, numpy
+for name in ("lathe_rc", "lathe_rc_msgs", "std_msgs", "builtin_interfaces"):
+    print(name, found.get_package_prefix(name))
+print(lathe_rc.__file__)
+"""
+    commands = [
+        f'. "{workplace.INSTALL}/setup.bash"',
+        f"python -c '{program}'",
+        "lathe --version",
+        f'"{workplace.INSTALL}/lib/lathe_rc/tool" --help',
+    ]
+    clean = {"PATH": os.defpath, "HOME": os.environ["HOME"], "COLUMNS": "120"}
+    command = ["bash", "--norc", "-c", " && ".join(commands)]
+    done = subprocess.run(command, env=clean, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    prefixes = dict(line.split() for line in lines[:4])
+    assert prefixes["lathe_rc"] == prefixes["lathe_rc_msgs"] == str(workplace.INSTALL)
+    assert prefixes["std_msgs"] == prefixes["builtin_interfaces"] != str(workplace.INSTALL)
+    assert lines[4] == str(workplace.ROOT / "lathe_rc" / "__init__.py"), (
+        "one path of a module, one cache of its kernels"
+    )
+    assert re.fullmatch(r"\S+, version \d+\.\d+\.\d+", lines[5])
+    assert lines[6].startswith("usage: ros2 run lathe_rc tool ")
 
 
 def test_wheels_paths_are_mended(monkeypatch, tmp_path):

@@ -431,7 +431,7 @@ def test_flood_of_events_is_refused_by_name(tmp_path):
             {"pre": 60.0, "memory": 2**20},
             r"recorder.pre = 60 s takes \d+ B of memory, \d+ B for 64 samples .* allows pre = 0\.\d+ s: shorten pre or",
         ),
-        ({"triggers": ["tol: *"]}, r"recorder.triggers = 'tol: \*': no node 'tol' in the cell; allowed: electrodyn"),
+        ({"triggers": ["tol: *"]}, r"recorder.triggers = 'tol: \*': no node 'tol' in the cell; did you mean tool\?"),
         ({"triggers": ["freeze"]}, r"triggers = 'freeze'; allowed: a pattern of NODE: ACTION, like '\*: freeze'"),
         ({"faults": ["second 1: bag off"]}, r"faults = .*: a recorder has none; allowed: none \(see triggers"),
         ({"pre": -1.0}, r"recorder.pre = -1.0; allowed: a finite number from 0 up to 3600 \[s\]"),

@@ -153,8 +153,9 @@ def test_result_is_frozen_and_the_same_again(name):
     ("arguments", "text"),
     [
         (["fork"], "no study 'fork'; allowed: invariance, "),
+        (["invarience"], "no study 'invarience'; did you mean invariance?"),
         (["invariance", "--set", "t0_ms"], "--set 't0_ms'; allowed: PARAM=VALUE"),
-        (["invariance", "--set", "t0=2"], "invariance.t0: unknown parameter; allowed: "),
+        (["invariance", "--set", "t0=2"], "invariance.t0: unknown parameter; did you mean t0_ms?"),
         (["invariance", "--set", "t0_ms=0"], "invariance.t0_ms = 0; allowed: a finite number above 0 up to 1000 [ms]"),
         (["invariance", "--set", "t0_ms=nan"], "invariance.t0_ms = nan; allowed: a finite number"),
         (["invariance", "--set", "t0_ms=2,3"], "invariance.t0_ms = '2,3'; allowed: a finite number"),

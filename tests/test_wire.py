@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The quick codec of blocks: its bytes are those of rosbags, and what it cannot read it says."""
 
+import struct
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.wire import Decoder, Encoder
+from lathe_rc.cell.wire import Decoder, Encoder, NoBlockError
 
 types = st.sampled_from(sorted(messages.block_types()))
 lengths = st.one_of(st.integers(1, 70), st.just(messages.MAX_BLOCK))
@@ -84,10 +85,111 @@ def test_earlier_block_is_not_changed_by_a_later_one():
 INFO = ("run", "/tool", 0, 15_625, False, 0)
 
 
-def test_block_with_a_frame_is_refused():
+class Cdr:
+    """CDR as the standard has it (XCDR version 1), written independently of rosbags; padding is random.
+
+    Args:
+        big: big-endian.
+        noise: random numbers.
+        representation: identifier in the encapsulation; None: of CDR in this byte order.
+    """
+
+    def __init__(self, big, noise, representation=None):
+        self.order, self.noise = (">" if big else "<"), noise
+        identifier = int(not big) if representation is None else representation
+        self.head, self.body = identifier.to_bytes(2, "big") + noise.bytes(2), b""
+
+    def align(self, size):
+        self.body += self.noise.bytes(-len(self.body) % size)
+
+    def number(self, kind, value):
+        self.align(struct.calcsize(kind))
+        self.body += struct.pack(self.order + kind, value)
+
+    def text(self, value):
+        content = value.encode() + b"\0"
+        self.number("I", len(content))
+        self.body += content
+
+    def array(self, samples):
+        self.number("I", samples.size)
+        self.align(samples.itemsize)
+        self.body += samples.astype(samples.dtype.newbyteorder(self.order)).tobytes()
+
+    def bytes(self, rest):
+        return self.head + self.body + self.noise.bytes(rest)
+
+
+def by_hand(msgtype, signals, info, log_ns, *, seed, frame="", big=False, rest=0, representation=None):
+    """A block as another implementation may encode it, with ``rest`` bytes of padding at its end."""
+    made = Cdr(big, np.random.default_rng(seed), representation)
+    seconds, nanoseconds = divmod(log_ns, 1_000_000_000)
+    made.number("i", seconds)
+    made.number("I", nanoseconds)
+    made.text(frame)
+    made.text(info[0])
+    made.text(info[1])
+    for kind, value in zip("QI?Q", info[2:], strict=True):
+        made.number(kind, value)
+    for array in signals.values():
+        made.array(array)
+    return made.bytes(rest)
+
+
+@settings(max_examples=200)
+@given(
+    types, st.integers(1, 70), names, names, names, st.booleans(), st.integers(0, 3), st.booleans(),
+    st.integers(0, 2**32),
+)  # fmt: skip
+def test_blocks_as_others_may_encode_them_are_taken(msgtype, samples, run_id, source, frame, big, rest, last, seed):
+    """Of 10 000 blocks with random padding, in any byte order, with any frame and encapsulation, none is refused."""
+    decoder, ours = Decoder(msgtype), Encoder(msgtype, run_id, source, 15_625)
+    for number in range(50):
+        end = last and number == 49
+        signals = signals_of(msgtype, (samples + 1) // 2 if end else samples, seed + number)
+        info = (run_id, source, number * samples, 15_625, end, 7 * number)
+        log_ns, expected = ours.encode(info[2], signals, last=end, companions=info[5])
+        data = by_hand(msgtype, signals, info, log_ns, seed=seed + number, frame=frame, big=big, rest=rest)
+        block = decoder.decode(data)
+        assert (block.run_id, block.source, block.first_index, block.step_ns, block.last, block.companions) == info
+        assert (block.log_ns, same_bits(block.signals, signals)) == (log_ns, True)
+        assert decoder.message == expected
+
+
+@pytest.mark.parametrize("representation", [2, 3, 6, 7, 10, 0x0100])
+def test_encapsulations_that_are_not_plain_cdr_are_no_blocks(representation):
     signals, _ = encoded()
-    with pytest.raises(ValueError, match=r"^/tool sends a block that is not encoded as .* with no frame_id$"):
-        Decoder(messages.TOOL).decode(by_rosbags(messages.TOOL, signals, info=INFO, frame="lathe"))
+    data = by_hand(messages.TOOL, signals, INFO, 0, seed=1, representation=representation)
+    with pytest.raises(NoBlockError, match="ToolBlock cannot be decoded"):
+        Decoder(messages.TOOL).decode(data)
+
+
+@pytest.mark.parametrize("frame", ["", "lathe"])
+def test_a_block_that_ros_itself_serializes_is_taken(frame):
+    serialization = pytest.importorskip("rclpy.serialization")
+    from lathe_rc_msgs.msg import ToolBlock
+
+    signals, ours = encoded()
+    decoder = Decoder(messages.TOOL)
+    message = ToolBlock(**{name: array.tolist() for name, array in signals.items()})
+    message.header.stamp.sec, message.header.stamp.nanosec = 1, 4 * 15_625
+    message.header.frame_id = frame
+    message.block.run_id, message.block.source, message.block.step_ns = "run", "/tool", 15_625
+    block = decoder.decode(serialization.serialize_message(message))
+    assert (block.source, decoder.message) == ("/tool", ours)
+
+
+def test_lengths_bytes_that_are_missing_or_too_many_are_refused_in_any_encoding():
+    signals, _ = encoded()
+    for big in (False, True):
+        data = by_hand(messages.TOOL, signals, INFO, 0, seed=1, big=big)
+        decoder = Decoder(messages.TOOL)
+        for broken in (data[:-1], data[:40], data + bytes(4), b"", data[:3]):
+            with pytest.raises(NoBlockError):
+                decoder.decode(broken)
+        short = signals | {"error": signals["error"][:-1]}
+        with pytest.raises(ValueError, match=r"^/tool sends arrays of \[4, 5\] samples in one block$"):
+            decoder.decode(by_hand(messages.TOOL, short, INFO, 0, seed=1, big=big))
 
 
 def test_block_of_arrays_of_different_lengths_is_refused():
@@ -128,7 +230,7 @@ def test_fields_and_bounds_are_those_of_the_message_files():
 
 @given(data=st.data(), block=st.integers(1, 9))
 def test_many_blocks_read_at_once_are_those_read_one_by_one(data, block):
-    """Lengths, sources, gaps and ends may change anywhere; what follows one another comes as one block."""
+    """Lengths, sources, encodings, gaps, ends may change anywhere; what follows one another comes as one block."""
     decoder, encoded = Decoder(messages.ENCODER), []
     first = data.draw(st.integers(0, 2**40))
     for _ in range(data.draw(st.integers(1, 20))):
@@ -138,7 +240,10 @@ def test_many_blocks_read_at_once_are_those_read_one_by_one(data, block):
         signals = signals_of(messages.ENCODER, samples, first % 1000)
         encoder = Encoder(messages.ENCODER, "run", source, 15_625)
         last = data.draw(st.booleans())
-        encoded.append(encoder.encode(first, signals, last=last, companions=first % 7)[1])
+        log_ns, ours = encoder.encode(first, signals, last=last, companions=first % 7)
+        info = ("run", source, first, 15_625, last, first % 7)
+        theirs = by_hand(messages.ENCODER, signals, info, log_ns, seed=first, big=data.draw(st.booleans()))
+        encoded.append(data.draw(st.sampled_from([ours, ours, ours, theirs])))
         first += samples
     singles = [decoder.decode(message) for message in encoded]
     edges = np.cumsum([0, *map(len, encoded)])

@@ -5,14 +5,14 @@ from math import pi
 from pathlib import Path
 
 import pytest
-from cells import NODES, run, scenario
+from cells import NODES, announced, run, scenario
 
 from lathe_rc import harness
 from lathe_rc.cell import messages
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.stage import Input, Output, Stage
-from lathe_rc.cell.wiring import Cell
+from lathe_rc.cell.wiring import Cell, Unknown
 from lathe_rc.errors import InputError
 
 CONFIG = Path(__file__).parents[1] / "config"
@@ -85,7 +85,9 @@ def test_loop_without_a_delay_is_refused():
 
 def test_stage_may_be_put_between_two_others():
     between = {"stage": REPEATER, "remap": ["command_in:=coarse/command", "command_out:=coarse/checked"]}
-    with_it = run(between=between, electrodynamic_actuator={"remap": ["coarse/command:=coarse/checked"]})
+    learns = {"stop_ratio": 2.0}  # nobody knows what is between
+    behind = {"remap": ["coarse/command:=coarse/checked"]}
+    with_it = run(learning_controller=learns, between=between, electrodynamic_actuator=behind)
     without = run()
     assert with_it.digest["/coarse/checked"] == without.digest["/coarse/command"]
     assert with_it.digest["/tool"] == without.digest["/tool"]
@@ -100,7 +102,7 @@ def test_renamed_topic_changes_nothing_else():
 
 @pytest.mark.parametrize("rule", ["encoder", "encoder:=", ":=shaft", "encoder=shaft"])
 def test_malformed_remapping_is_refused(rule):
-    assert refusal(tool={"remap": [rule]}) == f"remap = {rule!r}; allowed: old:=new"
+    assert refusal(tool={"remap": [rule]}) == f"tool.remap = {rule!r}; allowed: old:=new"
 
 
 def test_second_spindle_is_refused():
@@ -185,3 +187,55 @@ def test_a_tool_that_is_not_brought_out_of_the_part_is_refused(change, said):
     loaded = scenarios.load(CONFIG / "supervised.yaml", [change])
     with pytest.raises(InputError, match=said):
         Cell(loaded.nodes).check()
+
+
+# --- members that nobody here knows
+
+
+LEFT_OPEN = "the parameters of {} are not known here: "
+
+
+@pytest.mark.parametrize(
+    ("file", "unknown", "left_open"),
+    [
+        ("piston", "learning_controller", []),
+        (
+            "piston",
+            "electrodynamic_actuator",
+            [
+                "whether learning_controller converges with electrodynamic_actuator",
+                "whether electrodynamic_actuator can follow the profile of tool",
+            ],
+        ),
+        (
+            "supervised",
+            "electrodynamic_actuator",
+            [
+                "whether learning_controller converges with electrodynamic_actuator",
+                "whether electrodynamic_actuator can follow the profile of tool",
+                "whether electrodynamic_actuator gets beyond supervisor.clear_position",
+            ],
+        ),
+        ("supervised", "learning_controller", ["whether learning_controller gets beyond supervisor.clear_position"]),
+        ("vibration", "profile", ["whether a drive can follow what tool reads"]),
+    ],
+)
+def test_of_a_member_that_nobody_knows_its_topics_count_and_what_is_not_checked_is_said(file, unknown, left_open):
+    cell = announced(scenarios.load(CONFIG / f"{file}.yaml"), unknown)
+    cell.check()
+    assert sorted(cell.unchecked) == sorted(LEFT_OPEN.format(unknown) + each for each in left_open)
+
+
+def test_what_does_not_depend_on_members_that_nobody_knows_is_checked():
+    slow = scenario({"nominal_rpm": 3000.0}, learning_controller={"feedback_delay": 3200})
+    with pytest.raises(InputError, match=r"^learning_controller.feedback_delay = 3200 samples: "):
+        announced(slow, "electrodynamic_actuator").check()
+
+
+def test_a_topic_that_a_member_that_nobody_knows_publishes_as_another_type_or_with_another_is_refused():
+    nodes = scenario().nodes
+    drive = {name: table for name, table in nodes.items() if name != "electrodynamic_actuator"}
+    with pytest.raises(InputError, match=r"reads coarse/state as .*ActuatorState, but other publishes .*ToolBlock$"):
+        Cell(drive, {"other": Unknown({"coarse/state": messages.TOOL}, {}, frozenset())})
+    with pytest.raises(InputError, match=r"^coarse/state is published by electrodynamic_actuator and other; remap one"):
+        Cell(nodes, {"other": Unknown({"coarse/state": messages.STATE}, {}, frozenset())})

@@ -2,6 +2,7 @@
 """The environment in which lathe_rc is built and run."""
 
 import os
+import shlex
 from collections.abc import Mapping
 from typing import TypedDict
 
@@ -68,9 +69,25 @@ def apply(wanted: Changes, environ: Mapping[str, str]) -> dict[str, str]:
 
 def run_environment(wanted: Changes, environ: Mapping[str, str]) -> dict[str, str]:
     """Return the environment in which to run lathe_rc."""
-    # The checkout goes first, so that a module has one path (and Numba one cache), wherever it is started.
-    python_path = [str(ROOT), *wanted["prepend"].get("PYTHONPATH", [])]
-    return apply(
-        Changes(prepend={**wanted["prepend"], "PYTHONPATH": python_path}, assign=wanted["assign"]),
-        {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", **environ},
-    )
+    return apply(wanted, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", **environ})
+
+
+def shell_lines(wanted: Changes) -> str:
+    """Return the changes as lines of a shell script; an entry that is there already stays where it is."""
+    paths = [
+        f'case ":${{{name}-}}:" in *":{entry}:"*) ;; *) export {name}="{entry}${{{name}:+:${name}}}" ;; esac\n'
+        for name, entries in wanted["prepend"].items()
+        for entry in reversed(entries)
+    ]
+    return "".join([*paths, *(f"export {name}={shlex.quote(value)}\n" for name, value in wanted["assign"].items())])
+
+
+def complete(script: str, ros: SourcedRos | None) -> str:
+    """Return colcon's setup script with what colcon does not know of.
+
+    That is the virtual environment, before what was built against it; and the checkout, which goes first, so that a
+    module has one path (and Numba one cache), wherever it is started.
+    """
+    virtual = changes(own_environment(ros))
+    checkout = Changes(prepend={"PYTHONPATH": [str(ROOT)]}, assign={})
+    return f"# Lines of ./lathe (tools/environment.py)\n{shell_lines(virtual)}\n{script}\n{shell_lines(checkout)}"

@@ -8,13 +8,14 @@ command needs are installed when one is called that does; each group of them has
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple, cast
 
 import installer
-from environment import Changes, build_environment, changes, own_environment
+from environment import Changes, build_environment, changes, complete
 from ros import SourcedRos, mend_cmake_paths
 from steps import Step, clear, write_atomically
 from workplace import BASE_PYTHON, BUILD, HOME, INSTALL, LOG, PYTHON, REQUIREMENTS, ROOT, VENV, say
@@ -44,7 +45,8 @@ class Group(NamedTuple):
 
 
 GROUPS = {
-    "test": Group("test.in", "5 s, 200 MB", sourced=True),
+    "notebook": Group("notebook.in", "10 s, 300 MB", sourced=True),
+    "test": Group("test.in", "5 s, 300 MB", sourced=True),
     "view": Group("view.in", "10 s, 400 MB", sourced=False),
 }
 
@@ -134,7 +136,7 @@ class Recipe:
                 mend_cmake_paths()
 
     def _install_group(self, name: str, lock: int) -> None:
-        with Step(f"packages to {name}", GROUPS[name].usual, CHECK_NETWORK, lock) as step:
+        with Step(f"packages: {name}", GROUPS[name].usual, CHECK_NETWORK, lock) as step:
             self._install(step, GROUPS[name].list)
 
     def _install(self, step: Step, *lists: str) -> None:
@@ -166,10 +168,15 @@ class Recipe:
             step.run(*colcon("--paths", ROOT, "--symlink-install"), environ=self._colcon_environment())
             # Some environments forbid Python to write byte code, and each start would compile a hundred modules anew.
             step.run(PYTHON, "-m", "compileall", "-q", ROOT / "lathe_rc", environ=build_environment(self._ros))
+            for script in (INSTALL / "setup.sh", INSTALL / "setup.bash"):
+                script.write_text(complete(script.read_text(encoding="utf-8"), self._ros), encoding="utf-8")
+            command = PYTHON.with_name("lathe")
+            command.unlink(missing_ok=True)
+            command.symlink_to(ROOT / "lathe")
             listing = BUILD / "environment"
             step.run(
                 *("bash", "-c", '. "$0" && env -0 > "$1"', INSTALL / "setup.bash", listing),
-                environ=own_environment(self._ros),
+                environ={"PATH": os.defpath},
             )
             return changes(dict(line.split("=", 1) for line in listing.read_text().split("\0") if line))
 

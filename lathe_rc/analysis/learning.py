@@ -23,6 +23,24 @@ Response = Callable[[Array], Complex]
 _COARSE, _FINE, _PEAKS = 1025, 65, 3  # points over all waves, then around each of the worst peaks
 
 
+def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[float, float]:
+    """Supremum of the magnitude of a factor of a cycle, and the waves per revolution where it is.
+
+    Args:
+        operator: the factor at waves per revolution, shape (n,).
+        highest: waves per revolution.
+    """
+    waves = np.linspace(0.0, highest, _COARSE)
+    size = np.abs(operator(waves))
+    inner = np.flatnonzero((size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:])) + 1
+    peaks = np.append(inner, (0, _COARSE - 1))
+    peaks = peaks[np.argsort(size[peaks])[-_PEAKS:]]
+    beside = highest / (_COARSE - 1)
+    near = np.concatenate([np.linspace(w - beside, w + beside, _FINE) for w in waves[peaks]]).clip(0.0, highest)
+    fine = np.abs(operator(near))
+    return float(fine.max()), float(near[np.argmax(fine)])
+
+
 @dataclass(frozen=True)
 class LearningLoop:
     """One self-learning channel.
@@ -86,15 +104,7 @@ class LearningLoop:
         Over all waves up to the Nyquist limits of grid and sampling.
         """
         highest = min(self.grid / 2, np.pi / (self.step * speed))
-        waves = np.linspace(0.0, highest, _COARSE)
-        size = np.abs(self.operator(waves, speed))
-        inner = np.flatnonzero((size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:])) + 1
-        peaks = np.append(inner, (0, _COARSE - 1))
-        peaks = peaks[np.argsort(size[peaks])[-_PEAKS:]]
-        beside = highest / (_COARSE - 1)
-        near = np.concatenate([np.linspace(w - beside, w + beside, _FINE) for w in waves[peaks]]).clip(0.0, highest)
-        fine = np.abs(self.operator(near, speed))
-        return float(fine.max()), float(near[np.argmax(fine)])
+        return supremum(lambda waves: self.operator(waves, speed), highest)
 
     def supremum(self, speed: float) -> float:
         """See `worst`."""

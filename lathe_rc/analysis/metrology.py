@@ -40,11 +40,26 @@ class FormErrors:
     peak_to_valley: Array
     starts: npt.NDArray[np.int64]
 
+    def told(self) -> list[str]:
+        """In words: how many revolutions, and the error in the first and last of them, if there are any."""
+        count = f"{self.rms.size} revolution{'' if self.rms.size == 1 else 's'}"
+        ends = [f"{rms * 1e6:.4g}" for rms in (*self.rms[:1], *self.rms[1:][-1:])]
+        return [count, f"form error {' to '.join(ends)} µm RMS"] if ends else [count]
+
 
 def _starts(turns: Array, step: Array, first: int = 0) -> npt.NDArray[np.int64]:
     """First sample of each complete revolution from ``first`` on and of the one after; ``step`` in revolutions."""
     whole = int(np.floor(turns[-1] + 2 * step[-1]))
     return np.searchsorted(turns, np.arange(first, max(whole, first) + 1))
+
+
+def turns_before(angle: Array) -> int:
+    """Revolutions before the first complete one: 0 of a run, which begins in its first; more of a snapshot.
+
+    Args:
+        angle: true spindle angle [rad], shape (n,).
+    """
+    return int(np.ceil(angle[0] / (2.0 * np.pi))) if angle.size and angle[0] >= 2.0 * np.pi else 0
 
 
 def form_errors(angle: Array, error: Array, first: int = 0) -> FormErrors:

@@ -116,6 +116,7 @@ def check(path: Path) -> Findings:
         dense = {t: _Dense(t, k, findings, digester) for t, k in types.items() if k in messages.block_types()}
         sparse = {topic: SparseTopic() for topic, kind in types.items() if kind in messages.sparse_types()}
         counts = dict.fromkeys(types, 0)
+        findings.wrong += source.contradictions
         for topic, log_ns, data in source.messages():
             counts[topic] += 1
             if topic in dense:
@@ -124,7 +125,7 @@ def check(path: Path) -> Findings:
                 _add(sparse[topic], topic, types[topic], log_ns, data, findings)
         for topic, said in source.topics.items():
             if said.count != counts[topic]:
-                findings.wrong.append(f"{topic}: {counts[topic]} messages, {said.count} by the metadata")
+                findings.wrong.append(f"{topic}: {counts[topic]} messages, {said.count} by the index")
         findings.messages = sum(counts.values())
     _ends(dense, findings, part=part is not None)
     if part and not 0 < part[1] == findings.samples:

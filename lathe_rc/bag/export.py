@@ -17,6 +17,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals, full
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.names import instead
 
 _TOPIC = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 _LONGEST_TOPIC = 255  # characters; a file name has no more
@@ -107,7 +108,8 @@ def _selected(source: Source, wanted: Sequence[str]) -> dict[str, str]:
         raise InputError(f"{source.path}: no signal topics of lathe_rc; nothing to export")
     for topic in map(full, wanted):
         if topic not in types:
-            raise InputError(f"--topics {topic}: not in the bag; allowed: {', '.join(types)[:2000]}")
+            known = instead(topic, types, listing=f"lathe bag info {source.path}")
+            raise InputError(f"--topics {topic}: not in the bag; {known}")
     chosen = {topic: types[topic] for topic in dict.fromkeys(map(full, wanted))} or types
     for topic in chosen:
         if not _TOPIC.fullmatch(topic) or len(topic) > _LONGEST_TOPIC:

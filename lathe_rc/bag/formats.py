@@ -51,7 +51,7 @@ class Format(ABC):
         """All tables are closed: complete what they share."""
 
 
-def _schema(columns: Sequence[Column], name: Callable[[Column], str]) -> Any:
+def arrow_schema(columns: Sequence[Column], name: Callable[[Column], str]) -> Any:
     """Arrow's view of a table; the units are metadata of the fields."""
     return pa.schema(
         [
@@ -98,7 +98,7 @@ class Csv(_FileEach):
 
     def table(self, topic: str, columns: Sequence[Column]) -> Rows:
         """See `Format`."""
-        schema = _schema(columns, lambda column: column.label)
+        schema = arrow_schema(columns, lambda column: column.label)
         path = self.place / f"{file_name(topic)}.csv"
         options = csv.WriteOptions(quoting_style="needed")
         return _ArrowRows(csv.CSVWriter(path, schema, write_options=options), schema)
@@ -109,7 +109,7 @@ class Parquet(_FileEach):
 
     def table(self, topic: str, columns: Sequence[Column]) -> Rows:
         """See `Format`."""
-        schema = _schema(columns, lambda column: column.name)
+        schema = arrow_schema(columns, lambda column: column.name)
         path = self.place / f"{file_name(topic)}.parquet"
         return _ArrowRows(parquet.ParquetWriter(path, schema, compression="zstd"), schema)
 

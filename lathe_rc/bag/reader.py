@@ -33,6 +33,19 @@ class _Whole:
 def read(path: Path) -> Recording:
     """All signal topics of a bag; memory for all of it is needed, see `lathe_rc.bag.stream` otherwise.
 
+    Example:
+        >>> from pathlib import Path
+        >>> from lathe_rc import harness, resources
+        >>> from lathe_rc.bag import reader
+        >>> from lathe_rc.cell import scenario
+        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=3"])
+        >>> result = harness.run(piston, bag=Path("piston_bag"))
+        >>> recording = reader.read(Path("piston_bag"))
+        >>> recording.digests() == result.digest
+        True
+        >>> figure = recording.plot("three revolutions")
+        >>> figure.savefig("piston.png")
+
     Raises:
         InputError: not a bag.
         LatheError: a block is missing or repeated.
@@ -49,4 +62,5 @@ def read(path: Path) -> Recording:
             sparse[topic] = SparseTopic()
             for message in whole.sparse.get(topic, []):
                 sparse[topic].append(START_NS + message.index * header.step_ns, message.values)
-    return Recording(header.types, dense, sparse)
+    samples = next((array.size for signals in dense.values() for array in signals.values()), 0)
+    return Recording(header.types, dense, sparse, header.step_ns, header.samples - samples)

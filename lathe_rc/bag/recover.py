@@ -8,8 +8,10 @@ from pathlib import Path
 from lathe_rc.bag import story
 from lathe_rc.bag.salvage import Salvage
 from lathe_rc.bag.writer import BagWriter, refuse_existing
+from lathe_rc.errors import shown
 
 _CHUNK = 2**20  # [B]
+_ENCODING = "cdr"  # how messages are serialized in what this package writes
 
 
 @dataclass(frozen=True)
@@ -18,7 +20,7 @@ class Recovery:
 
     Attributes:
         saved: messages.
-        skipped: messages of topics whose type nobody knows.
+        skipped: messages of topics whose type or serialization format nobody knows.
         lost_bytes: bytes of the files that gave nothing.
         damage: what was wrong, one line each.
     """
@@ -49,26 +51,34 @@ def recover(path: Path, target: Path) -> Recovery:
     salvage = Salvage(path)
     writer = BagWriter(target, compression="zstd", chunk_size=_CHUNK, about={})
     known: set[str] = set()
-    refused: set[str] = set()
+    refused: dict[str, str] = {}
     saved = skipped = 0
+
+    def announce(topic: str) -> None:
+        said = salvage.topics[topic]
+        if said.encoding != _ENCODING:
+            refused[topic] = f"serialization format {shown(said.encoding)!r}"
+        elif writer.copy_topic(topic, said.type, said.qos, definition=said.definition, digest=said.digest):
+            known.add(topic)
+        else:
+            refused[topic] = f"type {said.type}"
+
     try:
         for topic, log_ns, data in salvage:
             if topic not in known and topic not in refused:
-                said = salvage.topics[topic]
-                added = writer.copy_topic(topic, said.type, said.qos, definition=said.definition, digest=said.digest)
-                (known if added else refused).add(topic)
+                announce(topic)
             if topic in refused:
                 skipped += 1
                 continue
             writer.write(topic, log_ns, data)
             saved += 1
-        for topic, said in salvage.topics.items():
-            if topic not in known | refused:  # announced, without a message
-                writer.copy_topic(topic, said.type, said.qos, definition=said.definition, digest=said.digest)
+        for topic in salvage.topics:
+            if topic not in known and topic not in refused:  # announced, without a message
+                announce(topic)
         writer.tell(salvage.about | {story.RECOVERED: f"{saved} messages; {salvage.lost_bytes} B lost"})
     finally:
         writer.close()
-    damage = [*salvage.damage, *(f"{topic}: type {salvage.topics[topic].type} is not known" for topic in refused)]
+    damage = [*salvage.damage, *(f"{topic}: {what} is not known" for topic, what in refused.items())]
     return Recovery(saved, skipped, salvage.lost_bytes, tuple(damage))
 
 
@@ -85,6 +95,7 @@ def mend(path: Path) -> Recovery | None:
         return None
     workshop = path.with_name(f"{path.name}.mending")
     shutil.rmtree(workshop, ignore_errors=True)
+    workshop.mkdir()
     new = workshop / path.name  # the file inside takes the folder's name
     found = recover(path, new)
     old = path.with_name(f"{path.name}.cut")

@@ -37,6 +37,7 @@ from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+from lathe_rc.names import instead
 from lathe_rc.part import ErrorsByRevolution
 
 
@@ -57,6 +58,7 @@ class Resimulation:
             the recorded error is not in the bag but made from them; otherwise empty.
         positions: topics and fields of the bag that this position is; otherwise empty.
         drives: that were identified.
+        warnings: what has changed since the bag was made, of classes of others.
     """
 
     scenario: Scenario
@@ -70,6 +72,7 @@ class Resimulation:
     between_rms: Samples = field(repr=False)
     positions: list[tuple[str, str]]
     drives: list[Identified]
+    warnings: list[str]
 
     @property
     def different(self) -> list[str]:
@@ -121,7 +124,7 @@ def with_controller(scenario: Scenario, file: Path) -> Scenario:
         if name == "/**":
             continue
         if name not in nodes:
-            raise InputError(f"{file}: no node {name!r} in the bag's scenario; allowed: {', '.join(nodes)}")
+            raise InputError(f"{file}: no node {name!r} in the bag's scenario; {instead(name, nodes)}")
         own = {key: value for key, value in values.items() if key not in SharedParameters.model_fields}
         stage = own.get("stage") or nodes[name].stage
         kind = kind_of(name, stage)
@@ -181,13 +184,14 @@ def resimulate(
         recorded = Recorded(source, topics or {})
         original = None if scenario is not None else _of_bag(recorded, source, Path(folder))
         if scenario is not None:
-            chosen = scenarios.load(resources.find(scenario), overrides)
+            chosen = scenarios.load(resources.scenario(scenario), overrides)
         else:
             assert original is not None, "it is the other source of a scenario"
             _refuse_overrides(original, overrides)
             chosen = story.scenario_of(source.about, Path(folder), overrides) if overrides else original
         if controller is not None:
             chosen = with_controller(chosen, controller)
+        warnings = story.changes(source.about) if original is not None else []
         _refuse_events(chosen, original)
         drives = identify.drives(recorded, chosen) if identified else []
         chosen = identify.with_identified(chosen, drives)
@@ -233,6 +237,7 @@ def resimulate(
         between_rms=compared.between_rms() if compared else np.empty(0),
         positions=compared.topics if compared else [],
         drives=drives,
+        warnings=warnings,
     )
 
 

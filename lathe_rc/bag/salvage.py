@@ -21,7 +21,7 @@ from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
 from lathe_rc.bag import trust
-from lathe_rc.bag.source import read_chunk, unpack, unpack_file, unpacked_size
+from lathe_rc.bag.source import files_of, read_chunk, unpack, unpack_file, unpacked_size
 from lathe_rc.bag.trust import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record
 from lathe_rc.errors import InputError, LatheError, shown
 
@@ -39,6 +39,7 @@ class Announced:
     definition: str
     digest: str
     qos: tuple[Qos, ...]
+    encoding: str
 
 
 @lru_cache(maxsize=8)
@@ -73,9 +74,7 @@ class Salvage:
     _described: int = 0  # characters of texts and definitions
 
     def __post_init__(self) -> None:
-        kinds = (".mcap", ".db3", ".zstd")
-        found = [self.path] if self.path.is_file() else list(self.path.glob("*"))
-        self._files = sorted(file for file in found if file.suffix in kinds)
+        self._files = files_of(self.path)
         if not self._files:
             raise InputError(f"{self.path}: no bag; allowed: a folder with .mcap or .db3 files, or such a file")
 
@@ -203,7 +202,7 @@ class Salvage:
         self._qos.add(channel)
         qos = _profiles(channel.metadata.get("offered_qos_profiles", "") or "[]")
         digest = channel.metadata.get("topic_type_hash", "")
-        self.topics[channel.topic] = Announced(schema.name, schema.data.decode(), digest, qos)
+        self.topics[channel.topic] = Announced(schema.name, schema.data.decode(), digest, qos, channel.message_encoding)
         channels[channel.id] = channel.topic
 
     # ---- SQLite -------------------------------------------------------------------------------------
@@ -231,8 +230,11 @@ class Salvage:
             defined = {kind: text for kind, text in rows.fetchmany(MOST_TOPICS) if isinstance(text, str)}
         except sqlite3.Error:
             defined = {}  # bags of older ROS have none
-        listed = base.execute("SELECT id, name, type, offered_qos_profiles FROM topics").fetchmany(MOST_TOPICS)
-        for number, name, kind, qos in listed:
+        try:
+            listed = base.execute("SELECT id, name, type, serialization_format, offered_qos_profiles FROM topics")
+        except sqlite3.Error:  # those of the oldest do not have that either
+            listed = base.execute("SELECT id, name, type, serialization_format, '' FROM topics")
+        for number, name, kind, encoding, qos in listed.fetchmany(MOST_TOPICS):
             trust.check_name(name)
             trust.check_name(kind)
             text = qos if isinstance(qos, str) else ""
@@ -240,5 +242,5 @@ class Salvage:
             definition = defined.get(kind, "")
             self._describe(len(definition) + len(text))
             names[number] = name
-            self.topics[name] = Announced(kind, definition, "", _profiles(text))
+            self.topics[name] = Announced(kind, definition, "", _profiles(text), str(encoding))
         return names

@@ -22,6 +22,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import START_NS
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.names import instead
 
 _CATCH_UP = 4  # messages or rows that go to the disk for each that comes, until a snapshot has caught up
 _SPARE_ROWS = 2  # kept beyond the time before a trigger: a trigger may lie in the row before the newest
@@ -130,8 +131,8 @@ class Snapshots:
         for pattern in self._table.triggers:
             node, colon, _ = pattern.partition(": ")
             if colon and not any(fnmatchcase(name, node) for name in nodes):
-                known = ", ".join(sorted(nodes))
-                raise InputError(f"{self._name}.triggers = {pattern!r}: no node {node!r} in the cell; allowed: {known}")
+                known = instead(node, sorted(nodes))
+                raise InputError(f"{self._name}.triggers = {pattern!r}: no node {node!r} in the cell; {known}")
 
     # ---- what comes in ------------------------------------------------------------------------------
 

@@ -7,8 +7,8 @@ Nothing in a bag is trusted: what it says of sizes is checked before anything of
 import heapq
 import struct
 import tempfile
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from io import BytesIO
 from itertools import chain, pairwise
 from operator import itemgetter
@@ -24,7 +24,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel
 from mcap.writer import MCAP0_MAGIC
-from rosbags.interfaces import Qos
+from rosbags.interfaces import Connection, Qos
 from rosbags.rosbag2 import Reader
 
 from lathe_rc.bag import trust
@@ -43,6 +43,8 @@ _CHANNELS = 2**16  # numbers that a channel may have
 _AT_ONCE = 2**14  # messages of a batch
 _CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
 _SQLITE = b"SQLite format 3\0"
+_METADATA = "metadata.yaml"
+_KINDS = (".mcap", ".db3", ".zstd")
 _RECOVER = "; lathe bag recover saves the rest"
 
 
@@ -89,6 +91,12 @@ class Topic:
     type: str
     qos: tuple[Qos, ...]
     count: int
+
+
+def files_of(path: Path) -> list[Path]:
+    """The files with the messages of a bag, by name: those of a folder, or the one that is named."""
+    found = [path] if path.is_file() else path.glob("*")
+    return sorted(file for file in found if file.suffix in _KINDS and file.is_file())
 
 
 def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
@@ -237,6 +245,7 @@ class Source:
         topics: by name.
         about: texts that the bag says of itself, see docs/bags.md.
         first_ns, last_ns: smallest and largest log time; 0 and 0 if it is empty.
+        contradictions: where metadata.yaml says other than the files hold, one line each; the files count.
 
     Raises:
         InputError: not a bag, or one that cannot be whole.
@@ -251,9 +260,9 @@ class Source:
         except (LatheError, MemoryError):
             raise
         except Exception as error:  # noqa: BLE001 - the libraries raise whatever broken bytes lead to
-            why, files = shown(error), [path] if path.is_file() else sorted(path.glob("*.mcap"))
-            for file in filter(Path.is_file, files):
-                why = _damage(file) or why
+            why, files = shown(error), files_of(path)
+            for file in files:
+                why = (file.suffix == ".mcap" and _damage(file)) or why
             raise InputError(f"{path}: not a readable bag ({why}){_RECOVER if files else ''}") from None
         try:
             self._read_head()
@@ -269,14 +278,18 @@ class Source:
 
         Raises:
             InputError: metadata that is too long.
-            ValueError: see `_check_storage`.
+            ValueError: there is nothing, or see `_check_storage`.
         """
+        if not self.path.exists():
+            raise ValueError("there is no such folder or file")
         if self.path.is_dir():
-            metadata = self.path / "metadata.yaml"
-            if metadata.exists():
-                if metadata.stat().st_size > MOST_TEXT * 16:
-                    raise InputError(f"{metadata}: {metadata.stat().st_size} B; allowed: up to {MOST_TEXT * 16}")
-                trust.check_yaml(metadata.read_text(encoding="utf-8"), metadata.name)
+            metadata = self.path / _METADATA
+            if not metadata.exists():
+                lack = "" if files_of(self.path) else ", nor a .mcap or .db3 file"
+                raise ValueError(f"no {_METADATA} in that folder{lack}")
+            if metadata.stat().st_size > MOST_TEXT * 16:
+                raise InputError(f"{metadata}: {metadata.stat().st_size} B; allowed: up to {MOST_TEXT * 16}")
+            trust.check_yaml(metadata.read_text(encoding="utf-8"), _METADATA)
         for file in sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]:
             if file.is_file():
                 _check_storage(file)
@@ -287,23 +300,46 @@ class Source:
         whole: Any = self._reader.storage
         self._storages: list[Any] = getattr(whole, "storages", [whole])
         self._packed = self._reader.compression_mode == "message"
-        connections = self._reader.connections
-        if len(connections) > MOST_TOPICS:
-            raise InputError(f"{self.path}: {len(connections)} topics; allowed: up to {MOST_TOPICS}")
-        self.topics: dict[str, Topic] = {}
+        self.topics = self._topics_of(self._reader.connections)
+        custom: Any = getattr(whole.metadata, "custom", None) or {}
+        texts = {key: text for key, text in custom.items() if isinstance(key, str) and isinstance(text, str)}
+        self.about: Mapping[str, str] = {key[:256]: text[:MOST_TEXT] for key, text in texts.items()}
+        spans = [each.metadata for each in self._storages if each.metadata.message_count]
+        self.first_ns = min((trust.number(span.start_time) for span in spans), default=0)
+        self.last_ns = max((trust.number(span.end_time) for span in spans), default=1) - 1
+        self.contradictions = self._believe_the_files()
+
+    def _believe_the_files(self) -> list[str]:
+        """Take the numbers of messages from the files; tells where metadata.yaml says something else."""
+        wrong: list[tuple[str, int]] = []
+        if self._reader.message_count and self.last_ns:
+            told = trust.number(self._reader.start_time), trust.number(self._reader.end_time) - 1
+            held = zip(("first", "last"), told, (self.first_ns, self.last_ns), strict=True)
+            wrong += [(f"{which} message at {said} ns", found) for which, said, found in held if said != found]
+        connections = [each for storage in self._storages for each in storage.connections]
+        counted = sum(each.msgcount for each in connections)
+        if counted == sum(each.metadata.message_count for each in self._storages):  # an index may leave them out
+            found = self._topics_of(connections)
+            for topic, said in {**found, **self.topics}.items():
+                told_of = self.topics[topic].count if topic in self.topics else 0
+                count = found[topic].count if topic in found else 0
+                wrong += [(f"{told_of} messages of {topic}", count)] if told_of != count else []
+                self.topics[topic] = replace(said, count=count)
+        return [f"{_METADATA} says {said}; the files: {found}" for said, found in wrong]
+
+    def _topics_of(self, connections: Sequence[Connection]) -> dict[str, Topic]:
+        """What a file, or the metadata, says of topics."""
+        found: dict[str, Topic] = {}
         for connection in connections:
             trust.check_name(connection.topic)
             trust.check_name(connection.msgtype)
             ext: Any = connection.ext
-            known = self.topics.get(connection.topic)
+            known = found.get(connection.topic)
             count = trust.number(connection.msgcount) + (known.count if known else 0)
-            self.topics[connection.topic] = Topic(connection.msgtype, tuple(ext.offered_qos_profiles), count)
-        custom: Any = getattr(whole.metadata, "custom", None) or {}
-        texts = {key: text for key, text in custom.items() if isinstance(key, str) and isinstance(text, str)}
-        self.about: Mapping[str, str] = {key[:256]: text[:MOST_TEXT] for key, text in texts.items()}
-        empty = not self._reader.message_count
-        self.first_ns = 0 if empty else trust.number(self._reader.start_time)
-        self.last_ns = 0 if empty else trust.number(self._reader.end_time) - 1
+            found[connection.topic] = Topic(connection.msgtype, tuple(ext.offered_qos_profiles), count)
+        if len(found) > MOST_TOPICS:
+            raise InputError(f"{self.path}: {len(found)} topics; allowed: up to {MOST_TOPICS}")
+        return found
 
     def __enter__(self) -> "Source":
         """Itself."""

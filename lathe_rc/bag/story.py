@@ -7,24 +7,29 @@ import json
 import platform
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from lathe_rc import __version__
+from lathe_rc import __version__, extensions
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.recorder import RecorderParameters
-from lathe_rc.cell.scenario import Scenario
-from lathe_rc.errors import InputError
+from lathe_rc.cell.scenario import Scenario, kind_of
+from lathe_rc.cell.stages import STAGES
+from lathe_rc.errors import InputError, shown
 from lathe_rc.files import contents
 
 SCENARIO, NAME, VERSIONS = "lathe_rc.scenario", "lathe_rc.name", "lathe_rc.versions"
 RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"
 FILE = "lathe_rc.file."  #: and NODE.PARAM: what was in the file that the parameter names
+ORIGINS = "lathe_rc.origins"  #: where classes of others come from, if there are any
 HELD = "lathe_rc.held"  #: samples from which on the newest value of a topic stands for those of a lost node
 RECOVERED = "lathe_rc.recovered"  #: that the bag was completed, and what that cost
 _MOST_FILE = 2**19  # longest such file that is kept [B]
 _LONGEST_NAME = 80  # characters of a file
+_HASH = 12  # characters that are shown of one
+_MOST_ORIGINS = 256
 _PACKAGES = ("numpy", "scipy", "numba", "mcap", "rosbags")
 
 
@@ -53,8 +58,103 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
         HOST_TOPICS: json.dumps(list(host_topics)),
         VERSIONS: json.dumps(_versions()),
         SCENARIO: Scenario(scenario.name, nodes).to_yaml(),
+        **({ORIGINS: json.dumps(found)} if (found := _origins(nodes)) else {}),
         **files,
     }
+
+
+def _origins(nodes: Mapping[str, NodeParameters]) -> dict[str, dict[str, object]]:
+    """Of each class of others where it comes from, see `Registry.origin`, and the parameters that name it."""
+    named: list[tuple[str, Mapping[str, str] | None]] = []
+    for node, table in nodes.items():
+        kind = kind_of(node, table.stage)
+        if kind in STAGES:
+            named.append((f"{node}.stage", STAGES.origin(kind)))
+        for name, row in type(table).rows().items():
+            if row.named is not None:
+                others = row.named.others(getattr(table, name))
+                named += [(f"{node}.{name}", row.named.registry.origin(each)) for each in dict.fromkeys(others)]
+    used: dict[str, list[str]] = {}
+    found: dict[str, dict[str, object]] = {}
+    for parameter, origin in named:
+        if origin is not None:
+            own = used.setdefault(origin["class"], [])
+            own.append(parameter)
+            found[origin["class"]] = {key: text for key, text in origin.items() if key != "class"} | {"used": own}
+    return found
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a class of others came from when a bag was made.
+
+    Attributes:
+        name: of the class, as ``package.module:Class``.
+        distribution, version: of the package; empty: it was not installed as one.
+        source: hash of its source.
+        used: parameters that name it, as NODE.PARAM.
+    """
+
+    name: str
+    distribution: str
+    version: str
+    source: str
+    used: tuple[str, ...]
+
+    @property
+    def package(self) -> str:
+        """Distribution and version; empty if it was not installed as one."""
+        return f"{self.distribution} {self.version}".strip()
+
+
+def origins(about: Mapping[str, str]) -> list[Origin]:
+    """Where the classes of others in a bag came from; empty if there are none, or what the bag says of them is none."""
+    found: list[Origin] = []
+    try:
+        for name, said in list(json.loads(about.get(ORIGINS, "{}")).items())[:_MOST_ORIGINS]:
+            texts = [str(said.get(key, "")) for key in ("distribution", "version", "source")]
+            distribution, version, source = (shown(text) if text else "" for text in texts)
+            used = tuple(shown(each) for each in said["used"][:_MOST_ORIGINS])
+            found.append(Origin(shown(name), distribution, version, source, used))
+    except (ValueError, TypeError, AttributeError, KeyError, RecursionError):
+        return []
+    return found
+
+
+def _check_installed(about: Mapping[str, str]) -> None:
+    """Refuse a bag whose classes of others are not here.
+
+    Raises:
+        InputError: names one, and what to install.
+    """
+    for origin in origins(about):
+        try:
+            extensions.find(origin.name, "it")
+        except InputError as error:
+            module = origin.name.partition(":")[0].partition(".")[0]
+            allowed = f"put {module} where Python looks for it (the current folder, or PYTHONPATH)"
+            if origin.package:
+                allowed = f"install {origin.package}"
+            raise InputError(
+                f"{', '.join(origin.used)}: the bag was made with {origin.name}, and {error}; allowed: {allowed}"
+            ) from None
+
+
+def changes(about: Mapping[str, str]) -> list[str]:
+    """What has changed of the classes of others, all of which are here, since a bag was made; a line for each class."""
+    found = []
+    for origin in origins(about):
+        extensions.find(origin.name, origin.name)
+        now = extensions.origin(origin.name.partition(":")[0])
+        version = now.get("version", "")
+        if version != origin.version:
+            what = f"version {version or 'none'} here, and {origin.version or 'none'} when the bag was made"
+        elif now["source"] != origin.source:
+            what = f"source {now['source'][:_HASH]} here, and {origin.source[:_HASH]} when the bag was made"
+        else:
+            continue
+        found.append(f"{origin.name} has {what}")
+    return found
 
 
 def held(about: Mapping[str, str]) -> dict[str, int]:
@@ -96,6 +196,7 @@ def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str]
     """
     if SCENARIO not in about:
         raise InputError("the bag holds no scenario; it was not made by lathe_rc, or its recorder never saw the cell")
+    _check_installed(about)
     file = folder / "scenario.yaml"
     file.write_bytes(about[SCENARIO].encode(errors="surrogatepass"))
     sets: list[str] = []

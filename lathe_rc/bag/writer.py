@@ -167,10 +167,12 @@ def refuse_existing(path: Path) -> None:
     """Refuse a place where a bag cannot be begun.
 
     Raises:
-        InputError: something is there already.
+        InputError: something is there already, or the folder that it would be in is not there.
     """
     if path.exists():
         raise InputError(f"{path} exists; a bag is never overwritten: name another folder or remove it")
+    if not path.absolute().parent.exists():
+        raise InputError(f"{path}: there is no folder {path.parent}; make it, or name another one")
 
 
 class BagWriter:
@@ -183,7 +185,7 @@ class BagWriter:
         about: texts that the bag says of itself, see `tell`.
 
     Raises:
-        InputError: the folder exists or cannot be made.
+        InputError: the folder exists, or cannot be made where it is to be.
     """
 
     def __init__(self, path: Path, *, compression: Compression, chunk_size: int, about: Mapping[str, str]) -> None:

@@ -26,7 +26,7 @@ def uncompiled(stages: Iterable[Stage]) -> list[Stage]:
     """Those whose steps nobody has compiled on this machine; of those that have the same one, the first."""
     known, found = native.compiled(), []
     for stage in stages:
-        if stage.step is not None and (name := stage.native().name) not in known:
+        if stage.is_compiled and (name := stage.native().name) not in known:
             known.add(name)
             found.append(stage)
     return found

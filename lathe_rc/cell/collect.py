@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checking the signals of an offline run, and keeping them in memory."""
 
+import contextlib
+import os
 from collections.abc import Collection, Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +17,7 @@ from lathe_rc.cell.wire import NotFiniteError, check_finite
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.jit import kernel
+from lathe_rc.names import instead
 
 
 @kernel
@@ -51,6 +55,36 @@ class Finite:
         raise LatheError(min(found)[2])
 
 
+def _free_memory() -> int:
+    """What programs can still have without swapping [B]; all that there is where nobody says."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            name, _, size = line.partition(":")
+            if name == "MemAvailable":
+                return int(size.split()[0]) * 1024
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def check_room(cell: Cell) -> None:
+    """Refuse a run whose signals this machine cannot keep: form errors and digests are made of all of them.
+
+    Raises:
+        InputError: says what they take, what there is, and how long a run may be.
+    """
+    fields = [messages.sample_fields(source.type).values() for source in cell.dense.values()]
+    needed = cell.expected_samples * sum(np.dtype(kind).itemsize for kinds in fields for kind in kinds)
+    free, master = _free_memory(), cell.master
+    if needed > free:
+        turns = master.parameters.revolutions
+        most = turns * free / needed
+        most_said = f"{most:,.0f}" if most > 10.0 else f"{most:.2g}"
+        raise InputError(
+            f"{master.name}.revolutions = {turns:g}: {cell.expected_samples:.4g} samples of all signals take "
+            f"{needed / 2**30:,.1f} GiB of memory, {free / 2**30:,.1f} GiB are free; allowed: up to "
+            f"{most_said} here (nodes that lathe node or launch starts keep no signals)"
+        )
+
+
 class Collector:
     """Collects whole arrays; a sink of the engine.
 
@@ -67,8 +101,9 @@ class Collector:
         known = {**cell.dense, **cell.sparse}
         self._sources = known if topics is None else {topic: known[topic] for topic in topics if topic in known}
         if missing := [topic for topic in topics or () if topic not in known]:
-            raise InputError(f"no topic {missing[0]!r} in the cell; allowed: {', '.join(known)}")
-        self._framer = Framer("", "", cell.master.shared.step_ns)
+            raise InputError(f"no topic {missing[0]!r} in the cell; {instead(missing[0], known)}")
+        self._step_ns = cell.master.shared.step_ns
+        self._framer = Framer("", "", self._step_ns)
         self._dense = {
             topic: messages.allocate(source.type, samples)
             for topic, source in self._sources.items()
@@ -96,4 +131,5 @@ class Collector:
                 framed = self._framer.sparse(message)
                 part.add(messages.stamp_ns(framed), framed)
         types = {f"/{topic}": source.type for topic, source in self._sources.items()}
-        return Recording(types, {f"/{topic}": signals for topic, signals in self._dense.items()}, sparse)
+        dense = {f"/{topic}": signals for topic, signals in self._dense.items()}
+        return Recording(types, dense, sparse, self._step_ns)

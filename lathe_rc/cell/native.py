@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.extensions import source_hash
 from lathe_rc.files import replacing
-from lathe_rc.jit import cache_folder, kernel
+from lathe_rc.jit import cache_folder, is_ours, kernel
 from lathe_rc.placed import Placed, Words, call
 
 Integers = npt.NDArray[np.int64]
@@ -28,15 +29,18 @@ _FIELDS = {np.dtype(np.float64): "floats", np.dtype(np.uint8): "octets"}
 _MODULE = '''"""Written by lathe_rc.cell.native: {step} as a function of addresses.
 
 The memory is {memory}.
+The source is {source}.
 """
 
 import {module}
 from lathe_rc.placed import at, entry, floats, octets, store
 
+STEP = {step}
+
 
 @entry
 def enter(memory, first, start, samples, fields, reached):
-    sample, reason = {step}(
+    sample, reason = STEP(
         at(memory, MEMORY),
         first,
         start,
@@ -125,13 +129,19 @@ def _text(step: Step, memory: Placed, inputs: Sequence[np.dtype[Any]], outputs: 
 
     read = list(enumerate(inputs))
     return _MODULE.format(
-        step=f"{step.__module__}.{step.__name__}",
+        step=f"{step.__module__}.{step.__qualname__}",
+        source=_source(step.__module__),
         module=step.__module__,
         memory=memory,
         inputs=arrays(field for field in read if field[1] == np.float64),
         flags=arrays((field for field in read if field[1] == np.uint8), without="(octets(fields, 0, 0),)"),
         outputs=arrays(enumerate(outputs, len(inputs))),
     )
+
+
+def _source(module: str) -> str:
+    """What tells versions of a step apart: ours have a cache each."""
+    return "that of lathe_rc" if is_ours(module) else source_hash(module)
 
 
 def compiled() -> set[str]:

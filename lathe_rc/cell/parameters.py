@@ -5,9 +5,10 @@ ROS descriptors, validation, help and the documentation are made from these tabl
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
-from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -16,6 +17,7 @@ from pydantic.fields import FieldInfo
 from lathe_rc.cell.messages import MAX_BLOCK
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import Named
+from lathe_rc.names import instead
 
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
 
@@ -91,7 +93,13 @@ class Row:
 
 
 class Table(BaseModel):
-    """A set of parameters; immutable, refuses unknown names, wrong types and values out of range."""
+    """A set of parameters; immutable, refuses unknown names, wrong types and values out of range.
+
+    Attributes:
+        listing: the command that lists the parameters of a kind of node or a study; empty if there is none.
+    """
+
+    listing: ClassVar[str] = ""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True)
 
@@ -109,20 +117,40 @@ class Table(BaseModel):
         """
         try:
             return cls(**values)
+        except InputError as error:  # of a `model_post_init`, whose messages begin with a parameter, or of a class
+            dot = "." if str(error).partition(" ")[0] in cls.model_fields else ": "
+            raise InputError(f"{node}{dot}{error}") from None
         except ValidationError as error:
             first = error.errors()[0]
             name = str(first["loc"][0])
             if first["type"] == "extra_forbidden":
-                known = ", ".join(sorted(cls.model_fields))
-                raise InputError(f"{shown(f'{node}.{name}')}: unknown parameter; allowed: {known}") from None
+                listing = cls.listing.format(shown(values.get("stage") or node))
+                known = instead(name, sorted(cls.model_fields), listing=listing)
+                raise InputError(f"{shown(f'{node}.{name}')}: unknown parameter; {known}") from None
+            if why := str(first.get("ctx", {}).get("error", "")):  # there is such a name, but the class cannot be used
+                raise InputError(f"{node}.{name}: {why}") from None
             given = f"{values[name]!r:.200}"
             raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
 
 
+@contextmanager
+def about(node: str, *names: str) -> Iterator[None]:
+    """Let a refusal of what is made of some parameters name them: ``node.a, b: ...``; one that does stays as it is.
+
+    Physics and control know nothing of parameters; who makes them of a table does.
+    """
+    try:
+        yield
+    except InputError as error:
+        if not str(error).startswith(f"{node}."):
+            error.args = (f"{node}.{', '.join(names)}: {str(error).removeprefix(f'{node}: ')}",)
+        raise
+
+
 def names_others(table: type[Table], values: Mapping[str, object]) -> bool:
     """Whether one of the values names a class of another package."""
-    rows = ((row, values.get(name, row.default)) for name, row in table.rows().items())
-    return any(row.named and value not in row.choices for row, value in rows)
+    rows = ((row.named, values.get(name, row.default)) for name, row in table.rows().items())
+    return any(named and named.others(value) for named, value in rows)
 
 
 @cache
@@ -177,6 +205,8 @@ class SharedParameters(Table):
 class NodeParameters(SharedParameters):
     """What every node has."""
 
+    listing: ClassVar[str] = "lathe node {} --help"
+
     stage: str = parameter("", "what the node is; empty: its name says it")
     remap: list[str] = parameter([], "topic names to replace, as old:=new")
     events: list[str] = parameter(
@@ -191,6 +221,13 @@ class NodeParameters(SharedParameters):
         "input topics whose publisher keeps no messages for those who come late (a device with default QoS)",
     )
     autostart: bool = parameter(default=True, doc="configure and activate by itself")
+
+    def model_post_init(self, context: Any, /) -> None:
+        """Refuse a rule that replaces nothing."""
+        super().model_post_init(context)
+        for rule in self.remap:
+            if not all(rule.partition(":=")):
+                raise InputError(f"remap = {rule!r}; allowed: old:=new")
 
     @property
     def commanded_topic(self) -> str:
@@ -219,15 +256,9 @@ class RestartParameters(NodeParameters):
 
 
 def remapped(table: NodeParameters, topic: str) -> str:
-    """The relative name of a topic after the node's ``remap`` rules.
-
-    Raises:
-        InputError: a rule is not of the form old:=new.
-    """
+    """The relative name of a topic after the node's ``remap`` rules."""
     for rule in table.remap:
-        old, arrow, new = rule.partition(":=")
-        if not arrow or not old or not new:
-            raise InputError(f"remap = {rule!r}; allowed: old:=new")
+        old, _, new = rule.partition(":=")
         if old == topic:
             return new
     return topic

@@ -196,7 +196,7 @@ class Program:
     def _load(self, number: int) -> None:
         """Take what a stage has in its memory now, and when it wants Python next."""
         stage, row = self._stages[number], self._plan[number]
-        if stage.step is not None:
+        if stage.is_compiled:
             native = stage.native()
             row[_STEP], row[_WORDS] = native.address, native.words.ctypes.data
         row[_DUE], self._turn[number] = stage.due

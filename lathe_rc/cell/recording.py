@@ -5,11 +5,19 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lathe_rc.cell.messages import NOT_SIGNALS, Samples, Signals
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import NOT_SIGNALS, START_NS, Samples, Signals
+from lathe_rc.cell.stage import Sparse
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from lathe_rc.analysis.metrology import FormErrors
 
 _PIECE = 2**15  # samples that are hashed in one go
 
@@ -32,7 +40,7 @@ class SparseTopic:
             self.values.setdefault(name, []).append(value)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Recording:
     """All signal topics of a run.
 
@@ -40,11 +48,73 @@ class Recording:
         types: message type by fully qualified topic.
         dense: by fully qualified topic, the arrays of each field, shape (samples,).
         sparse: by fully qualified topic.
+        step_ns: sampling step [ns]; 0 without a dense topic.
+        first: sample that the arrays begin with; 0 but in a snapshot.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from lathe_rc import harness, resources
+        >>> from lathe_rc.cell import scenario
+        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=3"])
+        >>> recording = harness.run(piston).recording
+        >>> recording
+        <Recording: 9 topics, 10785 samples (0.169 s), 3 revolutions, form error 150.8 to 1.166 µm RMS>
+        >>> print(f"{recording.dense['/tool']['error'].min() * 1e6:.1f} µm")
+        -232.7 µm
+        >>> recording.sparse["/coarse/learning"].values["cycle"]
+        [1, 2]
     """
 
     types: Mapping[str, str]
     dense: Mapping[str, Signals]
     sparse: Mapping[str, SparseTopic]
+    step_ns: int
+    first: int = 0
+
+    def __repr__(self) -> str:
+        """What it holds, in a line."""
+        size = f"{self.samples} samples ({self.samples * self.step_ns * 1e-9:.3g} s)"
+        return f"<Recording: {', '.join([f'{len(self.types)} topics', size, *self.errors.told()])}>"
+
+    def _repr_html_(self) -> str:
+        """Its topics as a table, for notebooks."""
+        from lathe_rc.view import notebook
+
+        return notebook.recording(self)
+
+    @property
+    def samples(self) -> int:
+        """Of each dense topic."""
+        return next((array.size for signals in self.dense.values() for array in signals.values()), 0)
+
+    @cached_property
+    def errors(self) -> "FormErrors":
+        """Form error of each complete revolution; of none if there is no tool."""
+        from lathe_rc.analysis.metrology import form_errors, turns_before
+
+        if not {messages.ENCODER, messages.TOOL} <= {self.types[topic] for topic in self.dense}:
+            return form_errors(np.empty(0), np.empty(0))
+        angle = self.of_type(messages.ENCODER)["angle_true"]
+        return form_errors(angle, self.of_type(messages.TOOL)["error"], turns_before(angle))
+
+    def frame(self, topic: str) -> Any:
+        """A topic as a table: a row a sample, or a message; see `lathe_rc.frames.frame`."""
+        from lathe_rc import frames
+
+        return frames.frame(self, topic)
+
+    def plot(self, title: str = "") -> "Figure":
+        """Desired form, form error over angle, form error by revolution; see `lathe_rc.view.figure.draw`."""
+        from lathe_rc.view import figure
+
+        return figure.draw(self, title)
+
+    def messages(self, topic: str) -> list[Sparse]:
+        """The messages of a sparse topic, by its fully qualified name."""
+        found, kind = self.sparse[topic], self.types[topic]
+        rows = [dict(zip(found.values, row, strict=True)) for row in zip(*found.values.values(), strict=True)]
+        places = [(stamp - START_NS) // self.step_ns for stamp in found.stamps]
+        return [Sparse(topic, kind, index, values) for index, values in zip(places, rows, strict=True)]
 
     def of_type(self, msgtype: str) -> Signals:
         """The signals of the first topic of a block type."""

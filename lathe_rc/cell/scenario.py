@@ -16,6 +16,7 @@ from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.errors import InputError, shown
+from lathe_rc.names import instead
 
 
 class _Tables(Mapping[str, type[NodeParameters]]):
@@ -28,7 +29,11 @@ class _Tables(Mapping[str, type[NodeParameters]]):
 
     def allowed(self) -> str:
         """The kinds, in words."""
-        return f"{RECORDER}, {STAGES.allowed()}"
+        return f"{', '.join(self)}, or PACKAGE.MODULE:CLASS"
+
+    def instead(self, kind: str) -> str:
+        """The kinds that look like one that there is not, or all of them, in words."""
+        return f"{instead(kind, self)} (others: PACKAGE.MODULE:CLASS)"
 
     def __iter__(self) -> Iterator[str]:
         yield from STAGES
@@ -59,7 +64,7 @@ def kind_of(node: str, stage: object) -> str:
     """
     kind = str(stage or node)
     if kind not in TABLES:
-        raise InputError(f"{node}: no stage {kind!r}; allowed: {TABLES.allowed()} (set {node}.stage)")
+        raise InputError(f"{node}: no stage {shown(kind)!r}; {TABLES.instead(kind)}; set {node}.stage")
     return kind
 
 
@@ -85,7 +90,7 @@ def _quoted(value: Value) -> object:
     return _Text(value) if isinstance(value, str) else value
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scenario:
     """A cell, described.
 
@@ -97,7 +102,17 @@ class Scenario:
 
     name: str
     nodes: dict[str, NodeParameters]
-    fingerprints: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
+    fingerprints: Mapping[str, str] = field(default_factory=dict, compare=False)
+
+    def __repr__(self) -> str:
+        """Its name and nodes, in a line."""
+        return f"<Scenario {self.name}: {', '.join(self.nodes)}>"
+
+    def _repr_html_(self) -> str:
+        """Its nodes and what is set in them, as a table, for notebooks."""
+        from lathe_rc.view import notebook
+
+        return notebook.scenario(self)
 
     @property
     def shared(self) -> SharedParameters:
@@ -128,13 +143,14 @@ class Scenario:
             InputError: a node that there is not, or one that is named twice.
         """
         if groups is None:
-            named = [text for table in self.nodes.values() for text in getattr(table, "processes", [])]
-            groups = [text.split("+") for text in named]
+            named = [(node, text) for node, table in self.nodes.items() for text in getattr(table, "processes", [])]
+            what = f"{named[0][0]}.processes" if named else what
+            groups = [text.split("+") for _, text in named]
         split = [[name.strip() for name in group] for group in groups]
         seen: set[str] = set()
         for name in (name for group in split for name in group):
             if name not in self.nodes:
-                raise InputError(f"{what}: no node {name!r} in the scenario; allowed: {', '.join(self.nodes)}")
+                raise InputError(f"{what}: no node {shown(name)!r} in the scenario; {instead(name, self.nodes)}")
             if name in seen:
                 raise InputError(f"{what}: {name} is named twice; allowed: each node in one process")
             seen.add(name)
@@ -148,10 +164,24 @@ class Scenario:
 
         Raises:
             InputError: one line for the first thing that is wrong.
+
+        Example:
+            >>> from pathlib import Path
+            >>> from lathe_rc import resources
+            >>> from lathe_rc.cell import scenario
+            >>> piston = scenario.load(resources.find(Path("piston.yaml")))
+            >>> shorter = piston.varied({"learning_controller.lead_time": 1.3e-3, "block_size": 128})
+            >>> piston.nodes["learning_controller"].lead_time, shorter.nodes["learning_controller"].lead_time
+            (0.001425, 0.0013)
+            >>> {table.block_size for table in shorter.nodes.values()}
+            {128}
+            >>> piston.varied({"learning_controller.lead_tim": 1.3e-3})
+            Traceback (most recent call last):
+            lathe_rc.errors.InputError: learning_controller.lead_tim: unknown parameter; allowed: ...
         """
         changes: dict[str, dict[str, Value]] = {}
         for target, value in values.items():
-            node, name = _target(target, self.nodes, target)
+            node, name = _target(target, {node: self.kind(node) for node in self.nodes}, target)
             for each in [node] if node != _EVERYONE else self.nodes:
                 changes.setdefault(each, {})[name] = _absolute(self.kind(each), name, value, Path())
         tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
@@ -174,8 +204,13 @@ class Scenario:
         return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=None)
 
 
-def _target(text: str, nodes: Iterable[str], what: str) -> tuple[str, str]:
-    """Node and parameter of ``NODE.PARAM`` or, for a shared parameter, ``PARAM``; ``what`` is said in messages.
+def _target(text: str, kinds: Mapping[str, str], what: str) -> tuple[str, str]:
+    """Node and parameter of ``NODE.PARAM`` or, for a shared parameter, ``PARAM``.
+
+    Args:
+        text: that names them.
+        kinds: of the nodes, by name.
+        what: is said in messages.
 
     Raises:
         InputError: there is no such node, or the parameter is not shared.
@@ -183,12 +218,13 @@ def _target(text: str, nodes: Iterable[str], what: str) -> tuple[str, str]:
     node, dot, name = text.strip().partition(".")
     if not dot:
         if node not in SharedParameters.model_fields:
-            shared = ", ".join(SharedParameters.model_fields)
-            raise InputError(f"{what}: {node!r} is not shared; allowed: {shared}, or NODE.PARAM=VALUE")
+            owners = [owner for owner, kind in kinds.items() if node in TABLES[kind].model_fields]
+            known = f"did you mean {' or '.join(f'{owner}.{node}' for owner in owners[:3])}?" if owners else ""
+            known = known or f"not NODE.PARAM=VALUE either; {instead(node, SharedParameters.model_fields)}"
+            raise InputError(f"{what}: {node!r} is not shared; {known}")
         return _EVERYONE, node
-    if node not in nodes or node == _EVERYONE:
-        present = ", ".join(name for name in nodes if name != _EVERYONE)
-        raise InputError(f"{what}: no node {node!r} in the scenario; allowed: {present}")
+    if node not in kinds:
+        raise InputError(f"{what}: no node {node!r} in the scenario; {instead(node, kinds)}")
     return node, name
 
 
@@ -197,14 +233,15 @@ def _override(text: str, nodes: dict[str, dict[str, Value]]) -> None:
     target, equals, value = text.partition("=")
     if not equals:
         raise InputError(f"--set {text!r}; allowed: NODE.PARAM=VALUE, or PARAM=VALUE for a shared parameter")
-    node, name = _target(target, nodes, f"--set {text!r}")
+    kinds = {name: kind_of(name, own.get("stage")) for name, own in nodes.items() if name != _EVERYONE}
+    node, name = _target(target, kinds, f"--set {text!r}")
     parsed = ros_yaml.parse_value(value, f"--set {shown(target)}")
     if node == _EVERYONE:
         for values in nodes.values():
             values.pop(name, None)
         nodes.setdefault(node, {})[name] = parsed
     else:
-        nodes[node][name] = _absolute(kind_of(node, nodes[node].get("stage")), name, parsed, Path())
+        nodes[node][name] = _absolute(kinds[node], name, parsed, Path())
 
 
 def _absolute(kind: str, name: str, value: Value, folder: Path) -> Value:
@@ -270,6 +307,20 @@ def load(path: Path, overrides: Iterable[str] = (), *, complete: bool = False) -
 
     Raises:
         InputError: one line for the first thing that is wrong.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from lathe_rc import resources
+        >>> from lathe_rc.cell import scenario
+        >>> path = resources.find(Path("piston.yaml"))  # here, or among those that come with lathe_rc
+        >>> piston = scenario.load(path, ["spindle_encoder.revolutions=20", "block_size=128"])
+        >>> piston
+        <Scenario piston: spindle_encoder, learning_controller, electrodynamic_actuator, tool, recorder>
+        >>> piston.nodes["spindle_encoder"].revolutions, piston.shared.block_size
+        (20.0, 128)
+        >>> scenario.load(path, ["tol.feed=1.0"])
+        Traceback (most recent call last):
+        lathe_rc.errors.InputError: --set 'tol.feed=1.0': no node 'tol' in the scenario; allowed: spindle_encoder, ...
     """
     nodes = ros_yaml.read(path)
     for name, values in nodes.items():
@@ -287,7 +338,8 @@ def load(path: Path, overrides: Iterable[str] = (), *, complete: bool = False) -
     for name, values in nodes.items():
         for key in SharedParameters.model_fields:
             if key in values and key in shared and values[key] != shared[key]:
-                raise InputError(f"{name}.{key} = {values[key]}: {_EVERYONE} says {shared[key]}; keep one")
+                given = f"{name}.{key} = {values[key]}"
+                raise InputError(f"{given}: {_EVERYONE} says {shared[key]}; keep one ({key}=... sets all nodes)")
         tables[name] = TABLES[kind_of(name, values.get("stage"))].read(name, {**shared, **values})
     tables = tables if complete else models.resolved(tables)
     return _agreed(path.stem, tables, {name: _fingerprint(table) for name, table in tables.items()})

@@ -4,7 +4,7 @@
 A stage's output depends on its parameters, its state and its declared inputs alone; the length of the blocks
 changes no bit. Hosts (the offline engine, a ROS node) feed it in order and know nothing of what it does.
 
-Most stages compute by a compiled step, which a program of many stages can call (`lathe_rc.cell.program`):
+Most stages compute by a step, which a program of many stages can call if it is compiled (`lathe_rc.cell.program`):
 
     reached, reason = step(memory, first, start, inputs, flags, outputs)
 
@@ -14,7 +14,6 @@ Inputs are the arrays of float64 of all fields of all input ports in their order
 one if there are none, and outputs are the arrays of all fields of all output ports.
 """
 
-import math
 import re
 from abc import ABC
 from collections.abc import Collection, Iterator, Sequence
@@ -27,8 +26,10 @@ import numpy as np
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.native import Native, Step
-from lathe_rc.cell.parameters import NodeParameters, remapped
+from lathe_rc.cell.parameters import NodeParameters, about, remapped
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.jit import is_compiled, is_ours, kernel
+from lathe_rc.names import instead
 from lathe_rc.safety import faults
 from lathe_rc.safety.faults import Fault
 from lathe_rc.safety.injection import Injection, Port
@@ -86,6 +87,7 @@ class Trigger:
     kind: str  # revolution, second or sample
     value: float
     action: str
+    parameter: str  # that lists it: events or faults
     ends: bool = False  # a fault that has begun
 
     @property
@@ -100,6 +102,7 @@ DONE, PYTHON = 0, -1  #: why a step, or a program of steps, has stopped
 NEVER = np.iinfo(np.int64).max  #: no sample at all
 
 _NOTHING = np.empty(0)
+_MOST_SAMPLES = 2**53  # that a double counts
 
 _EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)(?:\s+to\s+([0-9.eE+-]+))?\s*:\s*(\S.*?)\s*")
 _FAULT, _REPAIR = "fault", "repair"  # verbs of the events that all stages know: fault FAULT, repair FAULT or TARGET
@@ -121,7 +124,7 @@ class Stage(ABC):
         foreign: type of each topic that its node hears from outside the cell, by name before remapping.
         tells: events come about by themselves that only `process` knows of.
         own_inputs: number of inputs that `process` gets; one more may tell the spindle angle to the events.
-        step: compiled; None: the stage has its own `process`, in Python.
+        step: compiled, or in Python; None: the stage has its own `process`.
     """
 
     kind: ClassVar[str]
@@ -137,7 +140,7 @@ class Stage(ABC):
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        if not getattr(cls, "kind", ""):
+        if not hasattr(cls, "kind") and not is_ours(cls.__module__):
             cls.kind = cls.__name__
         if "process" in vars(cls) and "step" not in vars(cls):
             cls.step = None  # what it inherits computes something else
@@ -190,7 +193,8 @@ class Stage(ABC):
                 step=self.shared.step,
             )
         for trigger in self._triggers:
-            self.check_action(trigger.action)
+            with about(self.name, trigger.parameter):
+                self.check_action(trigger.action)
 
     @property
     def takes_events(self) -> bool:
@@ -200,13 +204,14 @@ class Stage(ABC):
     def _trigger(self, what: str, text: str, *, ends: bool = False) -> Trigger:
         match = _EVENT.fullmatch(text)
         try:
-            trigger = Trigger(match[1], float(match[2]), match[4], ends) if match and not match[3] else None
+            trigger = Trigger(match[1], float(match[2]), match[4], what, ends) if match and not match[3] else None
         except ValueError:
             trigger = None
-        if trigger is None or not 0 <= trigger.value < math.inf:
+        per_unit = self.shared.sample_rate if trigger and trigger.kind == "second" else 1
+        if trigger is None or not 0 <= trigger.value * per_unit < _MOST_SAMPLES:
             raise InputError(
                 f"{self.name}.{what} = {text!r}; allowed: 'revolution R: ACTION', 'second T: ACTION' or "
-                "'sample N: ACTION'"
+                f"'sample N: ACTION', before sample {_MOST_SAMPLES}"
             )
         return trigger
 
@@ -245,8 +250,8 @@ class Stage(ABC):
                 self._injection.check_target(rest)
             return
         if action not in self.actions:
-            known = ", ".join(self.actions) or f"none ({self.kind} has no events)"
-            raise InputError(f"{self.name}: event {action!r}; allowed: {known}")
+            known = instead(action, self.actions) if self.actions else f"allowed: none ({self.kind} has no events)"
+            raise InputError(f"{self.name}: event {action!r}; {known}")
 
     def _check_allowed(self, what: str) -> None:
         if not self.shared.allow_faults:
@@ -356,7 +361,8 @@ class Stage(ABC):
         try:
             yield
         except LatheError as error:
-            error.args = (f"{self.name}: {error}",)
+            if not str(error).startswith((f"{self.name}.", f"{self.name}: ")):
+                error.args = (f"{self.name}: {error}",)
             raise
 
     def compute(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
@@ -481,6 +487,21 @@ class Stage(ABC):
         """What the step works on, a NamedTuple of arrays and constants; another one may be given after each stop."""
         return ()
 
+    @property
+    def is_compiled(self) -> bool:
+        """Whether a program can call the step."""
+        return is_compiled(self.step)
+
+    def _advance(self, first: int, start: int, fields: Sequence[Any], samples: int) -> Reached:
+        """Call the step for the arrays of all fields, shape (samples,)."""
+        assert self.step is not None, "a stage without a step has its own `process`"
+        if self.is_compiled:
+            return self.native()(first, start, fields, samples)
+        inputs = sum(len(port.fields) for port in self.inputs[: self.own_inputs])
+        flags = tuple(field for field in fields[:inputs] if field.dtype != np.float64)
+        floats = tuple(field for field in fields[:inputs] if field.dtype == np.float64)
+        return self.step(self.memory, first, start, floats, flags, tuple(fields[inputs:]))
+
     def native(self) -> Native:
         """The step with the memory as it is now, as a function of addresses."""
         if self._native is None:
@@ -534,12 +555,18 @@ class Stage(ABC):
         sparse: list[Sparse] = []
         told = reached = 0
         while True:
-            reached, reason = self.native()(first, reached, fields, samples)
+            reached, reason = self._advance(first, reached, fields, samples)
             if reason == DONE:
                 return sparse + self.tell(first + told, first + samples)
             sparse += self.tell(first + told, first + reached)
             told = reached
             sparse += self.serve(reason, first, reached, inputs, outputs)
+
+
+def step_of(stage: type[Stage], loop: Step, *, compiled: bool) -> Step:
+    """Make a function that has been written for a class its step."""
+    loop.__module__, loop.__qualname__ = stage.__module__, f"{stage.__qualname__}.step"
+    return kernel(loop) if compiled else loop
 
 
 def cut(signals: Sequence[Signals], start: int, stop: int) -> list[Signals]:
@@ -551,7 +578,7 @@ def compile_kernels(stage: Stage) -> None:
     """Compile what the stage runs: the first block then takes no longer than the next."""
     if stage.shared.allow_faults:
         faults.prepare()
-    if stage.step is not None:
+    if stage.is_compiled:
         assert stage.native().address, "that compiles it"
         return
     inputs = [

@@ -2,7 +2,7 @@
 """The wired cell: stages in the order in which they compute, topics by name, and the checks before a start."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 
@@ -14,6 +14,7 @@ from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stage import Input, Stage
 from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.stages.drive import Drive
+from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.profile import ProfileStage
 from lathe_rc.cell.stages.supervisor import Supervisor
@@ -31,13 +32,32 @@ class Source:
     type: str
 
 
+@dataclass(frozen=True)
+class Unknown:
+    """A member whose stage or parameters nobody here knows: of it counts what it announces of its topics.
+
+    Attributes:
+        dense: message type by relative topic, of those that carry a block a block.
+        sparse: the same of those that carry messages at chosen samples.
+        reads: relative topics.
+    """
+
+    dense: Mapping[str, str]
+    sparse: Mapping[str, str]
+    reads: frozenset[str]
+
+
 class Cell:
     """All stages of a scenario, wired.
 
     Args:
         nodes: table of each node by name; nodes that are no stages are left out.
+        unknown: members that nobody here knows more of than their topics, by name.
 
     Attributes:
+        unknown: see above.
+        unchecked: what `check` could not check since it depends on them, or since a law or drive of others does not
+            tell what is needed; one line each.
         stages: by node name, in the order of the forward edges.
         dense: publisher of each topic that carries a block a block, by relative topic.
         sparse: the same for topics that carry messages at chosen samples.
@@ -46,7 +66,8 @@ class Cell:
         InputError: a topic without or with two publishers, types that do not match, a loop without a delay.
     """
 
-    def __init__(self, nodes: Mapping[str, NodeParameters]) -> None:
+    def __init__(self, nodes: Mapping[str, NodeParameters], unknown: Mapping[str, Unknown] | None = None) -> None:
+        self.unknown, self.unchecked = unknown or {}, list[str]()
         made: dict[str, Stage] = {}
         for name, table in nodes.items():
             kind = kind_of(name, table.stage)
@@ -59,16 +80,23 @@ class Cell:
                 self._add(self.dense, remapped(stage.shared, output.topic), Source(name, output.type))
             for topic, msgtype in stage.sparse_topics.items():
                 self._add(self.sparse, remapped(stage.shared, topic), Source(name, msgtype))
+        self._add_unknown()
         order: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(made, ()))
         for name, stage in made.items():
             for port in stage.inputs:
                 source = self.source(stage, port)
-                if port.delay == 0:
+                if port.delay == 0 and source.node in made:
                     order.add(name, source.node)
         try:
             self.stages = {name: made[name] for name in order.static_order()}
         except CycleError as error:
             raise InputError(f"{' -> '.join(error.args[1])}: a loop without a feedback delay cannot start") from None
+
+    def _add_unknown(self) -> None:
+        for name, member in self.unknown.items():
+            for topics, published in ((self.dense, member.dense), (self.sparse, member.sparse)):
+                for topic, msgtype in published.items():
+                    self._add(topics, topic, Source(name, msgtype))
 
     def _add(self, topics: dict[str, Source], topic: str, source: Source) -> None:
         other = self.dense.get(topic) or self.sparse.get(topic)
@@ -89,6 +117,16 @@ class Cell:
         if source.type != port.type:
             raise InputError(f"{stage.name} reads {topic} as {port.type}, but {source.node} publishes {source.type}")
         return source
+
+    def _publisher(self, topic: str, question: str) -> Stage | None:
+        """The stage that publishes a topic; None if nobody here knows it: then the question stays open."""
+        name = self.dense[topic].node
+        if name in self.unknown:
+            self._leave_open(question, name)
+        return self.stages.get(name)
+
+    def _leave_open(self, question: str, name: str) -> None:
+        self.unchecked.append(f"the parameters of {name} are not known here: {question}")
 
     @property
     def master(self) -> TimeMaster:
@@ -153,13 +191,14 @@ class Cell:
         return min(delays, default=None)
 
     def check(self) -> None:
-        """Refuse what cannot work, with the figures, before anything moves.
+        """Refuse what cannot work, with the figures, before anything moves; `unchecked` says what was left out.
 
         Raises:
             InputError: a block longer than a feedback delay, a profile that a drive cannot follow, a tool that is not
                 brought out of the part, a memory that would be read before it is learned, a learning loop that does
                 not converge.
         """
+        self.unchecked.clear()
         low, high = self.master.speed_range()
         if low <= 0.0:
             raise InputError(f"{self.master.name}: speed falls to {low:.4g} rad/s; allowed: above 0")
@@ -177,13 +216,12 @@ class Cell:
                 self._check_retraction(stage)
                 self._check_clearance(stage)
             if isinstance(stage, LearningController):
-                self._check_delay(stage, high)
                 self._check_preview(stage)
-                for response, drive in self._learned(stage):
-                    _check_convergence(stage, drive, response, low, high)
-                    self._check_reach(stage, drive)
+            if isinstance(stage, Learner):
+                self._check_delay(stage, high)
+                self._check_convergence(stage, stage.checked_speeds(low, high))
 
-    def _learned(self, stage: LearningController) -> list[tuple[Response, str]]:
+    def _learned(self, stage: Learner) -> list[tuple[Response, str]]:
         """Responses and names of the drives that a channel commands."""
         commands = {remapped(stage.shared, output.topic) for output in stage.outputs}
         return [
@@ -194,6 +232,29 @@ class Cell:
             if remapped(drive.shared, topic) in commands and any(port.topic == topic for port in drive.inputs)
         ]
 
+    def _check_convergence(self, stage: Learner, speeds: Collection[float]) -> None:
+        command = remapped(stage.shared, stage.outputs[0].topic)
+        unknown = [name for name, member in self.unknown.items() if command in member.reads]
+        for name in unknown:
+            self._leave_open(f"whether {stage.name} converges with {name}", name)
+        learned, untold = self._learned(stage), list[str]()
+        for response, drive in learned:
+            self._check_reach(stage, drive)
+            found = {speed: stage.worst(response, speed) for speed in speeds}
+            told = [(worst, speed) for speed, worst in found.items() if worst is not None]
+            if told:
+                _check_factor(stage, drive, *max(told))
+            else:
+                untold.append(f"{stage.name}: {stage.kind} tells no factor of a cycle: nobody knows if it converges")
+        if not learned and not unknown:
+            untold.append(f"{stage.name}: no drive tells its response to {command}: nobody knows if it converges")
+        if untold and not (stage.parameters.stop_ratio or stage.parameters.allow_unstable):
+            raise InputError(
+                f"{untold[0]}; allowed: {stage.name}.stop_ratio above 0 (2: twice the error of the first cycle ends "
+                "the run), or allow_unstable"
+            )
+        self.unchecked += untold
+
     def _check_obedience(self, stage: Supervisor) -> None:
         """Where a retraction can be asked for, somebody takes the tool out."""
         asks = next((monitor for monitor in stage.monitors if monitor.reaction >= Reaction.RETRACT), None)
@@ -201,6 +262,7 @@ class Cell:
         found = [self.dense.get(remapped(stage.shared, f"{drive}/{what}")) for what in ("command", "state")]
         nodes = [source.node for source in found if source]
         listening = {reader.name for reader in self.readers(safety)}
+        listening |= {name for name, member in self.unknown.items() if safety in member.reads}
         if asks and nodes and not listening & set(nodes):
             asked = f"monitor {asks.name} asks for {asks.reaction.name.lower()}"
             raise InputError(
@@ -212,10 +274,13 @@ class Cell:
         """The tool has to get as far out of the part as is asked for before it is safe."""
         drive, clear = stage.parameters.drives[0], stage.parameters.clear_position
         for topic, name in ((f"{drive}/command", "retract_position"), (f"{drive}/state", "command_stroke")):
-            outlet = self.dense.get(remapped(stage.shared, topic))
+            outlet_topic = remapped(stage.shared, topic)
+            outlet = self.dense.get(outlet_topic)
             if outlet is None:
                 continue  # a series drive passes commands on inside
-            source = self.stages[outlet.node]
+            source = self._publisher(outlet_topic, f"whether {outlet.node} gets beyond {stage.name}.clear_position")
+            if source is None:
+                continue
             reached = getattr(source.shared, name, None)
             counts = reached if name == "command_stroke" else getattr(source.shared, "reaction_delay", 0)
             if counts and reached is not None and reached <= clear:
@@ -228,7 +293,7 @@ class Cell:
         """A drive gets no farther than its stroke."""
         clear = stage.parameters.clear_position
         outlet = self.dense.get(remapped(stage.shared, f"{stage.parameters.drives[0]}/state"))
-        drive = self.stages[outlet.node] if outlet else None
+        drive = self.stages.get(outlet.node) if outlet else None  # what is unknown has been said of the retraction
         if not isinstance(drive, Drive):
             return
         for limits in drive.limits().values():
@@ -238,7 +303,7 @@ class Cell:
                     f"stroke of {drive.name} ends at {limits.stroke:g} m; allowed: less than that"
                 )
 
-    def _check_reach(self, stage: LearningController, name: str) -> None:
+    def _check_reach(self, stage: Learner, name: str) -> None:
         """What it takes over, it takes over wherever the drive can be."""
         drive, parameters = self.stages[name], stage.parameters
         assert isinstance(drive, Drive), "it learns"
@@ -252,22 +317,28 @@ class Cell:
                     "wider bounds"
                 )
 
-    def _check_delay(self, stage: LearningController, speed: float) -> None:
+    def _check_delay(self, stage: Learner, speed: float) -> None:
         encoder = self.master.parameters
         count = 2 * math.pi / encoder.counts_per_revolution if encoder.counts_per_revolution else 0.0
         acceleration = self.master.largest_acceleration()
         largest = stage.largest_delay(speed, acceleration, count, encoder.speed_window * encoder.step)
         delay = stage.parameters.feedback_delay
-        if delay > largest:
+        if largest is None:
+            self.unchecked.append(f"{stage.name}: {stage.kind} tells no longest feedback_delay")
+        elif delay > largest:
+            least = stage.shared.block_size
+            allowed = f"allowed: {least} up to {largest}"
+            if largest < least:
+                allowed = f"not even a block of {least}; give more cycle_revolutions, less lead_time, or turn slower"
             raise InputError(
-                f"{stage.name}.feedback_delay = {delay} samples: at {speed:.4g} rad/s the cycle leaves {largest}; "
-                f"allowed: {stage.shared.block_size} up to {largest}"
+                f"{stage.name}.feedback_delay = {delay} samples: at {speed:.4g} rad/s the cycle leaves "
+                f"{max(largest, 0)}; {allowed}"
             )
 
     def _check_preview(self, stage: LearningController) -> None:
         if stage.parameters.lead_law != "exact_preview":
             return
-        told, true = stage.parameters.speed_law(), self.master.law
+        told, true = stage.parameters.speed_law(stage.name), self.master.law
         if true is None:
             raise InputError(
                 f"{stage.name}.lead_law = exact_preview, but nobody knows the speed of {self.master.name} in advance; "
@@ -282,13 +353,14 @@ class Cell:
     def _check_profile(self, tool: Tool, speed: float) -> None:
         """The first drive carries the profile; the others what it leaves."""
         owner, drive = self._form(tool), tool.parameters.drives[0]
-        source = self.stages[self.dense[remapped(tool.shared, f"{drive}/state")].node]
+        topic = remapped(tool.shared, f"{drive}/state")
+        source = self._publisher(topic, f"whether {self.dense[topic].node} can follow the profile of {tool.name}")
         if owner is None or owner.form is None or not isinstance(source, Drive):
             return
         acceleration = self.master.largest_acceleration()
         demand = owner.form.profile.demand(speed, acceleration, owner.parameters.feed)
-        for topic, limits in source.limits().items():
-            if remapped(source.shared, topic) != remapped(tool.shared, f"{drive}/state"):
+        for of, limits in source.limits().items():
+            if remapped(source.shared, of) != topic:
                 continue
             for what, asked, allowed, unit in (
                 ("stroke", demand.stroke * 1e6, limits.stroke * 1e6, "µm"),
@@ -305,19 +377,17 @@ class Cell:
         """The stage that has the tool's desired form."""
         if tool.form is not None:
             return tool
-        source = self.stages[self.dense[remapped(tool.shared, "reference")].node]
+        source = self._publisher(
+            remapped(tool.shared, "reference"), f"whether a drive can follow what {tool.name} reads"
+        )
         return source if isinstance(source, ProfileStage) else None
 
 
-def _check_convergence(stage: LearningController, drive: str, response: Response, low: float, high: float) -> None:
-    loop, parameters = stage.loop(response), stage.parameters
-    if parameters.law == "time_periodic":
-        low = high = parameters.nominal_speed
-    (supremum, waves), speed = max((loop.worst(s), s) for s in {low, (low + high) / 2, high})
-    if supremum >= 1.0 and not parameters.allow_unstable:
+def _check_factor(stage: Learner, drive: str, worst: tuple[float, float], speed: float) -> None:
+    largest, waves = worst
+    where = f"{waves * speed:.5g} rad/s ({waves:.4g} waves at {speed:.4g} rad/s)"
+    if largest >= 1.0 and not stage.parameters.allow_unstable:
         raise InputError(
-            f"{stage.name}: learning diverges with {drive}: sup|Q - Z| = {supremum:.4g} at {waves * speed:.5g} rad/s "
-            f"({waves:.4g} waves at {speed:.4g} rad/s) with lead_time = {parameters.lead_time * 1e3:.4g} ms, q_time = "
-            f"{parameters.q_time * 1e6:.4g} µs; allowed: below 1 (widen Q, change the lead, damp the drive, or set "
-            "allow_unstable)"
+            f"{stage.name}: learning diverges with {drive}: {stage.factor} = {largest:.4g} at {where} with "
+            f"{stage.settings()}; allowed: below 1 ({stage.remedy}, damp the drive, or set allow_unstable)"
         )

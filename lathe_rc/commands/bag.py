@@ -19,7 +19,6 @@ from lathe_rc.bag.recover import recover as recover_bag
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.tachogram import make as make_tachogram
 from lathe_rc.cell import messages
-from lathe_rc.errors import InputError, LatheError
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 _BAG = click.argument("path", metavar="BAG", type=click.Path(path_type=Path))
@@ -63,6 +62,7 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
             "span_s": span,
             "topics": topics,
             "about": dict(source.about),
+            "contradictions": source.contradictions,
         }
     told["error_um"] = _metrics(path, types) if metrics else None
     if as_json:
@@ -76,6 +76,8 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
         rate = f"{said['rate_hz']:.4g}" if said["rate_hz"] else ""
         table.add_row(Text(topic), Text(said["type"].rpartition("/")[2]), str(said["messages"]), rate)
     console.print(table)
+    for what in told["contradictions"]:
+        click.echo(what, err=True)
     console.print(f"span: {span:.6g} s from {told['start_s']:.6g} s on")
     if told["error_um"]:
         first, last = told["error_um"]["first"], told["error_um"]["last"]
@@ -87,6 +89,10 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
         if key == story.SCENARIO:
             console.print("scenario:")
             console.print(Text("  " + text.strip().replace("\n", "\n  ")))
+        elif key == story.ORIGINS:
+            for origin in story.origins({key: text}):
+                of = f" of {origin.package}" if origin.package else ""
+                console.print(Text(f"{', '.join(origin.used)}: {origin.name}{of}, source {origin.source}"))
         elif key.startswith(story.FILE):
             console.print(Text(f"{key.removeprefix(story.FILE)}: a file, {len(text)} characters in base64"))
         else:
@@ -98,13 +104,11 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
 @_JSON
 @click.pass_context
 def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
-    """Verify sequence, gaps, numbers, checksums and recorded digests; exit code 0: clean, 3: lossy, 1: wrong."""
-    if not path.exists():
-        raise InputError(f"{path}: no such bag")
-    try:
-        found = check_bag(path)
-    except InputError as error:
-        raise LatheError(str(error)) from None
+    """Verify sequence, gaps, numbers, checksums and recorded digests.
+
+    Exit code 0: clean, 3: lossy, 1: wrong, 2: no bag, or one that cannot be read.
+    """
+    found = check_bag(path)
     told = {
         "bag": str(path),
         "clean": not found.exit_code,

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from lathe_rc.analysis import hysteresis_fit, pid_tuning, reduced_order
 from lathe_rc.bag import reader
-from lathe_rc.errors import InputError
+from lathe_rc.commands import picture
 from lathe_rc.transfer import TransferFunction
 
 _POSITIVE = click.FloatRange(min=0, min_open=True)
@@ -67,11 +67,9 @@ def _coefficients(transfer: TransferFunction) -> dict[str, list[float]]:
 
 def _draw(path: Path, model: reduced_order.Fit, inverse: reduced_order.Fit) -> None:
     """Both stages of paper 004: the model over the measurement, and model and inverse in series over the step."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 3.6), layout="constrained")
-    FigureCanvasAgg(figure)
     for axes, found, title, wanted in zip(
         figure.subplots(1, 2),
         (model, inverse),
@@ -84,10 +82,7 @@ def _draw(path: Path, model: reduced_order.Fit, inverse: reduced_order.Fit) -> N
         axes.set(xlabel="time [s]", title=f"{title}: RMS {found.rms:.3g}")
         axes.grid(visible=True, alpha=0.3)
         axes.legend(fontsize=8)
-    try:
-        figure.savefig(path, dpi=130)
-    except OSError as error:
-        raise InputError(f"--figure {path}: cannot be written ({error.strerror})") from None
+    picture.save(figure, path)
 
 
 @fit.command()

@@ -105,5 +105,6 @@ TROUBLE: dict[str, Callable[[harness.Event], str]] = {
         + ("waits for it" if event["waits"] else "goes to its safe state, if it does not go on in time")
     ),
     "not_reached": lambda event: f"{event['node']}: the run ends before {'; '.join(event['events'])}",
+    "unchecked": lambda event: f"not checked: {event['message']}",
     "safe": lambda event: f"{event['why']}; the run ends at sample {event['end']}",
 }  #: what is said of an event in any case

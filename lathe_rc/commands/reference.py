@@ -4,9 +4,15 @@
 import click
 
 from lathe_rc import reference as pages
+from lathe_rc.cell.scenario import TABLES
+from lathe_rc.errors import InputError
 
 
 @click.command()
-def reference() -> None:
-    """Print the reference of nodes, topics, messages and parameters as Markdown."""
-    click.echo(pages.page(), nl=False)
+@click.argument("stages", nargs=-1)
+def reference(stages: tuple[str, ...]) -> None:
+    """Print the reference of nodes, topics, messages and parameters as Markdown, or that of some STAGES alone."""
+    for kind in stages:
+        if kind not in TABLES:
+            raise InputError(f"no stage {kind!r}; {TABLES.instead(kind)}")
+    click.echo("\n\n".join(map(pages.node, stages)) if stages else pages.page(), nl=bool(stages))

@@ -167,6 +167,8 @@ def resim(
         parameters=write_parameters,
         output=output,
     )
+    for warning in found.warnings:
+        click.echo(f"lathe: warning: {warning}", err=True)
     wrong = bool(found.different) and not found.changed
     if as_json:
         click.echo(json.dumps(_summary(found, bag, output)))

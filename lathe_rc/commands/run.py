@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 @click.option("--speed-factor", type=click.FloatRange(min=0), help="pace against real time; 0: as fast as possible")
 @click.option("--bag", type=click.Path(path_type=Path), help="folder to record to; must not exist")
 @click.option("--profile", type=click.Path(path_type=Path), help="CSV file to write the last revolution's profile to")
+@click.option("--figure", type=click.Path(path_type=Path), help="PNG to draw the form and its error to")
 @options.overrides
 @click.option("--domain", type=click.IntRange(0, 232), help="ROS domain, for others to listen; default: a free one")
 @click.option("--namespace", help="of the nodes, for two cells in one domain; default: /")
@@ -35,6 +36,7 @@ def run(
     speed_factor: float | None,
     bag: Path | None,
     profile: Path | None,
+    figure: Path | None,
     overrides: tuple[str, ...],
     domain: int | None,
     namespace: str | None,
@@ -55,6 +57,7 @@ def run(
         speed_factor,
         bag,
         profile,
+        figure,
         overrides,
         domain,
         namespace,

@@ -10,7 +10,7 @@ from rich.console import Console
 from lathe_rc import harness, part
 from lathe_rc.bag.record import recorder_of
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.commands import outcome
+from lathe_rc.commands import outcome, picture
 from lathe_rc.commands import scenario as scenarios
 from lathe_rc.commands.progress import Watch
 from lathe_rc.errors import InputError
@@ -44,6 +44,7 @@ def run(
     speed_factor: float | None,
     bag: Path | None,
     profile: Path | None,
+    figure: Path | None,
     overrides: tuple[str, ...],
     domain: int | None,
     namespace: str | None,
@@ -64,6 +65,10 @@ def run(
     for option, value in (("--domain", domain), ("--namespace", namespace), ("--start", start)):
         if value is not None and mode == "offline":
             raise InputError(f"{option} {value} with --mode offline; allowed: --mode processes or composed")
+    if figure:
+        picture.check_place(figure)
+    if profile and (profile.is_dir() or not profile.absolute().parent.is_dir()):
+        raise InputError(f"--profile {profile}: {'a folder' if profile.is_dir() else 'no such folder'}; name a file")
     result = _shown(
         loaded,
         mode=mode,
@@ -75,12 +80,15 @@ def run(
     )
     if profile:
         part.write_profile(profile, result.recording, result.part, [result.errors.rms.size - 1])
+    if figure:
+        picture.save(result.plot(), figure)
     if as_json:
         click.echo(json.dumps(result.summary()))
         return
     asks_for_snapshots = recorder_of(loaded)[1].mode != "continuous"
     told = _NO_SNAPSHOTS if asks_for_snapshots and not bag else ""
-    outcome.show(result, {"profile": profile} if profile else {}, told=told)
+    files = {name: path for name, path in (("profile", profile), ("figure", figure)) if path}
+    outcome.show(result, files, told=told)
 
 
 def demo(name: str, announcement: str, title: str, revolutions: float, folder: Path) -> None:
@@ -94,11 +102,9 @@ def demo(name: str, announcement: str, title: str, revolutions: float, folder: P
     console.print(announcement, highlight=False)
     folder.mkdir(parents=True, exist_ok=True)
     result = _shown(scenario, mode="processes", bag=place)
-    from lathe_rc.view import figure
-
-    picture = place.with_suffix(".png")
-    figure.save(picture, result.recording, result.errors, title)
+    drawn = place.with_suffix(".png")
+    picture.save(result.plot(title), drawn)
     console.print(outcome.table(result))
     for fact in outcome.facts(result):
         console.print(fact, highlight=False)
-    console.print(f"bag:    {place}\nfigure: {picture}", highlight=False, soft_wrap=True)
+    console.print(f"bag:    {place}\nfigure: {drawn}", highlight=False, soft_wrap=True)

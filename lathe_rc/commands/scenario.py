@@ -15,10 +15,7 @@ def load(name: str, overrides: Sequence[str]) -> Scenario:
     Raises:
         InputError: there is none, or it cannot be.
     """
-    path = Path(name)
-    if not path.exists() and path.suffix == "":
-        path = path.with_suffix(".yaml")
-    return scenarios.load(resources.find(path), overrides)
+    return scenarios.load(resources.scenario(Path(name)), overrides)
 
 
 def split(scenario: Scenario, groups: Sequence[str]) -> list[list[str]] | None:

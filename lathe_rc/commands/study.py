@@ -12,7 +12,9 @@ from rich.progress import Progress
 
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Row, Value
+from lathe_rc.commands import picture
 from lathe_rc.errors import InputError
+from lathe_rc.names import instead
 from lathe_rc.studies import STUDIES
 from lathe_rc.studies.study import Result, Study, StudyParameters
 
@@ -42,38 +44,25 @@ def read(study: Study[Any], overrides: Sequence[str]) -> StudyParameters:
     for override in overrides:
         name, equals, text = override.partition("=")
         if not equals:
-            raise InputError(f"--set {override!r}; allowed: PARAM=VALUE with PARAM one of {', '.join(rows)}")
+            raise InputError(f"--set {override!r}; allowed: PARAM=VALUE; lathe study {study.name} --help lists PARAM")
         name = name.strip()
         values[name] = _value(rows[name], text) if name in rows else text
     table: StudyParameters = study.parameters.read(study.name, values)
     return table
 
 
-def _check_place(path: Path) -> None:
-    """Refuse before anything is computed."""
-    if path.suffix.lower() != ".png":
-        raise InputError(f"--figure {path}; allowed: a file name that ends in .png")
-    if path.is_dir() or not path.parent.is_dir():
-        raise InputError(f"--figure {path}: {'is a folder' if path.is_dir() else 'no such folder'}; name a file")
-
-
 def _save(study: Study[Any], result: Result, path: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=study.size, layout="constrained")
-    FigureCanvasAgg(figure)
     result.draw(figure)
-    try:
-        figure.savefig(path, dpi=130)
-    except OSError as error:
-        raise InputError(f"--figure {path}: cannot be written ({error.strerror})") from None
+    picture.save(figure, path)
 
 
 class _StudyCommand(click.Command):
     """Runs a study; its help lists the parameters."""
 
-    def __init__(self, subject: Study[Any]) -> None:
+    def __init__(self, name: str, subject: Study[Any]) -> None:
         options = [
             click.Option(
                 ["--set", "overrides"], multiple=True, metavar="PARAM=VALUE", help="repeatable; lists as 1,2,3"
@@ -87,7 +76,7 @@ class _StudyCommand(click.Command):
             ),
             click.Option(["--json", "as_json"], is_flag=True, help="print one JSON object"),
         ]
-        super().__init__(subject.name, params=list(options), callback=self._run, help=subject.doc)
+        super().__init__(name, params=list(options), callback=self._run, help=subject.doc)
         self._subject = subject
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -102,7 +91,7 @@ class _StudyCommand(click.Command):
 
     def _run(self, overrides: tuple[str, ...], figure: Path, *, as_json: bool) -> None:
         parameters = read(self._subject, overrides)
-        _check_place(figure)
+        picture.check_place(figure)
         console = Console(stderr=True)
         with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
             result = self._subject.run(parameters, lambda items: progress.track(items, description=self._subject.name))
@@ -116,15 +105,42 @@ class _StudyCommand(click.Command):
 
 
 class _Studies(click.Group):
-    """The studies; refuses an unknown one in one line."""
+    """The studies, ours and those of other packages; refuses an unknown one in one line."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """See `click.Group`."""
+        return list(STUDIES)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """See `click.Group`.
+
+        Raises:
+            InputError: a study of others cannot be imported, or is none.
+        """
+        return _StudyCommand(cmd_name, STUDIES[cmd_name]) if cmd_name in STUDIES else None
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """See `click.Group`."""
+        with formatter.section("Studies"):
+            formatter.write_dl([(name, _summary(name)) for name in STUDIES])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """See `click.Group`."""
-        if args[0] not in self.commands and not args[0].startswith("-") and not ctx.resilient_parsing:
-            raise InputError(f"no study {args[0]!r}; allowed: {', '.join(self.commands)}")
+        if args[0] not in STUDIES and not args[0].startswith("-") and not ctx.resilient_parsing:
+            raise InputError(f"no study {args[0]!r}; {instead(args[0], STUDIES)}, or PACKAGE.MODULE:STUDY")
         return super().resolve_command(ctx, args)
+
+
+def _summary(name: str) -> str:
+    """What a study is about, and who offers it if we do not; one that cannot be used does not keep the others away."""
+    by = STUDIES.offered_by(name)
+    try:
+        about = STUDIES[name].doc
+    except InputError as error:
+        return str(error)
+    return f"{about} ({by})" if by else about
 
 
 @click.group(cls=_Studies, invoke_without_command=True)
@@ -133,9 +149,5 @@ def study(ctx: click.Context) -> None:
     """Compute a table or figure of the papers; without a name, list the studies."""
     if ctx.invoked_subcommand is None:
         width = max(map(len, STUDIES))
-        for name, subject in STUDIES.items():
-            click.echo(f"{name:{width}}  {subject.doc}")
-
-
-for _subject in STUDIES.values():
-    study.add_command(_StudyCommand(_subject))
+        for name in STUDIES:
+            click.echo(f"{name:{width}}  {_summary(name)}")

@@ -23,7 +23,7 @@ def member_of_none(
     kind: str,
     table: type[T],
     values: Mapping[str, object],
-    args: Sequence[str] | None = None,
+    args: Sequence[str],
     *,
     signals: SignalHandlerOptions | None = None,
     rosout: bool = True,
@@ -34,7 +34,7 @@ def member_of_none(
         kind: name of the node.
         table: its parameters.
         values: parameters; those of the command line of ROS come from ``args``.
-        args: ROS arguments; default: those of the process.
+        args: command line of ROS, from ``--ros-args`` on.
         signals: that ROS handles; default: all.
         rosout: whether what it tells goes to /rosout as well.
 
@@ -42,7 +42,7 @@ def member_of_none(
         InputError: a parameter that is refused.
     """
     dds.settle()
-    rclpy.init(args=None if args is None else ["lathe", *args], signal_handler_options=signals)
+    rclpy.init(args=["lathe", *args], signal_handler_options=signals)
     try:
         node = Node(
             kind,
@@ -50,6 +50,7 @@ def member_of_none(
             allow_undeclared_parameters=True,
             enable_rosout=rosout,
         )
+        declare.refuse_lost(node, args)
         given = {name: value for name, value in declare.overrides(node).items() if value is not None}
         yield node, table.read(kind, {**given, **values})
     finally:
@@ -62,7 +63,7 @@ def run(
     table: type[T],
     work: Callable[[Node, T], None],
     values: Mapping[str, object],
-    args: Sequence[str] | None = None,
+    args: Sequence[str],
 ) -> int:
     """Run a node until its work ends or fails, or Ctrl-C.
 
@@ -71,7 +72,7 @@ def run(
         table: its parameters.
         work: what it does.
         values: parameters; those of the command line of ROS come from ``args``.
-        args: ROS arguments; default: those of the process.
+        args: command line of ROS, from ``--ros-args`` on.
 
     Returns:
         The exit code.

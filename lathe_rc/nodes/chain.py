@@ -117,9 +117,9 @@ def form(node: "StageNode", cell: Cell | None = None) -> None:
         return
     namespace = node.get_namespace().rstrip("/") + "/"
     try:
-        cell = cell or Cell(node.tables(node.master.members))
+        cell = cell or Cell(node.tables(node.master.members), node.unknown(node.master.members))
     except InputError:
-        return  # members that nobody here knows: each node computes alone
+        return  # no cell can be made of them, as the time master says: each node computes alone
     here = {name: mates[namespace + name] for name in cell.stages if namespace + name in mates}
     for group in _groups(cell, here):
         if len(group) > 1:
@@ -127,16 +127,19 @@ def form(node: "StageNode", cell: Cell | None = None) -> None:
 
 
 def _groups(cell: Cell, here: Mapping[str, object]) -> list[list[str]]:
-    """The stages that are here, cut so that what leaves a group comes back to it by feedback alone."""
+    """The stages that are here, cut so that what leaves a group comes back to it by feedback alone.
+
+    Of members that nobody here knows it is not known which of their inputs are feedback: they come after every group.
+    """
     groups: list[list[str]] = [[]]
     beyond: set[str] = set()  # stages elsewhere that compute after some of the group at hand
     for name, stage in cell.stages.items():
         reads = {cell.source(stage, port).node for port in stage.inputs if not port.delay}
         if name in here:
-            if reads & beyond:
+            if reads & (beyond | cell.unknown.keys()):
                 groups.append([])
                 beyond.clear()
             groups[-1].append(name)
-        elif reads & {*groups[-1], *beyond}:
+        elif reads & {*groups[-1], *beyond, *cell.unknown}:
             beyond.add(name)
     return groups

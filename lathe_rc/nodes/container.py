@@ -3,12 +3,18 @@
 
 import sys
 
-from lathe_rc.nodes import process
+from lathe_rc.cell.scenario import TABLES
+from lathe_rc.nodes import arguments, process
 
 
 def main() -> None:
     """Run the nodes."""
-    sys.exit(process.run(*process.split(sys.argv[1:])))
+    words = sys.argv[1:]
+    if arguments.ask_for_help(words):
+        print(f"usage: ros2 run lathe_rc container NAME[:STAGE] ... [{arguments.ROS} ...]")
+        print(f"stages: {TABLES.allowed()}; ros2 run lathe_rc STAGE --help lists the parameters of one")
+        return
+    arguments.exit_with(lambda: process.run(*process.split(words)))
 
 
 if __name__ == "__main__":

@@ -2,12 +2,16 @@
 """ROS parameters from parameter tables."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, ParameterType
 from rclpy.node import Node
 
+from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import NodeParameters, Row
+from lathe_rc.errors import InputError
+from lathe_rc.nodes import arguments
 
 _OWN_OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
 
@@ -51,8 +55,36 @@ def overrides(node: Node) -> dict[str, Any]:
     return given
 
 
+def refuse_lost(node: Node, words: Sequence[str]) -> None:
+    """Refuse a ``-p`` for a node that something else has overruled, which ROS keeps quiet about.
+
+    Args:
+        node: as `overrides` wants it.
+        words: its command line.
+
+    Raises:
+        InputError: the node has another value.
+    """
+    given, name = overrides(node), node.get_name()
+    own = [rule for rule in arguments.rules(words) if rule.node in ("", name)]
+    for rule in own:
+        if rule.parameter.split(".")[0] in _OWN_OF_RCLPY:
+            continue
+        wanted = [ros_yaml.parse_value(each.value, name) for each in own if each.parameter == rule.parameter]
+        if repr(given.get(rule.parameter)) not in map(repr, wanted):
+            has = repr(given[rule.parameter]) if rule.parameter in given else "its default"
+            raise InputError(
+                f"-p {rule.text} does not reach {node.get_fully_qualified_name()}, which has {has}; "
+                + (
+                    f"write -p {name}:{rule.parameter}:=VALUE behind every --params-file"
+                    if node.get_namespace() == "/"
+                    else f"ROS has no -p {name}:PARAM in a namespace: write -p PARAM:=VALUE, or set it in the file"
+                )
+            )
+
+
 def declare(node: Node, table: type[NodeParameters]) -> NodeParameters:
-    """Validate what the node was given and declare every parameter of its table.
+    """Validate what the node was given and declare every parameter of its table; once declared, they stay.
 
     Raises:
         InputError: an unknown parameter, a wrong type or a value out of range.
@@ -60,7 +92,9 @@ def declare(node: Node, table: type[NodeParameters]) -> NodeParameters:
     given = overrides(node)
     values = table.read(node.get_name(), {name: value for name, value in given.items() if value is not None})
     for name in given:
-        node.undeclare_parameter(name)
+        if not node.describe_parameter(name).read_only:  # it was given, and is not declared yet
+            node.undeclare_parameter(name)
     for name, row in table.rows().items():
-        node.declare_parameter(name, getattr(values, name), descriptor(row), ignore_override=True)
+        if not node.has_parameter(name):
+            node.declare_parameter(name, getattr(values, name), descriptor(row), ignore_override=True)
     return values

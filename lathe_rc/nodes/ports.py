@@ -110,8 +110,8 @@ class BlockQueue:
 
         Raises:
             Stranger: another source or run, or no block at all.
-            LatheError: another step, a gap, a repeat, arrays of different lengths, or far more
-                blocks waiting than the window allows.
+            LatheError: another step, another time than that of its samples, a gap, a repeat, arrays of different
+                lengths, or far more blocks waiting than the window allows.
         """
         if self.held_from is not None:
             return None
@@ -136,6 +136,11 @@ class BlockQueue:
         # What else is checked cannot differ from block to block of a node in this process.
         self._append(run.block, len(run.companions))
 
+    @property
+    def message(self) -> bytes:
+        """The block that `add` has taken last, as our nodes encode it."""
+        return self._decoder.message
+
     def accept(self, block: Block) -> Block | None:
         """Check a block and queue it; see `add`."""
         self._admit(block.run_id, block.source)
@@ -144,6 +149,12 @@ class BlockQueue:
         if block.samples > self._size:
             raise LatheError(
                 f"{self.topic}: {block.source} sends {block.samples} samples in a block; expected {self._size} at most"
+            )
+        stamp = messages.START_NS + (block.first_index + block.samples - 1) * self._step_ns
+        if block.log_ns != stamp:
+            raise LatheError(
+                f"{self.topic}: {block.source} stamps the block from sample {block.first_index} on with "
+                f"{block.log_ns} ns; expected {stamp} ns, the time of its last sample"
             )
         if self.open:
             self.source, self.end, self.open = block.source, block.first_index, False

@@ -13,10 +13,12 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from types import FrameType
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 import numpy as np
 import rclpy
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
@@ -30,7 +32,7 @@ from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.encoder_device import EncoderDevice
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes import dds
+from lathe_rc.nodes import arguments, dds, declare
 from lathe_rc.nodes.encoder_node import EncoderNode
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.recorder_node import RecorderNode
@@ -50,7 +52,7 @@ _LONGEST_WAIT = 0.1  # [s] until signals and the harness are looked at again
 
 def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellNode:
     if kind not in TABLES:
-        raise InputError(f"{name}: no stage {kind!r}; allowed: {TABLES.allowed()}")
+        raise InputError(f"{name}: no stage {kind!r}; {TABLES.instead(kind)}")
     classes: dict[str, type[CellNode]] = {
         RECORDER: RecorderNode,
         SpindleEncoder.kind: SpindleNode,
@@ -120,6 +122,13 @@ def _work(nodes: Sequence[CellNode], stop: _Stop, until: float) -> None:
             return
 
 
+def _spin(executor: Executor, wait: float) -> None:
+    """Let the executor wait for the next event, up to so many seconds, and handle it."""
+    # EventsExecutor hands over events of what a node has destroyed since, when it was cleaned up.
+    with contextlib.suppress(InvalidHandle):
+        executor.spin_once(timeout_sec=wait)
+
+
 def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
     executor = EventsExecutor()
     for node in nodes:
@@ -140,13 +149,13 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
                     return
         due = _due(nodes, now)
         wait = 0.0 if any(node.due for node in nodes) else due - now
-        executor.spin_once(timeout_sec=min(max(wait, 0.0), _LONGEST_WAIT))
+        _spin(executor, min(max(wait, 0.0), _LONGEST_WAIT))
         # Take what else has arrived before computing: a burst in makes a burst out, and neighbours wake up once
         # for all of it. Waking them is the dearest part of a hop.
         # A flood must not keep anybody from signals and from its neighbours.
         handled, end = -1, time.monotonic() + _LONGEST_BURST
         while handled < (handled := sum(node.handled for node in nodes)) and not stop.signal:
-            executor.spin_once(timeout_sec=0.0)
+            _spin(executor, 0.0)
             if time.monotonic() >= end:
                 break
         _work(nodes, stop, due)
@@ -162,12 +171,12 @@ def _tune(name: str) -> None:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -> int:
+def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
     """Run nodes in this process until they are done, fail or are told to stop.
 
     Args:
         members: name and kind of each node.
-        args: command line with ``--ros-args``; default: that of the process.
+        args: command line of ROS, from ``--ros-args`` on.
 
     Returns:
         The exit code: 0, or that of the first node that has failed, or whose cell went to its safe state.
@@ -179,7 +188,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
     dds.settle()
     np.seterr(over="ignore", invalid="ignore")  # each node names its own numbers that are not finite
     try:
-        rclpy.init(args=None if args is None else ["lathe", *args], signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=["lathe", *args], signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         print(f"lathe: --ros-args: {_words(error)}", file=sys.stderr)
         return InputError.exit_code
@@ -189,6 +198,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str] | None = None) -
     try:
         for name, kind in members:
             nodes.append(_make(name, kind, reporter, exchange))
+            declare.refuse_lost(nodes[-1], args)
         _start(nodes, exchange)
         gc.collect()
         gc.freeze()  # the collector skips existing objects: it would walk through them again and again between blocks
@@ -226,13 +236,20 @@ def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
                 compile_kernels(STAGES[kind](name, TABLES[kind].read(name, values)))
 
 
-def split(arguments: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:
-    """Names and kinds of the nodes NAME[:STAGE] before ``--ros-args``, and what follows."""
-    end = list(arguments).index("--ros-args") if "--ros-args" in arguments else len(arguments)
-    parts = [text.partition(":") for text in arguments[:end]]
-    return [(name, kind or name) for name, _, kind in parts], list(arguments[end:])
+def split(words: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:
+    """Names and kinds of the nodes NAME[:STAGE] before ``--ros-args``, and what follows.
+
+    Raises:
+        InputError: there are none, or something else stands before ``--ros-args``.
+    """
+    named, rest = arguments.split(words)
+    for text in named or [""]:
+        if not text or text.startswith("-") or ":=" in text:
+            raise InputError(f"no node {text!r}; allowed: {TABLES.allowed()}, or NAME:STAGE; then {arguments.ROS} ...")
+    parts = [text.partition(":") for text in named]
+    return [(name, kind or name) for name, _, kind in parts], rest
 
 
-def main(kind: str) -> None:
+def main(kind: str) -> NoReturn:
     """Entry point of the executable of one kind of node."""
-    sys.exit(run([(kind, kind)]))
+    arguments.executable(kind, TABLES[kind], lambda words: run([(kind, kind)], words))

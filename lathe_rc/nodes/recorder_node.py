@@ -2,6 +2,7 @@
 """The recorder: every signal topic of the cell into one bag, sorted, complete, and closed whatever happens."""
 
 import json
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,13 @@ class RecorderNode(CellNode):
             full = self.topic(topic)
             self._open.add_topic(full, self._type_name(kind), offered_qos(qos.depth, "volatile"))
             self.create_subscription(kind, full, self.guarded(partial(self._on_host, kind, full)), qos, raw=True)
+
+    def clean_up_part(self) -> None:
+        """See `CellNode`; a bag without a block, of a cell that did not begin, is nothing to keep."""
+        self.finish()
+        if not self._blocks and self._path.is_dir():
+            shutil.rmtree(self._path)
+            self.get_logger().info(f"bag {self._path} removed: no block has come")
 
     @staticmethod
     def _type_name(kind: Any) -> str:
@@ -302,7 +310,7 @@ class RecorderNode(CellNode):
         block = queue.add(data)
         if block is None:
             return
-        self._newest[queue.topic] = data
+        self._newest[queue.topic] = data = queue.message
         queue.blocks.clear()
         if self._merger is None:
             self._write_unsorted(queue, block, data)

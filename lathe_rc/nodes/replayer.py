@@ -2,10 +2,10 @@
 """Executable: the ``replayer``, which sends again what a bag holds, whoever made it, with /clock."""
 
 import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,8 @@ from lathe_rc.cell.replayer import KIND, ReplayerParameters
 from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes import alone
+from lathe_rc.names import instead
+from lathe_rc.nodes import alone, arguments
 from lathe_rc.nodes.ports import latched_qos, message_class
 
 _DEPTH = 512  # of the queues: so many may be under way before readers must have acknowledged
@@ -76,11 +77,16 @@ class Replayer:
         self._source = Source(Path(parameters.bag))
         self._topics = set(parameters.topics) or set(self._source.topics) - {_CLOCK}
         if unknown := sorted(self._topics - set(self._source.topics)):
-            raise InputError(
-                f"{KIND}.topics: {', '.join(unknown)}; the bag has {', '.join(sorted(self._source.topics))}"
-            )
+            known = instead(unknown[0], sorted(self._source.topics), listing=f"lathe bag info {parameters.bag}")
+            raise InputError(f"{KIND}.topics: {unknown[0]} is not in the bag; {known}")
         if _CLOCK in self._topics:
             raise InputError(f"{KIND}.topics: {_CLOCK} is the replayer's own and tells the log times of the bag")
+        start, end, span_ns = parameters.start, parameters.end, self._source.last_ns - self._source.first_ns
+        if round(start * 1e9) > span_ns or 0.0 < end <= start:
+            raise InputError(
+                f"{KIND}.start = {start:g} s, end = {end:g} s: nothing to send; allowed: a start up to "
+                f"{span_ns * 1e-9:g} s, where the bag's last message is, and an end after it, or 0"
+            )
         if not 0 <= self._source.first_ns <= self._source.last_ns < _CLOCK_END:
             raise InputError(f"{parameters.bag}: log times up to {self._source.last_ns} ns; {_CLOCK} ends in 2038")
         self._classes = {topic: self._class(topic) for topic in sorted(self._topics)}
@@ -131,6 +137,8 @@ class Replayer:
         else:
             for topic in sorted(self._topics):
                 self._publish(self._node, topic)
+        for what in self._source.contradictions:
+            self._node.get_logger().warning(what)
         if _CLOCK in self._source.topics:
             self._node.get_logger().info(f"{_CLOCK} of the bag is left out: the replayer's tells the log times")
         while lonely := [topic for topic in sorted(self._topics) if self._readers(topic) < self._parameters.wait]:
@@ -228,7 +236,7 @@ class Replayer:
 
     def _chosen(self) -> Iterator[tuple[str, int, bytes]]:
         first = self._source.first_ns
-        start = first + round(self._parameters.start * 1e9)
+        start = first + round(self._parameters.start * 1e9) if self._parameters.start else None
         stop = first + round(self._parameters.end * 1e9) if self._parameters.end else None
         return self._source.messages(self._topics, start_ns=start, stop_ns=stop)
 
@@ -314,14 +322,14 @@ def _work(node: Node, parameters: ReplayerParameters) -> None:
     node.get_logger().info(f"{replayer.sent} messages sent")
 
 
-def run(values: Mapping[str, object], args: Sequence[str] | None = None) -> int:
+def run(values: Mapping[str, object], args: Sequence[str]) -> int:
     """Replay until the end, a failure, or Ctrl-C; see `alone.run`."""
     return alone.run(KIND, ReplayerParameters, _work, values, args)
 
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run({}))
+    arguments.executable(KIND, ReplayerParameters, partial(run, {}))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ more from the cell than all the showing.
 
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -24,7 +23,7 @@ from rclpy.subscription import Subscription
 
 from lathe_rc.cell.rerun_bridge import KIND, RerunBridgeParameters
 from lathe_rc.errors import LatheError
-from lathe_rc.nodes import alone
+from lathe_rc.nodes import alone, arguments
 from lathe_rc.nodes.ports import message_class
 from lathe_rc.view.rerun_heard import Backlog
 from lathe_rc.view.rerun_live import Live, Shown
@@ -147,12 +146,12 @@ def _nothing(_: bytes) -> None:
     """No executor calls back."""
 
 
-def run(values: Mapping[str, object], args: Sequence[str] | None = None) -> list[Shown]:
+def run(values: Mapping[str, object], args: Sequence[str]) -> list[Shown]:
     """Show what runs until Ctrl-C, the end of the viewer, or of the first run if so asked.
 
     Args:
         values: parameters; those of the command line of ROS come from ``args``.
-        args: ROS arguments; default: those of the process.
+        args: command line of ROS, from ``--ros-args`` on.
 
     Returns:
         The runs that were shown.
@@ -173,11 +172,12 @@ def run(values: Mapping[str, object], args: Sequence[str] | None = None) -> list
 
 def main() -> None:
     """Run the node."""
-    try:
-        run({})
-    except LatheError as error:
-        print(f"lathe: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
+
+    def bridge(words: Sequence[str]) -> int:
+        run({}, words)
+        return 0
+
+    arguments.executable(KIND, RerunBridgeParameters, bridge)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,9 @@ import os
 import time
 import traceback
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain, repeat
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -19,10 +21,12 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from std_msgs.msg import Empty
 
+from lathe_rc.bag.record import signal_depth
 from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import MASTERS
+from lathe_rc.cell.wiring import Unknown
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.nodes import declare
 from lathe_rc.nodes.exchange import Exchange
@@ -38,6 +42,8 @@ _LATCHED_DEPTH = 256
 _PATIENCE = 2.0  # [s] for others to acknowledge the last messages
 _GIVEN_UP = 2.0  # [s] of silence after which a time master is lost in a cell that does not wait
 _MOST_MEMBERS = 256  # announced names that are kept
+_TOLD_AFTER = (2.0, 8.0, 30.0)  # [s] of waiting until it is told what for; the last again and again
+_MOST_PUT_OFF = 8  # times the blocks in flight of each topic, while a node is deactivated
 
 
 class CellNode(LifecycleNode):
@@ -75,15 +81,25 @@ class CellNode(LifecycleNode):
         self.table: NodeParameters = TABLES[self.kind]()
         self.reporter = reporter
         self.exchange = exchange
-        self.over = self.done = False
         self.failure: LatheError | None = None
         self.next_tick, self.patience = time.monotonic(), _PATIENCE
-        self.active = False
         self.handled, self.due = 0, False
         self.full_name = self.get_fully_qualified_name()
+        self.strangers = Strangers(self._tell_stranger)
+        self._diagnostics_due = time.monotonic() + _DIAGNOSTICS_PERIOD
+        self._without_endpoints = self._endpoints()
+        self._service_change_state.callback = self._refusing(self._service_change_state.callback)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Be as before the first activation."""
+        self.active = self.over = self.done = False
         self.members: dict[str, Member] = {}
         self.master: Member | None = None
-        self.strangers = Strangers(self._tell_stranger)
+        self._put_off: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals that came while deactivated
+        self._told_unknown: set[str] = set()
+        self._tell_due = math.inf
+        self._tell_after: Iterator[float] = iter(())
         self._ready = self._safe = False
         self._without: set[str] = set()  # members that are lost
         self._cell: int | None = None  # what the time master has said
@@ -92,7 +108,6 @@ class CellNode(LifecycleNode):
         self._moved = 0.0  # when it has last completed a block, monotonic [s]
         self._master_stalls = False
         self._heard_elsewhere = True  # whether anybody beside the time master reads the progress
-        self._diagnostics_due = time.monotonic() + _DIAGNOSTICS_PERIOD
         self._repeat_due = 0.0
         self._host: dict[str, Publisher] = {}
         self.outlets: dict[str, Publisher] = {}
@@ -102,23 +117,35 @@ class CellNode(LifecycleNode):
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
         """Validate parameters and allocate."""
-        return self._transition(self._configure)
+        return self._transition(state, "inactive", self._configure)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
-        """Announce itself and exchange data from now on."""
-        return self._transition(self._activate)
+        """Announce itself and exchange data from now on; or go on, having been deactivated."""
+        return self._transition(state, "active", self._activate)
 
     def on_deactivate(self, state: State) -> TransitionCallbackReturn:
-        """Stop exchanging data."""
-        self.active = False
-        return TransitionCallbackReturn.SUCCESS
+        """Stand still: what comes is put off, and so the cell stands still as well."""
+        return self._transition(state, "inactive", self._deactivate)
+
+    def on_cleanup(self, state: State) -> TransitionCallbackReturn:
+        """Leave the cell, and be as before it was configured; not in the middle of a run, which needs its blocks."""
+        if self._takes_part:
+            self.get_logger().warning(
+                "cleanup refused in the middle of a run; activate to go on, or shutdown to give up"
+            )
+            return TransitionCallbackReturn.FAILURE
+        return self._transition(state, "unconfigured", self._clean_up)
+
+    def on_shutdown(self, state: State) -> TransitionCallbackReturn:
+        """Leave; in the middle of a run as one that has failed."""
+        return self._transition(state, "finalized", self._shut_down)
 
     def on_error(self, state: State) -> TransitionCallbackReturn:
         """Safe state: nothing is published any more."""
         self.active = False
         return TransitionCallbackReturn.SUCCESS
 
-    def _transition(self, step: Callable[[], None]) -> TransitionCallbackReturn:
+    def _transition(self, state: State, goal: str, step: Callable[[], None]) -> TransitionCallbackReturn:
         try:
             step()
         except LatheError as error:
@@ -128,7 +155,27 @@ class CellNode(LifecycleNode):
             self.get_logger().error(traceback.format_exc())
             self.fail(LatheError(f"{self.get_name()}: {type(error).__name__}: {shown(error)}"))
             return TransitionCallbackReturn.FAILURE
+        self.get_logger().info(f"{state.label} -> {goal}")
         return TransitionCallbackReturn.SUCCESS
+
+    def _refusing(self, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        """The lifecycle service, without the exception with which rclpy answers to what cannot be."""
+
+        def call(request: Any, response: Any) -> Any:
+            try:
+                return change(request, response)
+            except RuntimeError as error:
+                self.get_logger().warning(f"transition {request.transition.id} refused: {str(error).splitlines()[0]}")
+                response.success = False
+                return response
+
+        return call
+
+    @property
+    def _takes_part(self) -> bool:
+        """Whether the others of a cell that runs need it."""
+        runs = self._cell in (CellState.RUNNING, CellState.SAFE)
+        return runs and self.master is not None and not (self.over or self.failure)
 
     def _configure(self) -> None:
         self.table = declare.declare(self, TABLES[self.kind])
@@ -138,6 +185,17 @@ class CellNode(LifecycleNode):
         self.configure_part()
 
     def _activate(self) -> None:
+        self.active = self.due = True
+        if not self._host:
+            self._begin_to_exchange()
+        while self._put_off:
+            callback, message = self._put_off.popleft()
+            self.guarded(callback)(message)
+        self.announce()
+        self.reporter("active", self.get_name(), pid=os.getpid())
+
+    def _begin_to_exchange(self) -> None:
+        """Make what it exchanges data by."""
         add = self.create_publisher
         self._host = {
             "members": add(Member, "members", latched_qos(1)),
@@ -148,10 +206,40 @@ class CellNode(LifecycleNode):
         self.create_subscription(CellState, "cell_state", self.guarded(self._on_cell_state, always=True), latched_qos())
         self.create_publisher(Empty, f"~/{messages.ALIVE}", liveliness())
         self.watch = Watch(self, lambda: self.attempt(self.look_after_others))
-        self.active = True
+        self._tell_after = chain(_TOLD_AFTER, repeat(_TOLD_AFTER[-1]))
+        self._tell_due = time.monotonic() + next(self._tell_after)
         self.activate_part()
-        self.announce()
-        self.reporter("active", self.get_name(), pid=os.getpid())
+
+    def _deactivate(self) -> None:
+        self.active = False
+
+    def _clean_up(self) -> None:
+        self.clean_up_part()
+        self.active = self._ready = False
+        if self._host:
+            self.announce()  # it joins anew: the time master shall not begin without it
+            self._wait_for_acknowledgement([self._host["members"]])
+            self.watch.close()
+        for before, now, destroy in zip(self._without_endpoints, self._endpoints(), self._destroyers(), strict=True):
+            for endpoint in now - before:
+                destroy(endpoint)
+        self._forget()
+
+    def _shut_down(self) -> None:
+        if self._takes_part:
+            self.fail(LatheError(f"{self.get_name()} was shut down in the middle of a run"))
+        else:
+            self.finish()
+            self._clean_up()
+            self.done = True
+            self.reporter("done", self.get_name(), cpu_s=time.process_time())
+        self.active = False
+
+    def _endpoints(self) -> list[set[Any]]:
+        return [set(self.publishers), set(self.subscriptions), set(self.services)]
+
+    def _destroyers(self) -> list[Callable[[Any], object]]:
+        return [self.destroy_publisher, self.destroy_subscription, self.destroy_service]
 
     # ---- what a kind of node adds -------------------------------------------------------------------
 
@@ -183,6 +271,9 @@ class CellNode(LifecycleNode):
         """Give up because a member has."""
         self.fail(LatheError(f"{member.name} {why_failed(member)}"), cause="abandoned")
 
+    def clean_up_part(self) -> None:
+        """Let go of what it has made; publishers, subscriptions and services are destroyed by who calls."""
+
     def begin(self, *, joins: bool) -> None:
         """Every input and output is matched; ``joins``: the cell is running already."""
 
@@ -213,7 +304,7 @@ class CellNode(LifecycleNode):
         def call(message: Any) -> None:
             self.handled += 1
             self.due = True
-            if not self.active or (self.failure and not always):
+            if not self._host or (self.failure and not always):
                 return
             try:
                 callback(message)
@@ -221,6 +312,23 @@ class CellNode(LifecycleNode):
                 self.strangers.refuse(stranger)
             except LatheError as error:
                 self.fail(error)
+
+        return call
+
+    def _in_turn(self, callback: Callable[[Any], object]) -> Callable[[Any], None]:
+        """A callback for signals, which are put off while the node is deactivated: then nothing is lost.
+
+        Where nothing holds the spindle back they are left out, and counted as any that are missing.
+        """
+        most = _MOST_PUT_OFF * signal_depth(self.table)
+
+        def call(message: Any) -> None:
+            if self.active:
+                callback(message)
+            elif self.table.window:
+                self._put_off.append((callback, message))
+                if len(self._put_off) > most * (len(self.subscriptions_wanted()) + 1):
+                    raise LatheError(f"{self.full_name}: {len(self._put_off)} messages wait until it is active again")
 
         return call
 
@@ -275,12 +383,12 @@ class CellNode(LifecycleNode):
             inside: gets the `lathe_rc.nodes.exchange.Delivery` of a node of this process instead.
         """
         if self.exchange.has(topic):
-            self.exchange.listen(topic, self.full_name, self.guarded(inside))
+            self.exchange.listen(topic, self.full_name, self.guarded(self._in_turn(inside)))
             return
         self.inlets[topic] = self.create_subscription(
             message_class(msgtype),
             topic,
-            self.guarded(self._one_of_many(topic, callback)),
+            self.guarded(self._in_turn(self._one_of_many(topic, callback))),
             signal_qos(self.table, topic),
             raw=True,
             event_callbacks=self.subscription_events(topic),
@@ -372,15 +480,49 @@ class CellNode(LifecycleNode):
         return self.table.model_copy(update={"remap": changed})
 
     def tables(self, names: Iterable[str]) -> dict[str, NodeParameters]:
-        """The parameters that members have announced, by their name in this node's namespace; strangers left out."""
-        namespace = self.get_namespace().rstrip("/") + "/"
+        """The parameters that members have announced, by their name in this node's namespace; `unknown` left out.
+
+        Raises:
+            InputError: a member that is known has a parameter that cannot be.
+        """
+        found = {self._relative(name): self._table(name) for name in names}
+        return {name: table for name, table in found.items() if table is not None}
+
+    def unknown(self, names: Iterable[str]) -> dict[str, Unknown]:
+        """Members that nobody here knows more of than the topics that they have announced, as `tables` names them."""
         found = {}
         for name in names:
-            member = self.members[name]
-            if member.stage in TABLES:
-                values = json.loads(member.parameters) | {"stage": member.stage}
-                found[name.removeprefix(namespace)] = TABLES[member.stage].read(name, values)
+            if self._table(name) is None:
+                member = self.members[name]
+                dense, sparse = dict[str, str](), dict[str, str]()
+                for topic, msgtype, is_sparse in zip(member.publishes, member.types, member.sparse, strict=True):
+                    (sparse if is_sparse else dense)[self._relative(topic)] = msgtype
+                reads = frozenset(self._relative(topic) for topic in member.subscribes)
+                found[self._relative(name)] = Unknown(dense, sparse, reads)
         return found
+
+    def _relative(self, name: str) -> str:
+        """The name of a member or topic in this node's namespace."""
+        return name.removeprefix(self.get_namespace().rstrip("/") + "/")
+
+    def _table(self, name: str) -> NodeParameters | None:
+        """What a member has announced of its parameters; None, and told once, if nobody here knows what it is."""
+        member = self.members[name]
+        try:
+            kind = TABLES.get(member.stage)
+            why = "there is no such stage here"
+        except InputError as error:
+            kind, why = None, str(error)
+        if kind is not None:
+            values = json.loads(member.parameters) | {"stage": member.stage}
+            missing = [row for row in kind.rows() if row not in values]
+            if not missing:
+                return kind.read(name, values)
+            why = f"its parameters do not say {missing[0]}" + (f" and {len(missing) - 1} others" if missing[1:] else "")
+        if name not in self._told_unknown:
+            self._told_unknown.add(name)
+            self.get_logger().info(f"{name}, stage {shown(repr(member.stage))}, is known by its topics alone: {why}")
+        return None
 
     def relative_topics(self) -> list[str]:
         """Signal topics of the stage that it runs, before remapping, if it runs one."""
@@ -502,7 +644,7 @@ class CellNode(LifecycleNode):
 
     def _settle(self) -> None:
         """Become ready once every input and output is matched with its peers by name."""
-        if self._ready or self.failure or self.master is None or not self.complete:
+        if not self.active or self._ready or self.failure or self.master is None or not self.complete:
             return
         if any(self.members[name].state == Member.JOINING for name in self.master.members) or not self.matched():
             return
@@ -516,19 +658,52 @@ class CellNode(LifecycleNode):
 
         The graph knows names, but runs ahead of what DDS has matched; DDS counts matches, but without names.
         """
+        return next(self._unmatched(), None) is None
+
+    def _unmatched(self) -> Iterator[str]:
+        """The topics that have not met, and whom they lack."""
         assert self.master is not None
         peers = [self.members[name] for name in self.master.members if name != self.full_name]
         for topic, inlet in self.inlets.items():
             expected = {peer.name for peer in peers if topic in peer.publishes}
             found = _names(self.get_publishers_info_by_topic(topic))
-            if not expected or not expected <= found or inlet.get_publisher_count() < len(expected):
-                return False
+            if not expected:
+                yield f"{topic}, which no member publishes"
+            elif not expected <= found or inlet.get_publisher_count() < len(expected):
+                yield f"{topic} from {', '.join(sorted(expected - found or expected))}"
         for topic, outlet in self.outlets.items():
             expected = {peer.name for peer in peers if topic in peer.subscribes} - self.exchange.readers(topic)
             found = _names(self.get_subscriptions_info_by_topic(topic))
             if not expected <= found or outlet.get_subscription_count() < len(expected):
-                return False
-        return True
+                yield f"{topic} to {', '.join(sorted(expected - found or expected))}"
+
+    def missing(self) -> list[str]:
+        """Members and topics that it waits for until it can begin; empty if it has begun, or waits for nobody."""
+        if self.done or self.failure or (self._ready and self._cell not in (None, CellState.WAITING)):
+            return []
+        if not self.active:
+            return ["its own activation"]
+        if self.master is None:
+            lonely = [topic for topic, inlet in self.inlets.items() if not inlet.get_publisher_count()]
+            alone = any(member.stage in MASTERS for member in self.members.values())
+            master = [] if alone or not lonely else ["a time master"]
+            return [*master, *(f"a publisher of {topic}" for topic in lonely)]
+        others = [name for name in self.master.members if name != self.full_name]
+        states = {name: self.members[name].state if name in self.members else None for name in others}
+        unheard = [name for name, state in states.items() if state is None]
+        joining = [f"{name} to join" for name, state in states.items() if state == Member.JOINING]
+        if unheard or joining:
+            return [*unheard, *joining]
+        if not self._ready:
+            return list(self._unmatched())
+        return [f"{name} to be ready" for name, state in states.items() if state == Member.WIRED]
+
+    def _tell_what_is_missing(self, now: float) -> None:
+        """Say now and then what it waits for: nobody else knows."""
+        self._tell_due = now + next(self._tell_after)
+        if missing := self.missing():
+            self.get_logger().warning(f"waits for {'; '.join(missing)}")
+            self.reporter("waits", self.get_name(), missing=missing)
 
     # ---- progress and time --------------------------------------------------------------------------
 
@@ -555,25 +730,30 @@ class CellNode(LifecycleNode):
             self._leave([*acknowledged, self._host["progress"]])
 
     def _leave(self, acknowledged: list[Publisher]) -> None:
-        from rclpy.duration import Duration
-
-        for publisher in acknowledged:
-            if not publisher.wait_for_all_acked(Duration(seconds=self.patience)):
-                self.get_logger().warning(f"{publisher.topic}: not everybody has acknowledged the last message")
+        self._wait_for_acknowledgement(acknowledged)
         self.done = True
         self.reporter("done", self.get_name(), cpu_s=time.process_time())
+
+    def _wait_for_acknowledgement(self, publishers: list[Publisher]) -> None:
+        from rclpy.duration import Duration
+
+        for publisher in publishers:
+            if not publisher.wait_for_all_acked(Duration(seconds=self.patience)):
+                self.get_logger().warning(f"{publisher.topic}: not everybody has acknowledged the last message")
 
     def tick(self, now: float) -> None:
         """Do what is due by the wall clock; nothing here touches a sample."""
         self.next_tick = now + _TICK if not self._ready else now + 0.1
-        if self.active:
+        if self._host:
             if not self._ready:
                 self.attempt(self._settle)
             self.attempt(self.look_after_others)
             self._repeat(now)
+            if now >= self._tell_due:
+                self._tell_what_is_missing(now)
         if "progress" in self._host:
             self._heard_elsewhere = self._host["progress"].get_subscription_count() > 1
-        if self.active and now >= self._diagnostics_due:
+        if self._host and now >= self._diagnostics_due:
             self._diagnostics_due = now + _DIAGNOSTICS_PERIOD
             self._publish_diagnostics()
 

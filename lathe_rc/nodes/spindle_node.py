@@ -126,13 +126,15 @@ class SpindleNode(StageNode):
         if self._unsafe:
             self._unsafe -= {name for name in self._unsafe if self.members[name].state == Member.SAFE}
             self.release()
-        if self._running or not self._member_names:
+        if self._running or not self._member_names or not self.active:
             return
         known = [self.members.get(name) for name in self.member_names()]
         if all(member is not None and member.state == member.READY for member in known):
             # The same check as before an offline run, with the parameters that the members really have.
-            cell = Cell(self.tables(self.member_names()))
+            cell = Cell(self.tables(self.member_names()), self.unknown(self.member_names()))
             cell.check()
+            for what in cell.unchecked:
+                self.get_logger().warning(f"not checked: {what}")
             self._begin(cell)
 
     def _begin(self, cell: Cell | None = None) -> None:
@@ -205,7 +207,7 @@ class SpindleNode(StageNode):
 
     def release(self) -> None:
         """Let go every block that credit and pace allow."""
-        if not self._running or self.failure or self.done or self._unsafe:
+        if not (self._running and self.active) or self.failure or self.done or self._unsafe:
             return
         factor = self._pace.speed_factor
         size, step = self.table.block_size, self.table.step

@@ -112,6 +112,13 @@ class StageNode(CellNode):
         self.create_service(Schedule, "~/schedule", self._on_schedule)
         self.exchange.stages.append(self)
 
+    def clean_up_part(self) -> None:
+        """See `CellNode`."""
+        if self.chain is not None:
+            self.chain.leave()
+        if self in self.exchange.stages:
+            self.exchange.stages.remove(self)
+
     def tick(self, now: float) -> None:
         """See `CellNode`."""
         super().tick(now)

@@ -2,7 +2,6 @@
 """Executable: the ``topic_recorder``, which records any topics in the order in which they were published."""
 
 import signal
-import sys
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,7 +21,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.topic_recorder import KIND, TopicRecorderParameters
 from lathe_rc.errors import InputError, LossyRunError
-from lathe_rc.nodes import alone, offered
+from lathe_rc.nodes import alone, arguments, offered
 from lathe_rc.nodes.ports import message_class
 
 _CLOCK = "/clock"
@@ -254,14 +253,14 @@ def _work(node: Node, parameters: TopicRecorderParameters) -> None:
     recorder.run()
 
 
-def run(values: Mapping[str, object], args: Sequence[str] | None = None) -> int:
+def run(values: Mapping[str, object], args: Sequence[str]) -> int:
     """Record until it is stopped; see `alone.run`."""
     return alone.run(KIND, TopicRecorderParameters, _work, values, args)
 
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run({}))
+    arguments.executable(KIND, TopicRecorderParameters, partial(run, {}))
 
 
 if __name__ == "__main__":

@@ -79,6 +79,11 @@ class Watch:
             except (OSError, OverflowError) as error:  # no process has such a number, or none may be watched
                 self._node.get_logger().warning(f"{member.name}: its process {member.pid} is not watched ({error})")
 
+    def close(self) -> None:
+        """Watch nobody any more; the node destroys its subscriptions itself."""
+        while self._processes:
+            os.close(self._processes.popitem()[1])
+
     def _changed(self, name: str, status: Any) -> None:
         before = name in self.silent
         if status.alive_count:

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is watched: signals against thresholds, each by a rule of `lathe_rc.safety.rules`."""
+"""What is watched: signals against thresholds, each by a rule of `lathe_rc.safety.rules`, or in plain Python."""
 
-from collections.abc import Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from lathe_rc.errors import InputError
+from lathe_rc.extensions import code_of_others
 from lathe_rc.safety.rules import (
     GROWTH,
     INDEX,
@@ -18,6 +21,9 @@ from lathe_rc.safety.rules import (
     clear,
 )
 from lathe_rc.safety.state_machine import Reaction
+
+_LONGEST_NAME = 64  # of a monitor [B], as SafetyStatus.msg says
+_NOTHING = np.empty(0)
 
 
 @dataclass(frozen=True)
@@ -205,6 +211,107 @@ class Growth(Monitor):
     def reset(self) -> None:
         """See `Monitor`."""
         self.memory[3:] = _UNKNOWN
+
+
+class PlainMonitor(ABC):
+    """A monitor in plain Python, which looks at pieces of signals, one after the other.
+
+    It is made anew at a reset. What it finds must not depend on where pieces begin: what it needs of the samples
+    before, it keeps.
+
+    Args:
+        limit: threshold, told with its alarm.
+        step: sampling step [s].
+
+    Attributes:
+        limit, step: as given.
+    """
+
+    def __init__(self, limit: float, step: float) -> None:
+        self.limit, self.step = limit, step
+
+    @abstractmethod
+    def find(self, first: int, signal: Array, other: Array) -> Alarm | None:
+        """The first alarm in a piece; after one there are no further pieces until a reset.
+
+        Args:
+            first: index of the first sample of the piece in the run.
+            signal: what it watches, shape (n,); not to be changed.
+            other: a second signal, shape (n,); shape (0,) if there is none.
+        """
+
+
+class Plain:
+    """A `PlainMonitor` with its place in the cell; raises one alarm, and no other before it is reset.
+
+    Args:
+        name: of the monitor.
+        subject: what it watches.
+        limit: threshold.
+        reaction: what it asks for.
+        signals: places of one input and field, or of two.
+        make: of the monitor.
+
+    Attributes:
+        name, subject, limit, reaction: as given.
+
+    Raises:
+        InputError: it has too long a name, or cannot be made.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        subject: str,
+        limit: float,
+        reaction: Reaction,
+        *,
+        signals: Sequence[tuple[int, str]],
+        make: Callable[[], PlainMonitor],
+    ) -> None:
+        if len(name.encode()) > _LONGEST_NAME:
+            raise InputError(f"{name!r} is longer than messages carry; allowed: {_LONGEST_NAME} bytes (an entry point)")
+        self.name, self.subject, self.limit, self.reaction = name, subject, limit, reaction
+        self._signals, self._make = signals, make
+        self._monitor: PlainMonitor | None = None
+        self.reset()
+
+    def find(self, first: int, inputs: Sequence[Mapping[str, Array]]) -> Alarm | None:
+        """The alarm in the samples ``first`` on, if there is one.
+
+        Args:
+            first: index of the first one.
+            inputs: arrays of shape (n,) by field.
+
+        Raises:
+            InputError: the monitor goes wrong.
+        """
+        if self._monitor is None:
+            return None
+        signal, other = [*(_read_only(inputs[place][field]) for place, field in self._signals), _NOTHING][:2]
+        with code_of_others(f"monitor {self.name} at sample {first}"):
+            found = self._monitor.find(first, signal, other)
+            if found is None:
+                return None
+            alarm = Alarm(int(found.place), float(found.value))
+        if not 0 <= alarm.place < signal.size:
+            raise InputError(
+                f"monitor {self.name} at sample {first} finds something at place {alarm.place} of {signal.size}; "
+                f"allowed: 0 to {signal.size - 1}"
+            )
+        self._monitor = None
+        return alarm
+
+    def reset(self) -> None:
+        """Watch as from the first sample."""
+        with code_of_others(f"monitor {self.name}"):
+            self._monitor = self._make()
+
+
+def _read_only(signal: Array) -> Array:
+    view: Array = signal.view()
+    view.flags.writeable = False
+    return view
 
 
 class Clearance:

@@ -158,6 +158,9 @@ class Measured:
 
 
 _HEADERS = (("angle_deg", "radius_um"), ("angle_deg", "height_mm", "radius_um"))
+_FLATTEST = 0.01  # [µm] peak to valley of a form: nobody turns less
+_FARTHEST = 10_000.0  # [µm] that all of a form may be away from the middle
+_TURN_OF_RADIANS = 6.3  # [°] a column that spans no more is in another unit
 _CLOSEST = 1e-6  # [°, mm] between two points: closer ones are a slip, and their slope overflows
 
 
@@ -170,6 +173,29 @@ def _check_distances(path: Path, what: str, unit: str, places: Array) -> None:
         )
 
 
+def _check_units(path: Path, angle_deg: Array, radius_um: Array) -> None:
+    """Refuse columns that are most likely in another unit than their names say."""
+    low, high = angle_deg[0], angle_deg[-1]
+    if high - low <= _TURN_OF_RADIANS:
+        unit = "radians" if high > 1.0 else "revolutions"
+        raise InputError(
+            f"{path}: angle_deg spans {low:.4g} to {high:.4g}, which looks like {unit}; allowed: degrees all round, 0 "
+            "up to 360"
+        )
+    height = float(np.ptp(radius_um))
+    if 0.0 < height < _FLATTEST:
+        raise InputError(
+            f"{path}: radius_um is {height:.3g} µm from peak to valley, which looks like metres or millimetres; "
+            f"allowed: micrometres, 0 or {_FLATTEST:g} and above"
+        )
+    nearest = float(np.abs(radius_um).min())
+    if nearest > _FARTHEST:
+        raise InputError(
+            f"{path}: radius_um is {nearest:.4g} µm or more everywhere, which looks like radii, or nanometres; "
+            f"allowed: deviations from the mean radius in micrometres, up to {_FARTHEST:g}"
+        )
+
+
 def read_csv(path: Path) -> Measured:
     """Read a profile from a CSV file.
 
@@ -177,7 +203,8 @@ def read_csv(path: Path) -> Measured:
     order of rows. Every height must have the same angles.
 
     Raises:
-        InputError: the file is missing, malformed, holds a number that is not finite, or repeats an angle.
+        InputError: the file is missing, malformed, in other units, holds a number that is not finite, or repeats an
+            angle.
     """
     return _measured(read_text(path, "profile"), path)
 
@@ -196,6 +223,7 @@ def _measured(text: str, path: Path) -> Measured:
         raise InputError(f"{path}: angle {wrong:g}°; allowed: 0 up to but not including 360")
     if angle_deg.size < 3:
         raise InputError(f"{path}: {angle_deg.size} different angles; allowed: 3 or more")
+    _check_units(path, angle_deg, rows[:, 2])
     _check_distances(path, "angles", "°", np.append(angle_deg, angle_deg[0] + 360.0))
     _check_distances(path, "heights", " mm", heights_mm)
     radius = np.full((heights_mm.size, angle_deg.size), np.nan)

@@ -20,6 +20,7 @@ from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
 
+_MOST_SAMPLES = 2**53  # that a double counts
 _PACKED_LINES = 4  # rows of SpeedLaw.lines: amplitude [1], frequency [rad/s], phase [rad], start [s]
 
 
@@ -136,7 +137,8 @@ class SpeedLaw:
         """First sample index at which the true angle has reached ``angle`` [rad]; ``step`` in s.
 
         Raises:
-            InputError: the spindle may stand still or turn back, so the angle may never be reached.
+            InputError: the spindle may stand still or turn back, so the angle may never be reached; or it takes so long
+                that samples could no longer be counted.
         """
         lowest = self.speed_range()[0]
         horizon = angle / lowest if lowest > 0.0 else 2.0 * angle / self.nominal
@@ -145,6 +147,8 @@ class SpeedLaw:
             lowest = self.speed_range(horizon)[0]
         if lowest <= 0.0:
             raise InputError(f"spindle speed falls to {lowest:.4g} rad/s; allowed: above 0 (reduce the deviations)")
+        if not horizon / step < _MOST_SAMPLES:
+            raise InputError(f"that takes up to {horizon / step:.3g} samples; allowed: below {_MOST_SAMPLES}")
         low, high = 0, int(horizon / step) + 2
         while low < high:
             middle = (low + high) // 2

@@ -3,6 +3,7 @@
 
 from typing import Any
 
+from lathe_rc.extensions import Objects
 from lathe_rc.studies import (
     angle_domain,
     decoupling,
@@ -16,7 +17,7 @@ from lathe_rc.studies import (
 )
 from lathe_rc.studies.study import Study
 
-STUDIES: dict[str, Study[Any]] = {
+_OWN: dict[str, Study[Any]] = {
     module.STUDY.name: module.STUDY
     for module in (
         invariance,
@@ -30,3 +31,6 @@ STUDIES: dict[str, Study[Any]] = {
         decoupling,
     )
 }
+
+#: by name, ours and those of other packages
+STUDIES: Objects[Study[Any]] = Objects("study", Study, _OWN, "lathe_rc.studies")

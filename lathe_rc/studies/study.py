@@ -3,7 +3,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
 
 from rich.table import Table as RichTable
 from rich.text import Text
@@ -22,6 +22,8 @@ P = TypeVar("P", bound="StudyParameters")
 
 class StudyParameters(Table):
     """Parameters of a study: a table as nodes have it, whose lists are never empty."""
+
+    listing: ClassVar[str] = "lathe study {} --help"
 
     def model_post_init(self, context: Any, /) -> None:
         """Refuse empty lists: there would be nothing to compute."""

@@ -1,25 +1,58 @@
 # SPDX-License-Identifier: Apache-2.0
 """The figure of a run: profile, form error over angle, form error against revolution."""
 
-from pathlib import Path
+import io
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
+from matplotlib.ticker import MaxNLocator
 
-from lathe_rc.analysis.metrology import FormErrors
+from lathe_rc.analysis.metrology import FormErrors, turns_before
 from lathe_rc.cell import messages
 from lathe_rc.cell.recording import Recording
+from lathe_rc.errors import InputError
 
 _FIRST, _LAST = "#c0392b", "#1f6f8b"
+_IN_NOTEBOOK = 72.0  # [dots per inch]
 
 
-def save(path: Path, recording: Recording, errors: FormErrors, title: str) -> None:
-    """Draw the figure of a run into a PNG file."""
+class RunFigure(Figure):
+    """A figure that a notebook shows, though nobody has imported pyplot there."""
+
+    def _repr_png_(self) -> bytes:
+        return png(self)
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as a notebook shows it: small."""
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=_IN_NOTEBOOK, metadata={"Software": None})
+    return image.getvalue()
+
+
+def draw(recording: Recording, title: str = "") -> Figure:
+    """Desired form, form error over angle in the first and the last revolution, and form error by revolution.
+
+    Args:
+        recording: of a run, with a tool.
+        title: of the figure.
+
+    Returns:
+        A figure that pyplot does not know: its ``savefig`` writes it, notebooks show it.
+
+    Raises:
+        InputError: there is no tool, or not one complete revolution.
+    """
+    errors = recording.errors
+    if not errors.rms.size:
+        kinds = set(recording.types.values())
+        missing = [name for name, kind in (("encoder", messages.ENCODER), ("tool", messages.TOOL)) if kind not in kinds]
+        why = f"no {' and no '.join(missing)}; record both" if missing else "no complete revolution; let it run longer"
+        raise InputError(f"nothing to draw: the recording has {why}")
     encoder, tool = recording.of_type(messages.ENCODER), recording.of_type(messages.TOOL)
-    figure = Figure(figsize=(13, 4.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = RunFigure(figsize=(13, 4.4), layout="constrained")
     grid = figure.add_gridspec(1, 3, width_ratios=[1, 1.35, 1.35])
     figure.suptitle(title, fontsize=11)
 
@@ -27,7 +60,7 @@ def save(path: Path, recording: Recording, errors: FormErrors, title: str) -> No
         span = slice(int(errors.starts[number]), int(errors.starts[number + 1]))
         return np.rad2deg(np.mod(encoder["angle_true"][span], 2 * np.pi)), span
 
-    last = errors.rms.size - 1
+    before, last = turns_before(encoder["angle_true"]), errors.rms.size - 1
     form = figure.add_subplot(grid[0], projection="polar")
     assert isinstance(form, PolarAxes)
     for number, colour, label in ((0, _FIRST, "first"), (last, _LAST, "last")):
@@ -40,7 +73,8 @@ def save(path: Path, recording: Recording, errors: FormErrors, title: str) -> No
             label=f"{label} revolution",
         )
     low, high = tool["reference"].min() * 1e6, tool["reference"].max() * 1e6
-    form.set_rlim(low - 1.2 * (high - low), high + 0.1 * (high - low))
+    size = high - low or 1.0  # a round part
+    form.set_rlim(low - 1.2 * size, high + 0.1 * size)
     form.set_rlabel_position(75)
     form.set_yticks(np.linspace(low, high, 3).round())
     form.set_title("desired radius deviation [µm]", fontsize=10)
@@ -50,14 +84,14 @@ def save(path: Path, recording: Recording, errors: FormErrors, title: str) -> No
     over_angle = figure.add_subplot(grid[1])
     for number, colour in ((0, _FIRST), (last, _LAST)):
         degrees, span = revolution(number)
-        label = f"revolution {number + 1}: {errors.rms[number] * 1e6:.3g} µm RMS"
+        label = f"revolution {before + number + 1}: {errors.rms[number] * 1e6:.3g} µm RMS"
         over_angle.plot(degrees, np.abs(tool["error"][span]) * 1e6, color=colour, lw=1.1, label=label)
     over_angle.set(
         xlabel="spindle angle [°]",
         ylabel="|form error| [µm]",
         xlim=(0, 360),
         xticks=range(0, 361, 60),
-        yscale="log",
+        yscale=_scale(errors),
     )
     over_angle.set_ylim(bottom=max(errors.largest[last] * 1e6 / 300, 1e-4))
     over_angle.set_title("form error over angle", fontsize=10)
@@ -65,11 +99,28 @@ def save(path: Path, recording: Recording, errors: FormErrors, title: str) -> No
     over_angle.legend(fontsize=8, loc="center", bbox_to_anchor=(0.5, 0.6))
 
     curve = figure.add_subplot(grid[2])
-    revolutions = np.arange(1, errors.rms.size + 1)
-    curve.semilogy(revolutions, errors.largest * 1e6, ".-", color="#999999", lw=0.8, ms=4, label="largest")
-    curve.semilogy(revolutions, errors.rms * 1e6, ".-", color=_LAST, lw=1.2, ms=5, label="RMS")
-    curve.set(xlabel="revolution", ylabel="form error [µm]")
+    _by_revolution(curve, errors, before)
     curve.set_title("learning, revolution by revolution", fontsize=10)
-    curve.grid(visible=True, which="both", alpha=0.25)
-    curve.legend(fontsize=8)
-    figure.savefig(path, dpi=130)
+    return figure
+
+
+def learning(errors: FormErrors, before: int = 0) -> Figure:
+    """The form error by revolution alone, small; ``before``: revolutions before the first of them."""
+    figure = RunFigure(figsize=(5.0, 2.4), layout="constrained")
+    _by_revolution(figure.subplots(), errors, before)
+    return figure
+
+
+def _scale(errors: FormErrors) -> str:
+    """Of an axis of errors: a round part may be met at once, and a logarithm has no place for that."""
+    return "log" if errors.rms.all() else "linear"
+
+
+def _by_revolution(axes: Axes, errors: FormErrors, before: int) -> None:
+    revolutions = np.arange(before + 1, before + errors.rms.size + 1)
+    axes.plot(revolutions, errors.largest * 1e6, ".-", color="#999999", lw=0.8, ms=4, label="largest")
+    axes.plot(revolutions, errors.rms * 1e6, ".-", color=_LAST, lw=1.2, ms=5, label="RMS")
+    axes.set(xlabel="revolution", ylabel="form error [µm]", yscale=_scale(errors))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(visible=True, which="both", alpha=0.25)
+    axes.legend(fontsize=8)

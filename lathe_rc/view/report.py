@@ -17,7 +17,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from lathe_rc import __version__
-from lathe_rc.bag.story import FILE, RECOVERED, SCENARIO, VERSIONS
+from lathe_rc.bag.story import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS, origins
 from lathe_rc.cell import messages
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import replacing
@@ -266,8 +266,20 @@ def _versions(told: Gathered) -> Grid | None:
     return Grid(("made with", "version"), _cut(rows, len(given)), "", "docs/bags.md", ("made with", "version"))
 
 
+def _origins(told: Gathered) -> Grid | None:
+    found = origins(told.about)
+    if not found:
+        return None
+    rows = (
+        [printable(text) for text in (origin.name, origin.package or "–", ", ".join(origin.used), origin.source)]
+        for origin in found
+    )
+    columns = ("class of others", "of", "used by", "source")
+    return Grid(columns, _cut(rows, len(found)), "Source: its SHA-256.", "docs/parts.md", columns)
+
+
 def _about(told: Gathered) -> Grid | None:
-    given = {key: text for key, text in told.about.items() if key not in (SCENARIO, VERSIONS)}
+    given = {key: text for key, text in told.about.items() if key not in (SCENARIO, VERSIONS, ORIGINS)}
     if not given:
         return None
     rows = (
@@ -327,6 +339,7 @@ def render(told: Gathered, name: str, command: str) -> str:
         topics=_topics(told),
         events=_events(told),
         versions=_versions(told),
+        origins=_origins(told),
         about=_about(told),
         scenario=printable(told.about.get(SCENARIO, ""), _LONGEST_SCENARIO),
     )

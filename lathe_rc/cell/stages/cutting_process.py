@@ -10,7 +10,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from lathe_rc.analysis.shaft import STEEL_MODULUS, Shaft, Support
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
@@ -99,18 +99,19 @@ class CuttingProcessParameters(NodeParameters):
     def allowance(self, node: str) -> Allowance:
         """The allowance of a node."""
         if self.allowance_rms and self.allowance_rate:
-            raise InputError(f"{node}: allowance_rms and allowance_rate; give one of them")
+            raise InputError(f"{node}.allowance_rms and allowance_rate are both given; allowed: one of them")
         walk = unbounded(self.allowance_rate, self.step)
         if not self.allowance_rate:
             walk = mean_reverting(self.allowance_rms, self.allowance_time, self.step)
-        return Allowance(
-            walk,
-            order=np.array(self.run_out_order, dtype=float),
-            amplitude=np.array(self.run_out_amplitude),
-            phase=np.array(self.run_out_phase or [0.0] * len(self.run_out_order)),
-            seed=self.seed,
-            name=node,
-        )
+        with about(node, "run_out_order", "run_out_amplitude", "run_out_phase"):
+            return Allowance(
+                walk,
+                order=np.array(self.run_out_order, dtype=float),
+                amplitude=np.array(self.run_out_amplitude),
+                phase=np.array(self.run_out_phase or [0.0] * len(self.run_out_order)),
+                seed=self.seed,
+                name=node,
+            )
 
     def flexible(self) -> Shaft | None:
         """The shaft, if there is one."""
@@ -142,22 +143,26 @@ class CuttingProcessParameters(NodeParameters):
         )
         if len(self.gap_start) != len(self.gap_width):
             raise InputError(
-                f"{node}: {len(self.gap_start)} gap_start and {len(self.gap_width)} gap_width; as many each"
+                f"{node}.gap_start, gap_width: {len(self.gap_start)} and {len(self.gap_width)}; give as many of each"
             )
         if len({len(values) for values in spots}) > 1:
-            raise InputError(f"{node}: hard_spot_... of lengths {[len(v) for v in spots]}; give as many of each")
+            names = "hard_spot_start, hard_spot_width, hard_spot_bottom, hard_spot_top, hard_spot_factor"
+            raise InputError(f"{node}.{names}: of lengths {[len(v) for v in spots]}; give as many of each")
         heights = compliances = None
         shaft = self.flexible()
         if shaft is not None:
             heights = np.linspace(0.0, shaft.length, _HEIGHTS)
             compliances = shaft.compliance(heights)
-        return Part(
-            radius=self.radius,
-            gaps=list(zip(self.gap_start, self.gap_width, strict=True)),
-            hard_spots=[HardSpot(*spot) for spot in zip(*spots, strict=True)],
-            heights=heights,
-            compliances=compliances,
-        )
+        with about(node, "hard_spot_start", "hard_spot_width", "hard_spot_bottom", "hard_spot_top"):
+            hard_spots = [HardSpot(*spot) for spot in zip(*spots, strict=True)]
+        with about(node, "gap_start", "gap_width"):
+            return Part(
+                radius=self.radius,
+                gaps=list(zip(self.gap_start, self.gap_width, strict=True)),
+                hard_spots=hard_spots,
+                heights=heights,
+                compliances=compliances,
+            )
 
     def deflecting(self) -> Elasticity:
         """W3; of a shaft only the dynamics, since its compliance is the shaft's own."""
@@ -241,16 +246,18 @@ class CuttingProcessStage(Stage):
             raise InputError(f"{name}.moved_by = {moved}; allowed: each once")
         self._allowance = parameters.allowance(name)
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
-        self.cut = CuttingProcess(
-            material=SpecificForce(parameters.kc1, parameters.mc, parameters.wear_factor),
-            depth=parameters.depth,
-            lag=parameters.lag,
-            elasticity=parameters.deflecting(),
-            wear=Wear(parameters.wear, parameters.wear_per_metre, parameters.wear_per_second),
-            part=parameters.part(name),
-            overlap=parameters.regeneration,
-            step=parameters.step,
-        )
+        part = parameters.part(name)
+        with about(name, "lag"):
+            self.cut = CuttingProcess(
+                material=SpecificForce(parameters.kc1, parameters.mc, parameters.wear_factor),
+                depth=parameters.depth,
+                lag=parameters.lag,
+                elasticity=parameters.deflecting(),
+                wear=Wear(parameters.wear, parameters.wear_per_metre, parameters.wear_per_second),
+                part=part,
+                overlap=parameters.regeneration,
+                step=parameters.step,
+            )
         self._movers = moved
         self._damages = list[Fault]()
         self.declare(

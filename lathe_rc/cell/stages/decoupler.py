@@ -7,7 +7,7 @@ from annotated_types import Ge, Gt
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Stage
 from lathe_rc.control.decoupler import LAG, LEAK, PRESETS, Channels, Decoupler, compensators, decouple_along
 from lathe_rc.errors import InputError
@@ -56,7 +56,8 @@ class DecouplerParameters(NodeParameters):
             top, bottom = getattr(self, f"{name}_numerator"), getattr(self, f"{name}_denominator")
             if bool(top) != bool(bottom):
                 raise InputError(f"{node}.{name}_numerator and {name}_denominator; give both or none")
-            made[name] = TransferFunction(tuple(top), tuple(bottom)) if top else getattr(preset, name)
+            with about(node, f"{name}_numerator", f"{name}_denominator"):
+                made[name] = TransferFunction(tuple(top), tuple(bottom)) if top else getattr(preset, name)
         return Channels(**made)
 
 
@@ -93,7 +94,9 @@ class DecouplerStage(Stage):
     def __init__(self, name: str, parameters: DecouplerParameters) -> None:
         super().__init__(name, parameters)
         self.parameters = parameters
-        k1, k2 = compensators(parameters.channels(name), parameters.inverse_lag, parameters.leak)
+        channels = parameters.channels(name)
+        with about(name, "w1_numerator", "w2_numerator", "inverse_lag"):  # what is inverted, and by which lag
+            k1, k2 = compensators(channels, parameters.inverse_lag, parameters.leak)
         self._decoupler = Decoupler(k1 if parameters.k1 else None, k2 if parameters.k2 else None, parameters.step)
         fields = ("command", "set_point", "error")
         self.declare(

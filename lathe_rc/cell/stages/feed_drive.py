@@ -9,7 +9,7 @@ from annotated_types import Ge, Gt, Le
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse, Stage
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedParameters, remembered
 from lathe_rc.cell.stages.obedience import (
@@ -22,7 +22,6 @@ from lathe_rc.cell.stages.obedience import (
     listens,
     piece,
 )
-from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants import feed
 from lathe_rc.plants.feed import Feedback, FeedDrive, FeedTable, advance
@@ -32,6 +31,11 @@ from lathe_rc.signals.noise import Sensor, SensorTable, measure
 from lathe_rc.transfer import TransferFunction
 
 Axis = Literal["cross", "longitudinal"]
+_COEFFICIENTS = {
+    "dc_screw": ("velocity_gain", "lags", "zero"),
+    "fourth_order": ("gain", "a1", "a2", "a3", "a4"),
+    "sampled": ("sampled_gain", "sampled_lag"),
+}  # by model
 
 
 class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
@@ -171,7 +175,7 @@ class FeedDriveStage(Stage):
         super().__init__(name, parameters)
         self.parameters = parameters
         limits = parameters.command_limits()
-        try:
+        with about(name, *_COEFFICIENTS[parameters.model]):
             self.drive = FeedDrive(
                 parameters.transfer(),
                 step=parameters.step,
@@ -182,8 +186,6 @@ class FeedDriveStage(Stage):
                 feedback=parameters.feedback,
                 limits=limits,
             )
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from None
         self._clipping = Clipping(name, parameters)
         cuts = limits.any or bool(parameters.command_limit)
         self._clipped = np.zeros(messages.MAX_BLOCK if cuts else 1, np.uint8)

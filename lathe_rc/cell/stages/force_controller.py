@@ -69,7 +69,7 @@ class ForceController(Stage):
         self.parameters = parameters
         self.trajectory = Trajectory(name, parameters)
         self.pid = parameters.pid(
-            parameters.proportional, parameters.integral, parameters.derivative, parameters.derivative_filter
+            name, parameters.proportional, parameters.integral, parameters.derivative, parameters.derivative_filter
         )
         self._obedience = parameters.obeys(name)
         self.declare(

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The desired form of the part as parameters, and what evaluates it under the tool."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -10,11 +11,13 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc import resources
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import InputError
+from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel
 from lathe_rc.plants.tool import equal
+from lathe_rc.signals.part_profile import PartProfile, checked
 from lathe_rc.signals.profile import (
     Harmonics,
     Piston,
@@ -26,11 +29,18 @@ from lathe_rc.signals.profile import (
     tabulated,
 )
 
+_OWN = ("harmonics", "piston", "polygon", "csv")
+#: by name, those of other packages: ours have parameters of their own
+PROFILES: Registry[PartProfile] = Registry("profile", PartProfile, {}, "lathe_rc.profiles")
+
 
 class FormParameters(NodeParameters):
     """The desired form of the part and the feed along it."""
 
-    profile: Literal["harmonics", "piston", "polygon", "csv"] = parameter("harmonics", "kind of profile")
+    profile: Annotated[str, Named(PROFILES, _OWN)] = parameter("harmonics", "kind of profile")
+    profile_values: list[float] = parameter(
+        [], "profile of others: numbers that it is made of, in the order of its constructor"
+    )
     profile_file: str = parameter("", "csv: file with angle_deg, (height_mm,) radius_um", path=True)
     harmonic_order: list[Annotated[int, Ge(0), Le(2000)]] = parameter(
         [], "harmonics: waves per revolution; none at all: an oval of 225 µm (paper 000, Fig. 6)"
@@ -60,12 +70,20 @@ class FormParameters(NodeParameters):
         """The profile of a node.
 
         Raises:
-            InputError: lists of different lengths, sizes that do not fit, or a file that cannot be used.
+            InputError: lists of different lengths, sizes that do not fit, a file that cannot be used, or a profile of
+                others that is none.
         """
+        if self.profile not in _OWN:
+            make: Callable[..., PartProfile] = PROFILES[self.profile]
+            with code_of_others(f"{node}.profile = {self.profile!r}"):
+                made = make(*self.profile_values)
+                checked(made)
+                return made
         if self.profile == "csv":
             if not self.profile_file:
                 raise InputError(f"{node}.profile_file is empty; name the CSV file of the profile")
-            return read_csv(resources.find(Path(self.profile_file)))
+            with about(node, "profile_file"):
+                return read_csv(resources.find(Path(self.profile_file)))
         if self.profile == "piston":
             return Piston(
                 self.piston_ovality,
@@ -75,12 +93,14 @@ class FormParameters(NodeParameters):
                 self.piston_widest,
             )
         if self.profile == "polygon":
-            return Polygon(self.polygon_sides, self.polygon_inscribed_radius, self.polygon_corner_radius)
+            with about(node, "polygon_corner_radius"):
+                return Polygon(self.polygon_sides, self.polygon_inscribed_radius, self.polygon_corner_radius)
         order, amplitude = self.harmonic_order, self.harmonic_amplitude
         if not order and not amplitude:
             order, amplitude = [2], [225e-6]
         phase = self.harmonic_phase or [0.0] * len(order)
-        return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
+        with about(node, "harmonic_order", "harmonic_amplitude", "harmonic_phase"):
+            return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
 
 
 class FormTable(NamedTuple):

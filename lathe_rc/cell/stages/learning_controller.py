@@ -2,7 +2,7 @@
 """Self-learning controller of one channel."""
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -14,13 +14,14 @@ import numpy.typing as npt
 from lathe_rc.analysis.learning import LearningLoop, Response
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import MAX_BLOCK, Samples, Signals
-from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
+from lathe_rc.cell.parameters import about
+from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
+from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
 from lathe_rc.cell.stages.obedience import (
     NOBODY,
     OBEY,
     OUT_OF_REACH,
-    Obedience,
     ObedienceTable,
     apply,
     listens,
@@ -28,9 +29,8 @@ from lathe_rc.cell.stages.obedience import (
     obeyed,
     piece,
 )
-from lathe_rc.control import angle_memory, bounded, memory_file
+from lathe_rc.control import angle_memory, memory_file
 from lathe_rc.control.angle_memory import AngleMemory
-from lathe_rc.control.bounded import Takeover
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.identification import DriveIdentifier, Identified, IdentifierTable, accumulate, command_sent
 from lathe_rc.control.lead import PreviewTable, look_ahead
@@ -166,7 +166,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     return n, DONE
 
 
-class LearningController(Stage):
+class LearningController(Learner):
     """See `lathe_rc.control.repetitive`.
 
     Attributes:
@@ -177,27 +177,31 @@ class LearningController(Stage):
     Parameters = LearningControllerParameters
     actions = ("freeze", "learn", "clear", *_FILE_ACTIONS)
     announces = ("joined", "lost", OUT_OF_REACH)
+    parameters: LearningControllerParameters
+    factor = "sup|Q - Z|"
+    remedy = "widen Q, change the lead"
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: LearningControllerParameters) -> None:
         self.parameters = parameters
         super().__init__(name, parameters)
-        self._q = parameters.make_q()
+        self._q = parameters.make_q(name)
         self._controller = RepetitiveController(
             grid=parameters.points_per_revolution,
             revolutions=parameters.cycle_revolutions,
             q=self._q,
             gain=parameters.learning_gain,
             soft_start=parameters.soft_start,
-            preview=parameters.make_preview(),
-            correction=parameters.make_correction(),
+            preview=parameters.make_preview(name),
+            correction=parameters.make_correction(name),
             nominal=parameters.nominal_speed,
             delay=parameters.feedback_delay,
             join_below=parameters.join_below or np.inf,
             step=parameters.step,
         )
         self._joined = self._controller.joined
-        self._asks = parameters.identify or parameters.publish_margin
+        self._asks = parameters.identify or parameters.publish_margin or parameters.stop_ratio > 0.0
+        self._first_rms = np.nan
         self._controller.table.whole[angle_memory.ASKS] = self._asks
         self._state, self._margin = np.array([0, 0, 0, 0, -1]), np.zeros(1)
         self._check_identification()
@@ -213,7 +217,8 @@ class LearningController(Stage):
         inputs += [Input(f"{drive}/state", messages.STATE, ("measured_position",), delay) for drive in parameters.finer]
         if parameters.identify:
             inputs.append(Input("coarse/state", messages.STATE, ("measured_position",), delay))
-        self._obedience = self._obeys() if parameters.reaction_delay else None
+        settled = round(_SETTLED * parameters.lead_time / parameters.step) + delay
+        self._obedience = self._make_obedience(settled)
         inputs += listens(parameters)
         self._identifier = DriveIdentifier(
             model_delay=parameters.model_delay,
@@ -231,15 +236,6 @@ class LearningController(Stage):
         self.sparse_topics[_STATUS] = messages.LEARNING
         if self._scheduled_actions("load") and not self._scheduled_actions("save"):
             self._read_memory()
-
-    def _obeys(self) -> Obedience:
-        parameters = self.parameters
-        settled = round(_SETTLED * parameters.lead_time / parameters.step) + parameters.feedback_delay
-        bounded.prepare()
-        bounds = parameters.bounds()
-        reach = bounds.reach(parameters.retract_time)
-        takeover = Takeover(bounds, parameters.retract_position, parameters.step, reach=reach)
-        return Obedience(self.name, takeover, settled=settled)
 
     def _check_identification(self) -> None:
         parameters = self.parameters
@@ -269,15 +265,22 @@ class LearningController(Stage):
             step=parameters.step,
         )
 
-    def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
-        """Longest feedback delay [sample] that the cycle leaves.
+    def worst(self, drive: Response, speed: float) -> tuple[float, float]:
+        """See `Learner`: sup|Q - γZ|."""
+        return self.loop(drive).worst(speed)
 
-        Args:
-            speed: largest of the spindle [rad/s].
-            acceleration: largest of the spindle [rad/s²].
-            count: angle of one encoder count [rad]: the measured angle is late by up to that; 0 if ideal.
-            speed_window: time over which the encoder measures its speed [s]: one count more in it is a larger lead.
-        """
+    def checked_speeds(self, low: float, high: float) -> Collection[float]:
+        """See `Learner`."""
+        if self.parameters.law == "time_periodic":
+            return {self.parameters.nominal_speed}
+        return super().checked_speeds(low, high)
+
+    def settings(self) -> str:
+        """See `Learner`."""
+        return f"lead_time = {self.parameters.lead_time * 1e3:.4g} ms, q_time = {self.parameters.q_time * 1e6:.4g} µs"
+
+    def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
+        """See `Learner`."""
         parameters = self.parameters
         if parameters.law == "time_periodic":
             speed, acceleration, count = parameters.nominal_speed, 0.0, 0.0
@@ -311,7 +314,8 @@ class LearningController(Stage):
     def _read_memory(self) -> np.ndarray:
         parameters = self.parameters
         path = Path(parameters.memory_file)
-        return memory_file.load(path, parameters.cycle_points, parameters.points_per_revolution)
+        with about(self.name, "memory_file"):
+            return memory_file.load(path, parameters.cycle_points, parameters.points_per_revolution)
 
     def perform(self, action: str) -> None:
         """See `Stage`."""
@@ -390,6 +394,10 @@ class LearningController(Stage):
 
     def _end_cycle(self, cycle: Cycle) -> list[Sparse]:
         parameters = self.parameters
+        if cycle.number == 1:
+            self._first_rms = cycle.rms
+        if 0.0 < parameters.stop_ratio < cycle.rms / self._first_rms:
+            raise self._diverged(cycle.sample_index, cycle.rms, self._first_rms)
         found = self._identifier.fit() if parameters.identify else None
         if found is not None:
             self._model = found

@@ -2,28 +2,32 @@
 """Parameters of the learning controller, and the pieces of its law that they describe."""
 
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from lathe_rc.cell.parameters import ObedientParameters, RestartParameters, parameter
-from lathe_rc.cell.stages.retraction import BoundedParameters
+from lathe_rc.cell.parameters import about, parameter
+from lathe_rc.cell.stages.learner import LearnerParameters
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.lead import LeadLaw, Preview
+from lathe_rc.control.q_check import check
 from lathe_rc.control.q_filter import Exponential, Gaussian, LowPass, MovingAverage, QFilter
+from lathe_rc.extensions import Named, Registry, code_of_others
 
 _LEAD_LAWS = {law.name.lower(): law for law in LeadLaw}
-_Q_FILTERS: dict[str, Callable[[float, int], QFilter]] = {
-    "exponential": Exponential,
-    "gaussian": Gaussian,
-    "moving_average": MovingAverage,
-}
+#: by name, ours and those of other packages; each is made of its width in grid points and the grid points of a cycle
+Q_FILTERS: Registry[QFilter] = Registry(
+    "Q filter",
+    QFilter,
+    {"exponential": Exponential, "gaussian": Gaussian, "moving_average": MovingAverage},
+    "lathe_rc.q_filters",
+)
 _CORRECTIONS = {law.name.lower(): law for law in CorrectionLaw}
 
 
-class LearningControllerParameters(SpeedLawParameters, ObedientParameters, BoundedParameters, RestartParameters):
+class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
     """Law, lead, Q and correction of a channel, and the drive model that its stability margin is computed from.
 
     The speed deviations are what ``exact_preview`` knows in advance; no other law uses them.
@@ -51,7 +55,7 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters, Bound
     )
     lead_lag_lead: Annotated[float, Ge(0), Le(1)] = parameter(0.0, "correction lead_lag: T1", "s")
     lead_lag_lag: Annotated[float, Ge(0), Le(1)] = parameter(0.0, "correction lead_lag: T2", "s")
-    q_filter: Literal["exponential", "gaussian", "moving_average", "fir"] = parameter(
+    q_filter: Annotated[str, Named(Q_FILTERS, ("fir",))] = parameter(
         "exponential", "kind of the zero-phase Q; fir: flat up to q_pass"
     )
     q_time: Annotated[float, Ge(0), Le(1)] = parameter(
@@ -75,20 +79,10 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters, Bound
     cycle_revolutions: Annotated[int, Ge(1), Le(1024)] = parameter(
         1, "cycle angle θ; the whole part if it is as long", "rev"
     )
-    feedback_delay: Annotated[int, Ge(1), Le(2**24)] = parameter(
-        2048,
-        "samples from an error to when it is visible; at least a block, at most what the cycle leaves",
-        "sample",
-    )
     fall_back: Literal["frozen", "constant_lead"] = parameter(
         "frozen", "falling back: the memory frozen, or moreover read with the lead angle of the nominal speed"
     )
-    retract_position: float = parameter(0.0, "command when retracted", "m")
-    retract_time: Annotated[float, Gt(0)] = parameter(
-        1.0, "longest takeover: a command that is farther away begins where the way takes so long", "s"
-    )
     memory_file: str = parameter("", "file that the events save and load write and read", path=True)
-    allow_unstable: bool = parameter(default=False, doc="start although sup|Q - Z| is not below 1")
     publish_margin: bool = parameter(
         default=False, doc="publish the stability margin sample by sample as well, on coarse/margin, for a supervisor"
     )
@@ -115,31 +109,41 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters, Bound
         """Grid points in a cycle."""
         return self.points_per_revolution * self.cycle_revolutions
 
-    def make_q(self) -> QFilter:
-        """The Q filter.
+    def make_q(self, node: str) -> QFilter:
+        """The Q filter of a node.
 
         Raises:
-            InputError: it is wider than the memory can hold, or its bands are out of order.
+            InputError: it is wider than the memory can hold, its bands are out of order, or one of others is none.
         """
         per_point = self.points_per_revolution / (2 * np.pi)  # grid points per radian
         if self.q_filter == "fir":
             edge = 1.0 / (self.nominal_speed * per_point)
-            return LowPass(self.q_pass * edge, self.q_stop * edge, self.q_ripple, self.cycle_points)
-        return _Q_FILTERS[self.q_filter](self.q_time * self.nominal_speed * per_point, self.cycle_points)
+            with about(node, "q_pass", "q_stop", "q_ripple"):
+                return LowPass(self.q_pass * edge, self.q_stop * edge, self.q_ripple, self.cycle_points)
+        make = cast("Callable[[float, int], QFilter]", Q_FILTERS[self.q_filter])
+        width = self.q_time * self.nominal_speed * per_point
+        if self.q_filter in Q_FILTERS.own:
+            with about(node, "q_time"):
+                return make(width, self.cycle_points)
+        with about(node, "q_filter"), code_of_others(repr(self.q_filter)):
+            made = make(width, self.cycle_points)
+            check(made)
+            return made
 
-    def make_correction(self) -> Correction:
-        """The correction with its given model.
+    def make_correction(self, node: str) -> Correction:
+        """The correction of a node with its given model.
 
         Raises:
             InputError: a lead-lag term without a lag.
         """
-        return Correction(
-            _CORRECTIONS[self.correction],
-            self.model_natural_frequency,
-            self.model_damping,
-            self.lead_lag_lead,
-            self.lead_lag_lag,
-        )
+        with about(node, "lead_lag_lag"):
+            return Correction(
+                _CORRECTIONS[self.correction],
+                self.model_natural_frequency,
+                self.model_damping,
+                self.lead_lag_lead,
+                self.lead_lag_lag,
+            )
 
     @property
     def preview_time(self) -> float:
@@ -151,8 +155,8 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters, Bound
         """Lead angle that does not depend on the speed [rad]: of Wk2, which has constant parameters in the angle."""
         return (self.lead_time - self.preview_time) * self.nominal_speed
 
-    def make_preview(self) -> Preview:
-        """The lead law.
+    def make_preview(self, node: str) -> Preview:
+        """The lead law of a node.
 
         Raises:
             InputError: the deviations do not fit together.
@@ -160,7 +164,7 @@ class LearningControllerParameters(SpeedLawParameters, ObedientParameters, Bound
         return Preview(
             _LEAD_LAWS[self.lead_law],
             self.preview_time,
-            self.speed_law(),
+            self.speed_law(node),
             self.step,
             self.acceleration_window,
             self.constant_lead,

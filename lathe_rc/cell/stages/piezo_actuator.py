@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fine piezo tool drive."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc.analysis.learning import Response
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
 from lathe_rc.cell.stages.drive import Drive
@@ -27,6 +28,8 @@ from lathe_rc.plants.hysteresis import (
 from lathe_rc.plants.linear import Discretisation
 from lathe_rc.plants.piezo import FineTable, PiezoDrive, Stack, advance_fine
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
+
+_Named = Callable[..., AbstractContextManager[None]]
 
 
 class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
@@ -72,24 +75,28 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
     noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
     resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
 
-    def _hysteresis(self) -> PrandtlIshlinskii | BoucWen | None:
+    def _hysteresis(self, named: _Named) -> PrandtlIshlinskii | BoucWen | None:
         if self.hysteresis == "none":
             return None
         if self.hysteresis == "bouc_wen":
-            return BoucWen(self.bouc_wen_a, self.bouc_wen_beta, self.bouc_wen_gamma)
-        return self._plays(self.play_thresholds, self.play_weights, self.play_proportional)
+            with named("bouc_wen_a", "bouc_wen_beta", "bouc_wen_gamma"):
+                return BoucWen(self.bouc_wen_a, self.bouc_wen_beta, self.bouc_wen_gamma)
+        with named("play_thresholds", "play_weights", "play_proportional"):
+            return self._plays(self.play_thresholds, self.play_weights, self.play_proportional)
 
-    def _identified(self) -> PrandtlIshlinskii | BoucWen | None:
+    def _identified(self, named: _Named) -> PrandtlIshlinskii | BoucWen | None:
         """What the linearisation takes for the hysteresis."""
         if not self.identified_weights:
-            if self.identified_thresholds or self.identified_proportional:
-                raise InputError("identified_weights = []; allowed: one for each of identified_thresholds")
-            return self._hysteresis()
-        return self._plays(
-            self.identified_thresholds or self.play_thresholds,
-            self.identified_weights,
-            self.identified_proportional or self.play_proportional,
-        )
+            with named("identified_weights"):
+                if self.identified_thresholds or self.identified_proportional:
+                    raise InputError("empty; allowed: one for each of identified_thresholds")
+            return self._hysteresis(named)
+        with named("identified_thresholds", "identified_weights", "identified_proportional"):
+            return self._plays(
+                self.identified_thresholds or self.play_thresholds,
+                self.identified_weights,
+                self.identified_proportional or self.play_proportional,
+            )
 
     @staticmethod
     def _plays(thresholds: list[float], weights: list[float], proportional: float) -> PrandtlIshlinskii:
@@ -104,26 +111,32 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
         known = {"natural_frequency": self.natural_frequency, "damping": self.damping, "delay": 0.0}
         return {"fine/command": known}
 
-    def stack(self, node: str) -> Stack:
-        """Amplifier and ceramics of a node, at rest.
+    def stack(self, node: str, prefix: str = "") -> Stack:
+        """Amplifier and ceramics of a node, at rest; ``prefix`` begins the parameters where they are part of a table.
 
         Raises:
             InputError: a hysteresis without an inverse, or a lag far shorter than the step.
         """
-        try:
-            model = self._identified() if self.linearisation == "inverse" else None
+
+        def named(*names: str) -> AbstractContextManager[None]:
+            return about(node, *(prefix + name for name in names))
+
+        model, hysteresis = None, self._hysteresis(named)
+        if self.linearisation == "inverse":
+            model = self._identified(named)
+        with named("identified_scale"):
+            inverse = model.identified(self.identified_scale).inverse() if model else None
+        with named("amplifier_lag", "creep_shortest"):
             return Stack(
                 stroke=self.stroke,
                 amplifier_lag=self.amplifier_lag,
-                hysteresis=self._hysteresis(),
-                inverse=model.identified(self.identified_scale).inverse() if model else None,
+                hysteresis=hysteresis,
+                inverse=inverse,
                 creep_per_decade=self.creep_per_decade,
                 creep_times=self.creep_shortest * np.logspace(0, self.creep_decades - 1, self.creep_decades),
                 step=self.step,
                 method=self.discretisation,
             )
-        except InputError as error:
-            raise InputError(f"{node}: {error}") from None
 
 
 class Memory(NamedTuple):

@@ -7,13 +7,13 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, Le
 
 from lathe_rc import resources
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.native import Step
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.cell.stages.feed_drive import Axis
 from lathe_rc.cell.stages.obedience import OBEY, apply, listens, may_learn, piece
@@ -62,7 +62,9 @@ class PositionControllerParameters(ServoParameters):
     periodic_unit: Annotated[float, Gt(0)] = parameter(
         1.0, "periodic_hyperstable: displacement that the law takes for 1; it has numbers without a unit", "m"
     )
-    period: Annotated[float, Gt(0)] = parameter(PERIOD, "periodic_hyperstable: of set point and disturbance", "s")
+    period: Annotated[float, Gt(0), Le(3600)] = parameter(
+        PERIOD, "periodic_hyperstable: of set point and disturbance", "s"
+    )
     memory_filter: Annotated[float, Ge(0)] = parameter(
         0.1,
         "periodic_hyperstable: standard deviation of the zero-phase filter on the memory; 0: none, as published",
@@ -254,7 +256,8 @@ class PositionController(Stage):
         if parameters.measures == "edge":
             inputs.append(Input("cut", messages.CUT, ("deflection",), delay))
         if parameters.predistortion_file:
-            self._path = Predistortion.load(resources.find(Path(parameters.predistortion_file)))
+            with about(name, "predistortion_file"):
+                self._path = Predistortion.load(resources.find(Path(parameters.predistortion_file)))
             inputs.append(Input("longitudinal/state", messages.STATE, ("measured_position",), delay))
         self._held, self._log, self._logged = np.zeros(2), np.empty((_PERIODS, 8)), np.zeros(1, np.int64)
         self._obedience = parameters.obeys(name)
@@ -266,29 +269,35 @@ class PositionController(Stage):
         parameters = self.parameters
         if parameters.law == "pid":
             return parameters.pid(
-                parameters.proportional, parameters.integral, parameters.derivative, parameters.derivative_filter
+                self.name,
+                parameters.proportional,
+                parameters.integral,
+                parameters.derivative,
+                parameters.derivative_filter,
             )
         if parameters.law == "sampled_link":
             known = parameters.link == "ripple_free" and parameters.link_knows_delay
-            return SampledLink(
-                parameters.link,
-                gain=parameters.link_gain,
-                lag=parameters.link_lag,
-                step=parameters.step,
-                divisor=parameters.divisor,
-                delay=parameters.feedback_delay * parameters.step if known else 0.0,
+            with about(self.name, "link_gain", "link_lag", "divisor", "feedback_delay"):
+                return SampledLink(
+                    parameters.link,
+                    gain=parameters.link_gain,
+                    lag=parameters.link_lag,
+                    step=parameters.step,
+                    divisor=parameters.divisor,
+                    delay=parameters.feedback_delay * parameters.step if known else 0.0,
+                    limit=parameters.command_limit,
+                )
+        with about(self.name, "period", "memory_filter", "divisor"):
+            return PeriodicController(
+                periodic.PRESETS[parameters.periodic_gains],
+                period=parameters.period,
                 limit=parameters.command_limit,
+                step_s=parameters.step * parameters.divisor,
+                memory_filter=parameters.memory_filter,
+                anti_windup=parameters.anti_windup,
+                measurement_step=parameters.adc_step / parameters.periodic_unit,
+                command_step=parameters.dac_step,
             )
-        return PeriodicController(
-            periodic.PRESETS[parameters.periodic_gains],
-            period=parameters.period,
-            limit=parameters.command_limit,
-            step_s=parameters.step * parameters.divisor,
-            memory_filter=parameters.memory_filter,
-            anti_windup=parameters.anti_windup,
-            measurement_step=parameters.adc_step / parameters.periodic_unit,
-            command_step=parameters.dac_step,
-        )
 
     @property
     def step(self) -> Step:  # type: ignore[override]

@@ -11,7 +11,7 @@ from pydantic import create_model
 from lathe_rc.analysis.learning import Response
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, limited
 from lathe_rc.cell.stages.drive import Drive, Limits
@@ -21,7 +21,6 @@ from lathe_rc.cell.stages.retraction import OwnRetraction, followed
 from lathe_rc.cell.stages.set_point import SetPoint, sum_up
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import LimiterTable
-from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.linear import Discretisation
 from lathe_rc.plants.series import SeriesDrive, SeriesTable, advance
@@ -30,7 +29,7 @@ from lathe_rc.signals.noise import Sensor, SensorTable, measure
 T = TypeVar("T", bound=NodeParameters)
 
 _COARSE = "coarse"  # the displacement that the drive knows itself
-
+_FINE = "fine_"  # begins the parameters of the fine drive
 
 _SHARED = (*NodeParameters.model_fields, "discretisation")  # one value for both drives
 
@@ -58,7 +57,7 @@ class SeriesParameters(NodeParameters):
     @property
     def fine(self) -> PiezoActuatorParameters:
         """The table of the fine drive."""
-        return self._half("fine_", PiezoActuatorParameters)
+        return self._half(_FINE, PiezoActuatorParameters)
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
         """See `NodeParameters`; each drive by itself, without what one does to the other."""
@@ -77,7 +76,7 @@ SeriesDriveParameters = create_model(
     __module__=__name__,
     **{
         **_prefixed("coarse_", ElectrodynamicActuatorParameters),
-        **_prefixed("fine_", PiezoActuatorParameters),
+        **_prefixed(_FINE, PiezoActuatorParameters),
         "coarse_moving_mass": (Annotated[float, Gt(0)], parameter(1.2, "carriage and coil, without the tool", "kg")),
     },
 )
@@ -129,8 +128,8 @@ class SeriesDriveStage(Drive):
         super().__init__(name, parameters)
         self.parameters = parameters
         coarse, fine = parameters.coarse, parameters.fine
-        stack = fine.stack(name)
-        try:
+        stack = fine.stack(name, _FINE)
+        with about(name, "mass_ratio", "sample_rate"):
             self.drive = SeriesDrive(
                 stack,
                 carriage_frequency=coarse.natural_frequency,
@@ -148,12 +147,10 @@ class SeriesDriveStage(Drive):
                 step=parameters.step,
                 method=parameters.discretisation,
             )
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from None
         self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
         self._retraction = OwnRetraction(coarse, coarse.stroke)
         self._limited = LimitedCommand(name, coarse, "coarse"), LimitedCommand(name, fine, "fine")
-        self._set_point = SetPoint(name, fine, inside=(_COARSE,))
+        self._set_point = SetPoint(name, fine, inside=(_COARSE,), prefix=_FINE)
         # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
         self._coarse_noise = Sensor(coarse.noise_rms, 0.0, parameters.seed, f"{name}/coarse")
         self._fine_sensor = Sensor(fine.noise_rms, fine.resolution, parameters.seed, f"{name}/fine")

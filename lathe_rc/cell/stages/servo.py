@@ -6,7 +6,7 @@ from typing import Annotated, Literal, NamedTuple
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc.cell.messages import Samples
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE
 from lathe_rc.cell.stages.obedience import (
     NOBODY,
@@ -62,23 +62,24 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
         speed, limit = self.commands == "speed", self.command_limit
         return self.obedience(name, speed=speed, limit=limit, settled=self.feedback_delay)
 
-    def pid(self, proportional: float, integral: float, derivative: float, filter_: float) -> Pid:
-        """The PID of a table.
+    def pid(self, node: str, proportional: float, integral: float, derivative: float, filter_: float) -> Pid:
+        """The PID of a node.
 
         Raises:
             InputError: see `lathe_rc.control.pid`.
         """
-        return Pid(
-            PidGains(proportional, integral, derivative, filter_),
-            low=-self.command_limit,
-            high=self.command_limit,
-            step=self.step,
-            adc=self.adc_step,
-            dac=self.dac_step,
-            ramp=self.set_point_ramp,
-            smoothing=self.set_point_smoothing,
-            divisor=self.divisor,
-        )
+        with about(node, "proportional", "integral", "derivative", "derivative_filter"):
+            return Pid(
+                PidGains(proportional, integral, derivative, filter_),
+                low=-self.command_limit,
+                high=self.command_limit,
+                step=self.step,
+                adc=self.adc_step,
+                dac=self.dac_step,
+                ramp=self.set_point_ramp,
+                smoothing=self.set_point_smoothing,
+                divisor=self.divisor,
+            )
 
 
 class Listener(NamedTuple):

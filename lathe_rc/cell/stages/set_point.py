@@ -34,6 +34,7 @@ class SetPoint:
         node: that it is for.
         table: its parameters.
         inside: compensated displacements that the drive itself knows and no topic has to bring.
+        prefix: of the parameters, where the table is part of another one.
 
     Attributes:
         inputs: what it reads.
@@ -43,13 +44,12 @@ class SetPoint:
         InputError: nothing is chosen, or something twice.
     """
 
-    def __init__(self, node: str, table: SetPointParameters, inside: Sequence[str] = ()) -> None:
+    def __init__(self, node: str, table: SetPointParameters, inside: Sequence[str] = (), prefix: str = "") -> None:
         if len(set(table.compensates)) < len(table.compensates):
-            raise InputError(f"{node}: compensates {', '.join(table.compensates)}; allowed: each displacement once")
+            raise InputError(f"{node}.{prefix}compensates = {table.compensates}; allowed: each displacement once")
         if not (table.use_command or table.use_reference or table.compensates):
-            raise InputError(
-                f"{node} has no set point; choose the command, the reference, or a displacement that it compensates"
-            )
+            names = ", ".join(prefix + name for name in ("use_command", "use_reference", "compensates"))
+            raise InputError(f"{node}.{names}: there is no set point; allowed: one of them or more")
         inputs = []
         if table.use_command:
             inputs.append(Input("fine/command", messages.COMMAND, ("position",)))

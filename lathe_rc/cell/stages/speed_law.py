@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The spindle's speed law as parameters: of the spindle that follows it, and of whoever knows it in advance."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -8,9 +9,14 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc import resources
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.errors import InputError
+from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.signals import speed, tachogram
+from lathe_rc.signals.deviation_law import DeviationLaw, tabulated
+
+#: by name, those of other packages: ours are the parameters below
+SPEED_LAWS: Registry[DeviationLaw] = Registry("speed law", DeviationLaw, {}, "lathe_rc.speed_laws")
 
 
 class SpeedLawParameters(NodeParameters):
@@ -33,38 +39,58 @@ class SpeedLawParameters(NodeParameters):
     random_low: Annotated[float, Gt(0)] = parameter(1.0, "lower end of its band", "rad/s")
     random_high: Annotated[float, Gt(0)] = parameter(60.0, "upper end of its band", "rad/s")
     random_lines: Annotated[int, Ge(1), Le(1024)] = parameter(16, "spectral lines that it is made of")
+    deviation_law: Annotated[str, Named(SPEED_LAWS, ("",))] = parameter(
+        "", "a law of others in place of the tachogram, which is made of it; empty: none"
+    )
+    deviation_values: list[float] = parameter([], "numbers that it is made of, in the order of its constructor")
+    deviation_law_step: Annotated[float, Gt(0)] = parameter(1e-3, "step of its tachogram", "s")
+    deviation_law_end: Annotated[float, Gt(0)] = parameter(
+        60.0, "end of its tachogram, not before the end of the run; an endless one goes on with the last deviation", "s"
+    )
 
-    def speed_law(self) -> speed.SpeedLaw:
-        """The sum of all deviations.
+    def speed_law(self, node: str) -> speed.SpeedLaw:
+        """The sum of all deviations, for a node.
 
         Raises:
-            InputError: lists of different lengths, a tachogram out of order, twice, or in a file that cannot be used.
+            InputError: lists of different lengths, a tachogram or a band out of order, a file or law of others that
+                cannot be used, or more than one tachogram.
         """
         nominal = self.nominal_speed
         phase = self.deviation_phase or [0.0] * len(self.deviation_amplitude)
-        return (
-            speed.harmonic(
+        with about(node, "deviation_amplitude", "deviation_frequency", "deviation_phase"):
+            harmonic = speed.harmonic(
                 nominal,
                 np.array(self.deviation_amplitude),
                 np.array(self.deviation_frequency),
                 np.array(phase),
                 self.deviation_start,
             )
-            + self._tachogram()
-            + speed.band_limited_random(
+        with about(node, "random_low", "random_high"):
+            random = speed.band_limited_random(
                 nominal, self.random_rms, self.random_low, self.random_high, self.random_lines, self.seed
             )
-        )
+        return harmonic + self._tachogram(node) + random
 
-    def _tachogram(self) -> speed.SpeedLaw:
-        if not self.tachogram_file:
-            return speed.tachogram(
-                self.nominal_speed, np.array(self.tachogram_time), np.array(self.tachogram_deviation)
-            )
-        if self.tachogram_time or self.tachogram_deviation:
+    def _tachogram(self, node: str) -> speed.SpeedLaw:
+        """The one of the lists, of the file, or of a law of others."""
+        lists = bool(self.tachogram_time or self.tachogram_deviation)
+        given = {"deviation_law": self.deviation_law, "tachogram_file": self.tachogram_file, "tachogram_time": lists}
+        named = [name for name, value in given.items() if value]
+        if len(named) > 1:
             raise InputError(
-                f"tachogram_file = {self.tachogram_file} beside tachogram_time and tachogram_deviation; allowed: the "
-                "file or both lists"
+                f"{node}.{named[0]} = {given[named[0]]} beside {named[1]}; allowed: one of them, since each gives the "
+                "tachogram"
             )
-        time, rpm = tachogram.read(resources.find(Path(self.tachogram_file)))
-        return speed.tachogram(self.nominal_speed, time, rpm / self.nominal_rpm - 1.0)
+        if self.deviation_law:
+            with about(node, "deviation_law"), code_of_others(repr(self.deviation_law)):
+                make: Callable[..., DeviationLaw] = SPEED_LAWS[self.deviation_law]
+                return tabulated(
+                    self.nominal_speed, make(*self.deviation_values), self.deviation_law_step, self.deviation_law_end
+                )
+        time, deviation = np.array(self.tachogram_time), np.array(self.tachogram_deviation)
+        if self.tachogram_file:
+            with about(node, "tachogram_file"):
+                time, rpm = tachogram.read(resources.find(Path(self.tachogram_file)))
+                deviation = rpm / self.nominal_rpm - 1.0
+        with about(node, "tachogram_time", "tachogram_deviation"):
+            return speed.tachogram(self.nominal_speed, time, deviation)

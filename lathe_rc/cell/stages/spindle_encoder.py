@@ -7,9 +7,11 @@ import numpy as np
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.native import Step
+from lathe_rc.cell.parameters import about
 from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
+from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.signals.encoder import Encoder, EncoderTable, encode
 from lathe_rc.signals.speed import SpeedLaw
@@ -43,15 +45,23 @@ class SpindleEncoder(TimeMaster):
 
     def __init__(self, name: str, parameters: SpindleEncoderParameters) -> None:
         super().__init__(name, parameters)
-        self.law = parameters.speed_law()
-        self.samples = (
-            self.law.samples_until(2 * np.pi * parameters.revolutions, parameters.step)
-            if parameters.revolutions
-            else None
-        )
+        self.law = parameters.speed_law(name)
+        if parameters.revolutions:
+            with about(name, f"revolutions = {parameters.revolutions:g}"):
+                self.samples = self.law.samples_until(2 * np.pi * parameters.revolutions, parameters.step)
+        self._check_end()
         self.place_triggers()
         self._encoder = Encoder(self.law, parameters.step, parameters.counts_per_revolution, parameters.speed_window)
         self.declare(outputs=[Output("encoder", messages.ENCODER, Joint("angle", "speed"))])
+
+    def _check_end(self) -> None:
+        """A law of others is known up to the end of its tachogram."""
+        parameters, seconds = self.parameters, (self.samples or 0) * self.shared.step
+        if parameters.deviation_law and seconds > parameters.deviation_law_end:
+            raise InputError(
+                f"{self.name}.deviation_law_end = {parameters.deviation_law_end:g} s: the run takes {seconds:.5g} s; "
+                "allowed: not before its end"
+            )
 
     def sample_at(self, angle: float) -> int:
         """See `TimeMaster`."""

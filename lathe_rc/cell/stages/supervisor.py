@@ -2,6 +2,8 @@
 """Watches the cell and says what is to be done; who listens reads it as feedback with a declared delay."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -11,11 +13,24 @@ from annotated_types import Ge, Le
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
+from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage, cut
 from lathe_rc.errors import InputError
+from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel
 from lathe_rc.safety import state_machine
-from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Lookout, Monitor, Rate, Threshold
+from lathe_rc.safety.monitors import (
+    Alarm,
+    Below,
+    Clearance,
+    Growth,
+    IndexPulses,
+    Lookout,
+    Monitor,
+    Plain,
+    PlainMonitor,
+    Rate,
+    Threshold,
+)
 from lathe_rc.safety.rules import Watch, clear, walk
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
 
@@ -24,6 +39,17 @@ Asked = Literal["warn", "freeze", "fall_back", "hold", "retract", "stop"]
 MEMBERS_LOST = "members_lost"  #: stands for a monitor where the host says that members of the cell are lost
 RESET_REFUSED = "reset refused"  #: the same: while the tool is on its way out, or after a stop
 _SENSOR, _COMMAND, _MARGIN = ("measured_position", "effort"), ("position",), ("stability_margin",)
+_WATCHED = {
+    "encoder": messages.ENCODER,
+    "tool": messages.TOOL,
+    "cut": messages.CUT,
+    "command": messages.COMMAND,
+    "state": messages.STATE,
+    "margin": messages.MARGIN,
+}  # types of topics by the last part of their names
+
+#: by name, those of other packages: ours have thresholds of their own
+MONITORS: Registry[PlainMonitor] = Registry("monitor", PlainMonitor, {}, "lathe_rc.monitors")
 
 
 class SupervisorParameters(NodeParameters):
@@ -88,6 +114,15 @@ class SupervisorParameters(NodeParameters):
         [], "slides: measured position to each side; one for each, or none", "m"
     )
     slide_reaction: Asked = parameter("hold", "what is asked for then")
+    monitors: list[Annotated[str, Named(MONITORS)]] = parameter([], "monitors of others")
+    monitor_signals: list[str] = parameter(
+        [], "what each of them watches, as TOPIC.FIELD, like tool.measured_error or coarse/state.effort"
+    )
+    monitor_others: list[str] = parameter(
+        [], "a second signal for each, an empty text where there is none; empty: for none of them"
+    )
+    monitor_limits: list[float] = parameter([], "threshold of each, in the unit of what it finds")
+    monitor_reactions: list[Asked] = parameter([], "what each of them asks for")
 
     clear_position: Annotated[float, Ge(0)] = parameter(
         0.25e-3, "the tool is out of the part where the first drive's measured position is beyond this", "m"
@@ -135,6 +170,10 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     return n, DONE
 
 
+def _real(port: Input, field: str) -> bool:
+    return messages.sample_fields(port.type)[field] == np.float64
+
+
 class Supervisor(Stage):
     """See `lathe_rc.safety`.
 
@@ -152,7 +191,7 @@ class Supervisor(Stage):
         super().__init__(name, parameters)
         self.parameters = parameters
         self._inputs = [Input("encoder", messages.ENCODER, ("angle", "speed", "index_pulse"))]
-        self.monitors: list[Monitor] = []
+        self.monitors: list[Monitor | Plain] = []
         self._state = np.array([State.NOMINAL, Reaction.NONE, 0], np.int64)
         self._told: list[str] = []  # what others than monitors have done to the state since the last sample
         self._out = self._reads(f"{parameters.drives[0]}/state", messages.STATE, _SENSOR) if parameters.drives else None
@@ -162,9 +201,11 @@ class Supervisor(Stage):
         self._watch_drives()
         self._watch_margins()
         self._watch_cut()
-        fields = [(place, name) for place, port in enumerate(self._inputs) for name in port.fields]
-        numbers = {field: number for number, field in enumerate(f for f in fields if f[1] != "index_pulse")}
-        self._lookout = Lookout(self.monitors, numbers)
+        self._watch_for_others()
+        fields = [(place, name) for place, port in enumerate(self._inputs) for name in port.fields if _real(port, name)]
+        numbers = {field: number for number, field in enumerate(fields)}
+        self._lookout = Lookout([each for each in self.monitors if isinstance(each, Monitor)], numbers)
+        self._plain = [each for each in self.monitors if isinstance(each, Plain)]
         self._out_number = -1 if self._out is None else numbers[self._out, "measured_position"]
         self.declare(inputs=self._inputs, outputs=[Output("safety", messages.SAFETY)])
         self.sparse_topics["safety/status"] = messages.SAFETY_STATUS
@@ -189,8 +230,9 @@ class Supervisor(Stage):
             raise InputError(f"{self.name}.{name} = {limits}; allowed: one for each of {', '.join(of) or 'none'}")
         return [(subject, limit) for subject, limit in zip(of, limits or [0.0] * len(of), strict=True) if limit]
 
-    def _reaction(self, name: str) -> Reaction:
-        asked = Reaction[getattr(self.parameters, name).upper()]
+    def _reaction(self, name: str, text: str = "") -> Reaction:
+        """What a parameter asks for, or one of its texts."""
+        asked = Reaction[(text or getattr(self.parameters, name)).upper()]
         if asked >= Reaction.RETRACT and not self.parameters.drives:
             raise InputError(
                 f"{self.name}.{name} = {asked.name.lower()}, but no drive is named that takes the tool out; allowed: "
@@ -300,6 +342,38 @@ class Supervisor(Stage):
                 )
             )
 
+    def _watch_for_others(self) -> None:
+        table, own = self.parameters, ("monitor_signals", "monitor_limits", "monitor_reactions")
+        for name in (*own, "monitor_others") if table.monitor_others else own:
+            if len(getattr(table, name)) != len(table.monitors):
+                named = ", ".join(table.monitors) or "none"
+                raise InputError(f"{self.name}.{name} = {getattr(table, name)}; allowed: one for each of {named}")
+        others = table.monitor_others or [""] * len(table.monitors)
+        for name, signal, other, limit, asked in zip(
+            table.monitors, table.monitor_signals, others, table.monitor_limits, table.monitor_reactions, strict=True
+        ):
+            reaction = self._reaction("monitor_reactions", asked)
+            places = [self._field("monitor_signals", signal)]
+            places += [self._field("monitor_others", other)] if other else []
+            subject, make = f"{signal}, {other}" if other else signal, partial(MONITORS[name], limit, table.step)
+            with code_of_others(f"{self.name}.monitors"):
+                self.monitors.append(Plain(name, subject, limit, reaction, signals=places, make=make))
+
+    def _field(self, name: str, text: str) -> tuple[int, str]:
+        """Place of an input and its field, for a parameter with TOPIC.FIELD; the input is added or widened."""
+        topic, _, field = text.rpartition(".")
+        msgtype = _WATCHED.get(topic.rpartition("/")[2], "")
+        known = messages.sample_fields(msgtype) if msgtype else {}
+        if field not in known:
+            fields = ", ".join(f"{topic}.{each}" for each in known)
+            allowed = fields or f"TOPIC.FIELD with a TOPIC that ends in {', '.join(_WATCHED)}"
+            raise InputError(f"{self.name}.{name}: {text!r}; allowed: {allowed}")
+        place = self._reads(topic, msgtype, (field,))
+        port = self._inputs[place]
+        if field not in port.fields:
+            self._inputs[place] = replace(port, fields=(*port.fields, field))
+        return place, field
+
     # ---- samples ------------------------------------------------------------------------------------
 
     def perform(self, action: str) -> None:
@@ -311,6 +385,8 @@ class Supervisor(Stage):
             self._state[:2] = to, Reaction.NONE
             self._told.append(RESET)
             self._lookout.reset()
+            for monitor in self._plain:
+                monitor.reset()
         else:
             self._told.append(RESET_REFUSED)
 
@@ -341,7 +417,7 @@ class Supervisor(Stage):
     @property
     def memory(self) -> Memory:
         """See `Stage`."""
-        self._state[_TOLD] = bool(self._told)
+        self._state[_TOLD] = bool(self._told or self._plain)
         return Memory(self._lookout.watch, self._clearance.memory, self._out_number, self._state)
 
     def serve(
@@ -352,13 +428,23 @@ class Supervisor(Stage):
         sparse = [self._status(first, what, "", 0.0, 0.0) for what in self._told]
         self._told.clear()
         place = 0
-        for monitor, alarm in self._lookout.found():
+        for monitor, alarm in self._found(first, reached, inputs):
             self._fill(safety, inputs, first, place, alarm.place, sparse)
             place = alarm.place
             self._ask_for(monitor.reaction)
             sparse.append(self._status(first + place, monitor.name, monitor.subject, alarm.value, monitor.limit))
         self._fill(safety, inputs, first, place, reached, sparse)
         return sparse
+
+    def _found(self, first: int, reached: int, inputs: Sequence[Signals]) -> Sequence[tuple[Monitor | Plain, Alarm]]:
+        """Alarms in the samples up to ``reached``, by sample."""
+        found: list[tuple[Monitor | Plain, Alarm]] = [*self._lookout.found()]
+        piece = cut(inputs, 0, reached) if self._plain else ()
+        for monitor in self._plain:
+            alarm = monitor.find(first, piece)
+            if alarm is not None:
+                found.append((monitor, alarm))
+        return sorted(found, key=lambda one: one[1].place)
 
     def _fill(
         self, safety: Signals, inputs: Sequence[Signals], first: int, start: int, stop: int, sparse: list[Sparse]

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 from annotated_types import Ge, Le
 
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import Stage, Trigger
 from lathe_rc.signals.speed import SpeedLaw
 
@@ -92,4 +92,6 @@ class TimeMaster(Stage):
     def _by_sample(self, trigger: Trigger) -> Trigger:
         if trigger.kind != "revolution":
             return trigger
-        return replace(trigger, kind="sample", value=float(self.sample_at(2.0 * np.pi * trigger.value)))
+        with about(self.name, f"{trigger.parameter} = {trigger.text!r}"):
+            sample = self.sample_at(2.0 * np.pi * trigger.value)
+        return replace(trigger, kind="sample", value=float(sample))

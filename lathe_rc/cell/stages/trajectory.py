@@ -10,7 +10,7 @@ from annotated_types import Ge
 
 from lathe_rc import resources
 from lathe_rc.cell.messages import MAX_BLOCK, Samples
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.signals.example_002 import fill_reference
@@ -73,15 +73,17 @@ class Trajectory:
             if not parameters.trajectory_file:
                 raise InputError(f"{node}.trajectory_file is empty; name the CSV file of the trajectory")
             path = resources.find(Path(parameters.trajectory_file))
-            header, rows = read_table(path, [name.split(",") for name in _COLUMNS], "trajectory")
+            with about(node, "trajectory_file"):
+                header, rows = read_table(path, [name.split(",") for name in _COLUMNS], "trajectory")
             times, values = rows[:, 0].tolist(), (rows[:, 1] * _COLUMNS[",".join(header)]).tolist()
         if len(values) != len(times):
             raise InputError(
-                f"{node}: {len(values)} values of set_point and {len(times)} of set_point_time; give as many of each"
+                f"{node}.set_point, set_point_time: {len(values)} values and {len(times)} times; give as many of each"
             )
         self._times, self._values = np.array(times), np.array(values)
         if not self._times.size or np.any(np.diff(self._times) <= 0.0):
-            raise InputError(f"{node}: set point at {times[:5]} s; allowed: one time or more, each later than the last")
+            where = "trajectory_file" if self._kind == "csv" else "set_point_time"
+            raise InputError(f"{node}.{where}: {times[:5]} s; allowed: one time or more, each later than the last")
 
         self.course = Course(np.empty(MAX_BLOCK), np.zeros(2, np.int64))
 

@@ -9,7 +9,7 @@ from annotated_types import Ge, Gt, Le
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
@@ -67,19 +67,22 @@ class Vibration(Stage):
         # Two vibrations of a cell differ by their names; the 1 keeps each apart from its own sensor.
         random = np.random.default_rng(np.random.SeedSequence([parameters.seed, zlib.crc32(name.encode()), 1]))
         phase = parameters.line_phase or [0.0] * len(parameters.line_amplitude)
-        given = vibration.harmonic(
-            np.array(parameters.line_amplitude), np.array(parameters.line_frequency), np.array(phase)
-        )
-        drawn = vibration.band_limited_random(
-            parameters.random_rms, parameters.random_low, parameters.random_high, parameters.random_lines, random
-        )
+        with about(name, "line_amplitude", "line_frequency", "line_phase"):
+            given = vibration.harmonic(
+                np.array(parameters.line_amplitude), np.array(parameters.line_frequency), np.array(phase)
+            )
+        with about(name, "random_low", "random_high"):
+            drawn = vibration.band_limited_random(
+                parameters.random_rms, parameters.random_low, parameters.random_high, parameters.random_lines, random
+            )
         self.lines = np.concatenate((given, drawn), axis=1)
         nyquist = np.pi / parameters.step
-        if self.lines[1].max(initial=0.0) >= nyquist:
-            raise InputError(
-                f"{name}: vibration at {self.lines[1].max():g} rad/s; allowed: below {nyquist:g} rad/s, half the "
-                "sample rate"
-            )
+        for whose, lines in (("line_frequency", given), ("random_high", drawn)):
+            if lines[1].max(initial=0.0) >= nyquist:
+                raise InputError(
+                    f"{name}.{whose}: vibration at {lines[1].max():g} rad/s; allowed: below {nyquist:g} rad/s, half "
+                    "the sample rate"
+                )
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         self.declare(
             # The angle itself is not used: the spindle's blocks say which samples are due.

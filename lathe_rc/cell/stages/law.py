@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A control law of one's own: a class with its formula, sample by sample, and nothing of ports, blocks and events.
+
+class Memory(NamedTuple):
+    gain: float
+    sum: Array
+
+@kernel                                     # or nothing: then it is plain Python, slower, with the same bits
+def sample(memory: Memory, now: Now) -> float:
+    if now.learning:
+        memory.sum[0] += memory.gain * now.error
+    return memory.sum[0]
+
+class Integral(Law):
+    Parameters = IntegralParameters         # its table, derived from LawParameters
+    sample = staticmethod(sample)
+
+    def start(self) -> Memory:
+        return Memory(self.parameters.gain, np.zeros(1))
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from annotated_types import Ge
+
+from lathe_rc.analysis.learning import Array, Complex, Response, supremum
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, step_of
+from lathe_rc.cell.stages.learner import Learner, LearnerParameters
+from lathe_rc.cell.stages.obedience import (
+    NOBODY,
+    OBEY,
+    OUT_OF_REACH,
+    Obedience,
+    ObedienceTable,
+    apply,
+    listens,
+    may_learn,
+    piece,
+)
+from lathe_rc.jit import inlined, is_compiled
+from lathe_rc.safety.state_machine import Reaction
+
+_TURN = 2.0 * np.pi
+_DIVERGED = 1  # why a step stops
+
+
+class LawParameters(LearnerParameters):
+    """What every law has."""
+
+    stop_ratio: Annotated[float, Ge(0)] = parameter(
+        2.0,
+        "a revolution whose RMS error is more than so many times that of the form, or of the first revolution, ends "
+        "the run; 0: none does",
+    )
+
+
+class Now(NamedTuple):
+    """What a law knows at a sample.
+
+    Attributes:
+        sample: index of the sample.
+        time: since sample 0 [s].
+        angle: measured spindle angle [rad], unwrapped.
+        speed: measured spindle speed [rad/s].
+        error: measured form error [m] of ``feedback_delay`` samples ago; 0 before there is one.
+        error_angle: measured spindle angle of that sample [rad].
+        learning: False where the supervisor or an event forbids to learn.
+    """
+
+    sample: int
+    time: float
+    angle: float
+    speed: float
+    error: float
+    error_angle: float
+    learning: bool
+
+
+class GuardTable(NamedTuple):
+    """Compares a revolution's error with the form; see `LawParameters`.
+
+    Attributes:
+        limit: square of the ratio; 0: nothing is compared.
+        sums: squares of error and form in the revolution at hand, of the error in the one that ended last and in the
+            first one, and what the latter two are compared with [m²].
+        whole: samples in the revolution at hand, its number.
+    """
+
+    limit: float
+    sums: Samples
+    whole: npt.NDArray[np.int64]
+
+
+_ERROR, _FORM, _ENDED, _FIRST, _ALLOWED = range(5)
+
+
+@inlined
+def _grows(guard: GuardTable, angle: float, error: float, form: float) -> bool:
+    """Whether a revolution ends with this sample whose error is too large."""
+    turn = int(np.floor(angle / _TURN))
+    found = False
+    if turn > guard.whole[1] and guard.whole[0] > 0:
+        samples, number = guard.whole[0], guard.whole[1]
+        guard.sums[_ENDED] = guard.sums[_ERROR] / samples
+        if number == 0:
+            guard.sums[_FIRST] = guard.sums[_ENDED]
+        guard.sums[_ALLOWED] = guard.sums[_FORM] / samples
+        if guard.sums[_ALLOWED] == 0.0:
+            guard.sums[_ALLOWED] = guard.sums[_FIRST]
+        found = guard.limit > 0.0 and guard.sums[_ENDED] > guard.limit * guard.sums[_ALLOWED]
+        guard.sums[_ERROR] = guard.sums[_FORM] = 0.0
+        guard.whole[0] = 0
+        guard.whole[1] = turn
+    guard.sums[_ERROR] += error * error
+    guard.sums[_FORM] += form * form
+    guard.whole[0] += 1
+    return found
+
+
+class LawMemory(NamedTuple):
+    """What the step of a law works on.
+
+    Attributes:
+        law: its own.
+        guard: against a loop that diverges.
+        obedience: to the supervisor, if it ``listens``.
+        delay: of the error [sample].
+        period: sampling step [s].
+        learns: whether events let it learn, shape (1,).
+    """
+
+    law: Any
+    guard: GuardTable
+    obedience: ObedienceTable
+    delay: int
+    period: float
+    listens: bool
+    learns: npt.NDArray[np.int64]
+
+
+def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
+    """The step of a law, for `step_of`."""
+
+    def step(memory: LawMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
+        """See `lathe_rc.cell.stage`."""
+        angle, speed, error_angle, error, form = inputs
+        command = outputs[0]
+        while start < command.size:
+            stop, learning = command.size, memory.learns[0] != 0
+            if memory.listens:
+                stop = piece(memory.obedience, start, flags[0])
+                if stop == start:
+                    return start, OBEY
+                learning = learning and may_learn(memory.obedience)
+            for k in range(start, stop):
+                n = first + k
+                if n >= memory.delay and _grows(memory.guard, error_angle[k], error[k], form[k]):
+                    return k, _DIVERGED
+                now = Now(n, n * memory.period, angle[k], speed[k], error[k], error_angle[k], learning)
+                command[k] = sample(memory.law, now)
+            if memory.listens:
+                apply(memory.obedience, command[start:stop])
+            start = stop
+        return command.size, DONE
+
+    return step
+
+
+class Law(Learner):
+    """Base of control laws: commands a drive from the error that is visible.
+
+    A law of one's own has a table ``Parameters``, the memory that it starts with (`start`), and its formula
+    ``sample(memory, now)``, which gives the command [m]: a `kernel`, for which the memory is a NamedTuple of arrays of
+    float64, int64 or uint8, numbers, and NamedTuples of those; or a function in plain Python, for any memory. It may
+    change arrays of the memory and nothing else, and depends on the memory and on `Now` alone.
+
+    Attributes:
+        parameters: its table.
+        law: its memory.
+    """
+
+    Parameters = LawParameters
+    actions = ("freeze", "learn", "clear")
+    announces = (OUT_OF_REACH,)
+    sample: ClassVar[Callable[[Any, Now], float]]
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "sample" in vars(cls):
+            cls.step = staticmethod(step_of(cls, _loop(cls.sample), compiled=is_compiled(cls.sample)))
+
+    def __init__(self, name: str, parameters: LawParameters) -> None:
+        super().__init__(name, parameters)
+        self.parameters = parameters
+        self.law = self.start()
+        delay = parameters.feedback_delay
+        self._guard = GuardTable(parameters.stop_ratio**2, np.zeros(5), np.zeros(2, np.int64))
+        self._learns = np.ones(1, np.int64)
+        self._obedience: Obedience | None = self._make_obedience(delay)
+        self.declare(
+            inputs=[
+                Input("encoder", messages.ENCODER, ("angle", "speed")),
+                Input("encoder", messages.ENCODER, ("angle",), delay),
+                Input("tool", messages.TOOL, ("measured_error", "reference"), delay),
+                *listens(parameters),
+            ],
+            outputs=[Output("coarse/command", messages.COMMAND)],
+        )
+
+    @abstractmethod
+    def start(self) -> Any:
+        """The memory before sample 0, and after the event ``clear``."""
+
+    def contraction(self, drive: Response, waves: Array, speed: float) -> Complex | None:
+        """The factor by which a revolution changes the error at ``waves`` per revolution, shape (n,).
+
+        It is what the check before a start goes by: its magnitude must be below 1. A law that does not tell it is said
+        to be unchecked.
+
+        Args:
+            drive: response of the drive's position to its command at frequencies [rad/s].
+            waves: shape (n,).
+            speed: of the spindle [rad/s].
+        """
+        return None
+
+    def highest_waves(self, speed: float) -> float:
+        """Waves per revolution up to which `contraction` is looked at, at ``speed`` [rad/s]: the Nyquist limit."""
+        return float(np.pi / (self.parameters.step * speed))
+
+    def worst(self, drive: Response, speed: float) -> tuple[float, float] | None:
+        """See `Learner`."""
+        if self.contraction(drive, np.zeros(1), speed) is None:
+            return None
+        return supremum(lambda waves: self._told(drive, waves, speed), self.highest_waves(speed))
+
+    def _told(self, drive: Response, waves: Array, speed: float) -> Complex:
+        factor = self.contraction(drive, waves, speed)
+        assert factor is not None, "it has told one before"
+        return factor
+
+    def perform(self, action: str) -> None:
+        """See `Stage`."""
+        if action == "clear":
+            self.law = self.start()
+        else:
+            self._learns[0] = action == "learn"
+
+    @property
+    def memory(self) -> LawMemory:
+        """See `Stage`."""
+        listens = self._obedience is not None
+        obedience = self._obedience.table if self._obedience else NOBODY
+        parameters = self.parameters
+        return LawMemory(
+            self.law, self._guard, obedience, parameters.feedback_delay, parameters.step, listens, self._learns
+        )
+
+    def serve(
+        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
+    ) -> list[Sparse]:
+        """See `Stage`.
+
+        Raises:
+            LatheError: the loop diverges.
+        """
+        if reason == OBEY:
+            assert self._obedience is not None, "nobody else listens"
+            return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)
+        ended, allowed = np.sqrt(self._guard.sums[[_ENDED, _ALLOWED]]).tolist()
+        raise self._diverged(first + reached, ended, allowed)

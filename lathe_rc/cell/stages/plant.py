@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A drive of one's own: a class with its equation, sample by sample, and nothing of ports, blocks and events.
+
+class Memory(NamedTuple):
+    pole: float
+    position: Array
+
+@kernel                                     # or nothing: then it is plain Python, slower, with the same bits
+def sample(memory: Memory, command: float) -> tuple[float, float, float]:
+    memory.position[0] += memory.pole * (command - memory.position[0])
+    return memory.position[0], 0.0, 0.0     # position [m], velocity [m/s], effort [N or V]
+
+class FirstOrder(Plant):
+    Parameters = FirstOrderParameters       # its table, derived from PlantParameters
+    sample = staticmethod(sample)
+
+    def start(self) -> Memory:
+        return Memory(1.0 - np.exp(-self.parameters.step / self.parameters.lag), np.zeros(1))
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import numpy as np
+from annotated_types import Ge, Gt
+
+from lathe_rc.analysis.learning import Array, Complex, Response
+from lathe_rc.cell import messages
+from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse, step_of
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
+from lathe_rc.cell.stages.drive import Drive, Limits
+from lathe_rc.cell.stages.retraction import OwnRetraction, RetractionParameters, followed
+from lathe_rc.control.bounded import TakeoverTable
+from lathe_rc.control.limits import LimiterTable
+from lathe_rc.jit import is_compiled
+from lathe_rc.signals.noise import Sensor, SensorTable, measure
+
+_NO_FREQUENCY = np.zeros(1)  # [rad/s]
+
+
+class PlantParameters(LimitedParameters, RetractionParameters):
+    """Limits and sensor of a drive that moves the tool alone."""
+
+    stroke: Annotated[float, Gt(0)] = parameter(1e-3, "end stops at plus and minus this displacement", "m")
+    max_velocity: Annotated[float, Gt(0)] = parameter(1.0, "a profile that asks for more is refused", "m/s")
+    max_acceleration: Annotated[float, Gt(0)] = parameter(200.0, "a profile that asks for more is refused", "m/s^2")
+    noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
+    resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
+
+
+class PlantMemory(NamedTuple):
+    """What the step of a drive works on.
+
+    Attributes:
+        retraction: what it does by itself when members are lost.
+        limits: of its command.
+        plant: its own.
+        sensor: of its position.
+    """
+
+    retraction: TakeoverTable
+    limits: LimiterTable
+    plant: Any
+    sensor: SensorTable
+
+
+class SingleDrive(Drive):
+    """A drive that moves the tool alone: its command is limited, its position is measured, and it can retract.
+
+    Attributes:
+        parameters: its table.
+    """
+
+    announces = (LIMITED, FREE)
+    parameters: PlantParameters
+
+    def __init__(self, name: str, parameters: PlantParameters) -> None:
+        super().__init__(name, parameters)
+        self._retraction = OwnRetraction(parameters, parameters.stroke)
+        self._limited = LimitedCommand(name, parameters)
+        self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
+        self.declare(
+            inputs=[Input("coarse/command", messages.COMMAND, ("position",))],
+            outputs=[Output("coarse/state", messages.STATE, Joint("position", "velocity", "effort"))],
+            tells=self._limited.on,
+        )
+
+    @property
+    @abstractmethod
+    def machine(self) -> Any:
+        """Its own part of the memory."""
+
+    def limits(self) -> Mapping[str, Limits]:
+        """See `Drive`."""
+        table = self.parameters
+        return {"coarse/state": Limits(table.stroke, table.max_velocity, table.max_acceleration)}
+
+    def go_safe(self) -> None:
+        """See `Stage`."""
+        self._retraction.begin()
+
+    def finish(self, index: int) -> list[Sparse]:
+        """See `Stage`."""
+        return self._limited.finish(index)
+
+    @property
+    def memory(self) -> PlantMemory:
+        """See `Stage`."""
+        return PlantMemory(self._retraction.table, self._limited.table, self.machine, self._sensor.table)
+
+    def prepare(self, first: int, samples: int) -> None:
+        """See `Stage`."""
+        self._sensor.draw(samples)
+
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """See `Stage`."""
+        return self._limited.tell(first, end)
+
+
+Moved = tuple[float, float, float]  #: position [m], velocity [m/s], and effort [N or V] of a drive
+
+
+def _loop(sample: Callable[[Any, float], Moved]) -> Callable[..., Reached]:
+    """The step of a drive, for `step_of`."""
+
+    def step(memory: PlantMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
+        """See `lathe_rc.cell.stage`."""
+        (command,), (position, velocity, effort, measured_position) = inputs, outputs
+        given = limited(memory.limits, first, followed(memory.retraction, command))
+        for k in range(given.size):
+            position[k], velocity[k], effort[k] = sample(memory.plant, given[k])
+        measure(memory.sensor, position, measured_position)
+        return command.size, DONE
+
+    return step
+
+
+class Plant(SingleDrive):
+    """Base of drives of one's own.
+
+    One has a table ``Parameters``, the memory that it starts with (`start`), and its equation ``sample(memory,
+    command)``, which gives position, velocity and effort: a `kernel`, for which the memory is a NamedTuple of arrays of
+    float64, int64 or uint8, numbers, and NamedTuples of those; or a function in plain Python, for any memory. It may
+    change arrays of the memory and nothing else.
+
+    Attributes:
+        plant: its memory.
+    """
+
+    Parameters = PlantParameters
+    sample: ClassVar[Callable[[Any, float], Moved]]
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "sample" in vars(cls):
+            cls.step = staticmethod(step_of(cls, _loop(cls.sample), compiled=is_compiled(cls.sample)))
+
+    def __init__(self, name: str, parameters: PlantParameters) -> None:
+        self.parameters = parameters
+        super().__init__(name, parameters)
+        self.plant = self.start()
+
+    @abstractmethod
+    def start(self) -> Any:
+        """The memory before sample 0."""
+
+    def response(self, frequency: Array) -> Complex | None:
+        """Response of the position to the command at frequencies [rad/s], shape (n,).
+
+        It is what the check before a start and the stability margin go by. A drive that does not tell it is said to be
+        unchecked.
+        """
+        return None
+
+    @property
+    def machine(self) -> Any:
+        """See `SingleDrive`."""
+        return self.plant
+
+    def responses(self) -> Mapping[str, Response]:
+        """See `Drive`."""
+        if self.response(_NO_FREQUENCY) is None:
+            return {}
+        return {"coarse/command": self._told}
+
+    def _told(self, frequency: Array) -> Complex:
+        response = self.response(frequency)
+        assert response is not None, "it has told one before"
+        return response

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The file of an option ``--figure``."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lathe_rc.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def check_place(path: Path) -> None:
+    """Refuse before anything is computed.
+
+    Raises:
+        InputError: no picture can be written there.
+    """
+    if path.suffix.lower() != ".png":
+        raise InputError(f"--figure {path}; allowed: a file name that ends in .png")
+    if path.is_dir() or not path.parent.is_dir():
+        raise InputError(f"--figure {path}: {'is a folder' if path.is_dir() else 'no such folder'}; name a file")
+
+
+def save(figure: "Figure", path: Path) -> None:
+    """Write a figure.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    try:
+        figure.savefig(path, dpi=130)
+    except OSError as error:
+        raise InputError(f"--figure {path}: cannot be written ({error.strerror})") from None

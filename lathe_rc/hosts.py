@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The same cell in every host: the test of a stage of one's own.
+
+found = digests(scenario.load(Path("my_law.yaml")), tmp_path)
+assert all(topics == found["offline"] for topics in found.values())
+"""
+
+import importlib.util
+from collections.abc import Iterator, Mapping
+from functools import partial
+from pathlib import Path
+
+from lathe_rc import harness
+from lathe_rc.bag import reader, resim
+from lathe_rc.cell import batch
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.wiring import Cell
+
+Digests = Mapping[str, str]  #: of each signal topic
+
+_OTHER_BLOCK = 23  # samples: divides neither a revolution nor a second
+
+
+def digests(scenario: Scenario, folder: Path) -> dict[str, Digests]:
+    """Run a scenario in every host that this machine has.
+
+    Args:
+        scenario: short: it runs seven times.
+        folder: for its bag.
+
+    Returns:
+        The digests by host: ``offline`` (by way of its bag as well, read and simulated again), offline with blocks of
+        another length, as one of a batch, and, where there is ROS 2, composed in one process and with a process a node.
+
+    Raises:
+        LatheError: a run has failed.
+    """
+    return dict(_runs(scenario, folder))
+
+
+def _runs(scenario: Scenario, folder: Path) -> Iterator[tuple[str, Digests]]:
+    bag = folder / "offline"
+    yield "offline", harness.run(scenario, mode="offline", bag=bag).digest
+    yield "bag", reader.read(bag).digests()
+    yield "simulated again", resim.resimulate(bag).digest
+    other = scenario.varied({"block_size": _OTHER_BLOCK})
+    yield f"blocks of {_OTHER_BLOCK}", harness.run(other, mode="offline").digest
+    yield "batch", _in_a_batch(scenario)
+    if importlib.util.find_spec("rclpy"):
+        for mode in ("composed", "processes"):
+            yield mode, harness.run(scenario, mode=mode).digest
+
+
+def _in_a_batch(scenario: Scenario) -> Digests:
+    cell = Cell(scenario.nodes)
+    keep = partial(batch.Topics, topics=[*cell.dense, *cell.sparse])
+    outcome = next(batch.run([scenario], keep))
+    if outcome.error is not None:
+        raise outcome.error
+    assert outcome.kept is not None, "it has not failed"
+    return outcome.kept.digests()

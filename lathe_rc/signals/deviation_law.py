@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the spindle's speed deviation in plain Python: formulas of time, run as a tachogram."""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from lathe_rc.errors import InputError
+from lathe_rc.signals import speed
+from lathe_rc.signals.speed import Array, SpeedLaw
+
+_MOST = 2**22  # points of a tachogram
+
+
+class DeviationLaw(ABC):
+    """A law of the relative speed deviation; its constructor takes the numbers that a scenario gives it."""
+
+    @abstractmethod
+    def deviation(self, time: Array) -> Array:
+        """Deviation relative to the nominal speed [1] at ``time`` [s] from sample 0 on, both of shape (n,)."""
+
+
+def tabulated(nominal: float, law: DeviationLaw, step: float, end: float) -> SpeedLaw:
+    """A law as a piecewise-linear tachogram, held after its end.
+
+    Args:
+        nominal: speed [rad/s].
+        law: of the deviation.
+        step: between its points [s].
+        end: of the tachogram [s], rounded up to a whole number of steps.
+
+    Raises:
+        InputError: more points than allowed, or the law gives something else than a finite number for each time.
+    """
+    points = int(np.ceil(end / step)) + 1
+    if points > _MOST:
+        raise InputError(
+            f"{end:g} s in steps of {step:g} s are {points} points; allowed: {_MOST} (a longer step or an earlier end)"
+        )
+    time: Array = step * np.arange(points, dtype=np.float64)
+    deviation = np.asarray(law.deviation(time))
+    if deviation.shape != time.shape or deviation.dtype.kind not in "fiu":
+        raise InputError(
+            f"deviation(time) gives {deviation.dtype} of shape {deviation.shape} for times of shape {time.shape}; "
+            "allowed: a real number for each"
+        )
+    wrong = np.flatnonzero(~np.isfinite(deviation))
+    if wrong.size:
+        raise InputError(f"deviation(time) = {deviation[wrong[0]]} at {time[wrong[0]]:g} s; allowed: finite numbers")
+    return speed.tachogram(nominal, time, deviation.astype(np.float64))

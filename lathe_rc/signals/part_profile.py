@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Part profiles in plain Python: formulas of angle and height, run as a table like all profiles."""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from lathe_rc.errors import InputError
+from lathe_rc.signals.profile import Array, ProfileTable, tabulated
+
+_TURN = 2.0 * np.pi
+_CLOSED = 1e-9  # how far both ends of a revolution may be apart, by the largest deviation
+
+
+class PartProfile(ABC):
+    """A desired form; its constructor takes the numbers that a scenario gives it.
+
+    It is a `lathe_rc.signals.profile.Profile`, without heights of its own the same all along the part.
+    """
+
+    @property
+    def heights(self) -> Array:
+        """Positions along the part [m], increasing, between which linear interpolation is good; shape (m,)."""
+        return np.zeros(1)
+
+    @abstractmethod
+    def deviation(self, angle: Array, height: float) -> Array:
+        """Radius deviation [m] at ``angle`` [rad] (shape (n,)) and ``height`` [m]; 2π-periodic, shape (n,)."""
+
+
+def checked(profile: PartProfile) -> ProfileTable:
+    """The table of a profile that is one.
+
+    Raises:
+        InputError: heights out of order, or a deviation that is not finite, of another shape, or not periodic.
+    """
+    heights = np.asarray(profile.heights)
+    if heights.ndim != 1 or not heights.size or not np.all(np.isfinite(heights)) or np.any(np.diff(heights) <= 0.0):
+        raise InputError(f"heights of shape {heights.shape}; allowed: one or more finite positions that increase")
+    angle = np.linspace(0.0, _TURN, 361)
+    for height in heights.tolist():
+        deviation = np.asarray(profile.deviation(angle, height))
+        if deviation.shape != angle.shape or deviation.dtype.kind not in "fiu":
+            raise InputError(
+                f"deviation(angle, height) gives {deviation.dtype} of shape {deviation.shape} for angles of shape "
+                f"{angle.shape}; allowed: a real number for each"
+            )
+        wrong = np.flatnonzero(~np.isfinite(deviation))
+        if wrong.size:
+            raise InputError(
+                f"deviation = {deviation[wrong[0]]} m at {angle[wrong[0]]:.4g} rad, height {height:g} m; allowed: "
+                "finite numbers"
+            )
+        gap = abs(float(deviation[-1] - deviation[0]))
+        if gap > _CLOSED * max(float(np.abs(deviation).max()), 1e-6):
+            raise InputError(
+                f"deviation jumps by {gap:.4g} m from 2π to 0 rad at height {height:g} m; allowed: a periodic form"
+            )
+    return tabulated(profile)

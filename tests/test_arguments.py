@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line of a node's executable, as `ros2 run` calls it: help, what ROS passes over, parameters that lose."""
+
+import importlib.util
+import sys
+
+import pytest
+import rclpy
+from click.testing import CliRunner
+from rclpy.context import Context
+from rclpy.node import Node
+
+from lathe_rc.cell.scenario import TABLES
+from lathe_rc.cli import main
+from lathe_rc.errors import InputError
+from lathe_rc.nodes import declare
+
+ALONE = ["replayer", "topic_recorder", *(["rerun_bridge"] if importlib.util.find_spec("rerun") else [])]
+
+
+def run(monkeypatch, capsys, executable, *words):
+    """Exit code, stdout and stderr of an executable."""
+    monkeypatch.setattr(sys, "argv", [executable, *words])
+    monkeypatch.setenv("COLUMNS", "200")
+    try:
+        importlib.import_module(f"lathe_rc.nodes.{executable}").main()
+        code = 0
+    except SystemExit as exit_:
+        code = exit_.code
+    return code, *capsys.readouterr()
+
+
+@pytest.mark.parametrize("name", TABLES.own)
+def test_ros2_run_says_of_a_node_what_lathe_node_says(monkeypatch, capsys, name):
+    code, said, _ = run(monkeypatch, capsys, name, "--help")
+    assert code == 0
+    assert said.startswith(f"usage: ros2 run lathe_rc {name} ")
+    lathe = CliRunner(env={"COLUMNS": "200"}).invoke(main, ["node", name, "--help"]).stdout
+    assert said.replace(f"ros2 run lathe_rc {name}", f"lathe node {name}") == lathe
+
+
+@pytest.mark.parametrize("name", [*ALONE, "container"])
+def test_executables_that_are_no_nodes_of_a_cell_have_help_too(monkeypatch, capsys, name):
+    code, said, _ = run(monkeypatch, capsys, name, "-h")
+    assert code == 0
+    assert said.startswith(f"usage: ros2 run lathe_rc {name} ")
+
+
+@pytest.mark.parametrize("name", ["tool", *ALONE])
+@pytest.mark.parametrize("words", [["-p", "feed:=1.0"], ["feed:=1.0"], ["recorder", "--ros-args", "-p", "feed:=1.0"]])
+def test_what_ros_would_pass_over_is_refused(monkeypatch, capsys, name, words):
+    code, _, said = run(monkeypatch, capsys, name, *words)
+    assert code == 2
+    assert said.startswith(f"lathe: {name}: {words[0]!r}; allowed: --help, or --ros-args and what ROS takes: ")
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "named"), [([], ""), (["--ros-args"], ""), (["tool", "-p"], "-p"), (["a:=b"], "a:=b")]
+)
+def test_a_container_without_nodes_is_refused(monkeypatch, capsys, words, named):
+    code, _, said = run(monkeypatch, capsys, "container", *words)
+    assert code == 2
+    assert said.startswith(f"lathe: no node {named!r}; allowed: recorder, ")
+
+
+# --- parameters that lose
+
+OWN, SHARED = "/tool: {ros__parameters: {feed: 1.0}}\n", "/**: {ros__parameters: {feed: 3.0}}\n"
+
+
+def feed_of(folder, words, file):
+    """What the node ``tool`` gets, and whether what it does not get is refused."""
+    path = folder / "some.yaml"
+    path.write_text(file)
+    given = ["--ros-args", *(str(path) if word == "FILE" else word for word in words)]
+    context = Context()
+    rclpy.init(args=given, context=context)
+    try:
+        node = Node(
+            "tool",
+            context=context,
+            automatically_declare_parameters_from_overrides=True,
+            allow_undeclared_parameters=True,
+            enable_rosout=False,
+            start_parameter_services=False,
+        )
+        declare.refuse_lost(node, given)
+        return declare.overrides(node).get("feed")
+    finally:
+        context.try_shutdown()
+
+
+@pytest.mark.parametrize(
+    ("file", "words", "feed"),
+    [
+        (OWN, ["--params-file", "FILE", "-p", "feed:=2.0"], 2.0),
+        (SHARED + OWN, ["--params-file", "FILE", "-p", "tool:feed:=2.0"], 2.0),
+        (OWN + SHARED, ["--params-file", "FILE", "-p", "feed:=2.0"], 2.0),
+        (SHARED, ["--params-file", "FILE", "--param", "feed:=2.0", "-r", "__ns:=/left"], 2.0),
+        (SHARED + OWN, ["--params-file", "FILE", "-p", "recorder:feed:=2.0"], 1.0),
+        (OWN, ["--params-file", "FILE", "-p", "use_sim_time:=true", "--", "-p", "feed:=2.0"], 1.0),
+        (OWN, ["--params-file", "FILE", "-p", "tool:feed:=2.0", "-p", "tool:feed:=4.0"], 4.0),
+    ],
+)
+def test_a_parameter_on_the_command_line_reaches_its_node(domain, tmp_path, file, words, feed):
+    assert feed_of(tmp_path, words, file) == feed
+
+
+@pytest.mark.parametrize(
+    ("file", "words", "said"),
+    [
+        (SHARED + OWN, ["--params-file", "FILE", "-p", "feed:=2.0"], r"has 1\.0; write -p tool:feed:=VALUE behind "),
+        (
+            OWN,
+            ["-p", "tool:feed:=2.0", "--params-file", "FILE"],
+            r"has 1\.0; write -p tool:feed:=VALUE behind every --params",
+        ),
+        (SHARED, ["-p", "feed:=2.0", "--params-file", "FILE"], r"has 3\.0; write -p tool:feed:=VALUE behind "),
+        (
+            OWN,
+            ["--params-file", "FILE", "-p", "tool:feed:=2.0", "-r", "__ns:=/left"],
+            r"has its default; ROS has no -p tool:",
+        ),
+    ],
+)
+def test_a_parameter_that_something_else_overrules_is_refused(domain, tmp_path, file, words, said):
+    """ROS keeps quiet about it."""
+    with pytest.raises(InputError, match=r"^-p (tool:)?feed:=2\.0 does not reach (/left)?/tool, which " + said):
+        feed_of(tmp_path, words, file)

@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws, drives, stages and studies from outside of lathe_rc: in every host, checked as ours, found by name."""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lathe_rc import extensions, harness, hosts
+from lathe_rc.cell import scenario
+from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.cli import main
+from lathe_rc.errors import InputError, LatheError
+
+SHORT = "spindle_encoder.revolutions=4.0"
+
+
+def lathe(*arguments):
+    return CliRunner().invoke(main, [*arguments])
+
+
+@pytest.fixture
+def begin(tmp_path, monkeypatch):
+    """Makes a package with ``lathe new`` and stands in its folder."""
+
+    def make(kind, name, *options):
+        monkeypatch.chdir(tmp_path)
+        made = lathe("new", kind, name, *options)
+        assert made.exit_code == 0, made.output
+        monkeypatch.chdir(tmp_path / name)
+        monkeypatch.syspath_prepend(tmp_path / name)
+        return tmp_path / name / f"{name}.yaml"
+
+    return make
+
+
+def edit(package, old, new):
+    """Change the source of a package that has not been imported yet."""
+    path = Path(package) / "__init__.py"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+# --- in every host
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"), [("law", []), ("law", ["--plain"]), ("plant", []), ("stage", [])], ids=str
+)
+def test_what_lathe_new_writes_has_the_same_bits_in_every_host(begin, tmp_path, kind, options):
+    name = f"my_{kind}{'_plain' if options else ''}"
+    found = hosts.digests(scenario.load(begin(kind, name, *options), [SHORT]), tmp_path)
+    assert set(found) == {"offline", "bag", "simulated again", "blocks of 23", "batch", "composed", "processes"}
+    assert {host for host, topics in found.items() if topics != found["offline"]} == set()
+
+
+@pytest.mark.parametrize("kind", ["law", "plant", "stage"])
+def test_plain_python_has_the_bits_of_the_compiled_step(begin, kind):
+    digests = []
+    for name, options in ((f"my_{kind}", []), (f"my_{kind}_plain", ["--plain"])):
+        result = harness.run(scenario.load(begin(kind, name, *options), [SHORT]))
+        digests.append({topic: result.digest[topic] for topic in ("/tool", "/coarse/command", "/coarse/state")})
+    assert digests[0] == digests[1]
+
+
+def test_a_law_and_a_drive_learn_and_are_checked(begin):
+    """The piston's error falls to a hundredth, and nothing is unchecked."""
+    for kind in ("law", "plant"):
+        result = harness.run(scenario.load(begin(kind, f"my_{kind}")))
+        assert result.unchecked == []
+        assert result.errors.rms[-1] < 0.01 * result.errors.rms[0]
+
+
+def test_a_package_that_pip_has_installed_is_found_by_its_name(begin, tmp_path):
+    """Installed elsewhere, a law takes part under its bare name: in help, run, bag and report."""
+    file = begin("law", "my_law")
+    site = tmp_path / "site"
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        "--no-deps",
+        "--no-build-isolation",
+        "--target",
+        str(site),
+        ".",
+    ]
+    subprocess.run(pip, check=True, capture_output=True)
+    text = file.read_text()
+    (tmp_path / "cell.yaml").write_text(text.replace('    stage: "my_law:MyLaw"\n', ""))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])}
+
+    def told(*arguments):
+        run = [sys.executable, "-m", "lathe_rc", *arguments]
+        done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert "lead_time" in told("node", "my_law", "--help")
+    runs = {}
+    for mode in ("offline", "processes"):
+        runs[mode] = json.loads(told("run", "cell.yaml", "--mode", mode, "--revolutions", "4", "--bag", mode, "--json"))
+        told("bag", "check", mode)
+    assert runs["offline"]["digest"] == runs["processes"]["digest"]
+    assert runs["offline"]["unchecked"] == []
+    told("report", "offline", "-o", "report.html")
+    assert "my_law" in (tmp_path / "report.html").read_text()
+
+
+def test_a_study_runs_from_its_folder(begin):
+    begin("study", "my_study")
+    study = importlib.import_module("my_study").STUDY
+    rms = study.run(study.parameters(gains=[0.5, 1.0], revolutions=6.0)).rms
+    assert rms[1][-1] < rms[0][-1] < rms[0][0]
+
+
+# --- the check before the start
+
+
+def test_a_law_that_converges_with_no_drive_is_refused(begin):
+    with pytest.raises(InputError, match=r"my_law: learning diverges with electrodynamic_actuator: sup\|factor"):
+        harness.run(scenario.load(begin("law", "my_law"), ["my_law.lead_time=2.2e-3"]))
+
+
+def test_a_feedback_delay_that_the_cycle_does_not_leave_is_refused(begin):
+    with pytest.raises(InputError, match=r"my_law\.feedback_delay = 3900 samples: .* the cycle leaves 3\d\d\d"):
+        harness.run(scenario.load(begin("law", "my_law"), ["my_law.feedback_delay=3900"]))
+
+
+UNTOLD = "    def contraction(self"
+
+
+def test_a_law_that_tells_nothing_is_unchecked_and_stopped_when_it_diverges(begin):
+    file = begin("law", "silent_law", "--plain")
+    edit("silent_law", UNTOLD, "    def not_told(self")
+    edit("silent_law", "    def largest_delay(self", "    def not_told_either(self")
+    told = []
+    result = harness.run(scenario.load(file, [SHORT]), watch=told.append)
+    assert [each.partition(": ")[2] for each in result.unchecked] == [
+        "SilentLaw tells no longest feedback_delay",
+        "SilentLaw tells no factor of a cycle: nobody knows if it converges",
+    ]
+    assert [event["message"] for event in told if event["event"] == "unchecked"] == result.unchecked
+    with pytest.raises(LatheError, match=r"silent_law: sample \d+: the error grows: .* stop_ratio = 2") as stopped:
+        harness.run(scenario.load(file, ["silent_law.lead_time=8e-3"]))
+    assert stopped.value.exit_code == 1
+    harness.run(
+        scenario.load(
+            file, ["silent_law.lead_time=8e-3", "silent_law.stop_ratio=0.0", "silent_law.allow_unstable=true"]
+        )
+    )
+
+
+def test_a_drive_that_tells_no_response_needs_a_controller_that_stops(begin):
+    file = begin("plant", "silent_plant", "--plain")
+    edit("silent_plant", "    def response(self", "    def not_told(self")
+    with pytest.raises(InputError, match=r"learning_controller: no drive tells its response to coarse/command"):
+        harness.run(scenario.load(file))
+    stops = ["learning_controller.stop_ratio=2.0"]
+    assert len(harness.run(scenario.load(file, [SHORT, *stops])).unchecked) == 1
+    with pytest.raises(LatheError, match=r"learning_controller: sample \d+: the error grows"):
+        harness.run(scenario.load(file, [*stops, "silent_plant.delay=6e-3", "spindle_encoder.revolutions=60.0"]))
+
+
+# --- events and the supervisor
+
+
+def test_a_law_is_frozen_and_cleared_by_events(begin):
+    file = begin("law", "my_law")
+    events = 'my_law.events=["revolution 6: freeze", "revolution 8: learn", "revolution 10: clear"]'
+    rms = harness.run(scenario.load(file, [events, "spindle_encoder.revolutions=14.0"])).errors.rms
+    assert rms[11] > 10 * rms[9], "it has forgotten"
+    assert rms[13] < 0.1 * rms[11], "and learns again"
+
+
+# --- finding classes
+
+
+@pytest.mark.parametrize(
+    ("text", "stage", "said"),
+    [
+        ("", "nowhere_law:Law", "cannot be imported: ModuleNotFoundError: No module named 'nowhere_law'"),
+        ("", "found_0:Law", "found_0 has no 'Law'"),
+        ("Law = 3", "found_1:Law", "is 3; allowed: a class that derives from lathe_rc.cell.stage.Stage"),
+        ("raise RuntimeError('no\\nlicence')", "found_2:Law", "cannot be imported: RuntimeError: no"),
+    ],
+)
+def test_a_class_that_cannot_be_had_is_refused_in_one_line(tmp_path, monkeypatch, text, stage, said):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    Path(f"{stage.partition(':')[0]}.py").write_text(text) if "nowhere" not in stage else None
+    Path("cell.yaml").write_text(f'/law:\n  ros__parameters:\n    stage: "{stage}"\n')
+    with pytest.raises(InputError) as refused:
+        scenario.load(Path("cell.yaml"))
+    assert said in str(refused.value)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def offer(folder, distribution, value, version="1.0"):
+    """Pretend that a distribution is installed which offers the stage ``shared_name``."""
+    info = folder / f"{distribution}-{version}.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n")
+    (info / "entry_points.txt").write_text(f"[lathe_rc.stages]\nshared_name = {value}\n")
+
+
+def test_two_packages_that_offer_one_name_are_refused(tmp_path, monkeypatch):
+    offer(tmp_path, "first_maker", "first:Law")
+    offer(tmp_path, "other_maker", "other:Law")
+    monkeypatch.syspath_prepend(tmp_path)
+    extensions._offered.cache_clear()
+    with pytest.raises(InputError, match=r"first_maker 1.0 and other_maker 1.0 offer 'shared_name'"):
+        "shared_name" in STAGES  # noqa: B015 - it raises
+    monkeypatch.undo()
+    extensions._offered.cache_clear()
+
+
+def test_where_a_class_comes_from_is_known(begin):
+    begin("law", "my_law")
+    assert STAGES.origin("tool") is None
+    assert STAGES.origin("my_law:MyLaw") == {
+        "class": "my_law:MyLaw",
+        "source": extensions.source_hash("my_law"),
+    }
+
+
+def test_a_changed_source_is_compiled_anew(begin):
+    """The step of another source never runs from the cache."""
+    rms = []
+    file = begin("law", "changed_law")
+    for old, new in (
+        ("memory.gain * (error", "memory.gain * (error"),
+        ("memory.gain * (error", "0.5 * memory.gain * (error"),
+    ):
+        edit("changed_law", old, new)
+        command = [sys.executable, "-m", "lathe_rc", "run", str(file), "--revolutions", "4", "--json"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        rms.append(json.loads(done.stdout)["error_um"]["last"]["rms"])
+    assert rms[1] > 2 * rms[0]
+
+
+# --- lathe new
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("Law", "small letters"), ("tool", "lathe_rc's own"), ("my-law", "small letters")]
+)
+def test_a_name_that_cannot_be_is_refused(tmp_path, monkeypatch, name, said):
+    monkeypatch.chdir(tmp_path)
+    result = lathe("new", "law", name)
+    assert result.exit_code == 2
+    assert said in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_exists_is_left_alone(begin):
+    begin("law", "twice")
+    os.chdir("..")
+    before = sorted(Path("twice").rglob("*"))
+    assert lathe("new", "law", "twice").exit_code == 2
+    assert sorted(Path("twice").rglob("*")) == before
+
+
+def test_the_contraction_that_a_law_tells_is_that_of_its_run(begin):
+    """Per revolution the error of the oval falls by the factor that the law tells for two waves."""
+    file = begin("law", "my_law")
+    steady = [
+        "spindle_encoder.deviation_amplitude=[0.0]",
+        "my_law.learning_gain=0.3",
+        "spindle_encoder.revolutions=8.0",
+    ]
+    loaded = scenario.load(file, steady)
+    cell = Cell(loaded.nodes)
+    law, drive = cell.stages["my_law"], cell.stages["electrodynamic_actuator"]
+    speed = loaded.shared.nominal_speed
+    factor = abs(law.contraction(drive.responses()["coarse/command"], np.array([2.0]), speed)[0])
+    rms = harness.run(loaded).errors.rms
+    assert rms[5] / rms[4] == pytest.approx(factor, rel=0.02)
+
+
+# --- the page
+
+
+def test_the_law_on_the_page_runs(begin):
+    page = (Path(__file__).parents[1] / "docs" / "extending.md").read_text(encoding="utf-8")
+    file = begin("law", "paged", "--plain")
+    Path("integral.py").write_text(page.partition("```python\n")[2].partition("```")[0])
+    result = harness.run(scenario.load(file, [SHORT, "paged.stage=integral:Integral", "paged.rate=1.0"]))
+    assert result.digest["/coarse/command"] != ""
+    assert np.ptp(result.recording.dense["/coarse/command"]["position"]) > 1e-6
+
+
+def test_the_reference_of_a_stage_of_others_is_printed(begin):
+    begin("law", "my_law")
+    told = lathe("reference", "my_law:MyLaw")
+    assert told.exit_code == 0
+    assert told.stdout.startswith("## my_law:MyLaw")
+    assert "| `lead_time` | double | `0.001425` |" in told.stdout

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every transition of a node's lifecycle, and what a node says that waits."""
+
+import contextlib
+
+import pytest
+from cells import scenario
+
+pytest.importorskip("rclpy")
+
+import rclpy
+from lathe_rc_msgs.msg import CellState, Member
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.lifecycle import TransitionCallbackReturn
+
+from lathe_rc import harness
+from lathe_rc.bag import reader
+from lathe_rc.cell import messages
+from lathe_rc.errors import LatheError
+from lathe_rc.nodes.exchange import Exchange
+from lathe_rc.nodes.stage_node import StageNode
+
+WALK = [  # transition, whether it is possible, and where the node is then
+    (Transition.TRANSITION_ACTIVATE, False, "active"),
+    (Transition.TRANSITION_CLEANUP, False, "active"),
+    (Transition.TRANSITION_DEACTIVATE, True, "inactive"),
+    (Transition.TRANSITION_CONFIGURE, False, "inactive"),
+    (Transition.TRANSITION_ACTIVATE, True, "active"),
+    (Transition.TRANSITION_DEACTIVATE, True, "inactive"),
+    (Transition.TRANSITION_CLEANUP, True, "unconfigured"),
+    (Transition.TRANSITION_ACTIVATE, False, "unconfigured"),
+    (Transition.TRANSITION_CONFIGURE, True, "inactive"),
+    (Transition.TRANSITION_CLEANUP, True, "unconfigured"),
+    (Transition.TRANSITION_CONFIGURE, True, "inactive"),
+    (Transition.TRANSITION_ACTIVATE, True, "active"),
+]
+LOGGED = [
+    *("unconfigured -> inactive", "inactive -> active", "active -> inactive", "inactive -> active"),
+    *("active -> inactive", "inactive -> unconfigured", "unconfigured -> inactive", "inactive -> unconfigured"),
+    *("unconfigured -> inactive", "inactive -> active"),
+]
+LAST = "electrodynamic_actuator"  # is told to start by the tests
+
+
+class Manager:
+    """Asks nodes for transitions, as ``ros2 lifecycle`` does."""
+
+    def __init__(self, ghost):
+        self._ghost, self._clients = ghost, {}
+
+    def _ask(self, service, kind, request):
+        if service not in self._clients:
+            client = self._clients[service] = self._ghost.create_client(kind, service)
+            assert client.wait_for_service(60.0)
+            # A node that has not discovered yet who asks cannot answer: ask until it does what changes nothing.
+            nothing = GetState.Request() if kind is GetState else ChangeState.Request(transition=Transition(id=255))
+            while self._answer(client, nothing, 0.5) is None:
+                pass
+        answer = self._answer(self._clients[service], request, 60.0)
+        assert answer is not None, f"{service} does not answer"
+        return answer
+
+    def _answer(self, client, request, seconds):
+        future = client.call_async(request)
+        rclpy.spin_until_future_complete(self._ghost, future, timeout_sec=seconds)
+        return future.result()
+
+    def change(self, node, transition):
+        """Ask for a transition; returns whether it was made."""
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return self._ask(f"/{node}/change_state", ChangeState, request).success
+
+    def state(self, node):
+        return self._ask(f"/{node}/get_state", GetState, GetState.Request()).current_state.label
+
+
+@pytest.fixture
+def manager(ghost):
+    return Manager(ghost)
+
+
+@contextlib.contextmanager
+def waiting(manager, domain, cell, together=()):
+    """The processes of a cell that waits for its drive, and what lets that start."""
+    groups = [list(together), *([name] for name in cell.nodes if name not in together)]
+    with harness.Processes(cell, [group for group in groups if group], domain=domain) as processes:
+
+        def begin():
+            assert manager.change(LAST, Transition.TRANSITION_CONFIGURE)
+            assert manager.change(LAST, Transition.TRANSITION_ACTIVATE)
+
+        yield processes, begin
+
+
+@pytest.mark.parametrize(
+    ("node", "together"),
+    [
+        ("spindle_encoder", ()),
+        ("learning_controller", ()),
+        ("recorder", ()),
+        ("tool", ("spindle_encoder", "learning_controller", "tool")),
+    ],
+)
+def test_the_whole_state_machine_is_walked_and_the_cell_gives_its_bits(manager, domain, tmp_path, node, together):
+    """A node takes every transition before the run, stands still in its middle, and no bit of the run is changed."""
+    alone = scenario(spindle_encoder={"speed_factor": 0.1}, electrodynamic_actuator={"autostart": False})
+    cell = harness.with_recorder(alone, tmp_path / "bag", keep=True)
+    with waiting(manager, domain, cell, together) as (processes, begin):
+        processes.wait_for("active", node)
+        for transition, possible, then in WALK:
+            assert (manager.change(node, transition), manager.state(node)) == (possible, then)
+        begin()
+        processes.wait_for("progress")
+        assert manager.change(node, Transition.TRANSITION_DEACTIVATE)
+        if node != "spindle_encoder" and not together:
+            processes.wait_for("stall", member=f"/{node}")
+        assert (manager.change(node, Transition.TRANSITION_CLEANUP), manager.state(node)) == (False, "inactive")
+        assert manager.change(node, Transition.TRANSITION_ACTIVATE)
+        processes.wait_for_end()
+        said = [line for line in processes._log("+".join(together) or node) if f"[{node}]" in line]
+    found = [line.rpartition("]: ")[2] for line in said if " -> " in line]
+    assert found == [*LOGGED, "active -> inactive", "inactive -> active"]
+    assert reader.read(tmp_path / "bag").digests() == harness.run(alone).digest
+
+
+def test_who_is_shut_down_before_the_run_leaves_and_the_others_say_for_whom_they_wait(manager, domain, tmp_path):
+    nodes = scenario(electrodynamic_actuator={"autostart": False})
+    cell = harness.with_recorder(nodes, tmp_path / "bag", keep=True)
+    with waiting(manager, domain, cell) as (processes, _):
+        assert f"/{LAST}" in processes.wait_for("waits", "spindle_encoder")["missing"]
+        assert manager.change("tool", Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        assert processes.wait_for("exit", "tool")["code"] == 0
+        assert any(f"waits for /{LAST}" in line for line in processes._log("spindle_encoder"))
+
+
+@pytest.fixture
+def tool(ghost):
+    """A tool that has been activated in this process, and what it reports."""
+    told = []
+    node = StageNode("tool", "tool", lambda event, _, **values: told.append((event, values)), Exchange())
+    assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    yield node, told
+    node.destroy_node()
+
+
+def joins(node, name, state=Member.WIRED, **said):
+    """Let a member announce itself."""
+    node._on_member(Member(name=name, state=state, parameters="{}", **said))
+
+
+def test_who_waits_names_each_member_and_topic_that_is_missing(tool):
+    node, _ = tool
+    topics = ["/coarse/state", "/encoder"]
+    assert sorted(node.missing()) == ["a publisher of /coarse/state", "a publisher of /encoder", "a time master"]
+    joins(node, "/spindle", stage="spindle_encoder", members=["/spindle", "/drive", "/recorder", "/tool"])
+    assert node.missing() == ["/drive", "/recorder"]
+    joins(node, "/drive", Member.JOINING)
+    joins(node, "/recorder", Member.JOINING)
+    assert node.missing() == ["/drive to join", "/recorder to join"]
+    joins(node, "/drive", Member.READY, publishes=topics[:1], types=[messages.STATE], sparse=[False])
+    joins(node, "/recorder", subscribes=["/tool"])
+    joins(node, "/tool")
+    missing = ["/coarse/state from /drive", "/encoder, which no member publishes", "/tool to /recorder"]
+    assert sorted(node.missing()) == missing
+    node._ready = True
+    assert node.missing() == ["/spindle to be ready", "/recorder to be ready"]
+    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+    assert node.missing() == ["its own activation"]
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    node._on_cell_state(CellState(state=CellState.RUNNING))
+    assert node.missing() == []
+
+
+def test_what_is_missing_is_told_now_and_then_until_it_is_there(tool):
+    node, told = tool
+    begun = node._tell_due - 2.0
+    times = []
+    for second in range(101):
+        before = len(told)
+        node.tick(begun + second)
+        times += [second] * (len(told) - before)
+    assert times == [2, 10, 40, 70, 100]
+    node._cell, node._ready = CellState.RUNNING, True
+    node.tick(begun + 131.0)
+    assert [event for event, _ in told].count("waits") == 5
+
+
+def test_who_is_shut_down_in_the_middle_of_a_run_makes_the_cell_safe(manager, domain, tmp_path):
+    endless = scenario(spindle_encoder={"revolutions": 500.0, "speed_factor": 1.0})
+    cell = harness.with_recorder(endless, tmp_path / "bag", keep=True)
+    with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
+        processes.wait_for("cycle")
+        assert manager.change("tool", Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        with pytest.raises(LatheError, match=r"tool was shut down in the middle of a run: safe state from sample"):
+            processes.wait_for_end()
