@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real encoder as time master of a cell of nodes: by a serial line, by a topic, by a file at a pace."""
 
-import contextlib
 import os
 import pty
 import threading
@@ -12,13 +11,17 @@ import pytest
 from test_counts import COUNTS, TURN, follower, write_counts
 
 from lathe_rc import harness
+from lathe_rc.bag import reader
+from lathe_rc.bag.check import check
 from lathe_rc.bag.resim import resimulate
+from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.errors import LatheError
 
 pytest.importorskip("rclpy")
 
 from sensor_msgs.msg import JointState
 
+SAFE = ElectrodynamicActuatorParameters().safe_position
 PATIENT = {"max_lag": 60.0, "max_silence": 60.0}  # no test may depend on the wall clock
 
 
@@ -109,32 +112,66 @@ def test_a_topic_leads_a_cell(tmp_path, ghost, domain):
 
 
 @pytest.mark.parametrize(
-    ("cut", "changed", "message"),
+    ("rest", "message"),
     [
-        (0.1, {}, "the line ends at 0.0995 s, after 1.6"),
-        (0.2, {"max_gap": 2e-4}, "encoder_device: no counts from 0 to 0.0005 s, for 0.5 ms; allowed: up to max_gap"),
-        (0.2, {"max_lag": 1e-9}, "behind the encoder at sample"),
+        ("", r"encoder_device: the line ends at 0\.0995 s, after 1\.6\d* revolutions"),
+        ("1,x\n", r".*pipe: '1,x'; allowed: a time and a counter, as time_ns,counts"),
+        ("800000000000000000,9\n", r"encoder_device: no counts from 0.0995 to .*allowed: up to max_gap = 10 ms"),
     ],
-)  # fmt: skip
-def test_what_is_missing_or_late_is_said_and_ends_the_cell(tmp_path, cut, changed, message):
+)
+def test_when_the_encoder_is_lost_the_others_come_to_their_safe_state(tmp_path, rest, message):
+    """What is missing or wrong is said; the drive retracts while the spindle seems to go on at its last speed."""
     path, pipe = tmp_path / "counts.csv", tmp_path / "pipe"
-    write_counts(path, cut)
+    write_counts(path, 0.1)
     os.mkfifo(pipe)
-    begun = threading.Event()
+    begun, turns, told = threading.Event(), threading.Event(), []
 
     def write():
         begun.wait()
-        with pipe.open("w") as writer, contextlib.suppress(BrokenPipeError):
+        with pipe.open("w") as writer:
             writer.write(lines(path).partition("\n")[2])
+            writer.flush()
+            turns.wait()
+            writer.write(rest)
 
     threading.Thread(target=write, daemon=True).start()
 
     def watch(event):
+        told.append(event)
         if event["event"] == "block0":
             begun.set()
+        if event["event"] == "progress" and event["samples"]:
+            turns.set()
 
-    with pytest.raises(LatheError, match=message):
-        harness.run(device(device=str(pipe), **changed), mode="composed", watch=watch)
+    with pytest.raises(LatheError, match=rf"^{message}.*: safe state from sample \d+ on$"):
+        harness.run(device(device=str(pipe)), mode="composed", watch=watch, bag=tmp_path / "bag")
+    (safe,) = [event for event in told if event["event"] == "safe"]
+    assert (safe["lost"], safe["end"]) == ([], safe["sample"] + 12_800)
+    found = check(tmp_path / "bag")
+    assert (found.wrong, found.lost) == ([], [])
+    recording = reader.read(tmp_path / "bag")
+    assert {signals.size for fields in recording.dense.values() for signals in fields.values()} == {safe["end"]}
+    speed = recording.dense["/encoder"]["speed"]
+    assert np.ptp(speed[-10_000:]) < 1e-6 * speed[-1]
+    assert recording.dense["/coarse/state"]["position"][-1] == pytest.approx(SAFE, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"max_gap": 2e-4}, "no counts from 0 to 0.0005 s, for 0.5 ms; allowed: up to max_gap = 0.2 ms$"),
+        ({"max_lag": 1e-9}, "the cell is .* s behind the encoder at sample 0; allowed: up to max_lag = 1e-09 s"),
+    ],
+)
+def test_an_encoder_that_is_lost_before_the_first_sample_ends_the_cell_at_once(tmp_path, changed, message):
+    path = tmp_path / "counts.csv"
+    write_counts(path, 0.2)
+    with (
+        serial_line(lines(path)) as (line, watch, told),
+        pytest.raises(LatheError, match=f"^encoder_device: {message}"),
+    ):
+        harness.run(device(device=line, **changed), mode="composed", watch=watch)
+    assert "safe" not in {event["event"] for event in told}
 
 
 def test_silence_is_an_error_and_names_the_topic_that_nobody_publishes():

@@ -154,7 +154,7 @@ def test_bad_override_is_refused_in_one_line(cell, override, message):
         ("block_size: 32", "block_sizes: 32", "/**.block_sizes: unknown parameter"),
         ("block_size: 32", "revolutions: 2.0", "/**.revolutions: unknown parameter"),
         ("block_size: 32", "block_size: nan", "/**.block_size = nan; allowed: an integer"),
-        ("/tool:", "/fork:", "fork: no stage 'fork'; allowed: recorder, spindle_encoder, encoder_device"),
+        ("/tool:", "/fork:", "fork: no stage 'fork'; allowed: spindle_encoder, encoder_device"),
         ("/tool:", "/cell/tool:", "cell/tool: no stage"),
         ("profile: csv", "profile: cvs", "tool.profile = 'cvs'; allowed: one of harmonics, piston, polygon, csv"),
         ("[0.1]", "[0.1, .nan]", "deviation_amplitude = [0.1, nan]; allowed: a list, each a finite number"),

@@ -130,6 +130,14 @@ def test_nodes_of_a_process_share_an_enclave_and_read_each_other_in_memory():
     assert "coarse/state" in grouped["/a/b/tool"][0].subscribe
 
 
+def test_an_encoder_device_may_read_what_comes_from_outside_of_the_cell():
+    nodes = dict(scenario(encoder_device={"topic": "/lathe/joints", "revolutions": 1.0}).nodes)
+    del nodes["spindle_encoder"]
+    policy = security.policy(scenarios.Scenario("device", nodes))
+    assert "/lathe/joints" in policy["/encoder_device"][0].subscribe
+    assert not any("/lathe/joints" in profile.publish for enclave in policy.values() for profile in enclave)
+
+
 def test_an_operator_may_call_but_not_publish():
     policy = security.policy(scenario(), beside=[security.OPERATOR])
     (operator,) = policy.pop("/operator")

@@ -3,6 +3,7 @@
 
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,8 +20,23 @@ from lathe_rc.signals.counts import LineReader, Reading
 _POLL = 0.5e-3  # [s] between looks at a line
 
 
+class _EncoderLostError(LatheError):
+    """Nobody knows any more how the spindle turns."""
+
+
+@contextmanager
+def _losing_it() -> Iterator[None]:
+    """What goes wrong is the encoder's."""
+    try:
+        yield
+    except LatheError as error:
+        raise _EncoderLostError(*error.args) from None
+
+
 class EncoderNode(SpindleNode):
     """See the module; with a file it is a spindle like any other.
+
+    When the encoder is lost the others come to their safe state, while the spindle seems to go on at its last speed.
 
     Block k is due when the last reading that it needs would have been here, had it taken as long on its way as the
     quickest one so far.
@@ -28,7 +44,7 @@ class EncoderNode(SpindleNode):
 
     stage: EncoderDevice
     _line: LineReader | None = None
-    _listens = False
+    _listens = _lost = False
 
     def configure_part(self) -> None:
         """See `StageNode`."""
@@ -61,6 +77,7 @@ class EncoderNode(SpindleNode):
             self._listens = True
             self.create_subscription(JointState, topic, self.guarded(self._on_joints), asked(publishers))
 
+    @_losing_it()
     def _on_joints(self, joints: Any) -> None:
         where, name = self.topic(self._device.topic), self._device.joint
         if name and name not in joints.name:
@@ -77,7 +94,7 @@ class EncoderNode(SpindleNode):
     def _hear(self, readings: Iterator[Reading]) -> None:
         """Take readings; those before the run are over."""
         for time_ns, count in readings:
-            if not self._running or self.over:
+            if not self._running or self.over or self._lost:
                 continue
             self._came = time.monotonic()
             self.stage.hear(time_ns, count)
@@ -94,7 +111,8 @@ class EncoderNode(SpindleNode):
 
     def _at_once(self) -> int:
         """See `SpindleNode`; all that is there, for who has fallen behind has to catch up."""
-        return min(self._credit(), self.together) if self.stage.live else super()._at_once()
+        catches_up = self.stage.live and not self._lost
+        return min(self._credit(), self.together) if catches_up else super()._at_once()
 
     def _possible(self) -> int:
         """See `SpindleNode`: no more than the readings reach to."""
@@ -111,8 +129,8 @@ class EncoderNode(SpindleNode):
         """See `SpindleNode`; a real spindle does not wait."""
         if not self.stage.live:
             super()._fall_behind(late)
-        elif late > self._device.max_lag:
-            raise LatheError(
+        elif late > self._device.max_lag and not self._lost:
+            raise _EncoderLostError(
                 f"{self.get_name()}: the cell is {late:.3g} s behind the encoder at sample {self.samples}; allowed: up "
                 f"to max_lag = {self._device.max_lag:g} s (fewer processes, a larger block_size, or less to record)"
             )
@@ -130,8 +148,11 @@ class EncoderNode(SpindleNode):
         if self._line is not None:
             self.next_tick = min(self.next_tick, now + _POLL)
 
+    @_losing_it()
     def _look(self) -> None:
         """Take what has come on a line; has a topic its publisher; has nothing come for too long?"""
+        if self._lost:
+            return
         if self._line is None:
             self._listen_to_joints()
         else:
@@ -146,3 +167,14 @@ class EncoderNode(SpindleNode):
                 f"to max_silence = {self._device.max_silence:g} s"
                 + (f"; nobody publishes {self.topic(self._device.topic)}" if nobody else "")
             )
+
+    def fail(self, error: LatheError, *, cause: str = "error") -> None:
+        """See `SpindleNode`; without its encoder it leads the others to their safe state, if they can wait for it."""
+        if not isinstance(error, _EncoderLostError):
+            super().fail(error, cause=cause)
+        elif not self.table.window or not self._completed or not self.samples:
+            super().fail(LatheError(*error.args), cause=cause)
+        elif not self._lost:
+            self._lost = True
+            self.stage.go_on()
+            self._declare_safe(str(error))

@@ -58,7 +58,8 @@ class SpindleNode(StageNode):
         self._members_moved: dict[str, float] = {}  # monotonic time at which each has last completed a block
         self._stalled: frozenset[str] = frozenset()
         self._dead: dict[str, float] = {}  # monotonic time until which a member may be restarted
-        self._unsafe: set[str] = set()  # members that have not yet heard that others are lost
+        self._declared = False  # the safe state
+        self._unsafe: set[str] = set()  # members that have not yet heard of it
         self._end: int | None = None
         self._know_end()
         self._why = ""
@@ -100,7 +101,7 @@ class SpindleNode(StageNode):
 
     def _say(self, state: int, first: int, why: str = "") -> None:
         said = CellState(run_id=self.table.run_id, state=state, first_index=first, message=why[:1024])
-        if self._without:
+        if self._declared:
             assert self._end is not None, "the safe state has an end"
             said.end_index, said.lost = self._end, sorted(self._without)
         self._state.publish(said)
@@ -282,7 +283,7 @@ class SpindleNode(StageNode):
         self._say(CellState.ENDED, self.samples, self._why)
         self.get_logger().info(f"run ended: {self.blocks} blocks, {self.samples} samples")
         self.end([*self.outlets.values(), self._state])
-        if self._without:
+        if self._declared:
             super().fail(LatheError(self._why))
 
     def fail(self, error: LatheError, *, cause: str = "error") -> None:
@@ -312,7 +313,7 @@ class SpindleNode(StageNode):
         self._forgive(now - self._looked)
         self._looked = now
         for name in self.watch.ended() & self._completed.keys() - self._dead.keys():
-            restarts, self.patience = self.restarts(name) and not self._without, _GONE
+            restarts, self.patience = self.restarts(name) and not self._declared, _GONE
             self._dead[name] = now + (self._pace.restart_time if restarts else 0.0)
             self.get_logger().error(f"{name} has died at block {self._completed[name]}")
             self.reporter("dead", self.get_name(), member=name, blocks=self._completed[name], restarts=restarts)
@@ -379,25 +380,32 @@ class SpindleNode(StageNode):
             raise LatheError(f"{who} at sample {self.samples}; a cell with window = 0 cannot go on without it")
         if self._completed.keys() <= names:
             raise LatheError(f"{f'{self._why}; ' if self._why else ''}{who}: nobody is left at sample {self.samples}")
-        self._why = f"{self._why}; {who}" if self._why else f"{who}: safe state from sample {self.samples} on"
         before = self._least
         for name in names:
             del self._completed[name]
             self._dead.pop(name, None)
-        if not self._without and self._end != self.samples:
-            self._end = self.samples + max(1, round(self._pace.safe_time * self.table.sample_rate))
-            self._blocks_in_run = -(-self._end // self.table.block_size)
-        # After the first time all know what to do, and need only hear whom to do without.
-        self._unsafe = self._unsafe - names if self._without else set(self._completed)
         self._without |= names
+        self._unsafe -= names
         self.patience = _GONE
+        self._declare_safe(who)
+        if self._completed:
+            self._after(before, self._least)
+        else:
+            self.release()
+
+    def _declare_safe(self, why: str) -> None:
+        """Bring the cell to its safe state from the next sample on, once all members know."""
+        self._why = f"{self._why}; {why}" if self._why else f"{why}: safe state from sample {self.samples} on"
+        if not self._declared:
+            if self._end != self.samples:
+                self._end = self.samples + max(1, round(self._pace.safe_time * self.table.sample_rate))
+                self._blocks_in_run = -(-self._end // self.table.block_size)
+            # After the first time all know what to do, and need only hear whom to do without.
+            self._unsafe = set(self._completed)
+        self._declared = True
         self._say(CellState.SAFE, self.samples, self._why)
         self.get_logger().error(self._why)
         self.reporter(
             "safe", self.get_name(), sample=self.samples, end=self._end, lost=sorted(self._without), why=self._why
         )
         self._heard = time.monotonic()
-        if self._completed:
-            self._after(before, self._least)
-        else:
-            self.release()

@@ -26,6 +26,7 @@ Reading = tuple[int, float]  #: time [ns] and counter
 _READING = re.compile(r"\s*([-+]?[0-9.eE+-]+)\s*(?:[,;]|\s)\s*([-+]?[0-9.eE+-]+)\s*")
 _HEADERS = {"time_ns,counts": 1, "time_s,counts": 10**9}  # and nanoseconds in a unit of the first column
 _LONGEST_LINE = 256
+_GOES_ON = 3600  # [s]
 _PIECE = 65536  # bytes that are read at once
 _BAUD = {int(name[1:]): getattr(termios, name) for name in dir(termios) if re.fullmatch(r"B[1-9][0-9]+", name)}
 _IFLAG, _OFLAG, _CFLAG, _LFLAG, _ISPEED, _OSPEED, _CC = range(7)  # places in what termios gives
@@ -236,6 +237,13 @@ class CountedAngle:
                 f"{self._max_reverse:g}, a spindle that turns one way (inverted turns the sign)"
             )
         self._highest = max(self._highest, self._turned)
+        self._keep()
+
+    def go_on(self, speed: float) -> None:
+        """Take it that the spindle turns at ``speed`` [rad/s] from the newest reading on, for an hour."""
+        assert self._newest is not None, "a reading has come"
+        self._newest = self._newest[0] + _GOES_ON * 10**9, self._newest[1]
+        self._highest += speed * _GOES_ON * self._counts / (2.0 * np.pi)
         self._keep()
 
     def _keep(self) -> None:

@@ -89,6 +89,7 @@ class EncoderDevice(TimeMaster):
             max_gap=parameters.max_gap,
         )
         self._before: Samples | None = None  # the last angles, for the speed
+        self._speed = self.shared.nominal_speed  # the last one [rad/s]
         self._revolution = -1.0
         self._told: set[str] = set()
         self._told_late = 0
@@ -157,6 +158,10 @@ class EncoderDevice(TimeMaster):
         if self.samples is None and self.live:
             raise LatheError(self._too_short(f"{self.name}: the line"))
 
+    def go_on(self) -> None:
+        """Go on at the last speed: the encoder is lost, and the others have to come to their safe state."""
+        self.counted.go_on(self._speed)
+
     def _look_for_the_end(self) -> None:
         wanted = _TURN * self.parameters.revolutions
         if wanted and self.samples is None and self.counted.angle >= wanted:
@@ -206,6 +211,7 @@ class EncoderDevice(TimeMaster):
         out["angle"][:] = out["angle_true"][:] = angle
         out["speed"][:] = out["speed_true"][:] = (angle - whole[: angle.size]) / (window * step)
         self._before = whole[-window:].copy()
+        self._speed = float(out["speed"][-1])
         turns = np.floor(angle / _TURN)
         out["index_pulse"][:] = turns > np.concatenate(([self._revolution], turns[:-1]))
         self._revolution = float(turns[-1])
