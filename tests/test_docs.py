@@ -315,8 +315,8 @@ class TestLaunch:
                 "revolutions",
                 "no launch argument 'revolutions'; allowed: scenario, bag, namespace, NODE.PARAM .*nominal_rpm",
             ),
-            ("spindle.revolutions", "no node 'spindle' in the scenario; allowed: spindle_encoder, "),
-            ("spindle_encoder.revolution", "spindle_encoder.revolution: unknown parameter; allowed: "),
+            ("spindle.revolutions", "no node 'spindle' in the scenario; did you mean spindle_encoder?"),
+            ("spindle_encoder.revolution", "spindle_encoder.revolution: unknown parameter; did you mean revolutions"),
             ("tool.feed", "tool.feed = 'far'; allowed: a finite number"),
         ],
     )

@@ -21,7 +21,6 @@ from lathe_rc.cell.stages import STAGES
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.extensions import search_path
 
-
 _REFUSED = "refused: "  # begins what a process says of a stage whose step cannot be compiled
 
 
@@ -93,8 +92,9 @@ def main() -> None:
             with stage.named():
                 compile_kernels(stage)
         except InputError as error:
-            name = f"{_REFUSED}{error}"
-        print(name, flush=True)
+            print(f"{_REFUSED}{error}", flush=True)
+        else:
+            print(name, flush=True)
 
 
 if __name__ == "__main__":

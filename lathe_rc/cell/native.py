@@ -65,8 +65,8 @@ BROKEN = -2  #: where a step has come to that has raised an exception: Numba pri
 def broken(name: str) -> LatheError:
     """The error of a step that has raised an exception."""
     return LatheError(
-        f"{name}: the step has raised an exception, which Numba has printed on the error stream of its process (without "
-        "@kernel Python says where)"
+        f"{name}: the step has raised an exception, which Numba has printed on the error stream of its process; "
+        "without @kernel Python says where"
     )
 
 

@@ -184,7 +184,7 @@ class Replayer:
                 Member(
                     run_id=scenario.shared.run_id,
                     name=f"/{name}",
-                    stage=stage.kind,
+                    stage=kind_of(stage.name, stage.shared.stage),
                     state=Member.READY,
                     members=everybody if isinstance(stage, TimeMaster) else [],
                     publishes=[f"/{topic}" for topic in (*dense, *sparse)],
