@@ -88,7 +88,7 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
 
 def test_a_file_beside_the_lists_is_refused(tmp_path):
     both = {"tachogram_file": str(tmp_path / "speed.csv"), "tachogram_time": [0.0], "tachogram_deviation": [0.1]}
-    with pytest.raises(InputError, match="speed.csv beside tachogram_time; allowed: one of them"):
+    with pytest.raises(InputError, match=r"speed\.csv beside tachogram_time; allowed: one of them"):
         harness.run(scenario(spindle_encoder=both))
 
 
