@@ -12,6 +12,7 @@ import importlib
 import importlib.metadata
 import os
 import sys
+import sysconfig
 import traceback
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
@@ -210,11 +211,20 @@ def search_path() -> str:
     return os.pathsep.join([*given, *(str(Path(folder).absolute()) for folder in sys.path)])
 
 
+def is_ours(module: str) -> bool:
+    """Whether a module is one of lathe_rc: the folder of compiled code changes with its source.
+
+    The source of others is not looked at there; what is kept of their steps is, see `lathe_rc.cell.native`.
+    """
+    return module.startswith("lathe_rc.")
+
+
 @cache
 def source_hash(module: str) -> str:
-    """Hash of the source that a module stands in, and of all that it imports beside lathe_rc and what that needs.
+    """Hash of the source that a module stands in, and of what it imports beside lathe_rc and what kernels need.
 
-    Of a package all files count, of a module that stands alone its file.
+    Of a package all files count, of a module that stands alone its file. Of what is installed that counts which the
+    sources outside import, but not what it imports in turn.
 
     Raises:
         InputError: it has no file.
@@ -225,18 +235,20 @@ def source_hash(module: str) -> str:
     waiting = [module.partition(".")[0]]
     while waiting:
         top = waiting.pop()
-        if top in seen or top in _NOT_HASHED or top not in sys.modules:
+        if top in seen or top in COMMON or top not in sys.modules:
             continue
         seen.add(top)
         for path in _files(top):
             text = path.read_bytes()
             digest.update(path.name.encode() + text)
-            waiting += sorted(_imports(text))
+            if len(seen) == 1 or not path.is_relative_to(_INSTALLED):
+                waiting += sorted(_imports(text))
     return digest.hexdigest()
 
 
-#: whose versions do not change within a set-up; the first has its own hash
-_NOT_HASHED = {"lathe_rc", "numpy", "scipy", "numba", "annotated_types", "pydantic", *sys.stdlib_module_names}
+_INSTALLED = sysconfig.get_path("purelib")
+#: modules whose versions do not change within a set-up; the first has a hash of its own
+COMMON = {"lathe_rc", "numpy", "scipy", "numba", "annotated_types", "pydantic", *sys.stdlib_module_names}
 
 
 def _files(top: str) -> list[Path]:
@@ -244,7 +256,8 @@ def _files(top: str) -> list[Path]:
     module = sys.modules[top]
     if paths := [Path(each) for each in getattr(module, "__path__", ())]:
         return sorted(path for folder in paths for path in folder.rglob("*.py"))
-    return [Path(module.__file__)] if module.__file__ and module.__file__.endswith(".py") else []
+    file = getattr(module, "__file__", None) or ""
+    return [Path(file)] if file.endswith(".py") else []
 
 
 def _imports(text: bytes) -> set[str]:

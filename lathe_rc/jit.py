@@ -10,6 +10,8 @@ from typing import ParamSpec, TypeVar, cast
 import numba
 import platformdirs
 
+from lathe_rc.extensions import is_ours
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -49,19 +51,6 @@ if "NUMBA_CACHE_DIR" not in os.environ:
 def cache_folder() -> Path:
     """Where compiled code is kept."""
     return Path(os.environ.get("NUMBA_CACHE_DIR") or getattr(numba.config, "CACHE_DIR"))  # noqa: B009 - see above
-
-
-def is_ours(module: str) -> bool:
-    """Whether the folder of the cache changes with the source of a module.
-
-    That of others is not looked at; what is kept of their steps is, see `lathe_rc.cell.native`.
-    """
-    return module.startswith(f"{_PACKAGE.name}.")
-
-
-def is_compiled(function: object) -> bool:
-    """Whether a function is a kernel."""
-    return hasattr(function, "py_func")
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:

@@ -61,7 +61,7 @@ def test_what_ros_would_pass_over_is_refused(monkeypatch, capsys, name, words):
 def test_a_container_without_nodes_is_refused(monkeypatch, capsys, words, named):
     code, _, said = run(monkeypatch, capsys, "container", *words)
     assert code == 2
-    assert said.startswith(f"lathe: no node {named!r}; allowed: recorder, ")
+    assert said.startswith(f"lathe: no node {named!r}; allowed: spindle_encoder, ")
 
 
 # --- parameters that lose

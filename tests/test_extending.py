@@ -253,7 +253,14 @@ def test_a_changed_source_is_compiled_anew(begin):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"), [("Law", "small letters"), ("tool", "lathe_rc's own"), ("my-law", "small letters")]
+    ("name", "said"),
+    [
+        ("Law", "small letters"),
+        ("tool", "lathe_rc's own"),
+        ("my-law", "small letters"),
+        ("class", "word"),
+        ("numpy", "module"),
+    ],
 )
 def test_a_name_that_cannot_be_is_refused(tmp_path, monkeypatch, name, said):
     monkeypatch.chdir(tmp_path)
@@ -306,3 +313,76 @@ def test_the_reference_of_a_stage_of_others_is_printed(begin):
     assert told.exit_code == 0
     assert told.stdout.startswith("## my_law:MyLaw")
     assert "| `lead_time` | double | `0.001425` |" in told.stdout
+
+
+# --- mistakes
+
+
+def refused(file, *changes):
+    with pytest.raises(InputError) as error:
+        harness.run(scenario.load(file, [SHORT, *changes]))
+    assert len(str(error.value).splitlines()) == 1
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "said"),
+    [
+        ("nan_law", "return q - ", "return np.nan * waves + q - ", "with electrodynamic_actuator is not a number at 0"),
+        (
+            "short_law",
+            "return q - table.learning_gain * drive(waves * speed) * read",
+            "return q[:1]",
+            "short_law: contraction gives the shape (1,) for (1025,)",
+        ),
+        (
+            "raised_law",
+            "        q = 1.0 -",
+            "        q = 1 // 0 -",
+            "contraction: ZeroDivisionError in __init__.py, line",
+        ),
+        ("far_law", "return self.parameters.points / 2", "return np.nan", "highest_waves gives nan"),
+        (
+            "list_law",
+            "np.zeros(3))",
+            "[0.0, 0.0, 0.0])",
+            "memory of a compiled step: law.newest is a list; allowed: arrays",
+        ),
+        ("half_law", "np.zeros(3))", "np.zeros(3, np.float32))", "newest is an array of float32; allowed: float64,"),
+        ("gap_law", "np.zeros(3))", "np.zeros(6)[::2])", "newest is an array with gaps"),
+        ("single_law", "Memory(table.learning_gain", "Memory(np.float32(1)", "gain is a float32; allowed: arrays, int"),
+        ("typo_law", "now.error_angle, now.error, before", "now.error_angel, now.error, before", "error_angel"),
+        (
+            "default_law",
+            "parameter(1.0, ",
+            "parameter(3.0, ",
+            "default_law.learning_gain = 3.0; allowed: a finite number",
+        ),
+        ("dict_law", "Annotated[float, Gt(0), Le(2)]", "dict", "learning_gain is a <class 'dict'>; allowed: bool, int"),
+        (
+            "bare_law",
+            'parameter(1.0, "γ: part of the error that a revolution learns")',
+            "1.0",
+            "is no parameter; allowed:",
+        ),
+        ("no_law", "    sample = staticmethod(sample)\n", "", "NoLaw has no formula; allowed: sample = staticmethod"),
+    ],
+)
+def test_a_mistake_in_a_law_is_told_in_one_line(begin, name, old, new, said):
+    file = begin("law", name)
+    edit(name, old, new)
+    assert said in refused(file)
+
+
+def test_a_change_of_a_module_that_a_kernel_uses_is_compiled_anew(begin):
+    """Also where the kernel of another module is called, or a number of it is used."""
+    file = begin("law", "leaning_law")
+    edit("leaning_law", "TURN = 2.0 * np.pi", "from leaned_on import FACTOR\n\nTURN = 2.0 * np.pi")
+    edit("leaning_law", "memory.gain * (error", "FACTOR * memory.gain * (error")
+    rms = []
+    for factor in (1.0, 0.5):
+        Path("leaned_on.py").write_text(f"FACTOR = {factor}\n")
+        command = [sys.executable, "-m", "lathe_rc", "run", str(file), "--revolutions", "4", "--json"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        rms.append(json.loads(done.stdout)["error_um"]["last"]["rms"])
+    assert rms[1] > 2 * rms[0]

@@ -36,7 +36,7 @@ from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
 
 def made(name, kind):
-    return STAGES[kind](name, TABLES[kind].read(name, {}))
+    return STAGES[kind](name, TABLES[kind].read(name, {"stage": kind}))
 
 stages = [made("spindle_encoder", "spindle_encoder"), made("form", "profile"), made("other", "profile")]
 print(json.dumps([list(ahead.compile_ahead(stages)), list(ahead.compile_ahead(stages))]))
@@ -56,6 +56,6 @@ def test_steps_are_compiled_once_and_those_that_are_alike_together(tmp_path):
 def test_a_process_that_cannot_compile_is_an_error(monkeypatch):
     monkeypatch.setattr(ahead.native, "compiled", set)
     monkeypatch.setattr(ahead.sys, "executable", "/bin/false")
-    stage = STAGES["profile"]("form", TABLES["profile"].read("form", {}))
+    stage = STAGES["profile"]("form", TABLES["profile"].read("form", {"stage": "profile"}))
     with pytest.raises(LatheError, match="a process that compiles"):
         list(ahead.compile_ahead([stage]))

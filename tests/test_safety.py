@@ -737,7 +737,8 @@ def test_the_margin_that_is_published_is_that_of_the_newest_cycle():
 def test_the_margin_is_that_of_the_drive_as_it_is():
     """A drive that is faster than was believed: the margin falls when that has been identified."""
     faster = ["electrodynamic_actuator.natural_frequency=1200.0", "spindle_encoder.deviation_amplitude=[0.0]"]
-    loaded = supervised(*faster, "supervisor.margin_limit=[0.05]", "supervisor.error_limit=0.0")
+    believed = "learning_controller.model_natural_frequency=1038.0"
+    loaded = supervised(*faster, believed, "supervisor.margin_limit=[0.05]", "supervisor.error_limit=0.0")
     result = harness.run(loaded)
     margin = margin_of(result)
     stage = LearningController("controller", loaded.nodes["learning_controller"])

@@ -21,9 +21,9 @@ import numpy.typing as npt
 from numba.core.errors import NumbaError
 
 from lathe_rc.errors import InputError, LatheError, shown
-from lathe_rc.extensions import source_hash
+from lathe_rc.extensions import is_ours, source_hash
 from lathe_rc.files import replacing
-from lathe_rc.jit import cache_folder, is_ours, kernel
+from lathe_rc.jit import cache_folder, kernel
 from lathe_rc.placed import Placed, Words, call
 
 Integers = npt.NDArray[np.int64]
@@ -162,6 +162,17 @@ def _text(step: Step, memory: Placed, inputs: Sequence[np.dtype[Any]], outputs: 
         flags=arrays((field for field in read if field[1] == np.uint8), without="(octets(fields, 0, 0),)"),
         outputs=arrays(enumerate(outputs, len(inputs))),
     )
+
+
+def is_compiled(function: object) -> bool:
+    """Whether a function is a kernel."""
+    return hasattr(function, "py_func")
+
+
+def step_of(stage: type, loop: Step, *, compiled: bool) -> Step:
+    """Make a function that has been written for a class of stages its step."""
+    loop.__module__, loop.__qualname__ = stage.__module__, f"{stage.__qualname__}.step"
+    return kernel(loop) if compiled else loop
 
 
 def _source(module: str) -> str:

@@ -177,7 +177,7 @@ class Scenario:
             {128}
             >>> piston.varied({"learning_controller.lead_tim": 1.3e-3})
             Traceback (most recent call last):
-            lathe_rc.errors.InputError: learning_controller.lead_tim: unknown parameter; allowed: ...
+            lathe_rc.errors.InputError: learning_controller.lead_tim: unknown parameter; did you mean lead_time, ...
         """
         changes: dict[str, dict[str, Value]] = {}
         for target, value in values.items():
@@ -320,7 +320,7 @@ def load(path: Path, overrides: Iterable[str] = (), *, complete: bool = False) -
         (20.0, 128)
         >>> scenario.load(path, ["tol.feed=1.0"])
         Traceback (most recent call last):
-        lathe_rc.errors.InputError: --set 'tol.feed=1.0': no node 'tol' in the scenario; allowed: spindle_encoder, ...
+        lathe_rc.errors.InputError: --set 'tol.feed=1.0': no node 'tol' in the scenario; did you mean tool?
     """
     nodes = ros_yaml.read(path)
     for name, values in nodes.items():

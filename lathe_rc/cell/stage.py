@@ -25,10 +25,10 @@ import numpy as np
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
-from lathe_rc.cell.native import Native, Step
+from lathe_rc.cell.native import Native, Step, is_compiled
 from lathe_rc.cell.parameters import NodeParameters, about, remapped
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.jit import is_compiled, is_ours, kernel
+from lathe_rc.extensions import is_ours
 from lathe_rc.names import instead
 from lathe_rc.placed import unfit
 from lathe_rc.safety import faults
@@ -564,12 +564,6 @@ class Stage(ABC):
             sparse += self.tell(first + told, first + reached)
             told = reached
             sparse += self.serve(reason, first, reached, inputs, outputs)
-
-
-def step_of(stage: type[Stage], loop: Step, *, compiled: bool) -> Step:
-    """Make a function that has been written for a class its step."""
-    loop.__module__, loop.__qualname__ = stage.__module__, f"{stage.__qualname__}.step"
-    return kernel(loop) if compiled else loop
 
 
 def cut(signals: Sequence[Signals], start: int, stop: int) -> list[Signals]:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command ``lathe new``: a package of one's own to begin with, which runs and is tested as it is."""
 
-import importlib.util
 import keyword
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.errors import InputError
+from lathe_rc.extensions import COMMON
 
 
 @dataclass(frozen=True)
@@ -97,9 +97,9 @@ def _check_name(name: str) -> None:
     """Refuse what cannot be the name of a package and a node."""
     if not (name.isascii() and name.isidentifier() and name == name.lower()) or name.startswith("_"):
         raise InputError(f"{name!r}; allowed: small letters, digits and _, a letter first")
-    if keyword.iskeyword(name) or importlib.util.find_spec(name) is not None:
+    if keyword.iskeyword(name) or name in COMMON:
         raise InputError(f"{name!r} is a word or module of Python's already; allowed: another")
-    if name in TABLES.own or name in ("lathe_rc", "tests"):
+    if name in TABLES.own or name == "tests":
         raise InputError(f"{name!r} is a name of lathe_rc's own; allowed: another")
 
 

@@ -30,8 +30,9 @@ from annotated_types import Ge
 from lathe_rc.analysis.learning import Array, Complex, Response, supremum
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.native import is_compiled, step_of
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, step_of
+from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
 from lathe_rc.cell.stages.learner import Learner, LearnerParameters, checked
 from lathe_rc.cell.stages.obedience import (
     NOBODY,
@@ -46,7 +47,7 @@ from lathe_rc.cell.stages.obedience import (
 )
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import code_of_others
-from lathe_rc.jit import inlined, is_compiled
+from lathe_rc.jit import inlined
 from lathe_rc.safety.state_machine import Reaction
 
 _TURN = 2.0 * np.pi

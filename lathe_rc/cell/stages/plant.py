@@ -27,8 +27,9 @@ from annotated_types import Ge, Gt
 
 from lathe_rc.analysis.learning import Array, Complex, Response
 from lathe_rc.cell import messages
+from lathe_rc.cell.native import is_compiled, step_of
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse, step_of
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
 from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.cell.stages.learner import checked
@@ -37,7 +38,6 @@ from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import LimiterTable
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import code_of_others
-from lathe_rc.jit import is_compiled
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
 _NO_FREQUENCY = np.zeros(1)  # [rad/s]
