@@ -220,11 +220,13 @@ def is_ours(module: str) -> bool:
 
 
 @cache
-def source_hash(module: str) -> str:
-    """Hash of the source that a module stands in, and of what it imports beside lathe_rc and what kernels need.
+def source_hash(module: str, *, imports: bool = False) -> str:
+    """Hash of the source that a module stands in: of all files of its package, or of the file alone.
 
-    Of a package all files count, of a module that stands alone its file. Of what is installed that counts which the
-    sources outside import, but not what it imports in turn.
+    Args:
+        module: see above.
+        imports: of what it imports as well, beside lathe_rc and what kernels need. Of what is installed that counts
+            which sources outside import, but not what it imports in turn.
 
     Raises:
         InputError: it has no file.
@@ -241,7 +243,7 @@ def source_hash(module: str) -> str:
         for path in _files(top):
             text = path.read_bytes()
             digest.update(path.name.encode() + text)
-            if len(seen) == 1 or not path.is_relative_to(_INSTALLED):
+            if imports and (len(seen) == 1 or not path.is_relative_to(_INSTALLED)):
                 waiting += sorted(_imports(text))
     return digest.hexdigest()
 

@@ -177,7 +177,7 @@ def step_of(stage: type, loop: Step, *, compiled: bool) -> Step:
 
 def _source(module: str) -> str:
     """What tells versions of a step apart: ours have a cache each."""
-    return "that of lathe_rc" if is_ours(module) else source_hash(module)
+    return "that of lathe_rc" if is_ours(module) else source_hash(module, imports=True)
 
 
 def compiled() -> set[str]:
