@@ -351,7 +351,12 @@ def refused(file, *changes):
         ("half_law", "np.zeros(3))", "np.zeros(3, np.float32))", "newest is an array of float32; allowed: float64,"),
         ("gap_law", "np.zeros(3))", "np.zeros(6)[::2])", "newest is an array with gaps"),
         ("single_law", "Memory(table.learning_gain", "Memory(np.float32(1)", "gain is a float32; allowed: arrays, int"),
-        ("typo_law", "now.error_angle, now.error, before", "now.error_angel, now.error, before", "error_angel"),
+        (
+            "typo_law",
+            "now.error_angle, now.error, before",
+            "now.error_angel, now.error, before",
+            "cannot be compiled at __init__.py, line",
+        ),
         (
             "default_law",
             "parameter(1.0, ",

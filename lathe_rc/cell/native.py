@@ -62,10 +62,10 @@ _WRONG = ("Unknown attribute", "No implementation", "Cannot unify", "Cannot", "U
 BROKEN = -2  #: where a step has come to that has raised an exception: Numba prints it, and the function returns 0
 
 
-def broken(name: str) -> LatheError:
+def broken() -> LatheError:
     """The error of a step that has raised an exception."""
     return LatheError(
-        f"{name}: the step has raised an exception, which Numba has printed on the error stream of its process; "
+        "the step has raised an exception, which Numba has printed on the error stream of its process; "
         "without @kernel Python says where"
     )
 
@@ -121,16 +121,16 @@ class Native:
         self._reached[0] = BROKEN
         reason = _call(self.address, self.words, first, start, samples, self._fields, self._reached)
         if self._reached[0] == BROKEN:
-            raise broken(self.name)
+            raise broken()
         return int(self._reached[0]), reason
 
 
 def _cause(told: str) -> str:
     """What Numba says of code that it cannot compile, in a line: the innermost place, and what is wrong there."""
-    places = _PLACE.findall(told)
+    places = [found for found in _PLACE.findall(told) if not Path(found[0]).name.startswith("step_")]
     words = [line.strip() for line in told.splitlines()]
     why = next((line for line in reversed(words) if line.startswith(_WRONG)), next(filter(None, words), "no reason"))
-    where = f" at {Path(places[-1][0]).name}, line {places[-1][1]}" if places else ""
+    where = f" at {Path(places[0][0]).name}, line {places[0][1]}" if places else ""
     return f"a step cannot be compiled{where}: {shown(why)}"
 
 

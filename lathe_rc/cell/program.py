@@ -241,7 +241,7 @@ class Program:
         outputs = [tapes.view(tape, first, samples) for tape in self._wired[number].outputs]
         with stage.named():
             if reason == BROKEN:
-                raise broken(stage.name)
+                raise broken()
             if reason == PYTHON:
                 self._tell(number, first)
                 self._sparse[number] += stage.compute(first, inputs, outputs)
