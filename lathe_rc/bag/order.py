@@ -208,7 +208,7 @@ class Merger:
             self._needs = [need for need in self._needs if self._received.get(need[1], 0) < need[2]]
             ready = min([ready, *(row for row, _, _ in self._needs)])
         if self._final is not None and ready > self._final and self._finals < len(self._topics):
-            raise LatheError("topics are not cut into the same blocks: not all end with the same one; is `last` set in each?")
+            raise LatheError("topics are not cut into the same blocks: not all end with the same one (`last`)")
         while self.rows < ready:
             self._write(*self._at(self.rows), self._together(ready))
         self._late = sum(end == ready for end in self._ends)
