@@ -56,7 +56,8 @@ def test_stages_stand_in_the_order_of_the_forward_edges():
 
 def test_topic_without_publisher_is_refused():
     assert refusal(tool={"remap": ["coarse/state:=fine/state"]}) == (
-        "tool reads fine/state, which no node of the scenario publishes"
+        "tool reads fine/state, which no node of the scenario publishes; allowed: a node that does, or another topic "
+        "by tool.remap"
     )
 
 

@@ -113,7 +113,10 @@ class Cell:
         topic = remapped(stage.shared, port.topic)
         source = self.dense.get(topic)
         if source is None:
-            raise InputError(f"{stage.name} reads {topic}, which no node of the scenario publishes")
+            raise InputError(
+                f"{stage.name} reads {topic}, which no node of the scenario publishes; allowed: a node that does, or "
+                f"another topic by {stage.name}.remap"
+            )
         if source.type != port.type:
             raise InputError(f"{stage.name} reads {topic} as {port.type}, but {source.node} publishes {source.type}")
         return source
@@ -201,7 +204,9 @@ class Cell:
         self.unchecked.clear()
         low, high = self.master.speed_range()
         if low <= 0.0:
-            raise InputError(f"{self.master.name}: speed falls to {low:.4g} rad/s; allowed: above 0")
+            raise InputError(
+                f"{self.master.name}.nominal_rpm and its deviations: speed falls to {low:.4g} rad/s; allowed: above 0"
+            )
         for stage in self.stages.values():
             for port in stage.inputs:
                 if 0 < port.delay < stage.shared.block_size:
