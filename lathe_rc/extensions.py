@@ -207,8 +207,8 @@ def _distribution(dist: importlib.metadata.Distribution | None) -> str:
 
 def search_path() -> str:
     """Where Python looks for modules here, for the ``PYTHONPATH`` of another interpreter; what is in it stays first."""
-    given = filter(None, [os.environ.get("PYTHONPATH")])
-    return os.pathsep.join([*given, *(str(Path(folder).absolute()) for folder in sys.path)])
+    given = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
+    return os.pathsep.join(dict.fromkeys([*given, *(str(Path(folder).absolute()) for folder in sys.path)]))
 
 
 def is_ours(module: str) -> bool:

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, cast
 
+from lathe_rc.errors import InputError
+
 MOST = 2**26  #: longest file that is read whole [B]
 _NO_FILE = "not a file"
 
@@ -35,6 +37,16 @@ def _open_file(name: str, flags: int) -> int:
         os.close(number)
         raise OSError(errno.EINVAL, _NO_FILE)
     return number
+
+
+def check_place(option: str, path: Path) -> None:
+    """Refuse a place where no file can be written, before anything is computed.
+
+    Raises:
+        InputError: it is a folder, or in a folder that does not exist; ``option`` names it.
+    """
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        raise InputError(f"{option} {path}: {'is a folder' if path.is_dir() else 'no such folder'}; name a file")
 
 
 @contextlib.contextmanager

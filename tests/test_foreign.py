@@ -191,9 +191,7 @@ def test_a_member_is_known_if_its_stage_and_all_its_parameters_are(ghost, capfd,
             {"coarse/state": messages.STATE}, {"drive/events": messages.EVENT}, frozenset({"coarse/command"})
         )
         known = {"drive": KNOWN.model_copy(update={"stage": DRIVE})}
-        assert (node.tables(["/drive"]), node.unknown(["/drive"])) == (
-            (known, {}) if why is None else ({}, {"drive": unknown})
-        )
+        assert node.announced(["/drive"]) == ((known, {}) if why is None else ({}, {"drive": unknown}))
     said = "".join(capfd.readouterr())
     found = re.findall(rf"/drive, stage '{stage}', is known by its topics alone: (.*)$", said, re.MULTILINE)
     assert len(found) == (why is not None)
@@ -206,5 +204,5 @@ def test_a_parameter_that_cannot_be_is_refused_with_the_name_of_its_member(ghost
     wrong = KNOWN.model_copy(update={"damping": -1.0}).model_dump_json()
     node.members = {"/drive": Member(name="/drive", stage=DRIVE, parameters=wrong)}
     with pytest.raises(InputError, match=r"^/drive.damping = -1.0; allowed: a finite number above 0"):
-        node.tables(["/drive"])
+        node.announced(["/drive"])
     node.destroy_node()

@@ -169,10 +169,10 @@ def is_compiled(function: object) -> bool:
     return hasattr(function, "py_func")
 
 
-def step_of(stage: type, loop: Step, *, compiled: bool) -> Step:
-    """Make a function that has been written for a class of stages its step."""
+def step_of(stage: type, loop: Step, sample: object) -> Step:
+    """Make a function that has been written for a class of stages its step; compiled if what it calls is."""
     loop.__module__, loop.__qualname__ = stage.__module__, f"{stage.__qualname__}.step"
-    return kernel(loop) if compiled else loop
+    return kernel(loop) if is_compiled(sample) else loop
 
 
 def _source(module: str) -> str:

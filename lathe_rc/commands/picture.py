@@ -4,6 +4,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lathe_rc import files
 from lathe_rc.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,8 +19,7 @@ def check_place(path: Path) -> None:
     """
     if path.suffix.lower() != ".png":
         raise InputError(f"--figure {path}; allowed: a file name that ends in .png")
-    if path.is_dir() or not path.parent.is_dir():
-        raise InputError(f"--figure {path}: {'is a folder' if path.is_dir() else 'no such folder'}; name a file")
+    files.check_place("--figure", path)
 
 
 def save(figure: "Figure", path: Path) -> None:

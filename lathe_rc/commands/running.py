@@ -14,6 +14,7 @@ from lathe_rc.commands import outcome, picture
 from lathe_rc.commands import scenario as scenarios
 from lathe_rc.commands.progress import Watch
 from lathe_rc.errors import InputError
+from lathe_rc.files import check_place
 from lathe_rc.starting import Start
 
 _NO_SNAPSHOTS = "no snapshots: no --bag was given"
@@ -67,8 +68,8 @@ def run(
             raise InputError(f"{option} {value} with --mode offline; allowed: --mode processes or composed")
     if figure:
         picture.check_place(figure)
-    if profile and (profile.is_dir() or not profile.absolute().parent.is_dir()):
-        raise InputError(f"--profile {profile}: {'a folder' if profile.is_dir() else 'no such folder'}; name a file")
+    if profile:
+        check_place("--profile", profile)
     result = _shown(
         loaded,
         mode=mode,

@@ -117,7 +117,7 @@ def form(node: "StageNode", cell: Cell | None = None) -> None:
         return
     namespace = node.get_namespace().rstrip("/") + "/"
     try:
-        cell = cell or Cell(node.tables(node.master.members), node.unknown(node.master.members))
+        cell = cell or Cell(*node.announced(node.master.members))
     except InputError:
         return  # no cell can be made of them, as the time master says: each node computes alone
     here = {name: mates[namespace + name] for name in cell.stages if namespace + name in mates}

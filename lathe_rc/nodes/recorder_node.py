@@ -178,7 +178,7 @@ class RecorderNode(CellNode):
     def _explain(self) -> None:
         """Let the bag say what was run, with the parameters that the members really have."""
         names = list(self.members) if self.master is None else list(self.master.members)
-        tables = self.tables(names)
+        tables, _ = self.announced(names)
         if tables:
             host = [self.topic(topic) for topic in _HOST_TOPICS]
             self._open.tell(story.tell(Scenario(self.table.run_id or "cell", tables), host))

@@ -479,27 +479,29 @@ class CellNode(LifecycleNode):
         changed = sorted({rule for rule in rules if rule.split(":=")[0] != rule.split(":=")[1]})
         return self.table.model_copy(update={"remap": changed})
 
-    def tables(self, names: Iterable[str]) -> dict[str, NodeParameters]:
-        """The parameters that members have announced, by their name in this node's namespace; `unknown` left out.
+    def announced(self, names: Iterable[str]) -> tuple[dict[str, NodeParameters], dict[str, Unknown]]:
+        """What members have announced, by their name in this node's namespace: for a `lathe_rc.cell.wiring.Cell`.
+
+        Returns:
+            The parameters of those that are known here, and the topics of those of whom nobody here knows more.
 
         Raises:
             InputError: a member that is known has a parameter that cannot be.
         """
-        found = {self._relative(name): self._table(name) for name in names}
-        return {name: table for name, table in found.items() if table is not None}
-
-    def unknown(self, names: Iterable[str]) -> dict[str, Unknown]:
-        """Members that nobody here knows more of than the topics that they have announced, as `tables` names them."""
-        found = {}
+        tables, unknown = dict[str, NodeParameters](), dict[str, Unknown]()
         for name in names:
-            if self._table(name) is None:
-                member = self.members[name]
-                dense, sparse = dict[str, str](), dict[str, str]()
-                for topic, msgtype, is_sparse in zip(member.publishes, member.types, member.sparse, strict=True):
-                    (sparse if is_sparse else dense)[self._relative(topic)] = msgtype
-                reads = frozenset(self._relative(topic) for topic in member.subscribes)
-                found[self._relative(name)] = Unknown(dense, sparse, reads)
-        return found
+            table = self._table(name)
+            if table is None:
+                unknown[self._relative(name)] = self._topics_of(self.members[name])
+            else:
+                tables[self._relative(name)] = table
+        return tables, unknown
+
+    def _topics_of(self, member: Member) -> Unknown:
+        dense, sparse = dict[str, str](), dict[str, str]()
+        for topic, msgtype, is_sparse in zip(member.publishes, member.types, member.sparse, strict=True):
+            (sparse if is_sparse else dense)[self._relative(topic)] = msgtype
+        return Unknown(dense, sparse, frozenset(self._relative(topic) for topic in member.subscribes))
 
     def _relative(self, name: str) -> str:
         """The name of a member or topic in this node's namespace."""

@@ -131,7 +131,7 @@ class SpindleNode(StageNode):
         known = [self.members.get(name) for name in self.member_names()]
         if all(member is not None and member.state == member.READY for member in known):
             # The same check as before an offline run, with the parameters that the members really have.
-            cell = Cell(self.tables(self.member_names()), self.unknown(self.member_names()))
+            cell = Cell(*self.announced(self.member_names()))
             cell.check()
             for what in cell.unchecked:
                 self.get_logger().warning(f"not checked: {what}")

@@ -20,7 +20,7 @@ from lathe_rc import __version__
 from lathe_rc.bag.story import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS, origins
 from lathe_rc.cell import messages
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.files import replacing
+from lathe_rc.files import check_place, replacing
 from lathe_rc.view import report_figures as figures
 from lathe_rc.view.report_form import CUTOFF, Form
 from lathe_rc.view.report_gather import Gathered, gather
@@ -359,8 +359,7 @@ def write(bag: Path, page: Path) -> Gathered:
     """
     if page.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"-o {page}; allowed: a file name that ends in .html")
-    if page.is_dir() or not page.absolute().parent.is_dir():
-        raise InputError(f"-o {page}: {'is a folder' if page.is_dir() else 'no such folder'}; name a file")
+    check_place("-o", page)
     told = gather(bag)
     command = shlex.join(["lathe", "report", str(bag), "-o", str(page)])
     text = render(told, bag.resolve().name, command)

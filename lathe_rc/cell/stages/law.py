@@ -30,10 +30,9 @@ from annotated_types import Ge
 from lathe_rc.analysis.learning import Array, Complex, Response, supremum
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
-from lathe_rc.cell.native import is_compiled, step_of
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
-from lathe_rc.cell.stages.learner import Learner, LearnerParameters, checked
+from lathe_rc.cell.stages.learner import Learner, LearnerParameters
 from lathe_rc.cell.stages.obedience import (
     NOBODY,
     OBEY,
@@ -45,6 +44,7 @@ from lathe_rc.cell.stages.obedience import (
     may_learn,
     piece,
 )
+from lathe_rc.cell.stages.sampled import Sampled, checked
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import code_of_others
 from lathe_rc.jit import inlined
@@ -149,7 +149,7 @@ class LawMemory(NamedTuple):
 
 
 def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
-    """The step of a law, for `step_of`."""
+    """See `Sampled`."""
 
     def step(memory: LawMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
         """See `lathe_rc.cell.stage`."""
@@ -176,7 +176,7 @@ def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
     return step
 
 
-class Law(Learner):
+class Law(Sampled, Learner):
     """Base of control laws: commands a drive from the error that is visible.
 
     A law of one's own has a table ``Parameters``, the memory that it starts with (`start`), and its formula
@@ -193,19 +193,12 @@ class Law(Learner):
     actions = ("freeze", "learn", "clear")
     announces = (OUT_OF_REACH,)
     sample: ClassVar[Callable[[Any, Now], float]]
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        if "sample" in vars(cls):
-            cls.step = staticmethod(step_of(cls, _loop(cls.sample), compiled=is_compiled(cls.sample)))
+    loop = staticmethod(_loop)
 
     def __init__(self, name: str, parameters: LawParameters) -> None:
         super().__init__(name, parameters)
-        if self.step is None:
-            raise InputError(f"{name}: {type(self).__name__} has no formula; allowed: sample = staticmethod(FUNCTION)")
         self.parameters = parameters
-        with code_of_others(f"{name}: start"):
-            self.law = self.start()
+        self.law = self.started()
         delay = parameters.feedback_delay
         self._guard = GuardTable(parameters.stop_ratio**2, np.zeros(5), np.zeros(2, np.int64))
         self._learns = np.ones(1, np.int64)

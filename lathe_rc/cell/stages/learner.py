@@ -2,39 +2,20 @@
 """What all controllers that learn a drive have in common: what they tell for the checks before a start."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Annotated, ClassVar
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from lathe_rc.analysis.learning import Array, Complex, Response
+from lathe_rc.analysis.learning import Response
 from lathe_rc.cell.parameters import ObedientParameters, RestartParameters, parameter
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.stages.obedience import Obedience
 from lathe_rc.cell.stages.retraction import BoundedParameters
 from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Takeover
-from lathe_rc.errors import InputError, LatheError
-from lathe_rc.extensions import code_of_others
-
-
-def checked(what: str, ask: Callable[[], Complex | None], at: Array) -> Complex:
-    """A response that a law or drive of others tells, shape (n,).
-
-    Args:
-        what: it is, in words.
-        ask: gives it.
-        at: the waves or frequencies that it is asked for, shape (n,).
-
-    Raises:
-        InputError: it raises something, or gives another shape.
-    """
-    with code_of_others(what):
-        told = np.asarray(ask(), np.complex128)
-    if told.shape != at.shape:
-        raise InputError(f"{what} gives the shape {told.shape} for {at.shape}; allowed: a number for each")
-    return told
+from lathe_rc.errors import LatheError
 
 
 class LearnerParameters(ObedientParameters, BoundedParameters, RestartParameters):

@@ -27,16 +27,14 @@ from annotated_types import Ge, Gt
 
 from lathe_rc.analysis.learning import Array, Complex, Response
 from lathe_rc.cell import messages
-from lathe_rc.cell.native import is_compiled, step_of
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
 from lathe_rc.cell.stages.drive import Drive, Limits
-from lathe_rc.cell.stages.learner import checked
 from lathe_rc.cell.stages.retraction import OwnRetraction, RetractionParameters, followed
+from lathe_rc.cell.stages.sampled import Sampled, checked
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import LimiterTable
-from lathe_rc.errors import InputError
 from lathe_rc.extensions import code_of_others
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
@@ -126,7 +124,7 @@ Moved = tuple[float, float, float]  #: position [m], velocity [m/s], and effort 
 
 
 def _loop(sample: Callable[[Any, float], Moved]) -> Callable[..., Reached]:
-    """The step of a drive, for `step_of`."""
+    """See `Sampled`."""
 
     def step(memory: PlantMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
         """See `lathe_rc.cell.stage`."""
@@ -140,7 +138,7 @@ def _loop(sample: Callable[[Any, float], Moved]) -> Callable[..., Reached]:
     return step
 
 
-class Plant(SingleDrive):
+class Plant(Sampled, SingleDrive):
     """Base of drives of one's own.
 
     One has a table ``Parameters``, the memory that it starts with (`start`), and its equation ``sample(memory,
@@ -154,23 +152,12 @@ class Plant(SingleDrive):
 
     Parameters = PlantParameters
     sample: ClassVar[Callable[[Any, float], Moved]]
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        if "sample" in vars(cls):
-            cls.step = staticmethod(step_of(cls, _loop(cls.sample), compiled=is_compiled(cls.sample)))
+    loop = staticmethod(_loop)
 
     def __init__(self, name: str, parameters: PlantParameters) -> None:
-        if self.step is None:
-            raise InputError(f"{name}: {type(self).__name__} has no equation; allowed: sample = staticmethod(FUNCTION)")
         self.parameters = parameters
         super().__init__(name, parameters)
-        with code_of_others(f"{name}: start"):
-            self.plant = self.start()
-
-    @abstractmethod
-    def start(self) -> Any:
-        """The memory before sample 0."""
+        self.plant = self.started()
 
     def response(self, frequency: Array) -> Complex | None:
         """Response of the position to the command at frequencies [rad/s], shape (n,).
