@@ -13,6 +13,7 @@ NODES = [
     "encoder_device",
     "profile",
     "learning_controller",
+    "disturbance_controller",
     "electrodynamic_actuator",
     "piezo_actuator",
     "series_drive",

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a controller takes for its drive: given once, with the drive, unless the model shall be another.
+"""What a controller takes for its drive, the form and the encoder: given once, with those, unless it shall be another.
 
 A parameter that `lathe_rc.cell.parameters.parameter` marks with a quantity of the drive, and that nobody has given,
 gets the value of the drive that reads what the controller commands. Quantities with the same word before a dot belong
-together: who gives one of them gives all.
+together: who gives one of them gives all. The same holds for what a table ``asks``: it is that of the node that knows it.
 """
 
 from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import cast
 
-from lathe_rc.cell.parameters import NodeParameters, remapped
+from lathe_rc.cell.parameters import NodeParameters, Value, remapped
 from lathe_rc.errors import InputError
 
 Quantity = float | list[float]
@@ -59,6 +59,23 @@ def _model(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters
     return {name: values.get(name, cast("Quantity", rows[name].default)) for name in missing}
 
 
+def _known(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters]) -> dict[str, Value]:
+    """The values that nobody has given of what a table asks."""
+    values: dict[str, Value] = {}
+    for names in table.asks:
+        if names & table.model_fields_set:
+            continue
+        told = {other: known for other, each in tables.items() if names <= (known := each.known()).keys()}
+        first, *others = [*told] or [""]
+        for other in others:
+            if differing := sorted(name for name in names if told[other][name] != told[first][name]):
+                raise InputError(
+                    f"{node}.{differing[0]} is not given, and {first} and {other} differ in it; allowed: to give it"
+                )
+        values |= {name: told[first][name] for name in names} if first else {}
+    return values
+
+
 def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
     """The tables of a cell by node, with the models that nobody has given; they count as not given still.
 
@@ -67,7 +84,7 @@ def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
     """
     made = dict(tables)
     for node, table in tables.items():
-        values = _model(node, table, tables)
+        values: dict[str, Value] = {**_model(node, table, tables), **_known(node, table, tables)}
         if any(getattr(table, name) != value for name, value in values.items()):
             made[node] = table.model_copy(update=values)
             made[node].model_fields_set.difference_update(values)

@@ -212,6 +212,7 @@ class NodeParameters(SharedParameters):
     """What every node has."""
 
     listing: ClassVar[str] = "lathe node {} --help"
+    asks: ClassVar[tuple[frozenset[str], ...]] = ()  #: parameters that come from who knows them, unless one is given
 
     stage: str = parameter("", "what the node is; empty: its name says it")
     remap: list[str] = parameter([], "topic names to replace, as old:=new")
@@ -242,6 +243,10 @@ class NodeParameters(SharedParameters):
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
         """Of a drive: what controllers may know of it, by command topic before remapping and by quantity."""
+        return {}
+
+    def known(self) -> Mapping[str, Value]:
+        """What others may know of the node, by their parameter."""
         return {}
 
 

@@ -271,6 +271,16 @@ def _cubic(row: Array, place: float) -> float:
     return float(((row[j, 0] * u + row[j, 1]) * u + row[j, 2]) * u + row[j, 3])
 
 
+@inlined
+def _cubic_derivatives(c: Array, u: float) -> tuple[float, float, float]:
+    """A cubic, highest power first, and its first two derivatives at ``u``."""
+    return (
+        ((c[0] * u + c[1]) * u + c[2]) * u + c[3],
+        (3.0 * c[0] * u + 2.0 * c[1]) * u + c[2],
+        6.0 * c[0] * u + 2.0 * c[1],
+    )
+
+
 @kernel
 def deviation_along(heights: Array, table: Array, angle: Array, height: Array, deviation: Array) -> None:
     """Fill the radius deviation [m] at angles [rad] and heights [m], shape (n,), from a `ProfileTable`.
@@ -305,6 +315,47 @@ def deviation_along(heights: Array, table: Array, angle: Array, height: Array, d
                 value = _cubic(below, place)
                 deviation[k] = value + v * (_cubic(above, place) - value) if v > 0.0 else value
         start = stop
+
+
+@kernel
+def derivatives_at(
+    heights: Array, table: Array, feed: float, start: float, part: int, angle: float
+) -> tuple[float, float, float]:
+    """Radius deviation [m] at an angle [rad], and its first two derivatives over the angle along the tool's path.
+
+    Args:
+        heights: see `deviation_along`.
+        table: see `deviation_along`.
+        feed: see `height_along`.
+        start: see `height_along`.
+        part: see `height_along`.
+        angle: [rad].
+
+    Returns:
+        r [m], dr/dφ [m/rad], d²r/dφ² [m/rad²]. The slope along the part counts in the first derivative.
+    """
+    turns = angle / _TURN
+    if part > 0:
+        turns -= part * np.floor(turns / part)
+    height = start + feed * turns
+    row, last = 0, heights.size - 1
+    while row < last and height >= heights[row + 1]:
+        row += 1
+    per_radian = table.shape[1] / _TURN
+    place = angle * per_radian
+    whole = np.floor(place)
+    j, u = np.int64(whole) & (table.shape[1] - 1), place - whole
+    value, slope, bow = _cubic_derivatives(table[row, j], u)
+    if row < last and height > heights[row]:
+        apart = heights[row + 1] - heights[row]
+        v = (height - heights[row]) / apart
+        above, steeper, rounder = _cubic_derivatives(table[row + 1, j], u)
+        along = (above - value) / apart * feed / _TURN
+        value += v * (above - value)
+        slope += v * (steeper - slope)
+        bow += v * (rounder - bow)
+        return value, slope * per_radian + along, bow * per_radian**2
+    return value, slope * per_radian, bow * per_radian**2
 
 
 @dataclass(frozen=True)

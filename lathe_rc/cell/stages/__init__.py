@@ -4,6 +4,7 @@
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.stages.cutting_process import CuttingProcessStage
 from lathe_rc.cell.stages.decoupler import DecouplerStage
+from lathe_rc.cell.stages.disturbance_controller import DisturbanceController
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
 from lathe_rc.cell.stages.encoder_device import EncoderDevice
 from lathe_rc.cell.stages.feed_drive import FeedDriveStage
@@ -24,6 +25,7 @@ _OWN: tuple[type[Stage], ...] = (
     SpindleEncoder,
     EncoderDevice,
     LearningController,
+    DisturbanceController,
     ElectrodynamicActuator,
     PiezoActuator,
     SeriesDriveStage,

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The desired form of the part as parameters, and what evaluates it under the tool."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc import resources
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
-from lathe_rc.cell.parameters import NodeParameters, about, parameter
+from lathe_rc.cell.parameters import NodeParameters, Value, about, parameter
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
@@ -66,6 +66,10 @@ class FormParameters(NodeParameters):
         0, "feed: after so many revolutions the next part begins at start_height; 0: one endless part", "rev"
     )
 
+    def known(self) -> Mapping[str, Value]:
+        """See `NodeParameters`."""
+        return {name: getattr(self, name) for name in FORM}
+
     def form(self, node: str) -> Profile:
         """The profile of a node.
 
@@ -101,6 +105,9 @@ class FormParameters(NodeParameters):
         phase = self.harmonic_phase or [0.0] * len(order)
         with about(node, "harmonic_order", "harmonic_amplitude", "harmonic_phase"):
             return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
+
+
+FORM = frozenset(FormParameters.model_fields) - frozenset(NodeParameters.model_fields)  #: names of its parameters
 
 
 class FormTable(NamedTuple):

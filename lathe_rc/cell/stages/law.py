@@ -75,6 +75,7 @@ class Now(NamedTuple):
         error: measured form error [m] of ``feedback_delay`` samples ago; 0 before there is one.
         error_angle: measured spindle angle of that sample [rad].
         learning: False where the supervisor or an event forbids to learn.
+        position: measured position of the drive [m] of that sample, for a law that ``senses`` it; otherwise 0.
     """
 
     sample: int
@@ -84,6 +85,7 @@ class Now(NamedTuple):
     error: float
     error_angle: float
     learning: bool
+    position: float
 
 
 class GuardTable(NamedTuple):
@@ -136,6 +138,7 @@ class LawMemory(NamedTuple):
         obedience: to the supervisor, if it ``listens``.
         delay: of the error [sample].
         period: sampling step [s].
+        senses: whether it reads the drive's measured position.
         learns: whether events let it learn, shape (1,).
     """
 
@@ -145,6 +148,7 @@ class LawMemory(NamedTuple):
     delay: int
     period: float
     listens: bool
+    senses: bool
     learns: npt.NDArray[np.int64]
 
 
@@ -153,8 +157,8 @@ def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
 
     def step(memory: LawMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
         """See `lathe_rc.cell.stage`."""
-        angle, speed, error_angle, error, form = inputs
-        command = outputs[0]
+        angle, speed, error_angle, error, form = inputs[:5]
+        position, command = inputs[-1], outputs[0]
         while start < command.size:
             stop, learning = command.size, memory.learns[0] != 0
             if memory.listens:
@@ -166,7 +170,8 @@ def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
                 n = first + k
                 if n >= memory.delay and _grows(memory.guard, error_angle[k], error[k], form[k]):
                     return k, _DIVERGED
-                now = Now(n, n * memory.period, angle[k], speed[k], error[k], error_angle[k], learning)
+                sensed = position[k] if memory.senses else 0.0
+                now = Now(n, n * memory.period, angle[k], speed[k], error[k], error_angle[k], learning, sensed)
                 command[k] = sample(memory.law, now)
             if memory.listens:
                 apply(memory.obedience, command[start:stop])
@@ -187,9 +192,11 @@ class Law(Sampled, Learner):
     Attributes:
         parameters: its table.
         law: its memory.
+        senses: it reads the measured position of the drive that it commands.
     """
 
     Parameters = LawParameters
+    senses: ClassVar[bool] = False
     actions = ("freeze", "learn", "clear")
     announces = (OUT_OF_REACH,)
     sample: ClassVar[Callable[[Any, Now], float]]
@@ -208,6 +215,7 @@ class Law(Sampled, Learner):
                 Input("encoder", messages.ENCODER, ("angle", "speed")),
                 Input("encoder", messages.ENCODER, ("angle",), delay),
                 Input("tool", messages.TOOL, ("measured_error", "reference"), delay),
+                *([Input("coarse/state", messages.STATE, ("measured_position",), delay)] if self.senses else []),
                 *listens(parameters),
             ],
             outputs=[Output("coarse/command", messages.COMMAND)],
@@ -261,7 +269,14 @@ class Law(Sampled, Learner):
         obedience = self._obedience.table if self._obedience else NOBODY
         parameters = self.parameters
         return LawMemory(
-            self.law, self._guard, obedience, parameters.feedback_delay, parameters.step, listens, self._learns
+            self.law,
+            self._guard,
+            obedience,
+            parameters.feedback_delay,
+            parameters.step,
+            listens,
+            self.senses,
+            self._learns,
         )
 
     def serve(

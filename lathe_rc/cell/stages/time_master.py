@@ -2,13 +2,14 @@
 """What gives the cell its time and angle: a spindle that is emulated, a real encoder, or one that was recorded."""
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Le
 
-from lathe_rc.cell.parameters import NodeParameters, about, parameter
+from lathe_rc.cell.parameters import NodeParameters, Value, about, parameter
 from lathe_rc.cell.stage import Stage, Trigger
 from lathe_rc.signals.speed import SpeedLaw
 
@@ -42,6 +43,10 @@ class TimeMasterParameters(NodeParameters):
     processes: list[str] = parameter(
         [], "nodes that share a process, as 'coarse+tool', for harness and launch; those not named have one each"
     )
+
+    def known(self) -> Mapping[str, Value]:
+        """See `NodeParameters`."""
+        return {"encoder_counts": self.counts_per_revolution}
 
 
 class TimeMaster(Stage):

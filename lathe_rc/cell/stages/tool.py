@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tool against the part: desired form, displacement, form error."""
 
+from collections.abc import Mapping
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Le, MinLen
 
 from lathe_rc.cell import messages
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import Value, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
 from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, evaluate
 from lathe_rc.errors import InputError
@@ -34,6 +35,10 @@ class ToolParameters(FormParameters):
     deflection_delay: Annotated[int, Ge(1), Le(2**31 - 1)] = parameter(
         64, "deflects: delay of the feedback edge from the cut, at least a block", "sample"
     )
+
+    def known(self) -> Mapping[str, Value]:
+        """See `NodeParameters`."""
+        return super().known() if self.reference == "own" else {}
 
 
 class Memory(NamedTuple):

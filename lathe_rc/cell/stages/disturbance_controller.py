@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A law that holds when speed, force and drive vary.
+
+It feeds the form forward through the inverse of the drive in time, learns the disturbance at the drive's input over the
+angle and reads it ahead, and answers what the memory does not know with a disturbance observer. See
+`lathe_rc.cell.stages.form_law` and `lathe_rc.control.disturbance`.
+"""
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
+
+from lathe_rc.analysis.learning import Array, Complex, Response
+from lathe_rc.cell.parameters import about, parameter
+from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, feed_forward
+from lathe_rc.cell.stages.law import Now
+from lathe_rc.control.angle_filter import AngleFilterTable, at, follow
+from lathe_rc.control.disturbance import (
+    LEAK,
+    DisturbanceTable,
+    FormAhead,
+    commanded,
+    disturbance,
+    expected,
+    forget,
+    observed,
+    smoothing,
+)
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+
+
+class DisturbanceControllerParameters(FormLawParameters):
+    """Inverse feed-forward of the form, a repetitive memory of the disturbance, a disturbance observer."""
+
+    observer_bandwidth: Annotated[float, Ge(0)] = parameter(
+        4000.0, "bandwidth ωo of the disturbance observer; 0: none", "rad/s"
+    )
+    learning_gain: Annotated[float, Ge(0), Lt(1)] = parameter(
+        0.5, "part of what a revolution brings that the memory takes up in the long run; 0: there is no memory"
+    )
+    learned_waves: Annotated[float, Gt(0), Le(1000)] = parameter(
+        60.0, "waves per revolution at which the filter S of what is learned has fallen to a half"
+    )
+    learning_bandwidth: Annotated[float, Gt(0)] = parameter(8000.0, "bandwidth of what is learned", "rad/s")
+    follows_speed: bool = parameter(default=True, doc="learn how the disturbance changes with the speed as well")
+    points_per_revolution: Annotated[int, Ge(64), Le(65536)] = parameter(
+        512, "points of the memory per revolution, a power of 2"
+    )
+    identify: bool = parameter(default=True, doc="identify damping and natural frequency of the drive")
+    identification_bandwidth: Annotated[float, Gt(0)] = parameter(
+        1500.0, "bandwidth of its filters: above the profile's harmonics, below the noise", "rad/s"
+    )
+    identification_forgetting: Annotated[float, Ge(0), Lt(1)] = parameter(
+        0.7, "weight that a revolution's measurements keep after the next"
+    )
+
+    def make(self, node: str) -> DisturbanceTable:
+        """What a node knows before its first sample.
+
+        Raises:
+            InputError: a memory that cannot be made.
+        """
+        points = self.points_per_revolution
+        if points & (points - 1):
+            raise InputError(f"{node}.points_per_revolution = {points}; allowed: a power of 2, 64 up to 65536")
+        with about(node, "learned_waves"):
+            return disturbance(
+                step=self.step,
+                nominal=self.nominal_speed,
+                model=(self.model_natural_frequency, self.model_damping, self.model_delay),
+                late=self.feedback_delay,
+                observer=self.observer_bandwidth,
+                learner=self.learning_bandwidth,
+                gain=self.learning_gain,
+                follows_speed=self.follows_speed,
+                waves=self.learned_waves,
+                points=points,
+                identifier=self.identification_bandwidth,
+                identifies=self.identify,
+                forgetting=self.identification_forgetting,
+            )
+
+
+class Memory(NamedTuple):
+    """What the law works on.
+
+    Attributes:
+        spindle: filter of the angle.
+        form: that is turned.
+        known: of drive and disturbance.
+        ahead: delay of the drive [s].
+        late: delay of the measured position [s].
+    """
+
+    spindle: AngleFilterTable
+    form: FormAhead
+    known: DisturbanceTable
+    ahead: float
+    late: float
+
+
+@kernel
+def sample(memory: Memory, now: Now) -> float:
+    """See `Law`."""
+    spindle, known = memory.spindle, memory.known
+    follow(spindle, now.angle)
+    found = 0.0
+    if now.sample >= known.late:
+        angle, speed = at(spindle, -memory.late)
+        found = observed(known, memory.form, now.sample, angle, speed, now.position, now.learning)
+    angle, speed = at(spindle, memory.ahead)
+    command = feed_forward(memory.form, known.model[0], known.model[1], angle, speed, spindle.state[2])
+    command -= expected(known, angle, speed) + found
+    commanded(known, now.sample, command)
+    return command
+
+
+class DisturbanceController(FormLaw):
+    """See the module.
+
+    Attributes:
+        parameters: its table.
+    """
+
+    kind = "disturbance_controller"
+    Parameters = DisturbanceControllerParameters
+    parameters: DisturbanceControllerParameters
+    law: Memory
+    sample = staticmethod(sample)
+    factor = "sup|factor of a revolution|"
+    remedy = "a model nearer to the drive, a smaller observer_bandwidth"
+
+    def start(self) -> Memory:
+        """See `Law`."""
+        parameters = self.parameters
+        late = parameters.feedback_delay * parameters.step
+        return Memory(self.make_filter(), self.form, parameters.make(self.name), parameters.model_delay, late)
+
+    def perform(self, action: str) -> None:
+        """See `Stage`: ``clear`` forgets the memory; what is known of angle and drive stays."""
+        if action == "clear":
+            forget(self.law.known)
+        else:
+            super().perform(action)
+
+    def settings(self) -> str:
+        """See `Learner`."""
+        parameters = self.parameters
+        model = f"{parameters.model_natural_frequency:.4g} rad/s, {parameters.model_damping:.3g}"
+        return f"a model of {model}, {parameters.model_delay * 1e3:.3g} ms"
+
+    def _model_error(self, drive: Response, frequency: Array) -> Complex:
+        """E = Wi/Ŵi - 1, the delays included."""
+        a1, a2 = self.parameters.inverse
+        p = 1j * frequency
+        return np.asarray(drive(frequency) * (1.0 + a1 * p + a2 * p * p) * np.exp(p * self.parameters.model_delay) - 1)
+
+    def contraction(self, drive: Response, waves: Array, speed: float) -> Complex:
+        """See `Law`: of the memory, or |E·L| of the observer where that is more, with the model that is given."""
+        parameters, frequency = self.parameters, waves * speed
+        error, p = self._model_error(drive, frequency), 1j * frequency
+        inside = np.zeros_like(error)
+        if parameters.observer_bandwidth:
+            late = parameters.model_delay + parameters.feedback_delay * parameters.step
+            inside = error * np.exp(-p * late) / (1.0 + p / parameters.observer_bandwidth) ** 3
+        if not parameters.learning_gain:
+            return inside
+        smooth, stages = self._smoothed(waves), 1.0 + p / parameters.learning_bandwidth
+        learned = parameters.learning_gain * smooth * np.exp(3.0 * p / parameters.learning_bandwidth) / stages**3
+        factor = 1.0 - LEAK * (1.0 - smooth) - learned * (1.0 + error) / (1.0 + inside)
+        return np.where(np.abs(inside) > np.abs(factor), np.abs(inside), factor)
+
+    def _smoothed(self, waves: Array) -> Array:
+        points = self.parameters.points_per_revolution
+        taps = smoothing(self.parameters.learned_waves, points)
+        places = np.arange(taps.size) - taps.size // 2
+        return np.asarray(np.cos(2 * np.pi / points * np.outer(waves, places)) @ taps)
+
+    def highest_waves(self, speed: float) -> float:
+        """See `Law`: the Nyquist limit of the memory."""
+        return 0.5 * self.parameters.points_per_revolution

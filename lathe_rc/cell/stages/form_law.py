@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What laws have in common that know the form of the part: they feed it forward through the inverse of the drive.
+
+    u = r(φ⁺) + a1·Ω⁺·r'(φ⁺) + a2·(Ω⁺²·r''(φ⁺) + (dΩ/dt)·r'(φ⁺)),    φ⁺ = φ(t + τ), Ω⁺ = Ω(t + τ)
+
+for a drive e^{-pτ}/(1 + a1·p + a2·p²). The form is a function of the angle and the drive one of time, so that this is
+right at any speed. Angle, speed and dΩ/dt are those of `lathe_rc.control.angle_filter`.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+
+from lathe_rc.cell.parameters import Value, parameter
+from lathe_rc.cell.stages.form import FORM, FormParameters
+from lathe_rc.cell.stages.law import Law, LawParameters
+from lathe_rc.control.angle_filter import AngleFilterTable, angle_filter
+from lathe_rc.control.disturbance import FormAhead
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+from lathe_rc.signals.profile import derivatives_at, tabulated
+
+
+class FormLawParameters(LawParameters, FormParameters):
+    """The form, the encoder and the drive as the law knows them; what is not given is that of the cell."""
+
+    asks: ClassVar[tuple[frozenset[str], ...]] = (FORM, frozenset({"encoder_counts"}))
+
+    feedback_delay: Annotated[int, Ge(1), Le(2**16)] = parameter(
+        64, "samples from a measured position or error to when it is visible; at least a block", "sample"
+    )
+    encoder_counts: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
+        0,
+        "counts of the encoder per revolution; 0: an ideal one; not given in a scenario: those of the spindle",
+    )
+    expected_deviation: Annotated[float, Gt(0), Le(1)] = parameter(
+        0.1, "amplitude of the speed deviations that the angle filter expects, relative to the nominal speed", "1"
+    )
+    expected_frequency: Annotated[float, Gt(0), Le(10_000)] = parameter(
+        300.0, "up to which frequency it expects them", "rad/s"
+    )
+    model_natural_frequency: Annotated[float, Gt(0)] = parameter(
+        1038.0, "drive model: ωn", "rad/s", drive="natural_frequency"
+    )
+    model_damping: Annotated[float, Gt(0)] = parameter(0.804, "drive model: ζ", drive="damping")
+    model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s", drive="delay")
+
+    def known(self) -> Mapping[str, Value]:
+        """See `NodeParameters`: the form is the tool's."""
+        return {}
+
+    @property
+    def commanded_topic(self) -> str:
+        """See `NodeParameters`."""
+        return "coarse/command"
+
+    @property
+    def inverse(self) -> tuple[float, float]:
+        """a1 [s] and a2 [s²] of the model."""
+        return 2.0 * self.model_damping / self.model_natural_frequency, 1.0 / self.model_natural_frequency**2
+
+
+class FormLaw(Law):
+    """Base of laws that know the form.
+
+    Attributes:
+        parameters: its table.
+        form: of the part.
+
+    Raises:
+        InputError: the height along the part is that of a slide, which nobody can look ahead along.
+    """
+
+    parameters: FormLawParameters
+    Parameters = FormLawParameters
+    senses: ClassVar[bool] = True
+
+    def __init__(self, name: str, parameters: FormLawParameters) -> None:
+        if parameters.height_from != "feed":
+            raise InputError(
+                f"{name}.height_from = {parameters.height_from}; allowed: feed, since the law looks ahead along the form"
+            )
+        profile = tabulated(parameters.form(name))
+        self.form = FormAhead(
+            profile.heights, profile.table, parameters.feed, parameters.start_height, parameters.part_revolutions
+        )
+        super().__init__(name, parameters)
+
+    def make_filter(self) -> AngleFilterTable:
+        """The filter of the spindle angle before sample 0."""
+        parameters = self.parameters
+        return angle_filter(
+            parameters.step,
+            parameters.encoder_counts,
+            parameters.nominal_speed,
+            parameters.expected_deviation,
+            parameters.expected_frequency,
+        )
+
+    def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
+        """See `Learner`: half a revolution, since what is late must not meet what is learned."""
+        return int(np.pi / (speed * self.parameters.step))
+
+
+@kernel
+def feed_forward(
+    form: FormAhead, a1: float, a2: float, angle: float, speed: float, acceleration: float
+) -> float:
+    """The command [m] that brings a drive to the form at an angle [rad], a speed [rad/s] and dΩ/dt [rad/s²]."""
+    value, slope, bow = derivatives_at(form.heights, form.table, form.feed, form.start, form.part, angle)
+    return value + a1 * speed * slope + a2 * (speed * speed * bow + acceleration * slope)
