@@ -14,6 +14,8 @@ NODES = [
     "profile",
     "learning_controller",
     "disturbance_controller",
+    "compound_controller",
+    "resonant_controller",
     "electrodynamic_actuator",
     "piezo_actuator",
     "series_drive",

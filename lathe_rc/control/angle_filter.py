@@ -31,7 +31,7 @@ class AngleFilterTable(NamedTuple):
 
     Attributes:
         step: sampling step [s].
-        count: angle of a count [rad]; 0: ideal.
+        quantum: angle of a count [rad]; 0: ideal.
         intensity: of the noise of dα/dt [rad²/s⁵].
         state: angle [rad], speed [rad/s], acceleration [rad/s²], shape (3,).
         covariance: of the state: φφ, φΩ, φα, ΩΩ, Ωα, αα, shape (6,).
@@ -39,7 +39,7 @@ class AngleFilterTable(NamedTuple):
     """
 
     step: float
-    count: float
+    quantum: float
     intensity: float
     state: Array
     covariance: Array
@@ -68,7 +68,7 @@ def follow(m: AngleFilterTable, measured: float) -> None:
     """Take the measured angle of the next sample [rad]; the state is then that of this sample."""
     step, state, p = m.step, m.state, m.covariance
     if np.isnan(m.before[0]):
-        state[0] = measured + 0.5 * m.count
+        state[0] = measured + 0.5 * m.quantum
         m.before[0] = measured
         return
     half = 0.5 * step * step
@@ -82,9 +82,9 @@ def follow(m: AngleFilterTable, measured: float) -> None:
     p12 = p[4] + step * p[5]
     p22 = p[5] + m.intensity * step
     passed = state[1] * step
-    every = m.count <= abs(passed)
+    every = m.quantum <= abs(passed)
     if every or measured != m.before[0]:
-        width = m.count if every else passed
+        width = m.quantum if every else passed
         spread = p00 + width * width / 12.0 + _ROUNDING
         off = measured + 0.5 * width - state[0]
         k0, k1, k2 = p00 / spread, p01 / spread, p02 / spread

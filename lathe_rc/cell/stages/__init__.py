@@ -2,6 +2,7 @@
 """The stages of the cell: physics and control laws with their parameters and ports."""
 
 from lathe_rc.cell.stage import Stage
+from lathe_rc.cell.stages.compound_controller import CompoundController
 from lathe_rc.cell.stages.cutting_process import CuttingProcessStage
 from lathe_rc.cell.stages.decoupler import DecouplerStage
 from lathe_rc.cell.stages.disturbance_controller import DisturbanceController
@@ -13,6 +14,7 @@ from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuator
 from lathe_rc.cell.stages.position_controller import PositionController
 from lathe_rc.cell.stages.profile import ProfileStage
+from lathe_rc.cell.stages.resonant_controller import ResonantController
 from lathe_rc.cell.stages.series_drive import SeriesDriveStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.cell.stages.supervisor import Supervisor
@@ -26,6 +28,8 @@ _OWN: tuple[type[Stage], ...] = (
     EncoderDevice,
     LearningController,
     DisturbanceController,
+    CompoundController,
+    ResonantController,
     ElectrodynamicActuator,
     PiezoActuator,
     SeriesDriveStage,

@@ -6,7 +6,8 @@ angle and reads it ahead, and answers what the memory does not know with a distu
 `lathe_rc.cell.stages.form_law` and `lathe_rc.control.disturbance`.
 """
 
-from typing import Annotated, NamedTuple
+from collections.abc import Callable
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
@@ -128,7 +129,7 @@ class DisturbanceController(FormLaw):
     Parameters = DisturbanceControllerParameters
     parameters: DisturbanceControllerParameters
     law: Memory
-    sample = staticmethod(sample)
+    sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
     factor = "sup|factor of a revolution|"
     remedy = "a model nearer to the drive, a smaller observer_bandwidth"
 

@@ -105,9 +105,7 @@ class FormLaw(Law):
 
 
 @kernel
-def feed_forward(
-    form: FormAhead, a1: float, a2: float, angle: float, speed: float, acceleration: float
-) -> float:
+def feed_forward(form: FormAhead, a1: float, a2: float, angle: float, speed: float, acceleration: float) -> float:
     """The command [m] that brings a drive to the form at an angle [rad], a speed [rad/s] and dΩ/dt [rad/s²]."""
     value, slope, bow = derivatives_at(form.heights, form.table, form.feed, form.start, form.part, angle)
     return value + a1 * speed * slope + a2 * (speed * speed * bow + acceleration * slope)

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The compound law for non-circular turning: PID with input feed-forward and dynamic compensation.
+
+The structure of PMC8878366 (L. Ji et al., 2022), of which we know the abstract: input feed-forward of the form with its
+velocity and acceleration, dynamic compensation of what the drive lags (here its inverse and its delay), and a PID on the
+following error. The settings are ours, tuned on the conditions of ``lathe study robust``.
+"""
+
+from collections.abc import Callable
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import numpy as np
+from annotated_types import Ge, Gt
+
+from lathe_rc.analysis.learning import Array, Complex, Response
+from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, feed_forward
+from lathe_rc.cell.stages.law import Now
+from lathe_rc.control.angle_filter import AngleFilterTable, at, follow
+from lathe_rc.control.disturbance import FormAhead
+from lathe_rc.jit import kernel
+
+
+class CompoundControllerParameters(FormLawParameters):
+    """Input feed-forward and dynamic compensation from the model, and a PID on the measured error."""
+
+    proportional: Annotated[float, Ge(0)] = parameter(0.3, "Kp")
+    integral: Annotated[float, Ge(0)] = parameter(250.0, "Ki", "1/s")
+    derivative: Annotated[float, Ge(0)] = parameter(3e-4, "Kd", "s")
+    derivative_bandwidth: Annotated[float, Gt(0)] = parameter(5000.0, "of its low-pass", "rad/s")
+
+
+class Memory(NamedTuple):
+    """What the law works on.
+
+    Attributes:
+        spindle: filter of the angle.
+        form: that is turned.
+        a1, a2, ahead: of the model [s, s², s].
+        late: samples until an error is seen.
+        proportional, integral, derivative: of the PID, the latter two per sample.
+        keep: of a sample before in the low-pass of the derivative.
+        state: integral, filtered derivative, error before, shape (3,).
+    """
+
+    spindle: AngleFilterTable
+    form: FormAhead
+    a1: float
+    a2: float
+    ahead: float
+    late: int
+    proportional: float
+    integral: float
+    derivative: float
+    keep: float
+    state: Array
+
+
+@kernel
+def sample(memory: Memory, now: Now) -> float:
+    """See `Law`."""
+    spindle, state = memory.spindle, memory.state
+    follow(spindle, now.angle)
+    angle, speed = at(spindle, memory.ahead)
+    command = feed_forward(memory.form, memory.a1, memory.a2, angle, speed, spindle.state[2])
+    if now.sample < memory.late:
+        return command
+    if now.sample == memory.late:
+        state[2] = now.error
+    if now.learning:
+        state[0] += memory.integral * now.error
+    state[1] = memory.keep * state[1] + (1.0 - memory.keep) * memory.derivative * (now.error - state[2])
+    state[2] = now.error
+    return float(command + memory.proportional * now.error + state[0] + state[1])
+
+
+class CompoundController(FormLaw):
+    """See the module.
+
+    Attributes:
+        parameters: its table.
+    """
+
+    kind = "compound_controller"
+    Parameters = CompoundControllerParameters
+    parameters: CompoundControllerParameters
+    sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
+
+    def start(self) -> Memory:
+        """See `Law`."""
+        parameters = self.parameters
+        step = parameters.step
+        return Memory(
+            self.make_filter(),
+            self.form,
+            *parameters.inverse,
+            parameters.model_delay,
+            parameters.feedback_delay,
+            parameters.proportional,
+            parameters.integral * step,
+            parameters.derivative / step,
+            float(np.exp(-parameters.derivative_bandwidth * step)),
+            np.zeros(3),
+        )
+
+    def open_loop(self, drive: Response, frequency: Array, speed: float) -> Complex:
+        """Response of the open loop at frequencies [rad/s], shape (n,)."""
+        parameters, p = self.parameters, 1j * frequency
+        derived = p * parameters.derivative / (1.0 + p / parameters.derivative_bandwidth)
+        pid = parameters.proportional + parameters.integral / p + derived
+        return np.asarray(drive(frequency) * pid * np.exp(-p * parameters.feedback_delay * parameters.step))

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Adaptive feed-forward cancellation whose resonators are indexed by the spindle angle.
+
+    u = u_form + Σ_k a_k·cos kφ + b_k·sin kφ,    k = 0 … K
+    da_k/dt = 2g·e·cos(kφ + θ_k)/|Wi(jkΩ)|,  db_k/dt = 2g·e·sin(kφ + θ_k)/|Wi(jkΩ)|,    θ_k = arg Wi(jkΩ)
+
+with the error e of ``feedback_delay`` samples ago and the angle of that sample. In the angle each order is an internal
+model of its own that holds whatever the speed does. u_form is the form through the inverse of the drive, as
+`lathe_rc.cell.stages.form_law` has it.
+
+Source: B. Wu, M. Bodson; X. Guo, M. Bodson (doi 10.1002/acs.1117): equivalence with an internal model at any rate of
+change of the frequency.
+"""
+
+from collections.abc import Callable
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+
+from lathe_rc.analysis.learning import Array, Complex, Response
+from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, feed_forward
+from lathe_rc.cell.stages.law import Now
+from lathe_rc.control.angle_filter import AngleFilterTable, at, follow
+from lathe_rc.control.disturbance import FormAhead
+from lathe_rc.jit import kernel
+
+
+class ResonantControllerParameters(FormLawParameters):
+    """The orders that are cancelled and how fast."""
+
+    highest_order: Annotated[int, Ge(0), Le(64)] = parameter(12, "K: waves per revolution that are cancelled at most")
+    rate: Annotated[float, Gt(0)] = parameter(20.0, "g: how fast an order is taken up", "1/s")
+
+
+class Memory(NamedTuple):
+    """What the law works on.
+
+    Attributes:
+        spindle: filter of the angle.
+        form: that is turned.
+        a1, a2, ahead: of the model [s, s², s].
+        late: samples until an error is seen.
+        step: sampling step [s].
+        gain: 2g·step.
+        amplitudes: a and b by order, shape (2, K + 1) [m].
+    """
+
+    spindle: AngleFilterTable
+    form: FormAhead
+    a1: float
+    a2: float
+    ahead: float
+    late: int
+    step: float
+    gain: float
+    amplitudes: Array
+
+
+@kernel
+def sample(memory: Memory, now: Now) -> float:
+    """See `Law`."""
+    spindle, a1, a2, amplitudes = memory.spindle, memory.a1, memory.a2, memory.amplitudes
+    follow(spindle, now.angle)
+    angle, speed = at(spindle, memory.ahead)
+    command = feed_forward(memory.form, a1, a2, angle, speed, spindle.state[2])
+    if now.sample >= memory.late and now.learning:
+        past, turning = at(spindle, -memory.late * memory.step)
+        amplitudes[0, 0] += 0.5 * memory.gain * now.error
+        for k in range(1, amplitudes.shape[1]):
+            # 1/Wi = (1 + a1·p + a2·p²)·e^{pτ} has the magnitude that is wanted and the phase -θ.
+            p = k * turning
+            real, imaginary = 1.0 - a2 * p * p, a1 * p
+            size = np.sqrt(real * real + imaginary * imaginary)
+            phase = k * past - np.arctan2(imaginary, real) - p * memory.ahead
+            amplitudes[0, k] += memory.gain * size * now.error * np.cos(phase)
+            amplitudes[1, k] += memory.gain * size * now.error * np.sin(phase)
+    here = spindle.state[0]
+    for k in range(amplitudes.shape[1]):
+        command += amplitudes[0, k] * np.cos(k * here) + amplitudes[1, k] * np.sin(k * here)
+    return command
+
+
+class ResonantController(FormLaw):
+    """See the module.
+
+    Attributes:
+        parameters: its table.
+    """
+
+    kind = "resonant_controller"
+    Parameters = ResonantControllerParameters
+    parameters: ResonantControllerParameters
+    sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
+
+    def start(self) -> Memory:
+        """See `Law`."""
+        parameters = self.parameters
+        return Memory(
+            self.make_filter(),
+            self.form,
+            *parameters.inverse,
+            parameters.model_delay,
+            parameters.feedback_delay,
+            parameters.step,
+            2.0 * parameters.rate * parameters.step,
+            np.zeros((2, parameters.highest_order + 1)),
+        )
+
+    def open_loop(self, drive: Response, frequency: Array, speed: float) -> Complex:
+        """Response of the open loop at frequencies [rad/s] and a constant ``speed`` [rad/s], shape (n,)."""
+        parameters, p = self.parameters, 1j * frequency
+        late = parameters.feedback_delay * parameters.step
+        a1, a2 = parameters.inverse
+        sum_of_orders = parameters.rate / p
+        for k in range(1, parameters.highest_order + 1):
+            order = k * speed
+            inverse = (1.0 + 1j * a1 * order - a2 * order**2) * np.exp(1j * order * (parameters.model_delay + late))
+            along = p * inverse.real - order * inverse.imag
+            # cos(kΩt - θ) has the transform (p·cos θ + kΩ·sin θ)/(p² + (kΩ)²), θ = -arg 1/Wi
+            sum_of_orders = sum_of_orders + 2.0 * parameters.rate * along / (p * p + order**2)
+        return np.asarray(drive(frequency) * np.exp(-p * late) * sum_of_orders)
