@@ -19,6 +19,8 @@ NODES = [
     "electrodynamic_actuator",
     "piezo_actuator",
     "series_drive",
+    "loaded_drive",
+    "loaded_series_drive",
     "vibration",
     "tool",
     "feed_drive",

@@ -11,6 +11,7 @@ from lathe_rc.cell.stages.encoder_device import EncoderDevice
 from lathe_rc.cell.stages.feed_drive import FeedDriveStage
 from lathe_rc.cell.stages.force_controller import ForceController
 from lathe_rc.cell.stages.learning_controller import LearningController
+from lathe_rc.cell.stages.loaded_drive import LoadedDriveStage, LoadedSeriesDrive
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuator
 from lathe_rc.cell.stages.position_controller import PositionController
 from lathe_rc.cell.stages.profile import ProfileStage
@@ -33,6 +34,8 @@ _OWN: tuple[type[Stage], ...] = (
     ElectrodynamicActuator,
     PiezoActuator,
     SeriesDriveStage,
+    LoadedDriveStage,
+    LoadedSeriesDrive,
     Vibration,
     ProfileStage,
     Tool,

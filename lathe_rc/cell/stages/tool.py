@@ -32,8 +32,10 @@ class ToolParameters(FormParameters):
     deflects: bool = parameter(
         default=False, doc="the deflection by the cutting force is part of the form error; no drive's sensor sees it"
     )
-    deflection_delay: Annotated[int, Ge(1), Le(2**31 - 1)] = parameter(
-        64, "deflects: delay of the feedback edge from the cut, at least a block", "sample"
+    deflection_delay: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
+        64,
+        "deflects: delay of the feedback edge from the cut, at least a block; 0 where the cut does not read the tool",
+        "sample",
     )
 
     def known(self) -> Mapping[str, Value]:
