@@ -18,10 +18,10 @@ not pass leaks away, a tenth in a revolution.
 
 **Identification.** a1 and a2 by least squares of u(t - τ) - x = a1·dx/dt + a2·d²x/dt² - f. f is unknown, but it repeats
 with the angle: the difference from the last revolution at the same angle has no f. It needs a speed that varies;
-otherwise the equation itself counts, with a small weight, and what it is wrong by repeats and is learned as a part of f.
+otherwise the equation itself counts, with a small weight, and what it is wrong by repeats and is learned as a part of
+f.
 
-Sources: spec/robust.md; T. Umeno, T. Kaneko, Y. Hori (disturbance observer, 1993); R. Nakano (learning over the
-position, 1996).
+Source: spec/robust.md; learning over the position for non-circular cutting: Nakano, 1996.
 """
 
 from typing import NamedTuple
@@ -50,8 +50,8 @@ _WHOLE = 3e-3  # weight of the equation itself beside its difference from the la
 _PARTS = 8  # of a revolution; the model is fitted after each
 _LEAST_EXCITED = 1e-6  # determinant of the normal equations, 1 for independent regressors
 
-# Places in the integer state: grid point that is being measured, the first one of all, whether there is one, revolutions
-# that are learned, whether a position has been seen.
+# Places in the integer state: grid point that is being measured, the first one of all, whether there is one,
+# revolutions that are learned, whether a position has been seen.
 _POINT, _FIRST, _BEGUN, _REVOLUTIONS, _SEEN = range(5)
 # Places in the sums of a grid point: what is learned and how often, relative speed, dx/dt, d²x/dt², u - x.
 _SUM, _COUNT, _SPEED, _VELOCITY, _ACCELERATION, _REST = range(6)

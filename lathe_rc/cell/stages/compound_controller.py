@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The compound law for non-circular turning: PID with input feed-forward and dynamic compensation.
 
-The structure of PMC8878366 (L. Ji et al., 2022), of which we know the abstract: input feed-forward of the form with its
-velocity and acceleration, dynamic compensation of what the drive lags (here its inverse and its delay), and a PID on the
-following error. The settings are ours, tuned on the conditions of ``lathe study robust``.
+The structure is that of PMC8878366, of which only the abstract was at hand: input feed-forward of the form with its
+velocity and acceleration, dynamic compensation of what the drive lags (here its inverse and its delay), and a PID on
+the following error. The settings are ours, tuned on the conditions of ``lathe study robust``.
 """
 
 from collections.abc import Callable

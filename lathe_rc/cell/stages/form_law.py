@@ -80,7 +80,7 @@ class FormLaw(Law):
     def __init__(self, name: str, parameters: FormLawParameters) -> None:
         if parameters.height_from != "feed":
             raise InputError(
-                f"{name}.height_from = {parameters.height_from}; allowed: feed, since the law looks ahead along the form"
+                f"{name}.height_from = {parameters.height_from}; allowed: feed, for the law looks ahead along it"
             )
         profile = tabulated(parameters.form(name))
         self.form = FormAhead(

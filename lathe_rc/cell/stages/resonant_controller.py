@@ -8,8 +8,7 @@ with the error e of ``feedback_delay`` samples ago and the angle of that sample.
 model of its own that holds whatever the speed does. u_form is the form through the inverse of the drive, as
 `lathe_rc.cell.stages.form_law` has it.
 
-Source: B. Wu, M. Bodson; X. Guo, M. Bodson (doi 10.1002/acs.1117): equivalence with an internal model at any rate of
-change of the frequency.
+Source: Guo, Bodson (doi 10.1002/acs.1117): equivalence with an internal model at any rate of change of the frequency.
 """
 
 from collections.abc import Callable
