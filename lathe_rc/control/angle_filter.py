@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Angle, speed and acceleration of a spindle from the counts of its encoder: a Kalman filter.
 
-    φ' = Ω,  Ω' = α,  α' = white noise
+    φ' = Ω,  Ω' = α,  α' = γ,  γ' = white noise
 
 A count says that the angle lies within it. Where the spindle passes several counts in a sample, each sample measures
 the angle to a count, and its middle is the measurement. Where a count lasts several samples, only its edges do, but
-better: the edge was passed within the last sample.
+better: the edge was passed within the last sample. γ is then more than such an encoder tells, and α' is white noise.
 
 The intensity of the noise follows from what the speed is expected to do: a deviation of relative amplitude d at the
-frequency w has the third derivative d·Ω0·w² at most, which lasts about 1/w. The filter is then as fast as the counts
-allow: its bandwidth is about (intensity/(variance of a measurement·time between two))^(1/6).
+frequency w has a derivative of order k of d·Ω0·w^k, which lasts about 1/w. The filter is then as fast as the counts
+allow.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.jit import kernel
+from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
 
@@ -32,14 +32,16 @@ class AngleFilterTable(NamedTuple):
     Attributes:
         step: sampling step [s].
         quantum: angle of a count [rad]; 0: ideal.
-        intensity: of the noise of dα/dt [rad²/s⁵].
-        state: angle [rad], speed [rad/s], acceleration [rad/s²], shape (3,).
-        covariance: of the state: φφ, φΩ, φα, ΩΩ, Ωα, αα, shape (6,).
+        order: states that it has, 4, or 3 without γ.
+        intensity: of the noise, per second, of the last of them.
+        state: φ [rad], Ω [rad/s], α [rad/s²], γ [rad/s³], shape (4,).
+        covariance: of the state, shape (4, 4).
         before: the measured angle of the last sample [rad], NaN before the first, shape (1,).
     """
 
     step: float
     quantum: float
+    order: int
     intensity: float
     state: Array
     covariance: Array
@@ -56,11 +58,28 @@ def angle_filter(step: float, counts: int, nominal: float, deviation: float, fre
         deviation: expected amplitude of the speed deviation, relative to Ω0.
         frequency: up to which it is expected [rad/s].
     """
-    count = _TURN / counts if counts else 0.0
-    acceleration = deviation * nominal * frequency
-    spread = np.array([count**2, 0.0, 0.0, (_LEAST_SPREAD * nominal) ** 2, 0.0, acceleration**2])
-    intensity = (acceleration * frequency) ** 2 / frequency
-    return AngleFilterTable(step, count, intensity, np.array([0.0, nominal, 0.0]), spread, np.array([np.nan]))
+    quantum = _TURN / counts if counts else 0.0
+    order = 4 if quantum <= nominal * step else 3
+    spread = deviation * nominal * frequency ** np.arange(4.0)  # of Ω and its derivatives
+    variances = np.array([quantum, _LEAST_SPREAD * nominal, spread[1], spread[2]]) ** 2
+    variances[order:] = 0.0
+    intensity = float(spread[order - 1] ** 2 / frequency)
+    state = np.array([0.0, nominal, 0.0, 0.0])
+    return AngleFilterTable(step, quantum, order, intensity, state, np.diag(variances), np.array([np.nan]))
+
+
+@inlined
+def _advance(step: float, p: Array) -> None:
+    """Covariance of the next sample: derivatives add to what they are derivatives of, in the rows and in the columns."""
+    half, sixth = 0.5 * step * step, step * step * step / 6.0
+    for j in range(4):
+        p[0, j] += step * p[1, j] + half * p[2, j] + sixth * p[3, j]
+        p[1, j] += step * p[2, j] + half * p[3, j]
+        p[2, j] += step * p[3, j]
+    for i in range(4):
+        p[i, 0] += step * p[i, 1] + half * p[i, 2] + sixth * p[i, 3]
+        p[i, 1] += step * p[i, 2] + half * p[i, 3]
+        p[i, 2] += step * p[i, 3]
 
 
 @kernel
@@ -71,38 +90,27 @@ def follow(m: AngleFilterTable, measured: float) -> None:
         state[0] = measured + 0.5 * m.quantum
         m.before[0] = measured
         return
-    half = 0.5 * step * step
-    state[0] += step * state[1] + half * state[2]
-    state[1] += step * state[2]
-    p00 = p[0] + 2.0 * step * p[1] + 2.0 * half * p[2] + step * step * p[3] + 2.0 * step * half * p[4]
-    p00 += half * half * p[5]
-    p01 = p[1] + step * p[2] + step * p[3] + (step * step + half) * p[4] + half * step * p[5]
-    p02 = p[2] + step * p[4] + half * p[5]
-    p11 = p[3] + 2.0 * step * p[4] + step * step * p[5]
-    p12 = p[4] + step * p[5]
-    p22 = p[5] + m.intensity * step
+    state[0], state[1], state[2] = at(m, step)
+    _advance(step, p)
+    p[m.order - 1, m.order - 1] += m.intensity * step
     passed = state[1] * step
     every = m.quantum <= abs(passed)
     if every or measured != m.before[0]:
         width = m.quantum if every else passed
-        spread = p00 + width * width / 12.0 + _ROUNDING
-        off = measured + 0.5 * width - state[0]
-        k0, k1, k2 = p00 / spread, p01 / spread, p02 / spread
-        state[0] += k0 * off
-        state[1] += k1 * off
-        state[2] += k2 * off
-        p22 -= k2 * p02
-        p12 -= k1 * p02
-        p11 -= k1 * p01
-        p02 -= k0 * p02
-        p01 -= k0 * p01
-        p00 -= k0 * p00
+        spread = p[0, 0] + width * width / 12.0 + _ROUNDING
+        off = (measured + 0.5 * width - state[0]) / spread
+        for i in range(4):
+            state[i] += p[i, 0] * off
+        for i in range(3, -1, -1):
+            for j in range(3, i - 1, -1):
+                p[i, j] -= p[0, i] * p[0, j] / spread
+                p[j, i] = p[i, j]
     m.before[0] = measured
-    p[0], p[1], p[2], p[3], p[4], p[5] = p00, p01, p02, p11, p12, p22
 
 
 @kernel
-def at(m: AngleFilterTable, later: float) -> tuple[float, float]:
-    """Angle [rad] and speed [rad/s] so much ``later`` than the last sample [s], or earlier, at its acceleration."""
-    angle, speed, acceleration = m.state[0], m.state[1], m.state[2]
-    return angle + later * (speed + 0.5 * later * acceleration), speed + later * acceleration
+def at(m: AngleFilterTable, later: float) -> tuple[float, float, float]:
+    """Angle [rad], speed [rad/s] and acceleration [rad/s²] so much ``later`` than the last sample [s], or earlier."""
+    angle, speed, acceleration, jerk = m.state[0], m.state[1], m.state[2], m.state[3]
+    turned = later * (speed + later * (acceleration / 2.0 + later * jerk / 6.0))
+    return angle + turned, speed + later * (acceleration + later * jerk / 2.0), acceleration + later * jerk

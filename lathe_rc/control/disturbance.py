@@ -42,10 +42,10 @@ _STAGES = 3  # first-order stages of each low-pass
 _TAIL = 5.0  # standard deviations at which S is cut off
 _HALF = float(np.sqrt(-2.0 * np.log(1.0 - np.sqrt(0.5))))  # where the twiced Gaussian is 1/2, for a deviation of 1
 _UNKNOWN = 1e4  # variance of a value before anything was learned, over that of a measurement
-_SLOPE = 1e3  # the same of its change with the relative speed
+_SLOPE = 1e2  # the same of its change with the relative speed
 _SLOPE_DRIFT = 1e-2  # part of that by which it may have changed in a revolution
 LEAK = 0.1  #: part of what S does not pass that a revolution takes out of the memory
-_SETTLED = 4  # revolutions that are learned before the change with the speed is
+_SETTLED = 8  # revolutions that are learned before the change with the speed is
 _WHOLE = 3e-3  # weight of the equation itself beside its difference from the last revolution
 _PARTS = 8  # of a revolution; the model is fitted after each
 _LEAST_EXCITED = 1e-6  # determinant of the normal equations, 1 for independent regressors
@@ -104,7 +104,9 @@ class DisturbanceTable(NamedTuple):
         smoothing: S by grid point, shape (odd,).
         identifier, identifies: low-pass of the identification, and whether it acts.
         before: dx/dt, d²x/dt² and u - x of the last revolution, shape (3, n).
-        sums, forgetting: of the normal equations, differences first; and what a revolution leaves of them.
+        sums: of the normal equations, differences first.
+        means: how many, and sums of dx/dt, d²x/dt² and u - x: a steady force counts for nothing.
+        forgetting: what a revolution leaves of both.
         point: sums of the grid point that is being measured.
         state: see above.
     """
@@ -133,6 +135,7 @@ class DisturbanceTable(NamedTuple):
     identifies: bool
     before: Array
     sums: Array
+    means: Array
     forgetting: float
     point: Array
     state: Integers
@@ -234,6 +237,7 @@ def disturbance(
         identifies=identifies,
         before=np.zeros((3, points)),
         sums=np.zeros(10),
+        means=np.zeros(4),
         forgetting=forgetting,
         point=np.zeros(6),
         state=np.zeros(5, np.int64),
@@ -242,7 +246,7 @@ def disturbance(
 
 def forget(m: DisturbanceTable) -> None:
     """Forget what was learned over the angle; model and observer stay."""
-    for array in (m.value, m.slope, m.fresh, m.spread, m.before, m.sums, m.point):
+    for array in (m.value, m.slope, m.fresh, m.spread, m.before, m.sums, m.means, m.point):
         array[:] = 0.0
     m.spread[0] = _UNKNOWN
     m.state[:_SEEN] = 0
@@ -368,11 +372,14 @@ def _end_point(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
     point[_SUM] = point[_COUNT] = 0.0
     state[_POINT] += 1
     passed = state[_POINT] - state[_FIRST]
-    if m.identifies and passed % (points // _PARTS) == 0 and passed > points // _PARTS:
+    # At first the model changes much, and soon; later whole revolutions tell it best.
+    part = points if state[_REVOLUTIONS] >= _SETTLED else points // _PARTS
+    if m.identifies and passed % part == 0 and passed > part:
         _fit(m, form, speed)
     if passed % points == 0:
         state[_REVOLUTIONS] += 1
         m.sums[:] *= m.forgetting
+        m.means[:] *= m.forgetting
         if state[_REVOLUTIONS] == _SETTLED and m.follows_speed:
             m.spread[2] = _SLOPE
 
@@ -414,13 +421,24 @@ def _sum_up(m: DisturbanceTable, here: int) -> None:
     sums[7] += acceleration * acceleration
     sums[8] += velocity * rest
     sums[9] += acceleration * rest
+    mean = m.means
+    mean[0] += 1.0
+    mean[1] += velocity
+    mean[2] += acceleration
+    mean[3] += rest
     before[0, here], before[1, here], before[2, here] = velocity, acceleration, rest
 
 
 @inlined
 def _fit(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
     """Fit the model; the memory goes along, since what a model does not explain is in it."""
+    count, v, a, r = m.means[0], m.means[1], m.means[2], m.means[3]
     s = m.sums[:5] + _WHOLE * m.sums[5:]
+    s[0] -= _WHOLE * v * v / count
+    s[1] -= _WHOLE * v * a / count
+    s[2] -= _WHOLE * a * a / count
+    s[3] -= _WHOLE * v * r / count
+    s[4] -= _WHOLE * a * r / count
     determinant = s[0] * s[2] - s[1] * s[1]
     if not determinant > _LEAST_EXCITED * s[0] * s[2]:
         return

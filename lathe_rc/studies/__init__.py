@@ -11,8 +11,10 @@ from lathe_rc.studies import (
     invariance,
     multichannel,
     piston,
+    robust,
     sampled_servo,
     saturation,
+    sensor_map,
     speed_deviation,
 )
 from lathe_rc.studies.study import Study
@@ -22,6 +24,8 @@ _OWN: dict[str, Study[Any]] = {
     for module in (
         invariance,
         speed_deviation,
+        sensor_map,
+        robust,
         multichannel,
         piston,
         angle_domain,

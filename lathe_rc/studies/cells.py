@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Running the scenarios of ``config/`` with changes."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from lathe_rc import harness, resources
-from lathe_rc.cell import scenario
+from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.errors import InputError
+from lathe_rc.studies.study import Track
 
 Values = Mapping[str, object]
+K = TypeVar("K")
 
 
 def _yaml(value: object) -> str:
@@ -27,3 +31,17 @@ def load(name: str, shared: Values | None = None, **nodes: Values) -> Scenario:
 def run(name: str, shared: Values | None = None, **nodes: Values) -> harness.Result:
     """Run it offline."""
     return harness.run(load(name, shared, **nodes))
+
+
+def kept(made: Sequence[Scenario], keep: batch.Make[K], track: Track) -> Iterator[K | None]:
+    """Run many; what a keeper keeps of each, in their order, None of one that failed on its way.
+
+    Raises:
+        InputError: one is refused.
+    """
+    outcomes = batch.run(made, keep)
+    for _ in track(range(len(made))):
+        outcome = next(outcomes)
+        if isinstance(outcome.error, InputError):
+            raise outcome.error
+        yield outcome.kept

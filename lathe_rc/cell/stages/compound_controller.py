@@ -24,10 +24,10 @@ from lathe_rc.jit import kernel
 class CompoundControllerParameters(FormLawParameters):
     """Input feed-forward and dynamic compensation from the model, and a PID on the measured error."""
 
-    proportional: Annotated[float, Ge(0)] = parameter(0.3, "Kp")
-    integral: Annotated[float, Ge(0)] = parameter(250.0, "Ki", "1/s")
-    derivative: Annotated[float, Ge(0)] = parameter(3e-4, "Kd", "s")
-    derivative_bandwidth: Annotated[float, Gt(0)] = parameter(5000.0, "of its low-pass", "rad/s")
+    proportional: Annotated[float, Ge(0)] = parameter(0.5, "Kp")
+    integral: Annotated[float, Ge(0)] = parameter(700.0, "Ki", "1/s")
+    derivative: Annotated[float, Ge(0)] = parameter(1.3e-3, "Kd", "s")
+    derivative_bandwidth: Annotated[float, Gt(0)] = parameter(1600.0, "of its low-pass", "rad/s")
 
 
 class Memory(NamedTuple):
@@ -61,8 +61,8 @@ def sample(memory: Memory, now: Now) -> float:
     """See `Law`."""
     spindle, state = memory.spindle, memory.state
     follow(spindle, now.angle)
-    angle, speed = at(spindle, memory.ahead)
-    command = feed_forward(memory.form, memory.a1, memory.a2, angle, speed, spindle.state[2])
+    angle, speed, acceleration = at(spindle, memory.ahead)
+    command = feed_forward(memory.form, memory.a1, memory.a2, angle, speed, acceleration)
     if now.sample < memory.late:
         return command
     if now.sample == memory.late:

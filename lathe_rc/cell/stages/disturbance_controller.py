@@ -109,10 +109,10 @@ def sample(memory: Memory, now: Now) -> float:
     follow(spindle, now.angle)
     found = 0.0
     if now.sample >= known.late:
-        angle, speed = at(spindle, -memory.late)
+        angle, speed, _ = at(spindle, -memory.late)
         found = observed(known, memory.form, now.sample, angle, speed, now.position, now.learning)
-    angle, speed = at(spindle, memory.ahead)
-    command = feed_forward(memory.form, known.model[0], known.model[1], angle, speed, spindle.state[2])
+    angle, speed, acceleration = at(spindle, memory.ahead)
+    command = feed_forward(memory.form, known.model[0], known.model[1], angle, speed, acceleration)
     command -= expected(known, angle, speed) + found
     commanded(known, now.sample, command)
     return command

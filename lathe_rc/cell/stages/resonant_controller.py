@@ -29,8 +29,8 @@ from lathe_rc.jit import kernel
 class ResonantControllerParameters(FormLawParameters):
     """The orders that are cancelled and how fast."""
 
-    highest_order: Annotated[int, Ge(0), Le(64)] = parameter(12, "K: waves per revolution that are cancelled at most")
-    rate: Annotated[float, Gt(0)] = parameter(20.0, "g: how fast an order is taken up", "1/s")
+    highest_order: Annotated[int, Ge(0), Le(64)] = parameter(24, "K: waves per revolution that are cancelled at most")
+    rate: Annotated[float, Gt(0)] = parameter(8.0, "g: how fast an order is taken up", "1/s")
 
 
 class Memory(NamedTuple):
@@ -62,22 +62,25 @@ def sample(memory: Memory, now: Now) -> float:
     """See `Law`."""
     spindle, a1, a2, amplitudes = memory.spindle, memory.a1, memory.a2, memory.amplitudes
     follow(spindle, now.angle)
-    angle, speed = at(spindle, memory.ahead)
-    command = feed_forward(memory.form, a1, a2, angle, speed, spindle.state[2])
+    angle, speed, acceleration = at(spindle, memory.ahead)
+    command = feed_forward(memory.form, a1, a2, angle, speed, acceleration)
     if now.sample >= memory.late and now.learning:
-        past, turning = at(spindle, -memory.late * memory.step)
+        past, turning, _ = at(spindle, -memory.late * memory.step)
         amplitudes[0, 0] += 0.5 * memory.gain * now.error
+        # cos and sin of k·(φ - Ωτ) by rotation; 1/Wi = (1 + a1·p + a2·p²)·e^{pτ} has the rest of the phase.
+        one, two = np.cos(past - turning * memory.ahead), np.sin(past - turning * memory.ahead)
+        cosine, sine = one, two
         for k in range(1, amplitudes.shape[1]):
-            # 1/Wi = (1 + a1·p + a2·p²)·e^{pτ} has the magnitude that is wanted and the phase -θ.
             p = k * turning
-            real, imaginary = 1.0 - a2 * p * p, a1 * p
-            size = np.sqrt(real * real + imaginary * imaginary)
-            phase = k * past - np.arctan2(imaginary, real) - p * memory.ahead
-            amplitudes[0, k] += memory.gain * size * now.error * np.cos(phase)
-            amplitudes[1, k] += memory.gain * size * now.error * np.sin(phase)
-    here = spindle.state[0]
+            real, imaginary = memory.gain * now.error * (1.0 - a2 * p * p), memory.gain * now.error * a1 * p
+            amplitudes[0, k] += cosine * real + sine * imaginary
+            amplitudes[1, k] += sine * real - cosine * imaginary
+            cosine, sine = cosine * one - sine * two, sine * one + cosine * two
+    one, two = np.cos(spindle.state[0]), np.sin(spindle.state[0])
+    cosine, sine = 1.0, 0.0
     for k in range(amplitudes.shape[1]):
-        command += amplitudes[0, k] * np.cos(k * here) + amplitudes[1, k] * np.sin(k * here)
+        command += amplitudes[0, k] * cosine + amplitudes[1, k] * sine
+        cosine, sine = cosine * one - sine * two, sine * one + cosine * two
     return command
 
 

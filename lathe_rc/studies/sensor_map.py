@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What encoder and position sensor leave of a law that does not know the speed, against the variable lead.
+
+The cell of `lathe_rc.studies.speed_deviation`, frozen, with the variable lead of paper 000 (eq. 20) and with
+``disturbance_controller``, over counts, noise, frequencies of the deviation and harmonics of the profile.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+from annotated_types import Ge, Gt, Le
+from rich.console import Group
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.parameters import Value, parameter
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.studies import cells
+from lathe_rc.studies.study import Study, StudyParameters, Track, comparison, untracked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = npt.NDArray[np.float64]
+
+_BEGINS = 3.0  # [s] the deviation, after 50 revolutions at constant speed
+_SHOWN = 1.0  # [s] of deviation
+_PLAIN, _OURS = "speed_deviation", "robust"  # scenarios
+_FREE: Mapping[str, Value] = {  # the linear drive is studied, not what it may be asked for
+    "electrodynamic_actuator.max_velocity": 1e3,
+    "electrodynamic_actuator.max_acceleration": 1e6,
+    "electrodynamic_actuator.stroke": 1.0,
+}
+
+
+class SensorMapParameters(StudyParameters):
+    """Sensors, deviations and profiles."""
+
+    counts: list[Annotated[int, Ge(0), Le(2**31 - 1)]] = parameter(
+        [1000, 3000, 10_000, 100_000, 1_000_000], "of the encoder per revolution; 0: ideal"
+    )
+    noise_nm: list[Annotated[float, Ge(0), Le(10_000)]] = parameter(
+        [0.0, 20.0, 200.0], "RMS noise of the position sensor", "nm"
+    )
+    wd: list[Annotated[float, Gt(0), Le(2000)]] = parameter(
+        [20.0, 60.0, 106.0, 150.0, 213.0, 300.0], "frequencies of the deviation", "rad/s"
+    )
+    harmonics: list[Annotated[int, Ge(1), Le(40)]] = parameter([2, 3, 4, 5], "waves of the profile per revolution")
+    amplitude_um: Annotated[float, Gt(0), Le(1000)] = parameter(225.0, "amplitude of the profile", "µm")
+    deviation: Annotated[float, Gt(0), Le(50)] = parameter(10.5, "amplitude of the deviation", "rad/s")
+
+
+@dataclass(frozen=True)
+class SensorMapResult:
+    """Largest errors while the speed swings [µm]; shape (counts, noise, harmonics, wd).
+
+    Attributes:
+        parameters: of the study.
+        plain: of the variable lead.
+        ours: of ``disturbance_controller``.
+        floor: of the variable lead at constant speed, shape (counts, noise, harmonics).
+    """
+
+    parameters: SensorMapParameters
+    plain: Array
+    ours: Array
+    floor: Array
+
+    @property
+    def ratio(self) -> Array:
+        """Error of ours over that of the variable lead."""
+        return self.ours / self.plain
+
+    def to_json(self) -> dict[str, Any]:
+        """All errors."""
+        given = self.parameters
+        return {
+            **{name: getattr(given, name) for name in ("counts", "noise_nm", "harmonics", "wd")},
+            "variable_lead_um": self.plain.tolist(),
+            "disturbance_controller_um": self.ours.tolist(),
+            "floor_um": self.floor.tolist(),
+            "worst_ratio": float(self.ratio.max()),
+        }
+
+    def table(self) -> Group:
+        """The worst ratio over the frequencies; and the errors behind it, which shows where it lies."""
+        given = self.parameters
+        rows = []
+        for (i, counts), (j, noise) in product(enumerate(given.counts), enumerate(given.noise_nm)):
+            worst = self.ratio[i, j].argmax(axis=-1)
+            told = [
+                f"{self.ratio[i, j, k, w]:.2f} ({self.ours[i, j, k, w]:.2f}/{self.plain[i, j, k, w]:.2f})"
+                for k, w in enumerate(worst)
+            ]
+            rows.append((str(counts or "ideal"), f"{noise:g}", *told))
+        columns = ("counts", "nm", *(f"{harmonic} waves" for harmonic in given.harmonics))
+        return Group(
+            comparison("Largest error over that of the variable lead, at the worst wd (µm/µm)", columns, rows),
+            f"largest of all {self.ratio.size}: {self.ratio.max():.2f}",
+        )
+
+    def draw(self, figure: "Figure") -> None:
+        """A map for each harmonic: counts over frequency, at the noise in the middle of those that are given."""
+        given = self.parameters
+        noise = len(given.noise_nm) // 2
+        panels = np.atleast_1d(figure.subplots(1, len(given.harmonics), sharey=True))
+        for k, axes in enumerate(panels):
+            shown = self.ratio[:, noise, k]
+            image = axes.imshow(shown, vmin=0.0, vmax=0.5, cmap="viridis_r", aspect="auto")
+            for (i, w), value in np.ndenumerate(shown):
+                axes.text(w, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color="white")
+            axes.set_xticks(range(len(given.wd)), [f"{wd:g}" for wd in given.wd], fontsize=7)
+            axes.set_yticks(range(len(given.counts)), [str(counts or "ideal") for counts in given.counts], fontsize=7)
+            axes.set_title(f"{given.harmonics[k]} waves, {given.noise_nm[noise]:g} nm", fontsize=10)
+            axes.set_xlabel("deviation [rad/s]")
+        panels[0].set_ylabel("counts per revolution")
+        figure.colorbar(image, ax=list(panels), label="error over that of the variable lead")
+
+
+class _Largest:
+    """Keeps the largest error [µm] from the begin of the deviation on."""
+
+    heard = ()
+
+    def __init__(self, cell: Cell, samples: int) -> None:
+        self._tool = next(topic for topic, source in cell.dense.items() if source.type == messages.TOOL)
+        self._begins = round(_BEGINS / cell.master.shared.step)
+        self._largest = 0.0
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        error = dense[self._tool]["error"][max(self._begins - first, 0) :]
+        self._largest = max(self._largest, float(np.abs(error).max(initial=0.0)) * 1e6)
+
+    def kept(self) -> float:
+        """See `lathe_rc.cell.batch.Keeper`."""
+        return self._largest
+
+
+def _cells(parameters: SensorMapParameters) -> list[Scenario]:
+    """For counts, noise and harmonics in turn: the plain law at constant speed, then both laws for each frequency."""
+    nominal = cells.load(_PLAIN).shared.nominal_speed
+    turns = (_BEGINS + _SHOWN) * nominal / (2 * np.pi)
+    bases = {name: cells.load(name, spindle_encoder={"revolutions": turns}) for name in (_PLAIN, _OURS)}
+    made = []
+    for counts, noise, harmonic in product(parameters.counts, parameters.noise_nm, parameters.harmonics):
+        changes: dict[str, Value] = {
+            **_FREE,
+            "spindle_encoder.counts_per_revolution": counts,
+            "electrodynamic_actuator.noise_rms": noise * 1e-9,
+            "tool.harmonic_order": [harmonic],
+            "tool.harmonic_amplitude": [parameters.amplitude_um * 1e-6],
+        }
+        for name, wd in [(_PLAIN, 0.0), *product(bases, parameters.wd)]:
+            swing: dict[str, Value] = {
+                "spindle_encoder.deviation_amplitude": [parameters.deviation / nominal if wd else 0.0],
+                "spindle_encoder.deviation_frequency": [wd or 1.0],
+            }
+            made.append(bases[name].varied({**changes, **swing}))
+    return made
+
+
+def run(parameters: SensorMapParameters, track: Track = untracked) -> SensorMapResult:
+    """Compute the study."""
+    shape = len(parameters.counts), len(parameters.noise_nm), len(parameters.harmonics), -1
+    found = np.reshape(
+        [np.nan if kept is None else kept for kept in cells.kept(_cells(parameters), _Largest, track)], shape
+    )
+    several = len(parameters.wd)
+    return SensorMapResult(
+        parameters, found[..., 1 : several + 1], found[..., several + 1 :], np.ascontiguousarray(found[..., 0])
+    )
+
+
+STUDY = Study(
+    "sensor-map",
+    "what encoder and sensor leave of a law that does not know the speed, against the variable lead",
+    SensorMapParameters,
+    run,
+    size=(16.0, 3.6),
+)
