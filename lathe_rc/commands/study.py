@@ -76,6 +76,8 @@ class _StudyCommand(click.Command):
             ),
             click.Option(["--json", "as_json"], is_flag=True, help="print one JSON object"),
         ]
+        if "quick" in subject.parameters.rows():
+            options.append(click.Option(["--quick"], is_flag=True, help="as --set quick=true"))
         super().__init__(name, params=list(options), callback=self._run, help=subject.doc)
         self._subject = subject
 
@@ -89,8 +91,8 @@ class _StudyCommand(click.Command):
                 ]
             )
 
-    def _run(self, overrides: tuple[str, ...], figure: Path, *, as_json: bool) -> None:
-        parameters = read(self._subject, overrides)
+    def _run(self, overrides: tuple[str, ...], figure: Path, *, as_json: bool, quick: bool = False) -> None:
+        parameters = read(self._subject, (*overrides, "quick=true") if quick else overrides)
         picture.check_place(figure)
         console = Console(stderr=True)
         with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:

@@ -70,7 +70,7 @@ def angle_filter(step: float, counts: int, nominal: float, deviation: float, fre
 
 @inlined
 def _advance(step: float, p: Array) -> None:
-    """Covariance of the next sample: derivatives add to what they are derivatives of, in the rows and in the columns."""
+    """Covariance of the next sample: each derivative adds to what it is the derivative of, in rows and columns."""
     half, sixth = 0.5 * step * step, step * step * step / 6.0
     for j in range(4):
         p[0, j] += step * p[1, j] + half * p[2, j] + sixth * p[3, j]

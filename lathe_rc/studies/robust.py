@@ -86,8 +86,8 @@ _LEARNING: cells.Values = {**_ANY, "stage": "learning_controller", "identify": F
 LAWS: dict[str, cells.Values] = {
     "000": {**_LEARNING, "lead_time": 2e-3, "q_time": 130e-6},
     "001": {**_LEARNING, "lead_time": 1.425e-3, "q_time": 67e-6},
-    "adaptive": {**_LEARNING, **_INVERSE, "identify": True},
-    "compound": {
+    "adapt.": {**_LEARNING, **_INVERSE, "identify": True},
+    "comp.": {
         **_ANY, "stage": "compound_controller",
         # tuned for drives that it is not told: more has to come from the error
         "proportional": 1.9, "integral": 28.0, "derivative": 1.4e-4, "derivative_bandwidth": 19_000.0,
@@ -201,7 +201,9 @@ def _finite(values: Array) -> list[Any]:
 def _figure(value: float) -> str:
     if not np.isfinite(value):
         return "-"
-    return f"{value:.0f}" if value >= 100.0 or value == int(value) else f"{value:.3g}"
+    if value == int(value):
+        return str(int(value))
+    return f"{value:.2f}" if value < 10.0 else f"{value:.1f}" if value < 1000.0 else f"{value:.0e}"
 
 
 @dataclass(frozen=True)
