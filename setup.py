@@ -10,6 +10,7 @@ from setuptools import find_packages, setup
 HERE = Path(__file__).resolve().parent
 NODES = [
     "spindle_encoder",
+    "loaded_spindle",
     "encoder_device",
     "profile",
     "learning_controller",

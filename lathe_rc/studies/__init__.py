@@ -6,6 +6,7 @@ from typing import Any
 from lathe_rc.extensions import Objects
 from lathe_rc.studies import (
     angle_domain,
+    coupling,
     decoupling,
     drive_models,
     invariance,
@@ -33,6 +34,7 @@ _OWN: dict[str, Study[Any]] = {
         saturation,
         sampled_servo,
         decoupling,
+        coupling,
     )
 }
 
