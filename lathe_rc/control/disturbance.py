@@ -18,8 +18,8 @@ not pass leaks away, a tenth in a revolution.
 
 **Identification.** a1 and a2 by least squares of u(t - τ) - x = a1·dx/dt + a2·d²x/dt² - f. f is unknown, but it repeats
 with the angle: the difference from the last revolution at the same angle has no f. It needs a speed that varies;
-otherwise the equation itself counts, with a small weight, and what it is wrong by repeats and is learned as a part of
-f.
+otherwise the equation itself counts, with a small weight, and beside it the model that was given, the more the larger f
+is. What the result is wrong by then repeats and is learned as a part of f.
 
 Source: spec/robust.md; learning over the position for non-circular cutting: Nakano, 1996.
 """
@@ -44,10 +44,11 @@ _HALF = float(np.sqrt(-2.0 * np.log(1.0 - np.sqrt(0.5))))  # where the twiced Ga
 _UNKNOWN = 1e4  # variance of a value before anything was learned, over that of a measurement
 _SLOPE = 1e2  # the same of its change with the relative speed
 _SLOPE_DRIFT = 1e-2  # part of that by which it may have changed in a revolution
+_SWINGS_IN = 10.0  # of a1 until the drive has
 LEAK = 0.1  #: part of what S does not pass that a revolution takes out of the memory
 _SETTLED = 8  # revolutions that are learned before the change with the speed is
-_WHOLE = 3e-3  # weight of the equation itself beside its difference from the last revolution
-_PARTS = 8  # of a revolution; the model is fitted after each
+_WHOLE = 3e-4  # weight of the equation itself beside its difference from the last revolution
+_UNSURE = (0.3, 0.4)  # standard deviations of a1 and a2 as they are given, relative
 _LEAST_EXCITED = 1e-6  # determinant of the normal equations, 1 for independent regressors
 
 # Places in the integer state: grid point that is being measured, the first one of all, whether there is one,
@@ -89,8 +90,9 @@ class DisturbanceTable(NamedTuple):
     Attributes:
         step: sampling step [s].
         nominal: speed Ω0 [rad/s].
-        model: a1 [s] and a2 [s²], shape (2,).
+        given, model: a1 [s] and a2 [s²] as they are told and as they are identified, shape (2,).
         late: samples until a position is seen.
+        begins: sample from which on it is learned from: until then the drive swings in.
         whole, part: of the drive's delay: samples, and the rest in samples.
         commands: of the past; sample n stands at n modulo their number, a power of two [m].
         observer, observes: low-pass of the observer, and whether it acts.
@@ -105,7 +107,7 @@ class DisturbanceTable(NamedTuple):
         identifier, identifies: low-pass of the identification, and whether it acts.
         before: dx/dt, d²x/dt² and u - x of the last revolution, shape (3, n).
         sums: of the normal equations, differences first.
-        means: how many, and sums of dx/dt, d²x/dt² and u - x: a steady force counts for nothing.
+        means: how many, sums of dx/dt, d²x/dt², u - x and (u - x)²: a steady force counts for nothing.
         forgetting: what a revolution leaves of both.
         point: sums of the grid point that is being measured.
         state: see above.
@@ -113,8 +115,10 @@ class DisturbanceTable(NamedTuple):
 
     step: float
     nominal: float
+    given: Array
     model: Array
     late: int
+    begins: int
     whole: int
     part: float
     commands: Array
@@ -210,13 +214,16 @@ def disturbance(
     """
     frequency, damping, delay = model
     whole = int(np.floor(delay / step + 1e-9))
+    given = np.array([2.0 * damping / frequency, 1.0 / frequency**2])
     spread = np.zeros((3, points))
     spread[0] = _UNKNOWN
     return DisturbanceTable(
         step=step,
         nominal=nominal,
-        model=np.array([2.0 * damping / frequency, 1.0 / frequency**2]),
+        given=given,
+        model=given.copy(),
         late=late,
+        begins=late + int(_SWINGS_IN * given[0] / step),
         whole=whole,
         part=max(delay / step - whole, 0.0),
         commands=np.zeros(1 << (late + whole + 2).bit_length()),
@@ -237,7 +244,7 @@ def disturbance(
         identifies=identifies,
         before=np.zeros((3, points)),
         sums=np.zeros(10),
-        means=np.zeros(4),
+        means=np.zeros(5),
         forgetting=forgetting,
         point=np.zeros(6),
         state=np.zeros(5, np.int64),
@@ -326,27 +333,31 @@ def observed(
         first, second = _derivatives(low.position, low.bandwidth)
         found = low.position[_STAGES] + m.model[0] * first + m.model[1] * second
         found -= low.command[_STAGES] + m.learned[_STAGES]
-    if learning and (m.learns or m.identifies):
-        _measure(m, form, angle, speed, position, command, known)
+    if m.learns or m.identifies:
+        low = m.learner
+        _pass(low.position, position, low.keep, low.take)
+        _pass(low.command, command + known, low.keep, low.take)
+        low = m.identifier
+        _pass(low.position, position, low.keep, low.take)
+        _pass(low.command, command, low.keep, low.take)
+        if learning and sample >= m.begins:
+            _measure(m, form, angle, speed)
+        else:
+            m.state[_BEGUN] = 0
     return found
 
 
 @inlined
-def _measure(
-    m: DisturbanceTable, form: FormAhead, angle: float, speed: float, position: float, command: float, known: float
-) -> None:
+def _measure(m: DisturbanceTable, form: FormAhead, angle: float, speed: float) -> None:
     low, point, state = m.learner, m.point, m.state
-    _pass(low.position, position, low.keep, low.take)
-    _pass(low.command, command + known, low.keep, low.take)
     first, second = _derivatives(low.position, low.bandwidth)
     beyond = low.position[_STAGES] + m.model[0] * first + m.model[1] * second - low.command[_STAGES]
     lag = _STAGES / low.bandwidth
     place = int(np.floor((angle - speed * lag) * (m.value.size / _TURN)))
     low = m.identifier
-    _pass(low.position, position, low.keep, low.take)
-    _pass(low.command, command, low.keep, low.take)
     if not state[_BEGUN]:
         state[_BEGUN], state[_POINT], state[_FIRST] = 1, place, place
+        m.fresh[:] = 0.0
     while state[_POINT] < place:
         _end_point(m, form, speed)
     if state[_POINT] == place:
@@ -371,13 +382,10 @@ def _end_point(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
         _sum_up(m, here)
     point[_SUM] = point[_COUNT] = 0.0
     state[_POINT] += 1
-    passed = state[_POINT] - state[_FIRST]
-    # At first the model changes much, and soon; later whole revolutions tell it best.
-    part = points if state[_REVOLUTIONS] >= _SETTLED else points // _PARTS
-    if m.identifies and passed % part == 0 and passed > part:
-        _fit(m, form, speed)
-    if passed % points == 0:
+    if (state[_POINT] - state[_FIRST]) % points == 0:
         state[_REVOLUTIONS] += 1
+        if m.identifies:
+            _fit(m, form, speed)
         m.sums[:] *= m.forgetting
         m.means[:] *= m.forgetting
         if state[_REVOLUTIONS] == _SETTLED and m.follows_speed:
@@ -426,32 +434,44 @@ def _sum_up(m: DisturbanceTable, here: int) -> None:
     mean[1] += velocity
     mean[2] += acceleration
     mean[3] += rest
+    mean[4] += rest * rest
     before[0, here], before[1, here], before[2, here] = velocity, acceleration, rest
 
 
 @inlined
 def _fit(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
-    """Fit the model; the memory goes along, since what a model does not explain is in it."""
-    count, v, a, r = m.means[0], m.means[1], m.means[2], m.means[3]
-    s = m.sums[:5] + _WHOLE * m.sums[5:]
-    s[0] -= _WHOLE * v * v / count
-    s[1] -= _WHOLE * v * a / count
-    s[2] -= _WHOLE * a * a / count
-    s[3] -= _WHOLE * v * r / count
-    s[4] -= _WHOLE * a * r / count
-    determinant = s[0] * s[2] - s[1] * s[1]
-    if not determinant > _LEAST_EXCITED * s[0] * s[2]:
+    """Fit the model; what it explained otherwise is in the memory, and goes along."""
+    count, v, a, r, rr = m.means[0], m.means[1], m.means[2], m.means[3], m.means[4]
+    whole, s = m.sums[5:].copy(), m.sums[:5].copy()
+    for k, mean in enumerate((v * v, v * a, a * a, v * r, a * r)):
+        whole[k] -= mean / count
+    determinant = whole[0] * whole[2] - whole[1] * whole[1]
+    if not determinant > _LEAST_EXCITED * whole[0] * whole[2]:
         return
+    a1 = (whole[3] * whole[2] - whole[4] * whole[1]) / determinant
+    a2 = (whole[4] * whole[0] - whole[3] * whole[1]) / determinant
+    # The force is as large in the waves that the drive moves in as in the others, where it is what is left.
+    left = _WHOLE * max(rr - r * r / count - a1 * whole[3] - a2 * whole[4], 0.0)
+    sure1, sure2 = left / (_UNSURE[0] * m.given[0]) ** 2, left / (_UNSURE[1] * m.given[1]) ** 2
+    s += _WHOLE * whole
+    s[0] += sure1
+    s[2] += sure2
+    s[3] += sure1 * m.given[0]
+    s[4] += sure2 * m.given[1]
+    determinant = s[0] * s[2] - s[1] * s[1]
     a1 = (s[3] * s[2] - s[4] * s[1]) / determinant
     a2 = (s[4] * s[0] - s[3] * s[1]) / determinant
     if not (a1 > 0.0 and a2 > 0.0):
         return
     more1, more2 = a1 - m.model[0], a2 - m.model[1]
     m.model[0], m.model[1] = a1, a2
+    for low, known in ((m.observer, m.learned), (m.learner, m.learner.command)):
+        first, second = _derivatives(low.position, low.bandwidth)
+        known[:] += more1 * first + more2 * second
     if not m.learns:
         return
-    points, reach = m.value.size, m.smoothing.size // 2
-    for i in range(max(m.state[_FIRST], m.state[_POINT] - reach - points), m.state[_POINT] - reach):
+    points = m.value.size
+    for i in range(m.state[_POINT] - points, m.state[_POINT]):
         _, slope, bow = derivatives_at(
             form.heights, form.table, form.feed, form.start, form.part, (i + 0.5) * _TURN / points
         )
