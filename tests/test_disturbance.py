@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from cells import scenario
+from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_rc import harness
@@ -16,12 +17,14 @@ from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.stages.law import Law
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.cli import main
 from lathe_rc.control import disturbance
 from lathe_rc.control.angle_filter import angle_filter, at, follow
 from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
 from lathe_rc.signals.encoder import Encoder
 from lathe_rc.signals.profile import Piston, derivatives_at, deviation_along, height_along, tabulated
+from lathe_rc.studies import STUDIES
 
 CONFIG = Path(__file__).parents[1] / "config"
 STEP = 1 / 64000
@@ -310,3 +313,36 @@ def test_a_law_that_senses_gets_the_measured_position():
     fields = np.random.default_rng(0).standard_normal((6, 64))
     law.step(law.memory, 0, 0, tuple(fields), (), (np.empty(64),))
     assert_array_equal(law.law.positions, fields[-1])
+
+
+# --- the studies that judge it
+
+
+def test_the_suite_has_it_within_the_tolerance_and_ahead_of_its_peer_with_everything_at_once():
+    study = STUDIES["robust"]
+    found = study.run(study.parameters(plants=1, revolutions=24, conditions=["all at once"])).to_json()
+    assert list(found) == [
+        "conditions", "laws", "tolerance_um", "largest_um", "rms_um", "revolutions", "effort_a", "margin",
+    ]  # fmt: skip
+    for plant in ("told", "worst"):
+        (errors,) = found["largest_um"][plant]
+        of = dict(zip(found["laws"], errors, strict=True))
+        assert of["ours"] == min(errors)
+        assert of["ours"] < 1.0 < min(of["told"], of["comp."])
+        assert found["revolutions"][plant][0][found["laws"].index("ours")] < 12
+
+
+def test_the_map_compares_each_sensor_with_the_variable_lead():
+    study = STUDIES["sensor-map"]
+    result = study.run(study.parameters(counts=[1000], noise_nm=[20.0], wd=[106.0, 213.0], harmonics=[2]))
+    assert result.ratio.shape == (1, 1, 1, 2)
+    found = result.to_json()
+    assert found["worst_ratio"] == result.ratio.max() < 0.5
+    assert 0.0 < found["floor_um"][0][0][0] < found["variable_lead_um"][0][0][0][0]
+
+
+def test_a_study_that_has_a_quick_form_has_an_option_for_it():
+    assert "--quick" in CliRunner().invoke(main, ["study", "robust", "--help"]).stdout
+    refused = CliRunner().invoke(main, ["study", "invariance", "--quick"])
+    assert refused.exit_code == 2
+    assert "--quick" in refused.stderr

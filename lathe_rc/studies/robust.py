@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
+from rich.table import Table as RichTable
 
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import Value, parameter
@@ -67,8 +68,11 @@ CONDITIONS: dict[str, Values] = {
     },
     "three keyways": {**_STEADY, **_EVEN},
     "uneven, worn": {**_STEADY, **_WHOLE},
+    "slowed by cut": {**_STEADY, **_EVEN},
     "all at once": {},
 }  # fmt: skip
+_SLOWED = "slowed by cut"  # three keyways, and a spindle that the cut slows in between
+_SPINDLE: cells.Values = {"stage": "loaded_spindle", "inertia": 0.03, "motor_inertia": 0.01, "torque_limit": 10.0}
 _QUICK = ("nominal", "speed 213", "three keyways", "all at once")
 
 _INVERSE: cells.Values = {
@@ -153,7 +157,7 @@ class RobustResult:
 
     def table(self) -> Group:
         """One table a quantity."""
-        tables = []
+        tables: list[RichTable | str] = []
         worst = f"worst of {self.largest.shape[-1]} drives"
         for title, values in (
             ("Largest form error of the last 10 revolutions [µm], told drive", self.largest[..., 0]),
@@ -203,7 +207,7 @@ def _figure(value: float) -> str:
         return "-"
     if value == int(value):
         return str(int(value))
-    return f"{value:.2f}" if value < 10.0 else f"{value:.1f}" if value < 1000.0 else f"{value:.0e}"
+    return f"{value:.2f}" if value < 10.0 else f"{value:.1f}" if value < 100.0 else f"{value:.0f}"
 
 
 @dataclass(frozen=True)
@@ -268,13 +272,13 @@ def _drives(count: int) -> list[tuple[float, float, float, float]]:
 
 
 def _cell(
-    bases: Mapping[str, Scenario], condition: str, law: str, drive: tuple[float, float, float, float]
+    bases: Mapping[tuple[str, bool], Scenario], condition: str, law: str, drive: tuple[float, float, float, float]
 ) -> Scenario:
     frequency, damping, stiffness, delay = drive
     true = (_TOLD[0] * frequency, _TOLD[1] * damping, _TOLD[2] * delay)
     told = true if law == _KNOWS else _TOLD
     machine = ("coarse_natural_frequency", "coarse_damping", "coarse_delay")
-    return bases[law].varied(
+    return bases[law, condition == _SLOWED].varied(
         {
             **CONDITIONS[condition],
             **{f"loaded_drive.{name}": value for name, value in zip(machine, true, strict=True)},
@@ -307,7 +311,11 @@ def run(parameters: RobustParameters, track: Track = untracked) -> RobustResult:
     if parameters.quick:
         conditions, count, revolutions = [name for name in conditions if name in _QUICK], min(count, 4), 30
     length = {"revolutions": float(revolutions)}
-    bases = {law: cells.load("robust_cutting", spindle_encoder=length, controller=LAWS[law]) for law in LAWS}
+    bases = {
+        (law, slowed): cells.load("robust_cutting", spindle_encoder={**length, **spindle}, controller=LAWS[law])
+        for law in LAWS
+        for slowed, spindle in ((False, {}), (True, _SPINDLE))
+    }
     drives = _drives(count)
     made = [_cell(bases, *names) for names in product(conditions, LAWS, drives)]
     shape = len(conditions), len(LAWS), len(drives)

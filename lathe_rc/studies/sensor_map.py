@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
+from rich.table import Table as RichTable
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals
@@ -89,21 +90,20 @@ class SensorMapResult:
         }
 
     def table(self) -> Group:
-        """The worst ratio over the frequencies; and the errors behind it, which shows where it lies."""
+        """The worst over the frequencies: of the ratio, and of the error itself."""
         given = self.parameters
-        rows = []
-        for (i, counts), (j, noise) in product(enumerate(given.counts), enumerate(given.noise_nm)):
-            worst = self.ratio[i, j].argmax(axis=-1)
-            told = [
-                f"{self.ratio[i, j, k, w]:.2f} ({self.ours[i, j, k, w]:.2f}/{self.plain[i, j, k, w]:.2f})"
-                for k, w in enumerate(worst)
-            ]
-            rows.append((str(counts or "ideal"), f"{noise:g}", *told))
+        tables: list[RichTable | str] = []
         columns = ("counts", "nm", *(f"{harmonic} waves" for harmonic in given.harmonics))
-        return Group(
-            comparison("Largest error over that of the variable lead, at the worst wd (µm/µm)", columns, rows),
-            f"largest of all {self.ratio.size}: {self.ratio.max():.2f}",
-        )
+        for title, values in (
+            ("Largest error over that of the variable lead, at the worst wd", self.ratio.max(axis=-1)),
+            ("Largest error [µm], at the worst wd", self.ours.max(axis=-1)),
+        ):
+            rows = [
+                (str(counts or "ideal"), f"{noise:g}", *(f"{value:.2f}" for value in values[i, j]))
+                for (i, counts), (j, noise) in product(enumerate(given.counts), enumerate(given.noise_nm))
+            ]
+            tables += [comparison(title, columns, rows), ""]
+        return Group(*tables, f"largest ratio of all {self.ratio.size}: {self.ratio.max():.2f}")
 
     def draw(self, figure: "Figure") -> None:
         """A map for each harmonic: counts over frequency, at the noise in the middle of those that are given."""
@@ -114,7 +114,8 @@ class SensorMapResult:
             shown = self.ratio[:, noise, k]
             image = axes.imshow(shown, vmin=0.0, vmax=0.5, cmap="viridis_r", aspect="auto")
             for (i, w), value in np.ndenumerate(shown):
-                axes.text(w, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color="white")
+                ink = "white" if value > 0.2 else "black"
+                axes.text(w, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=ink)
             axes.set_xticks(range(len(given.wd)), [f"{wd:g}" for wd in given.wd], fontsize=7)
             axes.set_yticks(range(len(given.counts)), [str(counts or "ideal") for counts in given.counts], fontsize=7)
             axes.set_title(f"{given.harmonics[k]} waves, {given.noise_nm[noise]:g} nm", fontsize=10)

@@ -133,6 +133,10 @@ class DisturbanceController(FormLaw):
     factor = "sup|factor of a revolution|"
     remedy = "a model nearer to the drive, a smaller observer_bandwidth"
 
+    def __init__(self, name: str, parameters: DisturbanceControllerParameters) -> None:
+        parameters.make(name)  # refuses what cannot be made, as ours
+        super().__init__(name, parameters)
+
     def start(self) -> Memory:
         """See `Law`."""
         parameters = self.parameters
