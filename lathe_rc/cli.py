@@ -31,6 +31,7 @@ COMMANDS = {
     "resim": "Run a recorded cell again, also with changes.",
     "run": "Run a scenario to its end.",
     "study": "Compute a table or figure of the papers.",
+    "sweep": "Compute many variations of a scenario into a table.",
     "view": "Show a bag in Rerun.",
 }  #: their summaries
 _BESIDES = {"container": "node"}  # commands in the module of another one

@@ -54,6 +54,9 @@ from lathe_rc.starting import Child, Start
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from lathe_rc.sweep.space import Space
+    from lathe_rc.sweep.sweep import Sweep
+
 Mode = Literal["offline", "composed", "processes"]
 Event = Mapping[str, Any]
 
@@ -281,6 +284,13 @@ def run(
     if result.bag is not None:
         write_digests(result.bag, result.digest)
     return result
+
+
+def sweep(scenario: Scenario, space: "Space", folder: Path, **options: Any) -> "Sweep":
+    """Compute variations of a cell into a table; the arguments are those of `lathe_rc.sweep.sweep.run`."""
+    from lathe_rc.sweep import sweep
+
+    return sweep.run(scenario, space, folder, **options)
 
 
 def _run(

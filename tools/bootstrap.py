@@ -50,7 +50,8 @@ def needed(arguments: Sequence[str]) -> Sequence[str]:
             if name not in GROUPS:
                 raise RefusalError(f"setup {name}; allowed: {', '.join(GROUPS)}, or nothing more")
         return arguments[1:]
-    return {"test": ["test", "view"], "view": ["view"]}.get(next(iter(arguments), ""), [])
+    wanted = {"sweep": ["sweep"], "test": ["sweep", "test", "view"], "tune": ["sweep"], "view": ["view"]}
+    return wanted.get(next(iter(arguments), ""), [])
 
 
 def set_up(ros: SourcedRos | None, groups: Sequence[str]) -> Changes:

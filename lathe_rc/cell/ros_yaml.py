@@ -150,6 +150,22 @@ def parse_value(text: str, source: str) -> Value:
     return "" if node is None else _value(node, source)
 
 
+def rows(text: str, source: str) -> list[dict[str, Value]]:
+    """A list of maps of values, each by the same rules.
+
+    Raises:
+        InputError: it is none.
+    """
+    root = _compose(text, source)
+    items = root.value if isinstance(root, yaml.SequenceNode) else []
+    if not items or not all(isinstance(item, yaml.MappingNode) for item in items):
+        raise InputError(f"{source}: no list of maps; allowed: '- {{NODE.PARAM: VALUE, ...}}', a line a cell")
+    found: list[dict[str, Value]] = [{} for _ in items]
+    for number, item in enumerate(items):
+        _flatten(item, f"{source}: row {number + 1}", "", found[number])
+    return found
+
+
 def read(path: Path) -> dict[str, dict[str, Value]]:
     """Parameters by node and name, in the order of the file.
 

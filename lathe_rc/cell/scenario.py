@@ -11,7 +11,7 @@ import yaml
 
 from lathe_rc import files
 from lathe_rc.cell import models, ros_yaml
-from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Value
+from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Value
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stages import MASTERS, STAGES
@@ -156,6 +156,28 @@ class Scenario:
             seen.add(name)
         return split + [[name] for name in self.nodes if name not in seen]
 
+    @property
+    def identity(self) -> str:
+        """A hash of all that changes a run: its nodes and their parameters, and what the files hold that they name."""
+        return _hash(self.fingerprints)
+
+    def parameter(self, target: str) -> Row:
+        """The row of a parameter in its node's table.
+
+        Args:
+            target: ``NODE.PARAM``, or ``PARAM`` for a shared parameter.
+
+        Raises:
+            InputError: there is none.
+        """
+        kinds = {node: self.kind(node) for node in self.nodes}
+        node, name = _target(target, kinds, shown(target))
+        rows = SharedParameters.rows() if node == _EVERYONE else TABLES[kinds[node]].rows()
+        if name not in rows:
+            known = instead(name, sorted(rows), listing=NodeParameters.listing.format(kinds[node]))
+            raise InputError(f"{shown(target)}: unknown parameter; {known}")
+        return rows[name]
+
     def varied(self, values: Mapping[str, Value]) -> "Scenario":
         """The same cell with other values, without reading its file again.
 
@@ -195,11 +217,17 @@ class Scenario:
             tables = {node: table.model_copy(update={"run_id": ""}) for node, table in tables.items()}
         return _agreed(self.name, tables, fingerprints)
 
-    def to_yaml(self) -> str:
-        """The complete parameter file; empty lists are left out, since rcl cannot read them."""
+    def to_yaml(self, *, given: bool = False) -> str:
+        """The complete parameter file; empty lists are left out, since rcl cannot read them.
+
+        Args:
+            given: what was given alone; read again, the rest takes its defaults, and models follow their drives.
+        """
         tree = {}
+        left_out = {"run_id"} if given and self.shared.run_id == _identity(self.fingerprints) else None
         for name, table in self.nodes.items():
-            values = {key: _quoted(value) for key, value in table.model_dump().items() if value != []}
+            kept = table.model_dump(exclude_unset=given, exclude=left_out)
+            values = {key: _quoted(value) for key, value in kept.items() if value != []}
             tree[f"/**/{name}"] = {"ros__parameters": values}
         return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=None)
 
@@ -252,7 +280,7 @@ def _absolute(kind: str, name: str, value: Value, folder: Path) -> Value:
     return str((folder / value).resolve())
 
 
-def _content(path: Path) -> str:
+def content(path: Path) -> str:
     """A hash of a file's content; its name if it is none, longer than any reader takes, or cannot be read."""
     try:
         return hashlib.sha256(files.contents(path)).hexdigest()
@@ -267,14 +295,18 @@ def _fingerprint(table: NodeParameters) -> str:
     values = table.model_dump(exclude=_HOST_PARAMETERS)
     for row in type(table).rows().values():
         if row.is_path and values[row.name]:
-            values[row.name] = _content(Path(values[row.name]))
+            values[row.name] = content(Path(values[row.name]))
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def _identity(fingerprints: Mapping[str, str]) -> str:
     """A run id that names the scenario's content: two runs of it give the same messages."""
+    return _hash(fingerprints)[:16]
+
+
+def _hash(fingerprints: Mapping[str, str]) -> str:
     said = {node: fingerprint for node, fingerprint in fingerprints.items() if fingerprint}
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
 def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mapping[str, str]) -> Scenario:
