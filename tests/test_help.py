@@ -8,6 +8,7 @@ import pytest
 from lathe_rc import frames, harness
 from lathe_rc.bag import reader
 from lathe_rc.cell import batch, recording, scenario
+from lathe_rc.sweep import sweep
 
 SHOWN = {
     "lathe_rc.harness.run": harness.run,
@@ -18,6 +19,7 @@ SHOWN = {
     "lathe_rc.cell.batch.run": batch.run,
     "lathe_rc.bag.reader.read": reader.read,
     "lathe_rc.frames.frame": frames.frame,
+    "lathe_rc.sweep.sweep.run": sweep.run,
 }
 
 

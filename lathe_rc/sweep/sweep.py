@@ -5,7 +5,7 @@ import hashlib
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -127,7 +127,8 @@ def run(
             with nullcontext(client) if client else client_of(scheduler, workers) as crew:
                 watch({"event": "ready", "dashboard": crew.dashboard_link})
                 jobs = (job for job in _jobs(kept, space) if job.key not in there)
-                _keep(kept, rows(crew, _order(kept), jobs, left), watch)
+                with closing(rows(crew, _order(kept), jobs, left)) as found:
+                    _keep(kept, found, watch)
     return Sweep(kept)
 
 

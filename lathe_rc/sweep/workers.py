@@ -9,7 +9,7 @@ import logging
 import signal
 import tempfile
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
@@ -33,7 +33,7 @@ _GROWTH = 4  # of a task's cells against the one before
 _MOST = 4096  # cells of a task
 _LEAST = 8  # towards the end tasks get shorter, down to this part of the others
 _AHEAD = 2  # tasks for each thread of the workers
-_CONNECT = 10  # [s] to reach a scheduler
+_CONNECT = 5  # [s] to reach a scheduler
 
 
 class Job(NamedTuple):
@@ -139,7 +139,7 @@ def _in_main_thread() -> bool:
     return threading.current_thread() is threading.main_thread()
 
 
-def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: int) -> Iterator[pa.Table]:
+def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: int) -> Generator[pa.Table]:
     """Compute cells; their rows as they come.
 
     Args:
