@@ -59,8 +59,37 @@ def test_ranges_lists_and_parts_of_the_scenarios_value(piston: Scenario) -> None
     assert [each[Q] for each in cells(piston, grid={Q: "1e-6:1e-4:3:log"})] == pytest.approx([1e-6, 1e-5, 1e-4])
     (half,) = cells(piston, grid={LEAD: "50%"})
     assert half[LEAD] == piston.nodes["learning_controller"].lead_time / 2
-    laws = cells(piston, grid={"learning_controller.lead_law": "variable_angle,constant_angle"})
-    assert [each["learning_controller.lead_law"] for each in laws] == ["variable_angle", "constant_angle"]
+    laws = cells(piston, grid={"learning_controller.lead_law": "variable,constant_angle"})
+    assert [each["learning_controller.lead_law"] for each in laws] == ["variable", "constant_angle"]
+
+
+def test_elements_of_lists_are_varied_and_tied(piston: Scenario) -> None:
+    base = piston.varied(
+        {"spindle_encoder.deviation_amplitude": [0.0, 0.1], "spindle_encoder.deviation_frequency": [9.0, 9.0]}
+    )
+    place = "spindle_encoder.deviation_amplitude[0]"
+    ties = {"spindle_encoder.deviation_frequency[1]": "spindle_encoder.deviation_amplitude[0] * 100"}
+    (cell,) = cells(base, grid={place: [0.05]}, ties=ties)
+    table = base.varied(cell).nodes["spindle_encoder"]
+    assert (table.deviation_amplitude, table.deviation_frequency) == ([0.05, 0.1], [9.0, 5.0])
+    with pytest.raises(InputError, match="a list of 2 there"):
+        cells(base, grid={"spindle_encoder.deviation_amplitude[2]": [0.05]})
+    with pytest.raises(InputError, match="no list there"):
+        cells(base, grid={f"{LEAD}[0]": [1e-3]})
+
+
+def test_models_follow_the_drives_or_stay(client: distributed.Client, tmp_path: Path) -> None:
+    two = scenarios.load(PISTON.with_name("two_channel.yaml"), ["spindle_encoder.revolutions=6"])
+    space_ = Space(grid={"electrodynamic_actuator.natural_frequency": ["80%"]})
+    found = {
+        models: harness.sweep(two, space_, tmp_path / models, client=client, models=models)
+        for models in ("follow", "nominal")
+    }
+    own = two.nodes["electrodynamic_actuator"].natural_frequency
+    known = [found[models].scenario(0).nodes["learning_controller"].model_natural_frequency for models in found]
+    assert known == [0.8 * own, own]
+    with pytest.raises(InputError, match="another cell"):
+        harness.sweep(two, space_, tmp_path / "nominal", client=client)
 
 
 def test_ties_follow_what_they_depend_on_in_whatever_order_they_are_given(piston: Scenario) -> None:
@@ -130,6 +159,9 @@ def test_cells_are_as_many_as_are_counted_and_differ(leads: list[float], most: i
         ({"ties": {Q: "learning_controller.lead_tine"}}, "unknown parameter"),
         ({"ties": {Q: f"{LEAD} / 0"}}, "division by zero"),
         ({"ties": {Q: "__import__('os').getcwd()"}}, "learning_controller.q_time"),
+        ({"grid": {LEAD: "1e-3,fast"}}, "learning_controller.lead_time = 'fast'; allowed: a finite number"),
+        ({"grid": {"block_size": [64.5]}}, "block_size = 64.5; allowed: an integer"),
+        ({"given": [{LEAD: "slow"}]}, "learning_controller.lead_time = 'slow'; allowed: a finite number"),
         ({"given": [{LEAD: 1e-3}, {LEAD: 1e-3}]}, "the same; allowed: each once"),
     ],
 )

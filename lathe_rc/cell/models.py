@@ -59,6 +59,13 @@ def _model(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters
     return {name: values.get(name, cast("Quantity", rows[name].default)) for name in missing}
 
 
+def given(table: NodeParameters) -> NodeParameters:
+    """The same table, whose models count as given."""
+    made = table.model_copy()
+    made.model_fields_set.update(_marked(type(table)))
+    return made
+
+
 def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
     """The tables of a cell by node, with the models that nobody has given; they count as not given still.
 

@@ -19,7 +19,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.sweep import row
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.space import Space, given
-from lathe_rc.sweep.sweep import Sweep
+from lathe_rc.sweep.sweep import Models, Sweep
 from lathe_rc.sweep.sweep import run as sweep_run
 
 _BEST = 5  # cells that are shown
@@ -100,6 +100,13 @@ def space_of(
     metavar="TOPIC.FIELD:STATISTIC",
     help=f"more columns: {', '.join(row.STATISTICS)}",
 )
+@click.option(
+    "--models",
+    type=click.Choice(["follow", "nominal"]),
+    default="follow",
+    show_default=True,
+    help="what controllers take for a drive that is varied: as it is, or as the scenario has it",
+)
 @options.overrides
 @click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of each run")
 @click.option("--out", type=click.Path(path_type=Path), help="folder of the results; default: sweep-SCENARIO")
@@ -115,6 +122,7 @@ def run(
     seeds: int,
     cells: Path | None,
     measures: tuple[str, ...],
+    models: Models,
     overrides: tuple[str, ...],
     revolutions: float | None,
     out: Path | None,
@@ -136,7 +144,14 @@ def run(
     try:
         with progress:
             found = sweep_run(
-                loaded, space, place, measures=measures, scheduler=scheduler, workers=workers, watch=progress
+                loaded,
+                space,
+                place,
+                measures=measures,
+                models=models,
+                scheduler=scheduler,
+                workers=workers,
+                watch=progress,
             )
     except KeyboardInterrupt:
         click.echo(
