@@ -103,7 +103,7 @@ class BestLawResult:
     def table(self) -> Group:
         """How often each law is the best, what it errs, and the adaptive inverse against the variable lead."""
         encoders = self.parameters.encoder_counts
-        columns = ("law", *(f"{counts:g}" for counts in encoders))
+        columns = ("law", *(f"{counts:,}" for counts in encoders))
         shares, medians = ({c: of(c) for c in encoders} for of in (self._shares, self._medians))
         ratio = self.error[_PLAIN] / self.error[_ADAPTIVE]
         tables = [
@@ -143,7 +143,7 @@ class BestLawResult:
                         self.frequency[here], self.amplitude[here] * 100.0, s=9, color=COLOURS[law], label=name
                     )
             upper[place].set(xscale="log", xlabel="frequency of the deviation [rad/s]", ylabel="deviation [%]")
-            upper[place].set_title(f"the best law, {counts:g} counts", fontsize=10)
+            upper[place].set_title(f"the best law, {counts:,} counts", fontsize=10)
             upper[place].legend(fontsize=6, loc="upper left")
             shown = lower[place].scatter(
                 self.noise[of], 100.0 * (self.model[of] - 1.0), c=np.clip(ratio[of], -1.5, 1.5), s=9, cmap="RdYlGn",

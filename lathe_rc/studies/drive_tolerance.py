@@ -106,6 +106,10 @@ class DriveToleranceResult:
         right.axhline(self.nominal, color="#7f7f7f", ls=":", label="the scenario's own")
         right.set(xlabel="tolerance of the drives (1σ) [%]", ylabel="form error that they stay below [µm]")
         right.legend(fontsize=8)
+        right.set_xticks(100.0 * np.array(self.parameters.tolerance))
+        for axis in (left.xaxis, right.xaxis, right.yaxis):
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter("")
         for axes in (left, right):
             axes.grid(visible=True, which="both", alpha=0.25)
 

@@ -33,7 +33,7 @@ COLOURS = {
     "time_periodic": "#7f7f7f",
     "constant_lead": "#c0392b",
     "variable_lead": "#e08e0b",
-    "variable_lead_second_order": "#b7950b",
+    "variable_lead_second_order": "#6e2c00",
     "second_order_inverse": "#7d3c98",
     "second_order_inverse_dynamic": "#2874a6",
     "exact_preview": "#148f77",
