@@ -2,16 +2,19 @@
 """Whether a part is in tolerance: the form error against what is allowed to each side.
 
 The tolerance ±t is that of a line profile (ISO 1101) whose zone is 2t wide, t to each side of the desired form. A
-revolution is in tolerance if its form error is nowhere larger than t; a run, from the revolution on after which each
-one is, to its end.
+revolution is in tolerance if its form error is nowhere larger than t; a run, from the revolution on from which all are,
+to its end. What is to spare is told of its last revolutions: the first that is in tolerance hardly is.
 """
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+
+LAST = 10  #: revolutions at the end of a run that its spare and its budget speak of, at most
 
 
 @dataclass(frozen=True)
@@ -22,8 +25,8 @@ class Verdict:
         tolerance: form error that is allowed to each side [m].
         revolutions: complete ones that were judged.
         since: revolution, counted from 1, from which on all are in tolerance; 0: the last is not.
-        largest: largest magnitude of the form error from there on; of the last revolution, if that is not in
-            tolerance; NaN without a revolution [m].
+        largest: largest magnitude of the form error in the last revolutions that are in tolerance, in `LAST` of them
+            at most; of the last, if that is not; NaN without a revolution [m].
     """
 
     tolerance: float
@@ -48,7 +51,9 @@ class Verdict:
             return f"not in tolerance ({allowed}): no complete revolution"
         if not self.in_tolerance:
             return f"not in tolerance ({allowed}): {self.largest * 1e6:.4g} µm in the last revolution"
-        return f"in tolerance ({allowed}) from revolution {self.since} on, {self.spare * 1e6:.3g} µm to spare"
+        return (
+            f"in tolerance ({allowed}) from revolution {self.since} on, {self.spare * 1e6:.3g} µm to spare at the end"
+        )
 
     def summary(self) -> dict[str, object]:
         """The same for JSON, lengths in µm."""
@@ -72,28 +77,22 @@ class Judge:
     def __init__(self, tolerance: float, before: int = 0) -> None:
         self._tolerance, self._before = tolerance, before
         self._count = self._since = 0
-        self._largest = np.nan
+        self._newest: deque[float] = deque(maxlen=LAST)
 
     def add(self, largest: Array) -> None:
         """Take the largest magnitude of the form error of the next revolutions [m], shape (n,)."""
-        if not largest.size:
-            return
-        outside = np.flatnonzero(~(largest <= self._tolerance))  # what is not a number is outside
-        if not outside.size:
-            worst = float(largest.max())
-            self._largest = max(self._largest, worst) if self._since else worst
-            self._since = self._since or self._count + 1
-        elif outside[-1] == largest.size - 1:
-            self._since, self._largest = 0, float(largest[-1])
-        else:
-            begin = int(outside[-1]) + 1
-            self._since, self._largest = self._count + begin + 1, float(largest[begin:].max())
-        self._count += largest.size
+        for value in largest.tolist():
+            self._count += 1
+            inside = value <= self._tolerance  # what is not a number is not
+            if not (inside and self._since):
+                self._newest.clear()
+                self._since = self._count if inside else 0
+            self._newest.append(value)
 
     def verdict(self) -> Verdict:
         """Of the revolutions so far."""
         since = self._since + self._before if self._since else 0
-        return Verdict(self._tolerance, self._count + self._before if self._count else 0, since, self._largest)
+        return Verdict(self._tolerance, self._count, since, max(self._newest, default=np.nan))
 
 
 def judge(largest: Array, tolerance: float) -> Verdict:

@@ -8,6 +8,7 @@ import numpy as np
 
 from lathe_rc.analysis.budget import TOLD, Budget, Causes, Decomposition
 from lathe_rc.analysis.metrology import evenly
+from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.cell import batch, messages, models
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import NodeParameters, Value
@@ -22,7 +23,6 @@ from lathe_rc.cell.stages.vibration import VibrationParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 
-REVOLUTIONS = 10  #: last ones of a run that its budget speaks of
 _TURN = 2.0 * np.pi
 _PREFIXES = ("", "coarse_", "fine_")  # of the parameters of a drive; those of a series drive have one
 _FACTOR = 0.9  # of a cycle, which a flat Q may have; or what the scenario's own has, if that is more
@@ -105,9 +105,9 @@ class _Keep:
         """Of the last complete revolutions."""
         angle = self._kept["angle"]
         # One more than is told of, for the spline; the last may be short of two samples.
-        before = max(int((angle[-1] + 2.0 * (angle[-1] - angle[-2])) / _TURN) - REVOLUTIONS - 1, 0)
+        before = max(int((angle[-1] + 2.0 * (angle[-1] - angle[-2])) / _TURN) - LAST - 1, 0)
         begin = int(np.searchsorted(angle, before * _TURN))
-        error = evenly(angle[begin:] - before * _TURN, self._kept["error"][begin:])[-REVOLUTIONS:]
+        error = evenly(angle[begin:] - before * _TURN, self._kept["error"][begin:])[-LAST:]
         return _Tail(error, self._kept["height"][begin:])
 
 

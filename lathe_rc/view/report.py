@@ -300,7 +300,7 @@ def _judged(found: Verdict) -> list[Fact]:
     tolerance = f"±{found.tolerance * 1e6:.4g} µm"
     if found.in_tolerance:
         facts = [Fact(f"{tolerance}, from revolution {found.since} on", "in tolerance", "good")]
-        return [*facts, Fact("to spare", f"{_number(found.spare * 1e6)} µm", "good")]
+        return [*facts, Fact("to spare at the end", f"{_number(found.spare * 1e6)} µm", "good")]
     facts = [Fact(f"{tolerance}, in the last revolution", "not in tolerance", "bad")]
     return [*facts, Fact("too much", f"{_number(-found.spare * 1e6)} µm", "bad")]
 
