@@ -315,7 +315,11 @@ def budget(
         >>> from lathe_rc.cell import scenario
         >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=60"])
         >>> for found in harness.budget(piston).causes:
-        ...     print(f"{found.name}: {found.share:.1%}")
+        ...     print(f"{found.name}: {found.percent()} %")
+        Q floor: -0.3 %
+        speed: 83.5 %
+        lead: 0.0 %
+        feed: 16.9 %
     """
     return budgets.budget(scenario, threads=threads, watch=watch)
 
