@@ -204,6 +204,8 @@ def test_a_q_that_cannot_be_flat_is_left_out_and_said_to_be():
             "no form error to budget: the cell has no encoder and tool; allowed: ",
         ),
         (("piston", "--revolutions", "0.5"), "budget of piston: no complete revolution; allowed: "),
+        (("piston", "--revolutions", "1e-9"), "budget of piston: no complete revolution; allowed: "),
+        (("piston", "--revolutions", "11.9996"), "its runs end with another revolution each"),
         (("piston", "--set", "tool.fed=1.0"), "tool.fed: unknown parameter; "),
     ],
 )

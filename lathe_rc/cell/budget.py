@@ -68,10 +68,12 @@ class _Tail:
     """The last revolutions of a run.
 
     Attributes:
+        whole: complete revolutions of the run.
         error: form error over even angles [m], shape (revolutions, points).
         height: of the tool along the part [m], shape (samples,).
     """
 
+    whole: int
     error: Samples
     height: Samples
 
@@ -104,11 +106,13 @@ class _Keep:
     def kept(self) -> _Tail:
         """Of the last complete revolutions."""
         angle = self._kept["angle"]
+        if angle.size < 2:
+            return _Tail(0, np.empty((0, 0)), angle)
         # One more than is told of, for the spline; the last may be short of two samples.
         before = max(int((angle[-1] + 2.0 * (angle[-1] - angle[-2])) / _TURN) - LAST - 1, 0)
         begin = int(np.searchsorted(angle, before * _TURN))
-        error = evenly(angle[begin:] - before * _TURN, self._kept["error"][begin:])[-LAST:]
-        return _Tail(error, self._kept["height"][begin:])
+        error = evenly(angle[begin:] - before * _TURN, self._kept["error"][begin:])
+        return _Tail(before + error.shape[0], error[-LAST:], self._kept["height"][begin:])
 
 
 def _not_yet(scenario: Scenario, values: Mapping[str, Value]) -> dict[str, Value]:
@@ -256,6 +260,17 @@ def _with(scenario: Scenario, found: Mapping[str, Cause], acting: Causes) -> Sce
     return scenario.varied(off)
 
 
+def _compared(scenario: Scenario, runs: Mapping[Causes, _Tail]) -> dict[Causes, Samples]:
+    """The form errors of the same revolutions."""
+    if len({tail.whole for tail in runs.values()}) > 1:
+        (master,) = scenario.masters
+        raise InputError(
+            f"budget of {scenario.name}: its runs end with another revolution each, a sample or two before it is "
+            f"complete; allowed: a whole number of {master}.revolutions"
+        )
+    return {acting: tail.error for acting, tail in runs.items()}
+
+
 def budget(
     scenario: Scenario, *, threads: int | None = None, watch: Callable[[int, int], None] | None = None
 ) -> Budget:
@@ -286,10 +301,10 @@ def budget(
         raise InputError(f"budget of {scenario.name}: no complete revolution; allowed: a longer run")
     found, left_out = causes(scenario, whole.height)
     split = Decomposition({name: cause.needs for name, cause in found.items()})
-    runs = {frozenset(found): whole.error}
-    runs |= {acting: tail.error for acting, tail in run(split.alone() - runs.keys(), found).items()}
-    told = split.split(runs, left_out)
+    runs = {frozenset(found): whole}
+    runs |= run(split.alone() - runs.keys(), found)
+    told = split.split(_compared(scenario, runs), left_out)
     if abs(told.interactions.share) >= TOLD:
-        runs |= {acting: tail.error for acting, tail in run(split.together() - runs.keys(), found).items()}
-        told = split.split(runs, left_out)
+        runs |= run(split.together() - runs.keys(), found)
+        told = split.split(_compared(scenario, runs), left_out)
     return told
