@@ -50,10 +50,10 @@ def test_what_adds_up_has_its_power_and_no_interactions():
 def test_what_two_causes_do_only_together_is_named_by_both():
     found = decomposed(
         dict.fromkeys("abc", ""),
-        lambda acting: sum((WAVES[cause] for cause in acting), np.cos(7 * ANGLE) * ({"a", "c"} <= acting)),
+        lambda acting: sum((WAVES[cause] for cause in acting), 0.1 + np.cos(7 * ANGLE) * ({"a", "c"} <= acting)),
     )
     told = shares(found)
-    assert told["interactions"] == pytest.approx(told["a with c"]) == pytest.approx(0.5 / 7.5)
+    assert told["interactions"] == pytest.approx(told["a with c"]) == pytest.approx(0.5 / 7.51)
     assert told["a with b"] == pytest.approx(0.0, abs=1e-12)
     assert [part.name for part in found.rows] == ["a", "b", "c", "rest", "interactions", "a with c"]
     assert found.explained == pytest.approx(1.0)
