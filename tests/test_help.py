@@ -13,6 +13,7 @@ from lathe_rc.sweep import sweep
 SHOWN = {
     "lathe_rc.harness.run": harness.run,
     "lathe_rc.harness.Result": harness.Result,
+    "lathe_rc.harness.budget": harness.budget,
     "lathe_rc.cell.scenario.load": scenario.load,
     "lathe_rc.cell.scenario.Scenario.varied": scenario.Scenario.varied,
     "lathe_rc.cell.recording.Recording": recording.Recording,

@@ -30,7 +30,7 @@ PISTON = Path(__file__).parents[1] / "config" / "piston.yaml"
 @pytest.fixture(scope="module")
 def piston() -> Scenario:
     """Four revolutions of the piston."""
-    return scenarios.load(PISTON, ["spindle_encoder.revolutions=4"])
+    return scenarios.load(PISTON, ["spindle_encoder.revolutions=4", "tool.tolerance=4e-6"])
 
 
 @pytest.fixture(scope="module")
@@ -195,6 +195,7 @@ def test_a_row_says_what_the_run_says(piston: Scenario) -> None:
     assert found[asked.name] == np.abs(effort[errors.starts[-2] : errors.starts[-1]]).max()
     assert found["digest"] == row.digest(result.recording)
     assert 0.0 < found["margin"] < 1.0
+    assert found["tool.in_tolerance_from"] == result.verdict.since > 1
 
 
 def test_what_goes_wrong_with_a_cell_stands_in_its_row(piston: Scenario) -> None:

@@ -79,3 +79,14 @@ def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
             made[node] = table.model_copy(update=values)
             made[node].model_fields_set.difference_update(values)
     return made
+
+
+def of_drives(node: str, tables: Mapping[str, NodeParameters]) -> dict[str, Quantity]:
+    """The model of a node as if nobody had given one: the values of the parameters by name.
+
+    Raises:
+        InputError: see `resolved`.
+    """
+    bare = tables[node].model_copy()
+    bare.model_fields_set.difference_update(_marked(type(bare)))
+    return _model(node, bare, {**tables, node: bare})

@@ -216,9 +216,14 @@ class SharedParameters(Table):
 
 
 class NodeParameters(SharedParameters):
-    """What every node has."""
+    """What every node has.
+
+    Attributes:
+        judging: parameters that change no sample and no message of a run, but what is said of it.
+    """
 
     listing: ClassVar[str] = "lathe node {} --help"
+    judging: ClassVar[frozenset[str]] = frozenset()
 
     stage: str = parameter("", "what the node is; empty: its name says it")
     remap: list[str] = parameter([], "topic names to replace, as old:=new")

@@ -335,7 +335,7 @@ def _fingerprint(table: NodeParameters) -> str:
     """A hash of what a table says of a run; empty if that changes none."""
     if isinstance(table, RecorderParameters):
         return ""
-    values = table.model_dump(exclude=_HOST_PARAMETERS)
+    values = table.model_dump(exclude=_HOST_PARAMETERS | table.judging)
     for row in type(table).rows().values():
         if row.is_path and values[row.name]:
             values[row.name] = content(Path(values[row.name]))
