@@ -30,6 +30,7 @@ _BAR = 46  # [px] a parameter
 _DIGITS = 5  # of the numbers that a page carries
 _POINTS = 400  # of a yield curve
 _SHARES = (0.95, 0.99)
+_AXIS = {"tickCount": 5, "grid": False, "format": "~g"}  # of a parameter
 _SHOWN = {"m": "median", "s": "smallest", "l": "largest"}
 
 
@@ -163,7 +164,7 @@ def _span(channel: str, axis: Axis, found: Bins, prefix: str) -> Spec:
     if axis.texts:
         return {channel: _named(axis, prefix)}
     ends = {"field": f"{prefix}x0", "type": "quantitative", "title": axis.label, "scale": _domain(axis, found)}
-    return {channel: {**ends, "axis": {"tickCount": 5, "grid": False}}, f"{channel}2": {"field": f"{prefix}x1"}}
+    return {channel: {**ends, "axis": _AXIS}, f"{channel}2": {"field": f"{prefix}x1"}}
 
 
 def _named(axis: Axis, prefix: str) -> Spec:
@@ -216,7 +217,7 @@ def lines(axes: Sequence[tuple[Axis, Bins]], across: int, third: int | None, goa
     """The goal over one parameter: a line for each value of another one, or the median with a band."""
     x, x_bins = axes[across]
     place: Spec = {"field": "xx", "type": "quantitative", "title": x.label, "scale": _domain(x, x_bins)}
-    place["axis"] = {"tickCount": 5, "grid": False}
+    place["axis"] = _AXIS
     place = _named(x, "x") if x.texts else place
     common: Spec = {"$schema": SCHEMA, "width": 640, "height": _FLAT, "autosize": FIT}
     up = {"type": "quantitative", "title": goal.label, "scale": goal.scale, "axis": {"format": "~g", "tickCount": 6}}

@@ -250,9 +250,10 @@ def _weight(axis: Axis, found: Effect) -> tuple[bool, float, float]:
 
 def _effects(seen: Seen, effects: Mapping[str, Sequence[Effect]], order: Sequence[int]) -> dict[str, Any]:
     """The table of what each goal depends on."""
-    columns = ["parameter", *(f"{goal.name} (log)" if goal.log else goal.name for goal in seen.goals)]
+    goals = [goal for goal in seen.goals if any(found.share is not None for found in effects[goal.name])]
+    columns = ["parameter", *(f"{goal.name} (log)" if goal.log else goal.name for goal in goals)]
     names = [f"{axis.name} (tied)" if axis.tied else axis.name for axis in seen.axes]
-    rows = [[names[place], *(_told(each[place]) for each in effects.values())] for place in order]
+    rows = [[names[place], *(_told(effects[goal.name][place]) for goal in goals)] for place in order]
     return {"columns": columns, "rows": rows}
 
 
@@ -321,14 +322,13 @@ def _yields(seen: Seen, done: Yield) -> list[str]:
     """What is said of the yield, a sentence each."""
     unit = f" {seen.goal.unit}" if seen.goal.unit else ""
     bound = "at least" if done.above else "at most"
-    found = []
-    for share in (0.95, 0.99):
-        limit = done.point(share)
-        found.append(
-            f"Fewer than {share:.0%} of the cells come to a result."
-            if limit is None
-            else f"{share:.0%} of the cells have {bound} {said(limit)}{unit}."
-        )
+    points = {share: done.point(share) for share in (0.95, 0.99)}
+    found = [
+        f"{share:.0%} of the cells have {bound} {said(limit)}{unit}."
+        for share, limit in points.items()
+        if limit is not None
+    ]
+    found += [f"Fewer than {share:.0%} come to a result." for share, limit in points.items() if limit is None][:1]
     if seen.tolerance is not None:
         low, high = done.interval(seen.tolerance)
         sure = f", of all that could be drawn {low:.2%} to {high:.2%} (95 % confidence)" if seen.is_sampled else ""

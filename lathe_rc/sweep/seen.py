@@ -19,7 +19,6 @@ GOAL = "tool.max_error"
 _LARGE = ("margin",)  # goals that are better the larger they are
 _UNITS = {"tool.in_tolerance_from": "revolutions"}
 _MOST_TEXTS = 24  # that are told apart
-_LONGEST = 60  # characters of a value
 
 
 class Seen:
@@ -138,4 +137,4 @@ def text_of(value: object) -> str:
         return str(value).lower()
     if isinstance(value, float):
         return f"{value:.6g}"
-    return shown(value, _LONGEST) if value != "" else "(empty)"
+    return shown(value) if value != "" else "(empty)"
