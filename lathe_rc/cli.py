@@ -16,6 +16,7 @@ from lathe_rc.errors import LatheError, shown
 COMMANDS = {
     "bag": "Ask bags what is in them; check and recover them; take a tachogram out.",
     "bench": "Measure how fast lathe_rc is here.",
+    "budget": "Tell what the form error of a scenario is made of.",
     "container": "Run several nodes in one process.",
     "demo": "Turn a piston with ROS 2 processes and draw it.",
     "export": "Export a recording as CSV, Parquet or NPZ.",

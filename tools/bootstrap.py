@@ -50,7 +50,8 @@ def needed(arguments: Sequence[str]) -> Sequence[str]:
             if name not in GROUPS:
                 raise RefusalError(f"setup {name}; allowed: {', '.join(GROUPS)}, or nothing more")
         return arguments[1:]
-    wanted = {"sweep": ["sweep"], "test": ["sweep", "test", "view"], "tune": ["sweep"], "view": ["view"]}
+    sweeps = {name: ["sweep"] for name in ("bench", "sweep", "tune")}
+    wanted = {**sweeps, "test": ["sweep", "test", "view"], "view": ["view"]}
     return wanted.get(next(iter(arguments), ""), [])
 
 

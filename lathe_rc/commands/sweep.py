@@ -19,7 +19,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.sweep import row
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.space import Space, given
-from lathe_rc.sweep.sweep import Sweep
+from lathe_rc.sweep.sweep import Models, Sweep
 from lathe_rc.sweep.sweep import run as sweep_run
 
 if TYPE_CHECKING:
@@ -103,6 +103,13 @@ def space_of(
     metavar="TOPIC.FIELD:STATISTIC",
     help=f"more columns: {', '.join(row.STATISTICS)}",
 )
+@click.option(
+    "--models",
+    type=click.Choice(["follow", "nominal"]),
+    default="follow",
+    show_default=True,
+    help="what controllers take for a drive that is varied: as it is, or as the scenario has it",
+)
 @options.overrides
 @click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of each run")
 @click.option("--out", type=click.Path(path_type=Path), help="folder of the results; default: sweep-SCENARIO")
@@ -118,6 +125,7 @@ def run(
     seeds: int,
     cells: Path | None,
     measures: tuple[str, ...],
+    models: Models,
     overrides: tuple[str, ...],
     revolutions: float | None,
     out: Path | None,
@@ -139,7 +147,14 @@ def run(
     try:
         with progress:
             found = sweep_run(
-                loaded, space, place, measures=measures, scheduler=scheduler, workers=workers, watch=progress
+                loaded,
+                space,
+                place,
+                measures=measures,
+                models=models,
+                scheduler=scheduler,
+                workers=workers,
+                watch=progress,
             )
     except KeyboardInterrupt:
         click.echo(

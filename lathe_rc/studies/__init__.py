@@ -6,8 +6,10 @@ from typing import Any
 from lathe_rc.extensions import Objects
 from lathe_rc.studies import (
     angle_domain,
+    best_law,
     decoupling,
     drive_models,
+    drive_tolerance,
     invariance,
     multichannel,
     piston,
@@ -22,6 +24,7 @@ _OWN: dict[str, Study[Any]] = {
     for module in (
         invariance,
         speed_deviation,
+        best_law,
         multichannel,
         piston,
         angle_domain,
@@ -29,6 +32,7 @@ _OWN: dict[str, Study[Any]] = {
         saturation,
         sampled_servo,
         decoupling,
+        drive_tolerance,
     )
 }
 

@@ -26,7 +26,7 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.sweep import row
 from lathe_rc.sweep.row import Measure
-from lathe_rc.sweep.space import Space, value_of
+from lathe_rc.sweep.space import Space
 
 _FORMAT = 1
 
@@ -78,7 +78,7 @@ class Folder:
         space = Space(**space.to_json())
         if not new:
             there = Folder(path)
-            if there.scenario.identity != scenario.identity:
+            if there.scenario.to_yaml(given=True) != scenario.to_yaml(given=True):
                 raise InputError(f"{path} holds a sweep of another cell ({there.scenario.name}); allowed: a new folder")
             if there.measures != list(measures):
                 named = ", ".join(each.name for each in there.measures) or "nothing"
@@ -142,7 +142,7 @@ class Folder:
         for target in self.targets:
             # A cell that was computed before a target was varied has the scenario's own value.
             if target in found.column_names and found.column(target).null_count:
-                base = pa.scalar(value_of(self.scenario, target), found.schema.field(target).type)
+                base = pa.scalar(self.scenario.value(target), found.schema.field(target).type)
                 filled = [base.as_py() if value is None else value for value in found.column(target).to_pylist()]
                 place = found.column_names.index(target)
                 found = found.set_column(place, found.schema.field(target), pa.array(filled, base.type))

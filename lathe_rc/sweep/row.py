@@ -29,6 +29,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from lathe_rc.analysis.metrology import FormErrors
+from lathe_rc.analysis.tolerance import judge
 from lathe_rc.cell import messages
 from lathe_rc.cell.batch import Errors
 from lathe_rc.cell.collect import Finite
@@ -40,6 +41,7 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.command_limits import LIMITED
 from lathe_rc.cell.stages.obedience import OUT_OF_REACH
+from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError, LatheError
 from lathe_rc.names import instead
@@ -132,6 +134,9 @@ class _Keeper(Errors):
         super().__init__(cell, samples)
         self.heard: Collection[str] = [topic for topic, source in cell.sparse.items() if source.type == messages.EVENT]
         self.limited: set[str] = set()
+        self.tolerance = next(
+            (stage.parameters.tolerance for stage in cell.stages.values() if isinstance(stage, Tool)), 0.0
+        )
         self._measures = [(each, np.empty(samples)) for each in measures]
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
@@ -211,4 +216,6 @@ def _found(cell: Cell, keeper: _Keeper) -> dict[str, Any]:
             "tool.rms_error": errors.rms[-1],
             "digest": keeper.digest,
         }
+    if keeper.tolerance:
+        found["tool.in_tolerance_from"] = judge(errors.largest, keeper.tolerance).since or None
     return found

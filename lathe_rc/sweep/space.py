@@ -68,8 +68,8 @@ class Drawn(NamedTuple):
 class Space:
     """Variations of a cell.
 
-    Targets are ``NODE.PARAM``, or ``PARAM`` for a shared parameter. A number that ends in ``%`` is that part of the
-    scenario's value.
+    Targets are ``NODE.PARAM``, ``NODE.PARAM[K]`` for an element of a list, or ``PARAM`` for a shared parameter. A
+    number that ends in ``%`` is that part of the scenario's value.
 
     Attributes:
         grid: values by target: a list, or a text: ``LOW:HIGH:COUNT`` (ends included), ``LOW:HIGH:COUNT:log``, or
@@ -121,6 +121,9 @@ class Space:
             raise InputError(f"seeds = {self.seeds}; allowed: from 1")
         for target in self.targets():
             scenario.parameter(target)
+        for cell in self.given:
+            for target, value in cell.items():
+                _check_type(target, scenario.parameter(target), value)
         if any(dict(first) == dict(second) for first, second in itertools.pairwise(sorted(self.given, key=canonical))):
             raise InputError("two of the given cells are the same; allowed: each once")
         if self.sampled and not self.sample:
@@ -189,12 +192,6 @@ def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArr
         yield draws[name](min(_PIECE, count - first))
 
 
-def value_of(scenario: Scenario, target: str) -> Value:
-    """What the scenario itself says."""
-    node, _, name = target.rpartition(".")
-    return cast("Value", getattr(scenario.nodes[node] if node else scenario.shared, name))
-
-
 def _number(scenario: Scenario, target: str, text: str) -> float:
     """A number, or a part of the scenario's value."""
     plain = text.strip()
@@ -205,7 +202,7 @@ def _number(scenario: Scenario, target: str, text: str) -> float:
         )
     if not plain.endswith("%"):
         return float(found)
-    base = value_of(scenario, target)
+    base = scenario.value(target)
     if isinstance(base, bool | str | list):
         raise InputError(f"{target} = {base!r} has no parts in %; allowed: values")
     return float(found) / 100.0 * base
@@ -217,7 +214,13 @@ def _axis(scenario: Scenario, target: str, told: str | Sequence[Value]) -> Seque
     Raises:
         InputError: a text that tells none.
     """
-    found = told if not isinstance(told, str) else _told(scenario, target, told)
+    row = scenario.parameter(target)
+    if isinstance(told, str):
+        found = _told(scenario, target, told)
+    else:
+        found = [_value(scenario, target, row, each) if isinstance(each, str) else each for each in told]
+    for value in found:
+        _check_type(target, row, value)
     if not found:
         raise InputError(f"{target}: no value; allowed: one or more")
     return list({canonical({target: value}): value for value in found}.values())
@@ -260,10 +263,21 @@ def _split(text: str) -> list[str]:
 
 
 def _value(scenario: Scenario, target: str, row: Row, text: str) -> Value:
+    if not row.is_list and row.type is str:
+        return text.strip("'\"")
     if not row.is_list and row.type in (int, float) and text.endswith("%"):
         found = _number(scenario, target, text)
         return found if row.type is float else round(found)
     return ros_yaml.parse_value(text, target)
+
+
+def _check_type(target: str, row: Row, value: Value) -> None:
+    """Refuse what can be no value of a parameter; whether it is in range is for the cell to say, in its row."""
+    kinds = (int, float) if row.type is float else row.type
+    items = value if isinstance(value, list) else [value]
+    wrong = [item for item in items if not isinstance(item, kinds) or (row.type is not bool and isinstance(item, bool))]
+    if wrong or row.is_list != isinstance(value, list):
+        raise InputError(f"{target} = {shown(repr(value))}; allowed: {row.allowed()}")
 
 
 def _drawn(scenario: Scenario, target: str, told: str) -> Drawn:
@@ -346,7 +360,9 @@ class _Formulas:
             known: dict[str, Any] = {"pi": math.pi}
             for name in self._named[target]:
                 node, dot, of = name.partition(".")
-                found = values.get(name, value_of(self._scenario, name))
+                found = values.get(name, self._scenario.value(name))
+                if isinstance(found, list):
+                    found = cast("Value", [values.get(f"{name}[{k}]", each) for k, each in enumerate(found)])
                 if dot:
                     known.setdefault(node, {})[of] = found
                 else:

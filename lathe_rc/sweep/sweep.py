@@ -5,10 +5,10 @@ import hashlib
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import distributed
 import pyarrow as pa
@@ -19,12 +19,13 @@ from lathe_rc.cell.scenario import Scenario, content
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.sweep import row
 from lathe_rc.sweep.folder import Folder
-from lathe_rc.sweep.space import Space, canonical, value_of
+from lathe_rc.sweep.space import Space, canonical
 from lathe_rc.sweep.workers import Job, Order, client_of, rows
 
 if TYPE_CHECKING:
     import pandas as pd
 
+Models = Literal["follow", "nominal"]
 Watch = Callable[[Mapping[str, Any]], None]
 
 _WRITE = 10.0  # [s] between writes of what has come
@@ -80,6 +81,7 @@ def run(
     folder: Path,
     *,
     measures: Sequence[str] = (),
+    models: Models = "follow",
     scheduler: str | None = None,
     workers: int | None = None,
     client: distributed.Client | None = None,
@@ -92,6 +94,8 @@ def run(
         space: which variations.
         folder: of the results; a sweep goes on where it was stopped, and takes more spaces.
         measures: further columns, ``TOPIC.FIELD:STATISTIC``.
+        models: of drives that controllers have, and that the scenario does not give: ``follow`` the drives that are
+            varied, or stay ``nominal``, as when one controller is to serve many drives.
         scheduler: address of a scheduler of Dask; None: workers of this machine.
         workers: processes of this machine; None: one for each core.
         client: of Dask, in place of both.
@@ -115,6 +119,7 @@ def run(
     """
     asked = [row.measure(text, scenario) for text in measures]
     space = Space(**space.to_json())
+    scenario = scenario.with_models_given() if models == "nominal" else scenario
     space.check(scenario)
     kept = Folder.begin(folder, scenario, space, asked)
     with kept.locked():
@@ -127,7 +132,8 @@ def run(
             with nullcontext(client) if client else client_of(scheduler, workers) as crew:
                 watch({"event": "ready", "dashboard": crew.dashboard_link})
                 jobs = (job for job in _jobs(kept, space) if job.key not in there)
-                _keep(kept, rows(crew, _order(kept), jobs, left), watch)
+                with closing(rows(crew, _order(kept), jobs, left)) as found:
+                    _keep(kept, found, watch)
     return Sweep(kept)
 
 
@@ -175,7 +181,7 @@ class _Key:
 
     def __init__(self, folder: Folder) -> None:
         scenario = folder.scenario
-        self._base = {target: value_of(scenario, target) for target in [*folder.targets, "seed"]}
+        self._base = {target: scenario.value(target) for target in [*folder.targets, "seed"]}
         self._files = {target for target in folder.targets if scenario.parameter(target).is_path}
         measured = [each.name for each in folder.measures]
         self._start = hashlib.sha256("\n".join([scenario.identity, *sorted(measured)]).encode())

@@ -9,7 +9,7 @@ import logging
 import signal
 import tempfile
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
@@ -33,7 +33,7 @@ _GROWTH = 4  # of a task's cells against the one before
 _MOST = 4096  # cells of a task
 _LEAST = 8  # towards the end tasks get shorter, down to this part of the others
 _AHEAD = 2  # tasks for each thread of the workers
-_CONNECT = 10  # [s] to reach a scheduler
+_CONNECT = 5  # [s] to reach a scheduler
 
 
 class Job(NamedTuple):
@@ -139,7 +139,7 @@ def _in_main_thread() -> bool:
     return threading.current_thread() is threading.main_thread()
 
 
-def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: int) -> Iterator[pa.Table]:
+def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: int) -> Generator[pa.Table]:
     """Compute cells; their rows as they come.
 
     Args:
@@ -191,6 +191,6 @@ def _result(future: distributed.Future[pa.Table], jobs: Sequence[Job]) -> pa.Tab
 def _next(size: int, found: pa.Table) -> int:
     """How many cells the next task has."""
     took: float = sum(found.column("seconds").to_pylist())
-    fitting = round(TASK * found.num_rows / max(took, 1e-6))
-    grown: int = _GROWTH * max(size, found.num_rows)
+    fitting: int = round(TASK * found.num_rows / max(took, 1e-6))
+    grown = _GROWTH * max(size, int(found.num_rows))
     return max(1, min(fitting, grown, _MOST))

@@ -34,6 +34,11 @@ class ToolParameters(FormParameters):
     deflection_delay: Annotated[int, Ge(1), Le(2**31 - 1)] = parameter(
         64, "deflects: delay of the feedback edge from the cut, at least a block", "sample"
     )
+    tolerance: Annotated[float, Ge(0)] = parameter(
+        0.0, "form error that is allowed to each side, for the verdict on a run; 0: none is given", "m"
+    )
+
+    judging = frozenset({"tolerance"})
 
 
 class Memory(NamedTuple):
