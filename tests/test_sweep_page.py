@@ -322,11 +322,13 @@ class TestPage:
         assert (shown.specs, written.figures, list((folder.path / "figures").iterdir())) == ({}, [], [])
         assert "<script" not in shown.source
 
-    def test_a_tolerance_study(self, tmp_path, monkeypatch):
+    def test_a_tolerance_study(self, tmp_path):
         """Drawn cells: the share within the tolerance, and between what the share of the whole batch is."""
-        monkeypatch.setattr(Seen, "tolerance", 0.3)
+        cell = scenario.load(
+            resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=10", "tool.tolerance=0.3e-6"]
+        )
         space = Space(sampled={LEAD: "normal:5%"}, sample="sobol:128", ties={Q: f"{LEAD} / 20"})
-        folder = swept(tmp_path / "sweep", space, lambda values: abs(values[LEAD] - 1.4e-3) * 2e-3)
+        folder = swept(tmp_path / "sweep", space, lambda values: abs(values[LEAD] - 1.4e-3) * 2e-3, cell)
         page.write(folder)
         shown = Shown(folder.path / "page.html")
         errors = np.array(folder.table(["tool.max_error"]).column("tool.max_error").to_pylist()) * 1e6

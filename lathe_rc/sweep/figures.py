@@ -30,7 +30,7 @@ _BAR = 46  # [px] a parameter
 _DIGITS = 5  # of the numbers that a page carries
 _POINTS = 400  # of a yield curve
 _SHARES = (0.95, 0.99)
-_AXIS = {"tickCount": 5, "grid": False, "format": "~g"}  # of a parameter
+_AXIS = {"tickCount": 5, "grid": False, "format": "~r"}  # of a parameter
 _SHOWN = {"m": "median", "s": "smallest", "l": "largest"}
 
 
@@ -191,7 +191,7 @@ def heat_map(axes: Sequence[tuple[Axis, Bins]], across: int, up: int, goal: Goal
     counts = [("n", "quantitative", "cells"), ("d", "quantitative", "with a result")]
     tip = _tip([("v", "quantitative", goal.label), ("xt", "nominal", x.label), ("yt", "nominal", y.label), *counts])
     where = {**_span("x", x, x_bins, "x"), **_span("y", y, y_bins, "y"), "tooltip": tip}
-    legend = {"orient": "top", "direction": "horizontal", "gradientLength": 220, "titleLimit": 320, "format": "~g"}
+    legend = {"orient": "top", "direction": "horizontal", "gradientLength": 220, "titleLimit": 320, "format": "~r"}
     colour = {"field": "v", "type": "quantitative", "title": goal.label, "legend": legend}
     colour["scale"] = {**goal.scale, "scheme": _MAP, "reverse": goal.above}
     return {
@@ -220,7 +220,7 @@ def lines(axes: Sequence[tuple[Axis, Bins]], across: int, third: int | None, goa
     place["axis"] = _AXIS
     place = _named(x, "x") if x.texts else place
     common: Spec = {"$schema": SCHEMA, "width": 640, "height": _FLAT, "autosize": FIT}
-    up = {"type": "quantitative", "title": goal.label, "scale": goal.scale, "axis": {"format": "~g", "tickCount": 6}}
+    up = {"type": "quantitative", "title": goal.label, "scale": goal.scale, "axis": {"format": "~r", "tickCount": 6}}
     tip = [("v", "quantitative", goal.label), ("xt", "nominal", x.label)]
     tip += [("n", "quantitative", "cells"), ("d", "quantitative", "with a result")]
     if third is None:
@@ -240,7 +240,7 @@ def lines(axes: Sequence[tuple[Axis, Bins]], across: int, third: int | None, goa
     z, _ = axes[third]
     low, high = sorted((across, third))
     bin_of = {low: "a", high: "b"}
-    legend = {"orient": "top", "direction": "horizontal", "titleLimit": 320, "gradientLength": 220, "format": "~g"}
+    legend = {"orient": "top", "direction": "horizontal", "titleLimit": 320, "gradientLength": 220, "format": "~r"}
     colour: Spec = {"title": z.label, "legend": legend}
     if z.texts:
         del legend["format"]
@@ -312,7 +312,7 @@ def cumulative(found: Yield, goal: Goal, tolerance: float | None) -> Spec:
         mark["c"] = tint
     known = [row["x"] for row in [*rows, *marks] if row["x"] is not None and (row["x"] > 0.0 or not goal.log)]
     middle = math.sqrt(min(known) * max(known)) if goal.log else (min(known) + max(known)) / 2.0
-    across: Spec = {"field": "x", "type": "quantitative", "axis": {"tickCount": 6, "format": "~g"}}
+    across: Spec = {"field": "x", "type": "quantitative", "axis": {"tickCount": 6, "format": "~r"}}
     across["title"] = f"{'at least' if goal.above else 'at most'}: {goal.label}"
     across["scale"] = {**goal.scale, "domain": [min(known), max(known)]}
     up = {"field": "y", "type": "quantitative", "title": "share of all cells", "axis": {"format": ".0%"}}

@@ -2,18 +2,19 @@
 """What is looked at of a sweep: its parameters as axes, its goals, and what the cells came to."""
 
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError, shown
 from lathe_rc.names import instead
 from lathe_rc.sweep import row
 from lathe_rc.sweep.effects import Axis
 from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
-from lathe_rc.sweep.space import value_of
 
 GOAL = "tool.max_error"
 _LARGE = ("margin",)  # goals that are better the larger they are
@@ -102,7 +103,7 @@ class Seen:
         found = []
         axes = {axis.name: axis for axis in self.axes}
         for target in self.folder.targets:
-            told, own = "; ".join(self._told(target)), text_of(value_of(self.folder.scenario, target))
+            told, own = "; ".join(self._told(target)), text_of(self.folder.scenario.value(target))
             axis = axes.get(target)
             if axis is None:
                 found.append([target, told, "", "", "1", own])
@@ -127,8 +128,8 @@ class Seen:
         scenario = self.folder.scenario
         if self.goal.name != GOAL or any(target.endswith(".tolerance") for target in self.folder.targets):
             return None
-        found = [float(getattr(scenario.nodes[node], "tolerance", 0.0)) for node in scenario.of_kind("tool")]
-        return found[0] * 1e6 if found and found[0] > 0.0 else None
+        tools = [cast("ToolParameters", scenario.nodes[node]) for node in scenario.of_kind("tool")]
+        return tools[0].tolerance * 1e6 if tools and tools[0].tolerance else None
 
 
 def text_of(value: object) -> str:
