@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sweeps: which cells, what is kept of them, and going on where one was stopped."""
 
+import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,7 +19,8 @@ from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
-from lathe_rc.sweep import row, space
+from lathe_rc.studies import best_law, drive_tolerance, speed_deviation
+from lathe_rc.sweep import row, space, workers
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.space import Space
 from lathe_rc.sweep.sweep import Sweep
@@ -303,3 +305,45 @@ def test_the_command_of_a_finished_sweep(
         main(["sweep", "show", str(tmp_path / "leads"), "--cell", "1"])
     assert ended.value.code == 2
     assert "learning diverges" in capsys.readouterr().err
+
+
+# ---- studies that are sweeps -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def own_workers(client: distributed.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Studies compute in this process: to start others takes seconds."""
+    monkeypatch.setattr(workers, "client_of", lambda *_: contextlib.nullcontext(client))
+
+
+@pytest.mark.usefixtures("own_workers")
+def test_all_laws_are_compared_at_the_same_conditions(tmp_path: Path) -> None:
+    asked = best_law.BestLawParameters(points=4, encoder_counts=[10_000], folder=str(tmp_path))
+    found = best_law.run(asked)
+    assert set(found.error) == set(speed_deviation.LAWS)
+    assert {error.shape for error in found.error.values()} == {(4,)}
+    swept = Sweep(Folder(tmp_path / "speed_deviation"))
+    for number, law in enumerate(found.error):
+        cell = swept.scenario(4 * number + 2)
+        encoder, learner = cell.nodes["spindle_encoder"], cell.nodes["learning_controller"]
+        told = (encoder.deviation_frequency[0], encoder.deviation_amplitude[0], encoder.counts_per_revolution)
+        assert told == (found.frequency[2], found.amplitude[2], found.counts[2])
+        assert learner.model_natural_frequency == pytest.approx(found.model[2] * 1038.0)
+        if law == "exact_preview":
+            assert learner.deviation_amplitude == encoder.deviation_amplitude
+            again = harness.run(cell).errors.largest[-11:].max() * 1e6
+            assert found.error[law][2] == again
+    assert all(found.error[law][k] == min(found.error[r][k] for r in found.rivals) for k, law in enumerate(found.best))
+    assert sum(found.to_json()["best"]["10000"].values()) == pytest.approx(100.0)
+
+
+@pytest.mark.usefixtures("own_workers")
+def test_a_larger_tolerance_of_drives_costs_more() -> None:
+    """And a drive with which learning would diverge counts as one that never gets there."""
+    asked = drive_tolerance.DriveToleranceParameters(tolerance=[0.01, 0.15], drives=16, revolutions=10.0)
+    found = drive_tolerance.run(asked)
+    narrow, wide = found.error
+    assert narrow.size == wide.size == 16
+    assert np.isinf(wide).sum() > np.isinf(narrow).sum() == 0
+    assert found.to_json()["99_percent_um"] == [narrow.max(), None]
+    assert narrow.min() < found.nominal < narrow.max()
