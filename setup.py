@@ -59,6 +59,7 @@ setup(
             "nodes/*.xml",
             "msg_defs/msg/*.msg",
             "msg_defs/srv/*.srv",
+            "sweep/*.j2",
             "view/*.j2",
             "templates/*/*.j2",
         ]

@@ -5,7 +5,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
@@ -21,6 +21,9 @@ from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.space import Space, given
 from lathe_rc.sweep.sweep import Models, Sweep
 from lathe_rc.sweep.sweep import run as sweep_run
+
+if TYPE_CHECKING:
+    from lathe_rc.sweep.page import Written
 
 _BEST = 5  # cells that are shown
 _INTERRUPTED = 130
@@ -224,7 +227,7 @@ def best(found: Sweep) -> list[dict[str, Any]]:
     return [each for each in table.slice(0, _BEST).to_pylist() if each["tool.max_error"] is not None]
 
 
-def _show(found: Sweep, *, as_json: bool) -> None:
+def _show(found: Sweep, written: "Written | None" = None, *, as_json: bool) -> None:
     statuses, top = found.statuses(), best(found)
     if as_json:
         told = {
@@ -233,6 +236,8 @@ def _show(found: Sweep, *, as_json: bool) -> None:
             "statuses": statuses,
             "best": top,
         }
+        if written:
+            told |= {"page": str(written.page), "figures": [str(path) for path in written.figures]}
         click.echo(json.dumps(told))
         return
     console = Console()
@@ -244,9 +249,12 @@ def _show(found: Sweep, *, as_json: bool) -> None:
             table.add_row(*(_said(name, value) for name, value in each.items()))
         console.print(table)
     console.print(", ".join(f"{count} {status}" for status, count in statuses.items()), highlight=False)
-    console.print(
-        f"rows:  {found.folder.path}/rows\npage:  lathe sweep show {found.folder.path}", highlight=False, soft_wrap=True
-    )
+    console.print(f"rows:    {found.folder.path}/rows", highlight=False, soft_wrap=True)
+    page = written.page if written else f"lathe sweep show {found.folder.path}"
+    console.print(f"page:    {page}", highlight=False, soft_wrap=True)
+    if written and written.figures:
+        count = len(written.figures)
+        console.print(f"figures: {written.figures[0].parent} ({count} PNG)", highlight=False, soft_wrap=True)
 
 
 def _said(name: str, value: object) -> str:
@@ -259,15 +267,20 @@ def _said(name: str, value: object) -> str:
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--cell", type=click.IntRange(0), help="run this cell again, and compare it with its row")
 @click.option("--bag", type=click.Path(path_type=Path), help="with --cell: folder to record it to")
+@click.option("--goal", metavar="COLUMN", help="what the page judges cells by  [default: tool.max_error]")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
-def show(folder: Path, cell: int | None, bag: Path | None, *, as_json: bool) -> None:
-    """Show what is in the FOLDER of a sweep."""
+def show(folder: Path, cell: int | None, bag: Path | None, goal: str | None, *, as_json: bool) -> None:
+    """Show what is in the FOLDER of a sweep, and write FOLDER/page.html and its figures: maps, sensitivity, yield."""
     found = Sweep(Folder(folder))
     if cell is None:
         if bag:
             raise InputError(f"--bag {bag} without --cell; allowed: --cell N --bag FOLDER")
-        _show(found, as_json=as_json)
+        from lathe_rc.sweep import page, seen
+
+        _show(found, page.write(found.folder, goal or seen.GOAL), as_json=as_json)
         return
+    if goal is not None:
+        raise InputError(f"--goal {goal} with --cell {cell}; allowed: one of them")
     result = harness.run(found.scenario(cell), bag=bag)
     kept = found.row(cell)
     same = row.digest(result.recording) == kept["digest"]

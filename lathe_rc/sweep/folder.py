@@ -138,7 +138,7 @@ class Folder:
         Args:
             columns: that are read; None: all.
         """
-        found = self._read(None if columns is None else ["cell", *columns])
+        found = self._read(None if columns is None else list(dict.fromkeys(["cell", *columns])))
         for target in self.targets:
             # A cell that was computed before a target was varied has the scenario's own value.
             if target in found.column_names and found.column(target).null_count:
