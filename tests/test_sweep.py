@@ -162,6 +162,7 @@ def test_cells_are_as_many_as_are_counted_and_differ(leads: list[float], most: i
         ({"ties": {Q: f"{LEAD} / 0"}}, "division by zero"),
         ({"ties": {Q: "__import__('os').getcwd()"}}, "learning_controller.q_time"),
         ({"grid": {LEAD: "1e-3,fast"}}, "learning_controller.lead_time = 'fast'; allowed: a finite number"),
+        ({"grid": {"learning_controller.lead_law": "variable,constant"}}, "= 'constant'; allowed: one of "),
         ({"grid": {"block_size": [64.5]}}, "block_size = 64.5; allowed: an integer"),
         ({"given": [{LEAD: "slow"}]}, "learning_controller.lead_time = 'slow'; allowed: a finite number"),
         ({"given": [{LEAD: 1e-3}, {LEAD: 1e-3}]}, "the same; allowed: each once"),

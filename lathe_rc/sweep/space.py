@@ -14,12 +14,11 @@ depends on nothing else; the values of the last grid change first. All of them a
 values: see `Space`.
 """
 
-import ast
 import csv
 import itertools
 import json
 import math
-import operator
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -27,7 +26,6 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 import scipy
-import simpleeval
 from numpy.typing import NDArray
 
 from lathe_rc import files
@@ -35,6 +33,7 @@ from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Row, Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, shown
+from lathe_rc.sweep.formulas import Formulas, ordered
 
 SAMPLERS = ("sobol", "halton", "latin", "random")
 _MOST_POINTS = 2**24
@@ -133,14 +132,14 @@ class Space:
         self._points()
         for target, told in self.sampled.items():
             _drawn(scenario, target, told)
-        _ordered(self.ties)
+        ordered(self.ties)
         next(self.cells(scenario))
 
     def cells(self, scenario: Scenario) -> Iterator[dict[str, Value]]:
         """The values of each cell, by target."""
         axes = {target: _axis(scenario, target, told) for target, told in self.grid.items()}
         first_seed = scenario.shared.seed
-        formulas = _Formulas(scenario, self.ties)
+        formulas = Formulas(scenario, self.ties)
         for given in self.given or ({},):
             for combination in itertools.product(*axes.values()):
                 fixed = {**given, **dict(zip(axes, combination, strict=True))}
@@ -189,7 +188,10 @@ def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArr
         "random": lambda count: generator.random((count, dimensions)),
     }
     for first in range(0, count, _PIECE):
-        yield draws[name](min(_PIECE, count - first))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # Sobol's points are spread best by powers of two
+            piece = draws[name](min(_PIECE, count - first))
+        yield piece
 
 
 def _number(scenario: Scenario, target: str, text: str) -> float:
@@ -276,6 +278,7 @@ def _check_type(target: str, row: Row, value: Value) -> None:
     kinds = (int, float) if row.type is float else row.type
     items = value if isinstance(value, list) else [value]
     wrong = [item for item in items if not isinstance(item, kinds) or (row.type is not bool and isinstance(item, bool))]
+    wrong += [item for item in items if row.choices and not row.named and item not in row.choices]
     if wrong or row.is_list != isinstance(value, list):
         raise InputError(f"{target} = {shown(repr(value))}; allowed: {row.allowed()}")
 
@@ -303,79 +306,6 @@ def _drawn(scenario: Scenario, target: str, told: str) -> Drawn:
     if name == "log" and not min(first, second) > 0.0:
         raise InputError(f"{target}={shown(told)}; allowed on a log range: ends above 0")
     return Drawn(name, first, second)
-
-
-_FUNCTIONS = {"sqrt": math.sqrt, "exp": math.exp, "log": math.log, "sin": math.sin, "cos": math.cos}
-
-
-def _names(formula: str) -> set[str]:
-    """The targets that a formula names."""
-    try:
-        tree = ast.parse(formula.strip(), mode="eval")
-    except SyntaxError:
-        raise InputError(f"formula {shown(formula)!r}; allowed: targets and numbers with + - * / ** ( )") from None
-    inner = {node.value for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-    called = {node.func for node in ast.walk(tree) if isinstance(node, ast.Call)}
-    named = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute | ast.Name)]
-    return {ast.unparse(node) for node in named if node not in inner and node not in called} - {"pi"}
-
-
-def _ordered(ties: Mapping[str, str]) -> list[str]:
-    """The tied targets, each after those that it depends on.
-
-    Raises:
-        InputError: they depend on one another in a circle.
-    """
-    from graphlib import CycleError, TopologicalSorter
-
-    depends = {target: _names(formula) & ties.keys() for target, formula in ties.items()}
-    try:
-        return list(TopologicalSorter(depends).static_order())
-    except CycleError as error:
-        raise InputError(
-            f"{' -> '.join(error.args[1])}: tied in a circle; allowed: formulas of other targets"
-        ) from None
-
-
-class _Formulas:
-    """Adds what is tied to the values of a cell."""
-
-    def __init__(self, scenario: Scenario, ties: Mapping[str, str]) -> None:
-        self._scenario, self._ties = scenario, {target: ties[target] for target in _ordered(ties)}
-        for formula in ties.values():
-            for name in _names(formula):
-                scenario.parameter(name)
-        self._named = {target: _names(formula) for target, formula in ties.items()}
-        power = {**simpleeval.DEFAULT_OPERATORS, ast.Pow: operator.pow}
-        self._evaluator = simpleeval.SimpleEval(operators=power, functions=_FUNCTIONS)
-        self._parsed = {target: self._evaluator.parse(formula) for target, formula in ties.items()}
-
-    def add_to(self, values: dict[str, Value]) -> dict[str, Value]:
-        """Values by target, the tied ones among them.
-
-        Raises:
-            InputError: a formula has no value.
-        """
-        for target, formula in self._ties.items():
-            known: dict[str, Any] = {"pi": math.pi}
-            for name in self._named[target]:
-                node, dot, of = name.partition(".")
-                found = values.get(name, self._scenario.value(name))
-                if isinstance(found, list):
-                    found = cast("Value", [values.get(f"{name}[{k}]", each) for k, each in enumerate(found)])
-                if dot:
-                    known.setdefault(node, {})[of] = found
-                else:
-                    known[node] = found
-            self._evaluator.names = known
-            try:
-                found = self._evaluator.eval(formula, previously_parsed=self._parsed[target])
-            except (simpleeval.InvalidExpression, ArithmeticError, ValueError, TypeError) as error:
-                raise InputError(f"{target} = {shown(formula)}: {shown(error)}") from None
-            row = self._scenario.parameter(target)
-            whole = row.type is int and isinstance(found, float) and found == round(found)
-            values[target] = round(found) if whole else float(found) if row.type is float else found
-        return values
 
 
 def given(path: Path) -> list[dict[str, Value]]:
