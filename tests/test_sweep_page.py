@@ -94,7 +94,7 @@ def bowl(values):
 
 @pytest.fixture(scope="module")
 def grid(tmp_path_factory):
-    space = Space(grid={LEAD: "1e-3:3e-3:9", Q: "1e-5:1e-3:7:log", LAW: ["fixed", "variable"]})
+    space = Space(grid={LEAD: "1e-3:3e-3:9", Q: "1e-5:1e-3:7:log", LAW: ["constant_angle", "variable"]})
     folder = swept(tmp_path_factory.mktemp("grid") / "sweep", space, bowl)
     return folder, page.write(folder), Shown(folder.path / "page.html")
 
@@ -225,7 +225,7 @@ class TestPage:
     def test_says_what_was_asked_for(self, grid):
         rows = grid[2].rows("What was varied")
         assert [f"{LEAD} [s]", "1e-3:3e-3:9", "0.001", "0.003", "9", "0.001425"] in rows
-        assert [LAW, "fixed, variable", "", "", "2", "variable"] in rows
+        assert [LAW, "constant_angle, variable", "", "", "2", "variable"] in rows
 
     def test_lists_the_best_cells_in_order(self, grid):
         folder, _, shown = grid
@@ -282,11 +282,13 @@ class TestPage:
         assert shown.rows("What matters")[0][1].startswith("1.000 (+")
 
     def test_texts_and_truth_values_are_parameters(self, tmp_path):
-        space = Space(grid={LAW: ["variable", "fixed"], "spindle_encoder.deviation_amplitude": [[0.05], [0.1], [0.2]]})
+        space = Space(
+            grid={LAW: ["variable", "constant_angle"], "spindle_encoder.deviation_amplitude": [[0.05], [0.1], [0.2]]}
+        )
         space = Space(grid={**space.grid, "electrodynamic_actuator.autostart": [True, False]})
-        folder = swept(tmp_path / "sweep", space, lambda values: 1e-6 * (1 + (values[LAW] == "fixed")))
+        folder = swept(tmp_path / "sweep", space, lambda values: 1e-6 * (1 + (values[LAW] == "constant_angle")))
         axes = {axis.name: axis for axis in Seen(folder).axes}
-        assert axes[LAW].texts == ["variable", "fixed"]
+        assert axes[LAW].texts == ["variable", "constant_angle"]
         assert axes["electrodynamic_actuator.autostart"].texts == ["false", "true"]
         assert_allclose(axes["spindle_encoder.deviation_amplitude"].distinct, [0.05, 0.1, 0.2])
         page.write(folder)
@@ -297,7 +299,7 @@ class TestPage:
     def test_texts_of_a_sweep_cannot_harm_the_page(self, tmp_path):
         """Names and reasons are somebody's texts: none of them ends the script or begins an element."""
         hostile = "</script><script>alert(1)</script>"
-        space = Space(grid={LAW: [hostile, "<b>$x"], Q: "1e-5,2e-5"})
+        space = Space(grid={"run_id": [hostile, "<b>$x"], Q: "1e-5,2e-5"})
         folder = swept(tmp_path / "sweep", space, lambda values: ("failed", hostile) if values[Q] < 1.5e-5 else 1e-6)
         page.write(folder)
         shown = Shown(folder.path / "page.html")

@@ -3,7 +3,6 @@
 
 import ast
 import math
-import operator
 from collections.abc import Mapping
 from graphlib import CycleError, TopologicalSorter
 from typing import Any, cast
@@ -14,7 +13,7 @@ from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, shown
 
-FUNCTIONS = {"sqrt": math.sqrt, "exp": math.exp, "log": math.log, "sin": math.sin, "cos": math.cos}
+_FUNCTIONS = {"sqrt": math.sqrt, "exp": math.exp, "log": math.log, "sin": math.sin, "cos": math.cos}
 
 
 def _names(formula: str) -> set[str]:
@@ -53,8 +52,7 @@ class Formulas:
             for name in _names(formula):
                 scenario.parameter(name)
         self._named = {target: _names(formula) for target, formula in ties.items()}
-        power = {**simpleeval.DEFAULT_OPERATORS, ast.Pow: operator.pow}
-        self._evaluator = simpleeval.SimpleEval(operators=power, functions=FUNCTIONS)
+        self._evaluator = simpleeval.SimpleEval(functions=_FUNCTIONS)
         self._parsed = {target: self._evaluator.parse(formula) for target, formula in ties.items()}
 
     def add_to(self, values: dict[str, Value]) -> dict[str, Value]:
