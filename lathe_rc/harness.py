@@ -56,6 +56,7 @@ if TYPE_CHECKING:
 
     from lathe_rc.sweep.space import Space
     from lathe_rc.sweep.sweep import Sweep
+    from lathe_rc.sweep.tune import Tuning
 
 Mode = Literal["offline", "composed", "processes"]
 Event = Mapping[str, Any]
@@ -291,6 +292,15 @@ def sweep(scenario: Scenario, space: "Space", folder: Path, **options: Any) -> "
     from lathe_rc.sweep import sweep
 
     return sweep.run(scenario, space, folder, **options)
+
+
+def tune(
+    scenario: Scenario, free: Mapping[str, Any], goals: Sequence[str], folder: Path, **options: Any
+) -> "Tuning":
+    """Search parameters of a cell; the arguments are those of `lathe_rc.sweep.tune.run`."""
+    from lathe_rc.sweep import tune
+
+    return tune.run(scenario, free, goals, folder, **options)
 
 
 def _run(

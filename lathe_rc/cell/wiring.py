@@ -230,7 +230,7 @@ class Cell:
                 self._check_delay(stage, high)
                 self._check_convergence(stage, stage.checked_speeds(low, high))
 
-    def _learned(self, stage: Learner) -> list[tuple[Response, str]]:
+    def learned(self, stage: Learner) -> list[tuple[Response, str]]:
         """Responses and names of the drives that a channel commands."""
         commands = {remapped(stage.shared, output.topic) for output in stage.outputs}
         return [
@@ -246,7 +246,7 @@ class Cell:
         unknown = [name for name, member in self.unknown.items() if command in member.reads]
         for name in unknown:
             self._leave_open(f"whether {stage.name} converges with {name}", name)
-        learned, untold = self._learned(stage), list[str]()
+        learned, untold = self.learned(stage), list[str]()
         for response, drive in learned:
             self._check_reach(stage, drive)
             found = {speed: stage.worst(response, speed) for speed in speeds}
