@@ -294,9 +294,7 @@ def sweep(scenario: Scenario, space: "Space", folder: Path, **options: Any) -> "
     return sweep.run(scenario, space, folder, **options)
 
 
-def tune(
-    scenario: Scenario, free: Mapping[str, Any], goals: Sequence[str], folder: Path, **options: Any
-) -> "Tuning":
+def tune(scenario: Scenario, free: Mapping[str, Any], goals: Sequence[str], folder: Path, **options: Any) -> "Tuning":
     """Search parameters of a cell; the arguments are those of `lathe_rc.sweep.tune.run`."""
     from lathe_rc.sweep import tune
 

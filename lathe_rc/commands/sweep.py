@@ -58,9 +58,7 @@ def space_of(
     vary: Sequence[str], draw: Sequence[str], tie: Sequence[str], sample: str, seeds: int, cells: Path | None
 ) -> Space:
     """The space that options name: with a sample, ranges without a count are part of it."""
-    varied = pairs(
-        "--vary", vary, "NODE.PARAM=LOW:HIGH:COUNT, =LOW:HIGH:COUNT:log, =A,B,C, or =LOW:HIGH of a --sample"
-    )
+    varied = pairs("--vary", vary, "NODE.PARAM=LOW:HIGH:COUNT, =LOW:HIGH:COUNT:log, =A,B,C, or =LOW:HIGH of a --sample")
     ranges = {target: told for target, told in varied.items() if sample and told.count(":") == 1}
     ranges |= {
         target: told for target, told in varied.items() if sample and told.count(":") == 2 and told.endswith(":log")

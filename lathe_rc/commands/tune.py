@@ -17,7 +17,6 @@ from lathe_rc.commands import scenario as scenarios
 from lathe_rc.commands.sweep import INTERRUPTED, Watch, pairs, space_of
 from lathe_rc.errors import InputError
 from lathe_rc.sweep import history, row
-from lathe_rc.sweep.space import value_of
 from lathe_rc.sweep.tune import BATCH, SAMPLERS, Trial, Tuning
 
 _LAWS = ("normal:", "uniform:")
@@ -50,7 +49,11 @@ _STEPS = 8  # of the history that are shown
 @click.option("--percentile", type=float, help="of --over this percentile counts, such as 95")
 @click.option("--trials", type=click.IntRange(1), default=100, show_default=True, help="in all, those there included")
 @click.option(
-    "--sampler", type=click.Choice(SAMPLERS), help="default: tpe for one goal, nsga2 for several; cmaes: ranges only"
+    "--sampler",
+    type=click.Choice(SAMPLERS),
+    default=SAMPLERS[0],
+    show_default=True,
+    help="cmaes: one goal, ranges alone; nsga2: several goals and many trials",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="of the search")
 @click.option("--batch", type=click.IntRange(1), default=BATCH, show_default=True, help="trials asked for at once")
@@ -79,7 +82,7 @@ def tune(
     seeds: int,
     percentile: float | None,
     trials: int,
-    sampler: str | None,
+    sampler: str,
     seed: int,
     batch: int,
     measures: tuple[str, ...],
@@ -151,6 +154,7 @@ class _Watch(Watch):
     def __call__(self, event: Mapping[str, Any]) -> None:
         """Take an event of `lathe_rc.sweep.tune.run`."""
         if event["event"] != "told":
+            self.told = event.get("trials", self.told)
             super().__call__(event)
             return
         tuning: Tuning = event["tuning"]
@@ -176,59 +180,64 @@ def _value(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _by_formula(tuning: Tuning) -> Trial | None:
-    """The trial with what the formulas give, if it was within the ranges."""
-    told = {target: found.value for target, found in tuning.formulas.items()}
-    start = {target: value_of(tuning.folder.scenario, target) for target in tuning.folder.tuning["free"]}
-    return next((trial for trial in tuning.trials if told and trial.values == start | told), None)
-
-
 def _show(tuning: Tuning, picture: Path) -> None:
     console = Console()
-    best, start, formula = tuning.best, tuning.start, _by_formula(tuning)
-    _show_history(console, tuning)
+
+    def say(text: str) -> None:
+        console.print(text, highlight=False, soft_wrap=True)
+
+    if told := _told_history(tuning):
+        say(told)
     if len(tuning.front) > 1:
         _show_front(console, tuning)
+    best, start = tuning.best, tuning.start
     if best and start:
-        table = Table(show_edge=False, header_style="bold")
-        table.add_column("")
-        for name in ("start", "best", *(["by formula"] if tuning.formulas else [])):
-            table.add_column(name, justify="right", overflow="fold")
-        if tuning.formulas:
-            table.add_column("formula", overflow="fold")
-        for target in best.values:
-            told = tuning.formulas.get(target)
-            said = [_value(told.value), told.formula] if told else ["", ""]
-            table.add_row(target, _value(start.values[target]), _value(best.values[target]), *said)
-        table.add_section()
-        columns = [_results(tuning, trial) if trial else {} for trial in (start, best, formula)]
-        for name in columns[0]:
-            table.add_row(name, *(column.get(name, "outside the ranges") for column in columns[: len(table.columns) - 2 if tuning.formulas else 2]))
-        console.print(table)
-        console.print(_cost_of(start, best), highlight=False)
+        _show_best(console, tuning, start, best)
+        say(_cost_of(start, best))
+    for target, found in tuning.formulas.items():
+        say(f"by formula, {target}: {found.formula}")
     feasible = sum(trial.score.feasible for trial in tuning.trials)
-    console.print(f"{len(tuning.trials)} trials, {feasible} meet all subjects", highlight=False)
+    say(f"{len(tuning.trials)} trials, {feasible} meet all subjects")
+    folder = tuning.folder.path
     if best:
-        path = tuning.folder.path / "best.yaml"
-        console.print(f"best:    {path} (trial {best.number}): lathe run {path}", highlight=False, soft_wrap=True)
+        say(f"best:    lathe run {folder / 'best.yaml'} (trial {best.number})")
     else:
-        console.print("nothing meets all subjects; allowed: wider ranges, weaker subjects, more trials")
-    console.print(
-        f"history: {picture}, {picture.with_suffix('.html').name}\nrows:    {tuning.folder.path}/rows, "
-        f"lathe sweep show {tuning.folder.path} --cell N",
-        highlight=False,
-        soft_wrap=True,
-    )
+        say("nothing meets all subjects; allowed: wider ranges, weaker subjects, more trials")
+    say(f"history: {picture}, {picture.with_suffix('.html')}")
+    say(f"rows:    lathe sweep show {folder} --cell {_first_cell(tuning, best or start)}")
+
+
+def _first_cell(tuning: Tuning, trial: Trial | None) -> int:
+    return trial.number * tuning.over.count(tuning.folder.scenario) if trial else 0
+
+
+def _show_best(console: Console, tuning: Tuning, start: Trial, best: Trial) -> None:
+    """Parameters and what came of them: of the start, the best, and what the formulas give."""
+    by_formula = tuning.by_formula
+    table = Table(show_edge=False, header_style="bold")
+    table.add_column("", overflow="fold")
+    for name in ("start", "best", *(["by formula"] if tuning.formulas else [])):
+        table.add_column(name, justify="right", no_wrap=True)
+    for target, value in best.values.items():
+        found = tuning.formulas.get(target)
+        given = [_value(found.value) if found else ""] if tuning.formulas else []
+        table.add_row(target, _value(start.values[target]), _value(value), *given)
+    table.add_section()
+    columns = [_results(tuning, trial) for trial in (start, best, by_formula) if trial]
+    for name in columns[0]:
+        table.add_row(name, *(column.get(name, "") for column in columns))
+    met = ["yes" if trial.score.feasible else "no" for trial in (start, best, by_formula) if trial]
+    table.add_row("meets all subjects", *met)
+    console.print(table)
 
 
 def _results(tuning: Tuning, trial: Trial) -> dict[str, str]:
-    """What came of a trial, by what it is."""
+    """Goals and margin of a trial, by what they are."""
     count = tuning.over.count(tuning.folder.scenario)
     which = "" if count == 1 else ", worst" if tuning.aims.percentile == 100.0 else f", {tuning.aims.percentile:g} %"
     shown = {f"{name}{which}": value for name, value in _goals(tuning, trial).items()}
     if not math.isnan(trial.score.margin):
         shown[f"margin{which}"] = f"{trial.score.margin:.4g}"
-    shown["subjects"] = "met" if trial.score.feasible else "not met"
     return shown
 
 
@@ -237,8 +246,8 @@ def _cost_of(start: Trial, best: Trial) -> str:
         return "no margin is told: nobody learns in this cell"
     change = best.score.margin - start.score.margin
     return (
-        f"the best {'costs' if change < 0.0 else 'gains'} {abs(change):.4g} of margin: {best.score.margin:.4g} in place "
-        f"of the start's {start.score.margin:.4g}"
+        f"the best {'costs' if change < 0.0 else 'gains'} {abs(change):.4g} of margin: {best.score.margin:.4g} in "
+        f"place of the start's {start.score.margin:.4g}"
     )
 
 
@@ -251,25 +260,26 @@ def _improvements(tuning: Tuning) -> list[Trial]:
     return found
 
 
-def _show_history(console: Console, tuning: Tuning) -> None:
+def _told_history(tuning: Tuning) -> str:
+    """What was better than all before, in a line."""
     steps = _improvements(tuning)
     if len(steps) > _STEPS:
-        steps = [steps[0], *steps[-_STEPS + 1 :]]
-    if steps:
-        column = tuning.aims.goals[0].column
-        told = " → ".join(f"{_goals(tuning, trial)[column]} (trial {trial.number})" for trial in steps)
-        console.print(f"{column}: {told}", highlight=False)
+        steps = [steps[0], *steps[1 - _STEPS :]]
+    column = tuning.aims.goals[0].column
+    told = " → ".join(f"{_goals(tuning, trial)[column]} (trial {trial.number})" for trial in steps)
+    return f"{column}: {told}" if told else ""
 
 
 def _show_front(console: Console, tuning: Tuning) -> None:
     table = Table(title="no other trial is better in all goals", title_justify="left", show_edge=False)
     front = tuning.front
-    names = ["trial", *_goals(tuning, front[0]), *front[0].values]
-    for name in names:
+    table.add_column("trial", justify="right", no_wrap=True)
+    for name in _results(tuning, front[0]):
         table.add_column(name, justify="right", overflow="fold")
     for trial in front:
-        table.add_row(str(trial.number), *_goals(tuning, trial).values(), *map(_value, trial.values.values()))
+        table.add_row(str(trial.number), *_results(tuning, trial).values())
     console.print(table)
+    console.print(f"{tuning.folder.path / 'front'}: a parameter file of each", highlight=False, soft_wrap=True)
 
 
 def _told(tuning: Tuning, trial: Trial | None) -> dict[str, Any] | None:
@@ -295,8 +305,8 @@ def _summary(tuning: Tuning) -> dict[str, Any]:
         "cells": tuning.over.count(tuning.folder.scenario),
         "start": _told(tuning, tuning.start),
         "best": _told(tuning, tuning.best),
-        "by_formula": _told(tuning, _by_formula(tuning)),
+        "by_formula": _told(tuning, tuning.by_formula),
         "formulas": {target: found._asdict() for target, found in tuning.formulas.items()},
         "front": [_told(tuning, trial) for trial in tuning.front],
-        "history": [[trial.number, _told(tuning, trial)["goals"]] for trial in _improvements(tuning)],
+        "history": [_told(tuning, trial) for trial in _improvements(tuning)],
     }

@@ -89,7 +89,7 @@ class Aims:
     @property
     def columns(self) -> list[str]:
         """Columns that a score is made of."""
-        named = [each.column for each in [*self.goals, *self.subjects]]
+        named = [goal.column for goal in self.goals] + [subject.column for subject in self.subjects]
         return list(dict.fromkeys(["status", "margin", *named]))
 
     def score(self, rows: Iterable[Mapping[str, Any]]) -> Score:

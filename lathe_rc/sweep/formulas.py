@@ -9,8 +9,9 @@ Of a learning controller (`lathe_rc.analysis.learning`), with Q, drive and inter
   keeps the margin with it, the lead that allows the shortest ``q_time``; where Q is not free, the one with the least
   sup|Q - γZ|.
 
-Of a force controller (`lathe_rc.analysis.pid_tuning`): the PID with the highest crossover that keeps 60° and 6 dB, around
-the longitudinal slide and the cut at the set point, with the feedback delay.
+Of a force controller (`lathe_rc.analysis.pid_tuning`): the PID with the highest crossover that keeps 60° and 6 dB. Its
+plant is the longitudinal slide W with the cut at the last set point F0: (1 - mc)·F0/v0·p·W/(1 + p·T), v0 the velocity
+that makes F0; the feedback delay is in it, limits, the elasticity and keyways are not.
 """
 
 import math
@@ -21,11 +22,20 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from lathe_rc.analysis.pid_tuning import fastest
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stages.cutting_process import CuttingProcessParameters
+from lathe_rc.cell.stages.feed_drive import FeedDriveParameters
+from lathe_rc.cell.stages.force_controller import ForceController
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+from lathe_rc.plants.cutting_force import SpecificForce
+from lathe_rc.transfer import TransferFunction
 
+_PID = ("proportional", "integral", "derivative", "derivative_filter")
+_PHASE_MARGIN, _GAIN_MARGIN = 60.0, 2.0  # [°], factor
+_BAND = (0.1, 1e3)  # [rad/s] of its crossover
 MARGIN = 0.05  #: that is kept where none is asked for
 _SHORTEST, _LONGEST = 1e-6, 1e-3  # [s] of q_time
 _NONE = 1.0  # [s]: in place of a q_time that there is not
@@ -58,6 +68,8 @@ def settings(scenario: Scenario, targets: Collection[str], margin: float = MARGI
     found: dict[str, Found] = {}
     for name, stage in cell.stages.items():
         free = {target.rpartition(".")[2] for target in targets if target.rpartition(".")[0] == name}
+        if isinstance(stage, ForceController) and free & set(_PID):
+            found |= {f"{name}.{key}": value for key, value in _force(scenario, stage).items()}
         if isinstance(stage, LearningController) and free & {"lead_time", "q_time", "learning_gain"}:
             found |= {f"{name}.{key}": value for key, value in _learning(cell, stage, free, margin).items()}
     return {target: found[target] for target in targets if target in found}
@@ -99,6 +111,29 @@ def _learning(cell: Cell, stage: LearningController, free: Collection[str], marg
     if "learning_gain" in free:
         found["learning_gain"] = Found(gain, "γ = 1 (paper 001, eqs 1-5)")
     return found
+
+
+def _force(scenario: Scenario, stage: ForceController) -> dict[str, Found]:
+    slides = [table for table in scenario.nodes.values() if isinstance(table, FeedDriveParameters)]
+    slides = [table for table in slides if table.axis == "longitudinal" and table.model == "dc_screw"]
+    cuts = [table for table in scenario.nodes.values() if isinstance(table, CuttingProcessParameters)]
+    table = stage.parameters
+    force = table.set_point[-1] if table.set_point else 0.0
+    if len(slides) != 1 or len(cuts) != 1 or not force > 0.0 or not cuts[0].depth > 0.0:
+        return {}
+    (slide,), (cut,) = slides, cuts
+    material = SpecificForce(cut.kc1, cut.mc, cut.wear_factor)
+    velocity = material.feed_for(force / cut.depth, cut.wear) * table.nominal_speed / (2.0 * math.pi)
+    way = slide.transfer()
+    plant = TransferFunction(way.numerator, way.denominator[:-1])  # velocity in place of the way
+    plant *= TransferFunction(((1.0 - cut.mc) * force / velocity,), (cut.lag, 1.0) if cut.lag else (1.0,))
+    margins = {"phase_margin": math.radians(_PHASE_MARGIN), "gain_margin": _GAIN_MARGIN}
+    try:
+        gains = fastest(plant, band=_BAND, **margins, wait=table.feedback_delay * table.step)
+    except InputError:  # no PID keeps these margins: no formula for this plant
+        return {}
+    values = (gains.proportional, gains.integral, gains.derivative, gains.filter)
+    return {name: Found(value, "PID of 60° and 6 dB") for name, value in zip(_PID, values, strict=True)}
 
 
 def _lag(response: Callable[[np.ndarray], np.ndarray]) -> float:

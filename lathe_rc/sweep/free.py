@@ -81,11 +81,14 @@ def _free(scenario: Scenario, target: str, told: str | Sequence[Value]) -> Free:
     row = scenario.parameter(target)
     parts = told.split(":") if isinstance(told, str) else []
     if len(parts) < 2 or row.is_list or row.type not in (int, float):
-        real = row.type is float and not row.is_list
-        values = [cast("Value", float(cast("float", value)) if real else value) for value in axis(scenario, target, told)]
+        values = axis(scenario, target, told)
+        if row.type is float and not row.is_list:
+            values = [float(cast("float", value)) for value in values]
         choices = {_known(value): value for value in values}
         if len(choices) < 2:
-            raise InputError(f"{target}={shown(told)}: one value is no choice; allowed: LOW:HIGH, or two and more values")
+            raise InputError(
+                f"{target}={shown(told)}: one value is no choice; allowed: LOW:HIGH, or two and more values"
+            )
         return Free(CategoricalDistribution(list(choices)), choices)
     log = parts[2:] == ["log"]
     if len(parts) != 2 + log:

@@ -3,9 +3,9 @@
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-import altair
+import altair as alt
 
 from lathe_rc.sweep.folder import writing
 from lathe_rc.sweep.tune import Trial, Tuning
@@ -34,7 +34,7 @@ def _shown(tuning: Tuning, trial: Trial, place: int) -> float | None:
     return goal.sign * cost * unit(goal.column)[0] if math.isfinite(cost) else None
 
 
-def chart(tuning: Tuning) -> altair.TopLevelMixin:
+def chart(tuning: Tuning) -> alt.LayerChart:
     """By trial: the goal, and the best so far; of several goals, the second over the first."""
     rows: list[dict[str, Any]] = []
     best: float | None = None
@@ -49,36 +49,40 @@ def chart(tuning: Tuning) -> altair.TopLevelMixin:
         told = {"trial": trial.number, "kind": kind, "first": values[0], "second": values[-1], "best": best}
         rows.append(told | {"front": trial.number in front})
     kinds = ["start", "meets all subjects", "does not"]
-    colour = altair.Color(
-        "kind:N", title=None, scale=altair.Scale(domain=kinds, range=[_START, _FEASIBLE, _OTHER]),
-        legend=altair.Legend(orient="top"),
+    colour = alt.Color(
+        "kind:N", title=None, scale=alt.Scale(domain=kinds, range=[_START, _FEASIBLE, _OTHER]),
+        legend=alt.Legend(orient="top"),
     )  # fmt: skip
-    base = altair.Chart(altair.InlineData(values=rows))
+    base = alt.Chart(alt.InlineData(values=rows))
     if several:
         first, second = (
-            altair.X("first:Q", title=_title(tuning, 0), scale=_scale(rows, "first")),
-            altair.Y("second:Q", title=_title(tuning, 1), scale=_scale(rows, "second")),
+            alt.X("first:Q", title=_title(tuning, 0), scale=_scale(rows, "first")),
+            alt.Y("second:Q", title=_title(tuning, 1), scale=_scale(rows, "second")),
         )
         line = base.transform_filter("datum.front").mark_line(color=_BEST).encode(first, second)
         dots = base.mark_circle(size=40).encode(first, second, colour, tooltip=["trial:Q", "first:Q", "second:Q"])
     else:
         scale = _scale(rows, "first")
-        trials = altair.X("trial:Q", title="trial")
+        trials = alt.X("trial:Q", title="trial")
         line = base.mark_line(color=_BEST, interpolate="step-after").encode(
-            trials, altair.Y("best:Q", scale=scale, title=_title(tuning, 0))
+            trials, alt.Y("best:Q", scale=scale, title=_title(tuning, 0))
         )
         dots = base.mark_circle(size=40).encode(
-            trials, altair.Y("first:Q", scale=scale), colour, tooltip=["trial:Q", "first:Q", "kind:N"]
+            trials, alt.Y("first:Q", scale=scale), colour, tooltip=["trial:Q", "first:Q", "kind:N"]
         )
-    title = f"Tuning of {tuning.folder.scenario.name}: {len(tuning.trials)} trials"
-    return altair.layer(dots, line).properties(width=_WIDTH, height=_HEIGHT, title=title)
+    text = f"Tuning of {tuning.folder.scenario.name}: {len(tuning.trials)} trials"
+    without = sum(not all(map(math.isfinite, trial.score.costs)) for trial in tuning.trials)
+    title = alt.TitleParams(
+        text, subtitle=f"{without} of them refused or diverged: not in the figure" if without else []
+    )
+    return cast("alt.LayerChart", alt.layer(dots, line).properties(width=_WIDTH, height=_HEIGHT, title=title))
 
 
-def _scale(rows: list[dict[str, Any]], name: str) -> altair.Scale:
+def _scale(rows: list[dict[str, Any]], name: str) -> alt.Scale:
     """Logarithmic, if all is above 0 and reaches over more than a decade."""
     values = [row[name] for row in rows if row[name] is not None]
     log = bool(values) and min(values) > 0.0 and max(values) > 10.0 * min(values)
-    return altair.Scale(type="log") if log else altair.Scale(zero=False)
+    return alt.Scale(type="log") if log else alt.Scale(zero=False)
 
 
 def write(tuning: Tuning) -> Path:

@@ -133,8 +133,8 @@ class _Keeper(Errors):
         self.heard: Collection[str] = [topic for topic, source in cell.sparse.items() if source.type == messages.EVENT]
         self.limited: set[str] = set()
         self._measures = [(each, np.empty(samples)) for each in measures]
-        if self._measures and not self._tool and self._encoder:
-            self._angle = np.empty(samples)  # a cell without a tool has revolutions all the same
+        # A cell without a tool has no form error, but revolutions all the same.
+        self._turned = np.empty(samples if measures and self._encoder and not self._tool else 0)
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
@@ -142,14 +142,14 @@ class _Keeper(Errors):
         for topic in self.heard:
             if any(message.values["action"].startswith(LIMITS) for message in sparse.get(topic, ())):
                 self.limited.add(topic.removesuffix("/events"))
-        if self._measures and not self._tool and self._encoder:
-            self._angle[first : first + samples] = dense[self._encoder]["angle_true"]
+        if self._turned.size and self._encoder:
+            self._turned[first : first + samples] = dense[self._encoder]["angle_true"]
         for asked, kept in self._measures:
             kept[first : first + samples] = dense[asked.topic][asked.field]
 
     def measured(self, errors: FormErrors) -> dict[str, float]:
         """By column; over the whole run, if there is no complete revolution."""
-        starts = errors.starts if self._tool else form_errors(self._angle, self._angle).starts
+        starts = errors.starts if self._tool else form_errors(self._turned, self._turned).starts
         last = slice(*starts[-2:]) if starts.size > 1 else slice(None)
         return {asked.name: STATISTICS[asked.statistic](kept[last]) for asked, kept in self._measures}
 

@@ -138,7 +138,9 @@ def order_of(folder: Folder) -> Order:
     return Order(scenario.name, text, scenario.identity, folder.targets, folder.measures, folder.schema)
 
 
-def keep(folder: Folder, found: Iterator[pa.Table], watch: Watch, take: Callable[[pa.Table], None] | None = None) -> None:
+def keep(
+    folder: Folder, found: Iterator[pa.Table], watch: Watch, take: Callable[[pa.Table], None] | None = None
+) -> None:
     """Write rows as they come, a file now and then; those that have come when something ends it, too.
 
     Args:

@@ -4,6 +4,7 @@
 DIR/trials.log       Optuna's journal: what was asked, and what came of it
 DIR/running/         a lock for each program that computes; who died is known by it
 DIR/best.yaml        the cell with the best trial's parameters
+DIR/front/           of several goals, the cells of all trials that no other is better than
 DIR, the rest        see `lathe_rc.sweep.folder`: cell n of trial m is the row m * (cells of a trial) + n
 
 Trials are asked for a batch at a time. Each is drawn with a random generator of its own, from the seed and its number,
@@ -105,6 +106,17 @@ class Tuning:
         return next((trial for trial in self.trials if trial.number == 0), None)
 
     @property
+    def by_formula(self) -> Trial | None:
+        """The trial with what the formulas give; None: they give nothing, or it is outside of the ranges."""
+        given = {target: found.value for target, found in self.formulas.items()}
+        scenario = self.folder.scenario
+
+        def own(trial: Trial) -> dict[str, Value]:
+            return {target: given.get(target, value_of(scenario, target)) for target in trial.values}
+
+        return next((trial for trial in self.trials if given and trial.values == own(trial)), None)
+
+    @property
     def front(self) -> list[Trial]:
         """The trials that no other is better than in all goals, by the first goal; of one goal, the best."""
         found: list[Trial] = []
@@ -186,7 +198,7 @@ def run(
     over: Space | None = None,
     percentile: float = 100.0,
     trials: int = 100,
-    sampler: str | None = None,
+    sampler: str = "tpe",
     seed: int = 0,
     batch: int = BATCH,
     ask_formulas: bool = True,
@@ -207,7 +219,7 @@ def run(
         over: plants and spindles; what counts is the worst of them, or a percentile. None: the scenario's own.
         percentile: see `over`; 100: the worst.
         trials: so many in all, those that are there already among them.
-        sampler: ``tpe``, ``cmaes`` or ``nsga2``; None: tpe for one goal, nsga2 for several.
+        sampler: ``tpe``; ``cmaes`` for one goal and ranges alone; ``nsga2``, which wants many trials, for several goals.
         seed: of the search.
         batch: trials that are asked for before the first of them is told.
         ask_formulas: let trial 1 be what `lathe_rc.sweep.formulas` gives, if it is within the ranges.
@@ -215,8 +227,8 @@ def run(
         scheduler: see `lathe_rc.sweep.sweep.run`, as the next two.
         workers: processes of this machine.
         client: of Dask, in place of both.
-        watch: called with the events of `lathe_rc.sweep.sweep.run`, and with ``told`` (trials: numbers of a batch;
-            tuning: what is there).
+        watch: called with the events of `lathe_rc.sweep.sweep.run`, ``began`` with the trials that are there, and with
+            ``told`` (tuning: what is there), after each batch.
 
     Raises:
         InputError: what is asked for cannot be, or the folder holds something else.
@@ -239,7 +251,7 @@ def run(
     if twice := [target for target in found if target in over.targets()]:
         raise InputError(f"{twice[0]}: free, and what the goal is over as well; allowed: one of both")
     over.check(scenario)
-    search = _sampler_name(sampler, wanted, found)
+    _check_sampler(sampler, wanted, found)
     for name, number in (("trials", trials), ("batch", batch)):
         if number < 1:
             raise InputError(f"{name} = {number}; allowed: from 1")
@@ -250,7 +262,7 @@ def run(
         "subjects": list(subjects),
         "percentile": percentile,
         "over": over.to_json(),
-        "sampler": search,
+        "sampler": sampler,
         "seed": seed,
         "batch": batch,
         "formulas": ask_formulas,
@@ -259,7 +271,8 @@ def run(
     state = _State(kept)
     with state.present() as me:
         asked = state.ask(me, trials)
-        watch({"event": "began", "cells": trials * state.count, "computed": state.finished() * state.count})
+        there = state.finished()
+        watch({"event": "began", "cells": trials * state.count, "computed": there * state.count, "trials": there})
         if asked:
             for stages in compile_ahead(Cell(scenario.nodes).stages.values()):
                 watch({"event": "compiling", "nodes": stages})
@@ -268,20 +281,31 @@ def run(
                 while asked:
                     state.compute(crew, asked, watch)
                     asked = state.ask(me, trials)
-    return state.tuning()
+    tuning = state.tuning()
+    if len(goals) > 1:
+        _write_front(tuning)
+    return tuning
 
 
-def _sampler_name(name: str | None, wanted: Aims, found: Mapping[str, Free]) -> str:
-    several = len(wanted.goals) > 1
-    search = name or ("nsga2" if several else "tpe")
-    if search not in SAMPLERS:
-        raise InputError(f"sampler {search!r}; {instead(search, SAMPLERS)}")
-    if search == "cmaes":
+def _write_front(tuning: Tuning) -> None:
+    place = tuning.folder.path / "front"
+    with writing(tuning.folder.path):
+        place.mkdir(exist_ok=True)
+        for path in place.glob("*.yaml"):
+            path.unlink(missing_ok=True)
+    for trial in tuning.front:
+        tuning.write(trial, place / f"trial-{trial.number}.yaml")
+
+
+def _check_sampler(name: str, wanted: Aims, found: Mapping[str, Free]) -> None:
+    if name not in SAMPLERS:
+        raise InputError(f"sampler {name!r}; {instead(name, SAMPLERS)}")
+    if name == "cmaes":
         lists = [target for target, each in found.items() if each.choices is not None]
-        if several or lists or len(found) < 2:
-            why = f"{len(wanted.goals)} goals" if several else f"the list of {lists[0]}" if lists else "one parameter"
+        if len(wanted.goals) > 1 or lists or len(found) < 2:
+            goals = f"{len(wanted.goals)} goals" if len(wanted.goals) > 1 else ""
+            why = goals or (f"the list of {lists[0]}" if lists else "one parameter")
             raise InputError(f"sampler cmaes with {why}; allowed: one goal and two or more ranges; or tpe, nsga2")
-    return search
 
 
 class _State:
@@ -296,9 +320,7 @@ class _State:
         self._folder, told = folder, folder.tuning
         scenario = folder.scenario
         measures = [each.name for each in folder.measures]
-        self._aims = aims(
-            scenario, told["goals"], told["subjects"], measures=measures, percentile=told["percentile"]
-        )
+        self._aims = aims(scenario, told["goals"], told["subjects"], measures=measures, percentile=told["percentile"])
         self._free = frees(scenario, told["free"])
         self._over = Space(**told["over"])
         self.count = self._over.count(scenario)
@@ -414,7 +436,7 @@ class _State:
         tuning = self.tuning()
         if best := tuning.best:
             tuning.write(best, self._folder.path / "best.yaml")
-        watch({"event": "told", "trials": list(jobs), "tuning": tuning})
+        watch({"event": "told", "tuning": tuning})
 
     def _take(self, table: pa.Table) -> None:
         for found in table.select(["key", *self._aims.columns]).to_pylist():
