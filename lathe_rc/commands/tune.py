@@ -20,7 +20,7 @@ from lathe_rc.sweep import history, row
 from lathe_rc.sweep.tune import BATCH, SAMPLERS, Trial, Tuning
 
 _LAWS = ("normal:", "uniform:")
-_STEPS = 8  # of the history that are shown
+_STEPS = 5  # of the history that are shown
 
 
 @click.command()
@@ -193,9 +193,11 @@ def _show(tuning: Tuning, picture: Path) -> None:
     best, start = tuning.best, tuning.start
     if best and start:
         _show_best(console, tuning, start, best)
-        say(_cost_of(start, best))
-    for target, found in tuning.formulas.items():
-        say(f"by formula, {target}: {found.formula}")
+        if cost := _cost_of(start, best):
+            say(cost)
+    for formula in dict.fromkeys(found.formula for found in tuning.formulas.values()):
+        targets = [target for target, found in tuning.formulas.items() if found.formula == formula]
+        say(f"by formula, {', '.join(targets)}: {formula}")
     feasible = sum(trial.score.feasible for trial in tuning.trials)
     say(f"{len(tuning.trials)} trials, {feasible} meet all subjects")
     folder = tuning.folder.path
@@ -242,8 +244,11 @@ def _results(tuning: Tuning, trial: Trial) -> dict[str, str]:
 
 
 def _cost_of(start: Trial, best: Trial) -> str:
-    if math.isnan(best.score.margin) or math.isnan(start.score.margin):
-        return "no margin is told: nobody learns in this cell"
+    """What the best costs in margin, in a sentence; empty if no cell learns."""
+    if math.isnan(best.score.margin):
+        return ""
+    if math.isnan(start.score.margin):
+        return f"the best has {best.score.margin:.4g} of margin; the start was refused before it had one"
     change = best.score.margin - start.score.margin
     return (
         f"the best {'costs' if change < 0.0 else 'gains'} {abs(change):.4g} of margin: {best.score.margin:.4g} in "
@@ -262,11 +267,13 @@ def _improvements(tuning: Tuning) -> list[Trial]:
 
 def _told_history(tuning: Tuning) -> str:
     """What was better than all before, in a line."""
-    steps = _improvements(tuning)
-    if len(steps) > _STEPS:
-        steps = [steps[0], *steps[1 - _STEPS :]]
     column = tuning.aims.goals[0].column
-    told = " → ".join(f"{_goals(tuning, trial)[column]} (trial {trial.number})" for trial in steps)
+    steps: dict[str, int] = {}
+    for trial in _improvements(tuning):
+        steps.setdefault(_goals(tuning, trial)[column], trial.number)
+    shown = list(steps.items())
+    shown = shown if len(shown) <= _STEPS else [shown[0], *shown[1 - _STEPS :]]
+    told = " → ".join(f"{value} (trial {number})" for value, number in shown)
     return f"{column}: {told}" if told else ""
 
 

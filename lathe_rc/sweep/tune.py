@@ -219,7 +219,7 @@ def run(
         over: plants and spindles; what counts is the worst of them, or a percentile. None: the scenario's own.
         percentile: see `over`; 100: the worst.
         trials: so many in all, those that are there already among them.
-        sampler: ``tpe``; ``cmaes`` for one goal and ranges alone; ``nsga2``, which wants many trials, for several goals.
+        sampler: ``tpe``; ``cmaes`` for one goal and ranges alone; ``nsga2`` for several goals and many trials.
         seed: of the search.
         batch: trials that are asked for before the first of them is told.
         ask_formulas: let trial 1 be what `lathe_rc.sweep.formulas` gives, if it is within the ranges.
