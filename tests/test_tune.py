@@ -20,7 +20,7 @@ from lathe_rc.control.pid import PidGains
 from lathe_rc.errors import InputError
 from lathe_rc.sweep import formulas, row, tune
 from lathe_rc.sweep.aims import aims
-from lathe_rc.sweep.free import frees
+from lathe_rc.sweep.free import Free, frees
 from lathe_rc.sweep.space import Space
 
 LEAD, Q = "learning_controller.lead_time", "learning_controller.q_time"
@@ -214,9 +214,18 @@ class TestSearch:
         assert same(again, tuned)
         assert same(tune.Tuning.load(tuned.folder.path), tuned)
 
-    def test_stopped_anywhere_and_begun_again_it_is_the_same_search(self, tuned, piston, client, tmp_path):
-        """Each time it is stopped after another row; what was computed is kept."""
+    def test_stopped_anywhere_and_begun_again_it_is_the_same_search(self, tuned, piston, client, tmp_path, monkeypatch):
+        """It is stopped after some rows, and in the middle of asking; what was computed is kept."""
         seen = []
+        suggest = Free.suggest
+
+        def stop(free, trial, target):
+            seen.append("asked")
+            if seen.count("asked") in {3, 20, 30}:
+                raise KeyboardInterrupt
+            suggest(free, trial, target)
+
+        monkeypatch.setattr(Free, "suggest", stop)
 
         def watch(event):
             seen.append(event["event"])
@@ -236,7 +245,7 @@ class TestSearch:
                 watch=watch,
             )
 
-        for _ in range(3):
+        for _ in range(6):
             with pytest.raises(KeyboardInterrupt):
                 go()
         assert same(go(), tuned)

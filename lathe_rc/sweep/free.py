@@ -4,7 +4,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
-from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.trial import Trial
 
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
@@ -20,12 +21,22 @@ class Free(NamedTuple):
         choices: the values of a list, by what Optuna knows them as; None: a range.
     """
 
-    distribution: BaseDistribution
+    distribution: CategoricalDistribution | FloatDistribution | IntDistribution
     choices: Mapping[str, Value] | None
 
     def value(self, told: Any) -> Value:
         """Of what Optuna has drawn."""
         return cast("Value", told) if self.choices is None else self.choices[told]
+
+    def suggest(self, trial: Trial, target: str) -> None:
+        """Let a trial have a value, if it has none yet."""
+        found = self.distribution
+        if isinstance(found, CategoricalDistribution):
+            trial.suggest_categorical(target, found.choices)
+        elif isinstance(found, IntDistribution):
+            trial.suggest_int(target, found.low, found.high, log=found.log)
+        else:
+            trial.suggest_float(target, found.low, found.high, log=found.log)
 
     def told(self, value: Value) -> Any:
         """What Optuna knows a value as."""

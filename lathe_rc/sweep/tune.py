@@ -399,11 +399,15 @@ class _State:
             missing = batch - number % batch if number % batch or not left else 0
             for _ in range(max(0, min(missing, most - number))):
                 self._study.sampler = self._sampler(number)
-                left.append(self._study.ask({target: free.distribution for target, free in self._free.items()}).number)
+                left.append(self._study.ask().number)
                 number += 1
             left = left[:batch]
             for each in left:
-                self._trial(each).set_user_attr(_BY, me)
+                self._study.sampler = self._sampler(each)
+                trial = self._trial(each)
+                trial.set_user_attr(_BY, me)
+                for target, free in self._free.items():  # who was stopped in the middle may have left some out
+                    free.suggest(trial, target)
             return [trial for trial in self._study.get_trials() if trial.number in left]
 
     def _trial(self, number: int) -> optuna.Trial:

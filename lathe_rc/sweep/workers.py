@@ -191,6 +191,6 @@ def _result(future: distributed.Future[pa.Table], jobs: Sequence[Job]) -> pa.Tab
 def _next(size: int, found: pa.Table) -> int:
     """How many cells the next task has."""
     took: float = sum(found.column("seconds").to_pylist())
-    fitting = round(TASK * found.num_rows / max(took, 1e-6))
+    fitting: int = round(TASK * found.num_rows / max(took, 1e-6))
     grown: int = _GROWTH * max(size, found.num_rows)
     return max(1, min(fitting, grown, _MOST))
