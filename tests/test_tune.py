@@ -12,12 +12,12 @@ from click.testing import CliRunner
 
 from lathe_rc import cli, harness, resources
 from lathe_rc.analysis.pid_tuning import evaluate
-from lathe_rc.cell import scenario
+from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.commands import sweep as command
 from lathe_rc.control.decoupler import PAPER
 from lathe_rc.control.pid import PidGains
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.sweep import formulas, row, tune
 from lathe_rc.sweep.aims import aims
 from lathe_rc.sweep.free import Free, frees
@@ -280,6 +280,13 @@ class TestSearch:
         after = go(tmp_path / "shared", 12)
         assert [trial.number for trial in after.trials] == list(range(12))
 
+    def test_a_journal_that_cannot_be_read_is_one_line(self, tuned, tmp_path):
+        for name in ("sweep.json", "scenario.yaml"):
+            (tmp_path / name).write_bytes((tuned.folder.path / name).read_bytes())
+        (tmp_path / "trials.log").write_text("{broken\n" * 2, encoding="utf-8")
+        with pytest.raises(LatheError, match=r"trials\.log: no journal of Optuna"):
+            tune.Tuning.load(tmp_path)
+
     def test_a_folder_holds_one_tuning_and_no_sweep(self, tuned, piston, client):
         path = tuned.folder.path
         with pytest.raises(InputError, match="holds a tuning; allowed: a new folder"):
@@ -390,6 +397,29 @@ class TestFormulas:
 
     def test_there_is_none_for_what_they_do_not_know(self, piston):
         assert formulas.settings(piston, ["tool.feed", "learning_controller.soft_start"]) == {}
+
+
+def test_the_robust_setting_of_the_page_is_twice_as_good_on_the_worst_plant_as_the_nominal_one():
+    """A setting tuned over 64 plants leaves less than half of what the nominal optimum does on the worst of them."""
+    two_channel = load("two_channel", 30)
+    plants = Space(
+        sampled={
+            "electrodynamic_actuator.natural_frequency": "uniform:90%:110%",
+            "electrodynamic_actuator.damping": "uniform:90%:110%",
+            "piezo_actuator.natural_frequency": "uniform:95%:105%",
+            "piezo_actuator.damping": "uniform:90%:110%",
+        },
+        sample="sobol:64",
+    )
+    names = (LEAD, Q, "fine_controller.lead_time", "fine_controller.q_time")
+    nominal = dict(zip(names, (1.28459e-3, 216.231e-6, 91.674e-6, 13.5154e-6), strict=True))
+    robust = dict(zip(names, (1.7713e-3, 139.249e-6, 92.5337e-6, 9.94758e-6), strict=True))
+
+    def worst(setting):
+        cells = (two_channel.varied({**setting, **plant}) for plant in plants.cells(two_channel))
+        return max(outcome.kept.largest[-1] for outcome in batch.run(cells, batch.Errors))
+
+    assert worst(robust) < 0.5 * worst(nominal)
 
 
 def test_the_command_shows_and_writes_what_it_found(tmp_path, monkeypatch, client):

@@ -27,7 +27,8 @@ import numpy as np
 import optuna
 import pyarrow as pa
 from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from lathe_rc import files
@@ -35,7 +36,7 @@ from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.names import instead
 from lathe_rc.sweep import formulas
 from lathe_rc.sweep.aims import Aims, Score, aims
@@ -308,6 +309,40 @@ def _check_sampler(name: str, wanted: Aims, found: Mapping[str, Free]) -> None:
             raise InputError(f"sampler cmaes with {why}; allowed: one goal and two or more ranges; or tpe, nsga2")
 
 
+class _Lock(JournalFileOpenLock):
+    """Of the journal. The system releases it when who holds it dies; Optuna's own would have to be waited for."""
+
+    def __init__(self, path: Path) -> None:
+        self._lock = filelock.FileLock(path)
+
+    def acquire(self) -> bool:
+        """See `JournalFileOpenLock`."""
+        self._lock.acquire()
+        return True
+
+    def release(self) -> None:
+        """See `JournalFileOpenLock`."""
+        self._lock.release()
+
+
+def _opened(path: Path, goals: int) -> tuple[JournalStorage, optuna.Study]:
+    """The journal, and the study in it.
+
+    Raises:
+        LatheError: it cannot be read.
+    """
+    try:
+        storage = JournalStorage(JournalFileBackend(str(path), _Lock(path.with_suffix(".lock"))))
+        directions = [StudyDirection.MINIMIZE] * goals
+        return storage, optuna.create_study(
+            study_name=_STUDY, storage=storage, directions=directions, load_if_exists=True
+        )
+    except (ValueError, KeyError) as error:
+        raise LatheError(
+            f"{path}: no journal of Optuna ({shown(error)}); allowed: as it was written, or a new folder"
+        ) from None
+
+
 class _State:
     """A tuning on the disk: Optuna's study, and the rows of its trials.
 
@@ -331,13 +366,7 @@ class _State:
         self._take(folder.table(["key", *self._aims.columns]))
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         with writing(folder.path), folder.locked(wait=True):
-            self._storage = JournalStorage(JournalFileBackend(str(folder.path / "trials.log")))
-            self._study = optuna.create_study(
-                study_name=_STUDY,
-                storage=self._storage,
-                directions=["minimize"] * len(self._aims.goals),
-                load_if_exists=True,
-            )
+            self._storage, self._study = _opened(folder.path / "trials.log", len(self._aims.goals))
             if not self._study.get_trials(deepcopy=False):
                 self._enqueue()
 
