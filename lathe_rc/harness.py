@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 
     from lathe_rc.sweep.space import Space
     from lathe_rc.sweep.sweep import Sweep
-    from lathe_rc.sweep.tune import Tuning
+    from lathe_rc.sweep.tuned import Tuning
 
 Mode = Literal["offline", "composed", "processes"]
 Event = Mapping[str, Any]

@@ -22,6 +22,7 @@ from lathe_rc.sweep import formulas, row, tune
 from lathe_rc.sweep.aims import aims
 from lathe_rc.sweep.free import Free, frees
 from lathe_rc.sweep.space import Space
+from lathe_rc.sweep.study import Study
 
 LEAD, Q = "learning_controller.lead_time", "learning_controller.q_time"
 FREE = {LEAD: "0.8e-3:2e-3", Q: "40e-6:300e-6:log"}
@@ -212,7 +213,7 @@ class TestSearch:
         )
         assert events == ["began"]
         assert same(again, tuned)
-        assert same(tune.Tuning.load(tuned.folder.path), tuned)
+        assert same(tune.load(tuned.folder.path), tuned)
 
     def test_stopped_anywhere_and_begun_again_it_is_the_same_search(self, tuned, piston, client, tmp_path, monkeypatch):
         """It is stopped after some rows, and in the middle of asking; what was computed is kept."""
@@ -250,7 +251,7 @@ class TestSearch:
                 go()
         assert same(go(), tuned)
         rows = tuned.sweep.table().drop_columns(["seconds"])
-        assert tune.Tuning.load(tmp_path / "stopped").sweep.table().drop_columns(["seconds"]).equals(rows)
+        assert tune.load(tmp_path / "stopped").sweep.table().drop_columns(["seconds"]).equals(rows)
 
     def test_more_trials_go_on_from_those_that_are_there(self, tuned, piston, client, tmp_path):
         for trials in (4, 8):
@@ -271,7 +272,7 @@ class TestSearch:
             return harness.tune(piston, FREE, ["margin"], folder, trials=trials, batch=4, client=client)
 
         go(tmp_path / "shared", 4)
-        state = tune._State(tune.Folder(tmp_path / "shared"))
+        state = Study(tune.Folder(tmp_path / "shared"))
         with state.present() as other:
             asked = [trial.number for trial in state.ask(other, 8)]
             assert asked == [4, 5, 6, 7]
@@ -285,7 +286,7 @@ class TestSearch:
             (tmp_path / name).write_bytes((tuned.folder.path / name).read_bytes())
         (tmp_path / "trials.log").write_text("{broken\n" * 2, encoding="utf-8")
         with pytest.raises(LatheError, match=r"trials\.log: no journal of Optuna"):
-            tune.Tuning.load(tmp_path)
+            tune.load(tmp_path)
 
     def test_a_folder_holds_one_tuning_and_no_sweep(self, tuned, piston, client):
         path = tuned.folder.path

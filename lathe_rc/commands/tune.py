@@ -17,7 +17,9 @@ from lathe_rc.commands import scenario as scenarios
 from lathe_rc.commands.sweep import INTERRUPTED, Watch, pairs, space_of
 from lathe_rc.errors import InputError
 from lathe_rc.sweep import history, row
-from lathe_rc.sweep.tune import BATCH, SAMPLERS, Trial, Tuning
+from lathe_rc.sweep.study import BATCH
+from lathe_rc.sweep.tune import SAMPLERS
+from lathe_rc.sweep.tuned import Trial, Tuning
 
 _LAWS = ("normal:", "uniform:")
 _STEPS = 5  # of the history that are shown

@@ -8,7 +8,7 @@ from typing import Any, cast
 import altair as alt
 
 from lathe_rc.sweep.folder import writing
-from lathe_rc.sweep.tune import Trial, Tuning
+from lathe_rc.sweep.tuned import Trial, Tuning
 
 _WIDTH, _HEIGHT = 560, 300
 _FEASIBLE, _OTHER, _BEST, _START = "#1f6f8b", "#c8cdd0", "#c0392b", "#e08e0b"
