@@ -18,7 +18,7 @@ from lathe_rc.commands import sweep as command
 from lathe_rc.control.decoupler import PAPER
 from lathe_rc.control.pid import PidGains
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.sweep import formulas, row, tune
+from lathe_rc.sweep import formulas, history, row, tune
 from lathe_rc.sweep.aims import aims
 from lathe_rc.sweep.free import Free, frees
 from lathe_rc.sweep.space import Space
@@ -439,6 +439,17 @@ def test_the_command_shows_and_writes_what_it_found(tmp_path, monkeypatch, clien
     told = json.loads(CliRunner().invoke(cli.main, [*asked, "--json"]).stdout)
     assert (told["trials"], told["cells"], told["best"]["feasible"]) == (3, 4, True)
     assert told["best"]["goals"]["tool.max_error"] <= told["start"]["goals"]["tool.max_error"]
+
+
+def test_where_nothing_runs_the_command_says_why(tmp_path, monkeypatch, client):
+    monkeypatch.setattr(tune, "client_of", lambda *_: tune.nullcontext(client))
+    monkeypatch.setattr(history, "write", lambda found: found.folder.path / "history.png")
+    asked = ["tune", "piston", "--set", "spindle_encoder.revolutions=0.0", "--free", f"{LEAD}=1e-3:2e-3"]
+    shown = CliRunner().invoke(
+        cli.main, [*asked, "--goal", "tool.max_error", "--trials", "2", "--out", str(tmp_path / "x")]
+    )
+    assert "nothing meets all subjects; allowed: wider ranges" in shown.stdout
+    assert "2 cells did not run to their end, as this one: spindle_encoder" in shown.stdout
 
 
 def test_ctrl_c_says_what_is_kept(tmp_path, monkeypatch, client):

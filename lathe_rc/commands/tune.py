@@ -3,6 +3,7 @@
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -207,6 +208,9 @@ def _show(tuning: Tuning, picture: Path) -> None:
         say(f"best:    lathe run {folder / 'best.yaml'} (trial {best.number})")
     else:
         say("nothing meets all subjects; allowed: wider ranges, weaker subjects, more trials")
+        reasons = Counter(filter(None, tuning.folder.table(["reason"]).column("reason").to_pylist()))
+        for reason, count in reasons.most_common(1):
+            say(f"{count} cells did not run to their end, as this one: {reason}")
     say(f"history: {picture}, {picture.with_suffix('.html')}")
     say(f"rows:    lathe sweep show {folder} --cell {_first_cell(tuning, best or start)}")
 
