@@ -33,6 +33,7 @@ COMMANDS = {
     "run": "Run a scenario to its end.",
     "study": "Compute a table or figure of the papers.",
     "sweep": "Compute many variations of a scenario into a table.",
+    "tune": "Search the parameters of a scenario that meet goals best.",
     "view": "Show a bag in Rerun.",
 }  #: their summaries
 _BESIDES = {"container": "node"}  # commands in the module of another one

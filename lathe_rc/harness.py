@@ -59,6 +59,7 @@ if TYPE_CHECKING:
 
     from lathe_rc.sweep.space import Space
     from lathe_rc.sweep.sweep import Sweep
+    from lathe_rc.sweep.tuned import Tuning
 
 Mode = Literal["offline", "composed", "processes"]
 Event = Mapping[str, Any]
@@ -332,6 +333,13 @@ def budget(
         feed: 16.9 %
     """
     return budgets.budget(scenario, threads=threads, watch=watch)
+
+
+def tune(scenario: Scenario, free: Mapping[str, Any], goals: Sequence[str], folder: Path, **options: Any) -> "Tuning":
+    """Search parameters of a cell; the arguments are those of `lathe_rc.sweep.tune.run`."""
+    from lathe_rc.sweep import tune
+
+    return tune.run(scenario, free, goals, folder, **options)
 
 
 def _run(

@@ -196,7 +196,7 @@ def test_a_row_says_what_the_run_says(piston: Scenario) -> None:
     assert found["tool.max_errors"].tolist() == errors.largest.tolist()
     assert (found["tool.rms_error"], found["tool.first_rms_error"]) == (errors.rms[-1], errors.rms[0])
     assert found[asked.name] == np.abs(effort[errors.starts[-2] : errors.starts[-1]]).max()
-    assert found["digest"] == row.digest(result.recording)
+    assert found["digest"] == row.digest(result.recording, [])
     assert 0.0 < found["margin"] < 1.0
     assert found["tool.in_tolerance_from"] == result.verdict.since > 1
 
@@ -263,7 +263,7 @@ def test_a_sweep_goes_on_where_it_was_stopped_and_adds_what_is_new(
     both = Sweep(Folder(tmp_path / "leads"))
     own = piston.nodes["learning_controller"].q_time
     assert both.table().column(Q).to_pylist() == [own, own, own, own, 70e-6]
-    assert row.digest(harness.run(both.scenario(4)).recording) == both.row(4)["digest"]
+    assert row.digest(harness.run(both.scenario(4)).recording, []) == both.row(4)["digest"]
 
 
 def test_a_folder_of_something_else_is_refused(piston: Scenario, client: distributed.Client, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from lathe_rc.sweep.page import Written
 
 _BEST = 5  # cells that are shown
-_INTERRUPTED = 130
+INTERRUPTED = 130
 
 
 class _Sweep(click.Group):
@@ -44,7 +44,7 @@ def sweep() -> None:
     """Compute many variations of a scenario into a table: lathe sweep SCENARIO --vary NODE.PARAM=LOW:HIGH:COUNT."""
 
 
-def _pairs(option: str, texts: Sequence[str], allowed: str) -> dict[str, str]:
+def pairs(option: str, texts: Sequence[str], allowed: str) -> dict[str, str]:
     """By target, of ``TARGET=...``."""
     found: dict[str, str] = {}
     for text in texts:
@@ -61,9 +61,7 @@ def space_of(
     vary: Sequence[str], draw: Sequence[str], tie: Sequence[str], sample: str, seeds: int, cells: Path | None
 ) -> Space:
     """The space that options name: with a sample, ranges without a count are part of it."""
-    varied = _pairs(
-        "--vary", vary, "NODE.PARAM=LOW:HIGH:COUNT, =LOW:HIGH:COUNT:log, =A,B,C, or =LOW:HIGH of a --sample"
-    )
+    varied = pairs("--vary", vary, "NODE.PARAM=LOW:HIGH:COUNT, =LOW:HIGH:COUNT:log, =A,B,C, or =LOW:HIGH of a --sample")
     ranges = {target: told for target, told in varied.items() if sample and told.count(":") == 1}
     ranges |= {
         target: told for target, told in varied.items() if sample and told.count(":") == 2 and told.endswith(":log")
@@ -71,8 +69,8 @@ def space_of(
     return Space(
         grid={target: told for target, told in varied.items() if target not in ranges},
         sampled=ranges
-        | _pairs("--draw", draw, "NODE.PARAM=normal:DEVIATION, =normal:MEAN:DEVIATION or =uniform:LOW:HIGH"),
-        ties=_pairs("--tie", tie, "NODE.PARAM=FORMULA"),
+        | pairs("--draw", draw, "NODE.PARAM=normal:DEVIATION, =normal:MEAN:DEVIATION or =uniform:LOW:HIGH"),
+        ties=pairs("--tie", tie, "NODE.PARAM=FORMULA"),
         sample=sample,
         seeds=seeds,
         given=given(cells) if cells else (),
@@ -161,7 +159,7 @@ def run(
             f"lathe: stopped; {progress.done} of {progress.cells} cells are in {place}: the same command goes on",
             err=True,
         )
-        raise click.exceptions.Exit(_INTERRUPTED) from None
+        raise click.exceptions.Exit(INTERRUPTED) from None
     _show(found, as_json=as_json)
 
 
@@ -192,6 +190,10 @@ class Watch:
 
     def __exit__(self, *exception: object) -> None:
         self._bar.stop()
+
+    def describe(self, text: str) -> None:
+        """Say what is going on."""
+        self._bar.update(self._task, description=text)
 
     def __call__(self, event: Mapping[str, Any]) -> None:
         """Take an event of `lathe_rc.sweep.sweep.run`."""
@@ -283,7 +285,7 @@ def show(folder: Path, cell: int | None, bag: Path | None, goal: str | None, *, 
         raise InputError(f"--goal {goal} with --cell {cell}; allowed: one of them")
     result = harness.run(found.scenario(cell), bag=bag)
     kept = found.row(cell)
-    same = row.digest(result.recording) == kept["digest"]
+    same = row.digest(result.recording, found.folder.measures) == kept["digest"]
     if as_json:
         click.echo(json.dumps({**result.summary(), "cell": cell, "same_digest": same}))
     else:

@@ -2,12 +2,12 @@
 """The folder of a sweep: the cell that is varied, the spaces that were asked for, and the rows as a Parquet data set.
 
 DIR/scenario.yaml    the cell, as it was given
-DIR/sweep.json       its identity, what is measured, the spaces
+DIR/sweep.json       its identity, what is measured, the spaces, or what is tuned
 DIR/rows/*.parquet   a row a cell, see `lathe_rc.sweep.row`
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -42,6 +42,7 @@ class Folder:
         scenario: the cell that is varied.
         measures: what is measured of each, beside the rest.
         spaces: that were asked for, in order.
+        tuning: what is tuned, see `lathe_rc.sweep.tune`; its ``targets`` are columns. None: it is no tuning.
 
     Raises:
         InputError: it holds no sweep.
@@ -62,10 +63,17 @@ class Folder:
             )
         self.measures = [Measure(*each) for each in told["measures"]]
         self.spaces = [Space(**each) for each in told["spaces"]]
+        self.tuning: Mapping[str, Any] | None = told.get("tuning")
 
     @staticmethod
-    def begin(path: Path, scenario: Scenario, space: Space, measures: Sequence[Measure]) -> "Folder":
-        """The sweep of a folder, which is made if it is not there, with one more space.
+    def begin(
+        path: Path,
+        scenario: Scenario,
+        space: Space | None,
+        measures: Sequence[Measure],
+        tuning: Mapping[str, Any] | None = None,
+    ) -> "Folder":
+        """The sweep of a folder, which is made if it is not there, with one more space; or its tuning.
 
         Raises:
             InputError: it holds something else.
@@ -74,16 +82,18 @@ class Folder:
         new = not (path / "sweep.json").exists()
         if new and path.exists() and (not path.is_dir() or any(each.name != "lock" for each in path.iterdir())):
             raise InputError(f"{path} holds something else than a sweep; allowed: a new folder, or that of a sweep")
-        spaces = [] if new else Folder(path).spaces
-        space = Space(**space.to_json())
+        spaces = []
         if not new:
             there = Folder(path)
+            spaces = there.spaces
             if there.scenario.to_yaml(given=True) != scenario.to_yaml(given=True):
                 raise InputError(f"{path} holds a sweep of another cell ({there.scenario.name}); allowed: a new folder")
             if there.measures != list(measures):
                 named = ", ".join(each.name for each in there.measures) or "nothing"
                 raise InputError(f"{path}: measures {named} beside the rest; allowed: the same, or a new folder")
-        if space not in spaces:
+            if there.tuning != tuning:
+                raise InputError(f"{path} holds {_difference(there.tuning, tuning)}; allowed: a new folder")
+        if space is not None and (space := Space(**space.to_json())) not in spaces:
             spaces.append(space)
         told = {
             "format": _FORMAT,
@@ -91,8 +101,9 @@ class Folder:
             "identity": scenario.identity,
             "measures": [list(each) for each in measures],
             "spaces": [each.to_json() for each in spaces],
+            **({} if tuning is None else {"tuning": tuning}),
         }
-        with _writing(path):
+        with writing(path):
             (path / "rows").mkdir(parents=True, exist_ok=True)
             if new:
                 with files.replacing(path / "scenario.yaml") as stream:
@@ -102,15 +113,18 @@ class Folder:
         return Folder(path)
 
     @contextmanager
-    def locked(self) -> Iterator[None]:
+    def locked(self, *, wait: bool = False) -> Iterator[None]:
         """Keep others from computing into the folder.
+
+        Args:
+            wait: for somebody who does already.
 
         Raises:
             InputError: somebody does already.
         """
         lock = filelock.FileLock(self.path / "lock")
         try:
-            lock.acquire(blocking=False)
+            lock.acquire(blocking=wait)
         except filelock.Timeout:
             raise InputError(f"{self.path}: another sweep computes into it; allowed: one at a time") from None
         try:
@@ -121,7 +135,9 @@ class Folder:
     @property
     def targets(self) -> list[str]:
         """What differs between the cells."""
-        return list(dict.fromkeys(target for space in self.spaces for target in space.targets() if target != "seed"))
+        tuned: Sequence[str] = self.tuning["targets"] if self.tuning else ()
+        named = [*tuned, *(target for space in self.spaces for target in space.targets())]
+        return [target for target in dict.fromkeys(named) if target != "seed"]
 
     @property
     def schema(self) -> pa.Schema:
@@ -189,13 +205,27 @@ class Folder:
             LatheError: it cannot be written; what was written before is there still.
         """
         place = self.path / "rows"
-        taken = [int(path.stem) for path in place.glob("*.parquet") if path.stem.isdigit()]
-        with _writing(self.path), files.replacing(place / f"{max(taken, default=-1) + 1:06d}.parquet") as stream:
-            pyarrow.parquet.write_table(pa.concat_tables(rows), cast("Any", stream), compression="zstd")
+        with writing(self.path), filelock.FileLock(self.path / "write.lock"):  # a tuning is computed by several
+            taken = [int(path.stem) for path in place.glob("*.parquet") if path.stem.isdigit()]
+            with files.replacing(place / f"{max(taken, default=-1) + 1:06d}.parquet") as stream:
+                pyarrow.parquet.write_table(pa.concat_tables(rows), cast("Any", stream), compression="zstd")
+
+
+def _difference(there: Mapping[str, Any] | None, asked: Mapping[str, Any] | None) -> str:
+    """What a folder holds that is not what is asked for, in words."""
+    if there is None or asked is None:
+        return "a sweep" if there is None else "a tuning"
+    name = next(name for name in there if there[name] != asked[name])
+    return f"a tuning with {name} {shown(json.dumps(there[name]))}, not {shown(json.dumps(asked[name]))}"
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
+def writing(path: Path) -> Iterator[None]:
+    """Say in one line why something cannot be written to a folder.
+
+    Raises:
+        LatheError: it cannot.
+    """
     try:
         yield
     except OSError as error:

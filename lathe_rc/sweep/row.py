@@ -15,7 +15,7 @@
 | limits | nodes that came to a limit of a command or a way |
 | TOPIC.FIELD:STATISTIC | what was asked to be measured, over the last revolution |
 | revolutions, samples, seconds | computed, and how long that took |
-| seed, version, digest | of the random parts; of lathe_rc; SHA-256 of the form error of all samples, little-endian |
+| seed, version, digest | of the random parts; of lathe_rc; see `digest` |
 """
 
 import hashlib
@@ -28,7 +28,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from lathe_rc.analysis.metrology import FormErrors
+from lathe_rc.analysis.metrology import FormErrors, form_errors
 from lathe_rc.analysis.tolerance import judge
 from lathe_rc.cell import messages
 from lathe_rc.cell.batch import Errors
@@ -138,6 +138,8 @@ class _Keeper(Errors):
             (stage.parameters.tolerance for stage in cell.stages.values() if isinstance(stage, Tool)), 0.0
         )
         self._measures = [(each, np.empty(samples)) for each in measures]
+        # A cell without a tool has no form error, but revolutions all the same.
+        self._turned = np.empty(samples if measures and self._encoder and not self._tool else 0)
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
@@ -145,28 +147,39 @@ class _Keeper(Errors):
         for topic in self.heard:
             if any(message.values["action"].startswith(LIMITS) for message in sparse.get(topic, ())):
                 self.limited.add(topic.removesuffix("/events"))
+        if self._turned.size and self._encoder:
+            self._turned[first : first + samples] = dense[self._encoder]["angle_true"]
         for asked, kept in self._measures:
             kept[first : first + samples] = dense[asked.topic][asked.field]
 
     def measured(self, errors: FormErrors) -> dict[str, float]:
         """By column; over the whole run, if there is no complete revolution."""
-        last = slice(*errors.starts[-2:]) if errors.rms.size else slice(None)
+        starts = errors.starts if self._tool else form_errors(self._turned, self._turned).starts
+        last = slice(*starts[-2:]) if starts.size > 1 else slice(None)
         return {asked.name: STATISTICS[asked.statistic](kept[last]) for asked, kept in self._measures}
 
     @property
-    def digest(self) -> str:
+    def digest(self) -> str | None:
         """See `digest`."""
-        return _digest(self._error)
+        return _digest([self._error] if self._tool else [kept for _, kept in self._measures])
 
 
-def digest(recording: Recording) -> str | None:
-    """What stands in the row of a cell that was run again; None without a tool or a complete revolution."""
-    has_errors = recording.errors.rms.size
-    return _digest(recording.of_type(messages.TOOL)["error"]) if has_errors else None
+def digest(recording: Recording, measures: Sequence[Measure]) -> str | None:
+    """What stands in the row of a cell that was run again.
+
+    SHA-256 of all samples, little-endian, of the form error; of a cell without a tool, of what is measured. None where
+    there is neither.
+    """
+    if messages.TOOL in (recording.types[topic] for topic in recording.dense):
+        return _digest([recording.of_type(messages.TOOL)["error"]])
+    return _digest([recording.dense[messages.full(each.topic)][each.field] for each in measures])
 
 
-def _digest(error: Samples) -> str:
-    return hashlib.sha256(error.astype("<f8", copy=False).data).hexdigest()
+def _digest(kept: Sequence[Samples]) -> str | None:
+    found = hashlib.sha256()
+    for samples in kept:
+        found.update(samples.astype("<f8", copy=False).data)
+    return found.hexdigest() if kept else None
 
 
 def compute(
@@ -204,6 +217,7 @@ def _found(cell: Cell, keeper: _Keeper) -> dict[str, Any]:
         "limits": ", ".join(sorted(keeper.limited)),
         "samples": cell.samples,
         "revolutions": errors.rms.size,
+        "digest": keeper.digest,
         **keeper.measured(errors),
     }
     if errors.rms.size:
@@ -214,7 +228,6 @@ def _found(cell: Cell, keeper: _Keeper) -> dict[str, Any]:
             "tool.first_rms_error": errors.rms[0],
             "tool.max_error": errors.largest[-1],
             "tool.rms_error": errors.rms[-1],
-            "digest": keeper.digest,
         }
     if keeper.tolerance:
         found["tool.in_tolerance_from"] = judge(errors.largest, keeper.tolerance).since or None

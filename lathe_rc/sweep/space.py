@@ -33,7 +33,7 @@ from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Row, Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, shown
-from lathe_rc.sweep.formulas import Formulas, ordered
+from lathe_rc.sweep.ties import Formulas, ordered
 
 SAMPLERS = ("sobol", "halton", "latin", "random")
 _MOST_POINTS = 2**24
@@ -103,7 +103,7 @@ class Space:
 
     def count(self, scenario: Scenario) -> int:
         """How many cells there are."""
-        axes = [len(_axis(scenario, target, told)) for target, told in self.grid.items()]
+        axes = [len(axis(scenario, target, told)) for target, told in self.grid.items()]
         return math.prod(axes) * max(self._points(), 1) * max(len(self.given), 1) * self.seeds
 
     def check(self, scenario: Scenario) -> None:
@@ -137,7 +137,7 @@ class Space:
 
     def cells(self, scenario: Scenario) -> Iterator[dict[str, Value]]:
         """The values of each cell, by target."""
-        axes = {target: _axis(scenario, target, told) for target, told in self.grid.items()}
+        axes = {target: axis(scenario, target, told) for target, told in self.grid.items()}
         first_seed = scenario.shared.seed
         formulas = Formulas(scenario, self.ties)
         for given in self.given or ({},):
@@ -194,7 +194,7 @@ def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArr
         yield piece
 
 
-def _number(scenario: Scenario, target: str, text: str) -> float:
+def number(scenario: Scenario, target: str, text: str) -> float:
     """A number, or a part of the scenario's value."""
     plain = text.strip()
     found = ros_yaml.scalar(plain.removesuffix("%"))
@@ -210,7 +210,7 @@ def _number(scenario: Scenario, target: str, text: str) -> float:
     return float(found) / 100.0 * base
 
 
-def _axis(scenario: Scenario, target: str, told: str | Sequence[Value]) -> Sequence[Value]:
+def axis(scenario: Scenario, target: str, told: str | Sequence[Value]) -> Sequence[Value]:
     """The values of a grid, each once.
 
     Raises:
@@ -238,7 +238,7 @@ def _told(scenario: Scenario, target: str, told: str) -> Sequence[Value]:
         raise InputError(
             f"{target}={shown(told)}; allowed: LOW:HIGH:COUNT, LOW:HIGH:COUNT:log, or values between commas"
         )
-    low, high = (_number(scenario, target, text) for text in parts[:2])
+    low, high = (number(scenario, target, text) for text in parts[:2])
     if log and not min(low, high) > 0.0:
         raise InputError(f"{target}={shown(told)}; allowed on a log range: ends above 0")
     count = int(parts[2])
@@ -268,7 +268,7 @@ def _value(scenario: Scenario, target: str, row: Row, text: str) -> Value:
     if not row.is_list and row.type is str:
         return text.strip("'\"")
     if not row.is_list and row.type in (int, float) and text.endswith("%"):
-        found = _number(scenario, target, text)
+        found = number(scenario, target, text)
         return found if row.type is float else round(found)
     return ros_yaml.parse_value(text, target)
 
@@ -300,7 +300,7 @@ def _drawn(scenario: Scenario, target: str, told: str) -> Drawn:
             f"{target}={shown(told)}; allowed: LOW:HIGH, LOW:HIGH:log, uniform:LOW:HIGH, normal:MEAN:DEVIATION or "
             "normal:DEVIATION"
         )
-    first, second = (_number(scenario, target, text) for text in rest)
+    first, second = (number(scenario, target, text) for text in rest)
     if name == "normal" and second < 0.0:
         raise InputError(f"{target}={shown(told)}; allowed: a deviation from 0")
     if name == "log" and not min(first, second) > 0.0:

@@ -71,7 +71,7 @@ class Sweep:
         return self.folder.scenario.varied(self.folder.values(number))
 
 
-def _ignore(event: Mapping[str, Any]) -> None:
+def ignore(event: Mapping[str, Any]) -> None:
     """Watch nothing."""
 
 
@@ -85,7 +85,7 @@ def run(
     scheduler: str | None = None,
     workers: int | None = None,
     client: distributed.Client | None = None,
-    watch: Watch = _ignore,
+    watch: Watch = ignore,
 ) -> Sweep:
     """Compute the cells of a space that are not in the folder yet.
 
@@ -132,24 +132,36 @@ def run(
             with nullcontext(client) if client else client_of(scheduler, workers) as crew:
                 watch({"event": "ready", "dashboard": crew.dashboard_link})
                 jobs = (job for job in _jobs(kept, space) if job.key not in there)
-                with closing(rows(crew, _order(kept), jobs, left)) as found:
-                    _keep(kept, found, watch)
+                with closing(rows(crew, order_of(kept), jobs, left)) as found:
+                    keep(kept, found, watch)
     return Sweep(kept)
 
 
-def _order(folder: Folder) -> Order:
+def order_of(folder: Folder) -> Order:
+    """What all jobs of a folder have in common."""
     scenario = folder.scenario
     text = scenario.to_yaml(given=True)
     return Order(scenario.name, text, scenario.identity, folder.targets, folder.measures, folder.schema)
 
 
-def _keep(folder: Folder, found: Iterator[pa.Table], watch: Watch) -> None:
-    """Write rows as they come, a file now and then; those that have come when something ends it, too."""
+def keep(
+    folder: Folder, found: Iterator[pa.Table], watch: Watch, take: Callable[[pa.Table], None] | None = None
+) -> None:
+    """Write rows as they come, a file now and then; those that have come when something ends it, too.
+
+    Args:
+        folder: of the rows.
+        found: see `lathe_rc.sweep.workers.rows`.
+        watch: see `run`.
+        take: gets the rows as well, before they are written.
+    """
     waiting: list[pa.Table] = []
     written = time.monotonic()
     try:
         for table in found:
             waiting.append(table)
+            if take:
+                take(table)
             watch({"event": "rows", "statuses": Counter(table.column("status").to_pylist())})
             if time.monotonic() > written + _WRITE:
                 some, waiting = waiting, []
@@ -162,7 +174,7 @@ def _keep(folder: Folder, found: Iterator[pa.Table], watch: Watch) -> None:
 
 def _jobs(folder: Folder, space: Space) -> Iterator[Job]:
     """All cells of a space, numbered through all spaces of the folder in the order in which they were asked for."""
-    key = _Key(folder)
+    key = Key(folder)
     if folder.spaces == [space]:
         for number, values in enumerate(space.cells(folder.scenario)):
             yield Job(number, key.of(values), values)
@@ -176,7 +188,7 @@ def _jobs(folder: Folder, space: Space) -> Iterator[Job]:
                 yield Job(number, found, values)
 
 
-class _Key:
+class Key:
     """Identity of a cell: that of the scenario, what is measured, and the values that are not the scenario's own."""
 
     def __init__(self, folder: Folder) -> None:

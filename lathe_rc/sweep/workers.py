@@ -192,5 +192,5 @@ def _next(size: int, found: pa.Table) -> int:
     """How many cells the next task has."""
     took: float = sum(found.column("seconds").to_pylist())
     fitting: int = round(TASK * found.num_rows / max(took, 1e-6))
-    grown = _GROWTH * max(size, int(found.num_rows))
+    grown: int = _GROWTH * max(size, found.num_rows)
     return max(1, min(fitting, grown, _MOST))
