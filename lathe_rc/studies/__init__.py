@@ -7,8 +7,10 @@ from lathe_rc.extensions import Objects
 from lathe_rc.studies import (
     angle_domain,
     coupling,
+    best_law,
     decoupling,
     drive_models,
+    drive_tolerance,
     invariance,
     multichannel,
     piston,
@@ -27,6 +29,7 @@ _OWN: dict[str, Study[Any]] = {
         speed_deviation,
         sensor_map,
         robust,
+        best_law,
         multichannel,
         piston,
         angle_domain,
@@ -35,6 +38,7 @@ _OWN: dict[str, Study[Any]] = {
         sampled_servo,
         decoupling,
         coupling,
+        drive_tolerance,
     )
 }
 

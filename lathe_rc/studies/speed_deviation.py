@@ -29,11 +29,11 @@ Overrides = Mapping[str, object]
 _CYCLES = 50  # learned at constant speed
 _SHOWN = 1.0  # [s] of deviation, at least a period and a half
 _DYNAMIC = "second_order_inverse_dynamic"
-_COLOURS = {
+COLOURS = {
     "time_periodic": "#7f7f7f",
     "constant_lead": "#c0392b",
     "variable_lead": "#e08e0b",
-    "variable_lead_second_order": "#b7950b",
+    "variable_lead_second_order": "#6e2c00",
     "second_order_inverse": "#7d3c98",
     "second_order_inverse_dynamic": "#2874a6",
     "exact_preview": "#148f77",
@@ -41,7 +41,7 @@ _COLOURS = {
     "adaptive_inverse": "#111111",
     "disturbance_controller": "#1e8449",
 }
-LAWS = tuple(_COLOURS)
+LAWS = tuple(COLOURS)
 OURS = "disturbance_controller"  #: the last of the laws: a stage of its own, in a cell of its own
 _TRACES = ("constant_lead", "variable_lead", "adaptive_inverse", OURS)
 
@@ -124,13 +124,13 @@ class SpeedDeviationResult:
         for axes, (place, wd) in zip(panels, shown, strict=True):
             for law in _TRACES:
                 turns, error = self.traces[law][place]
-                axes.plot(turns, error, color=_COLOURS[law], lw=0.8, label=law.replace("_", " "))
+                axes.plot(turns, error, color=COLOURS[law], lw=0.8, label=law.replace("_", " "))
             axes.set(xlabel="revolutions since the deviation began", ylabel="form error [µm]")
             axes.set_title(f"deviation at {wd:g} rad/s", fontsize=10)
         order = np.argsort(given.wd)
         for law in LAWS:
             overview.loglog(
-                np.array(given.wd)[order], np.array(self.largest[law])[order], ".-", color=_COLOURS[law],
+                np.array(given.wd)[order], np.array(self.largest[law])[order], ".-", color=COLOURS[law],
                 label=law.replace("_", " "), lw=1.0,
             )  # fmt: skip
         overview.set(xlabel="frequency of the deviation [rad/s]", ylabel="largest form error [µm]")
@@ -144,7 +144,13 @@ def _figure(value: float) -> str:
     return f"{value:.3g}"
 
 
-def _settings(parameters: SpeedDeviationParameters) -> dict[str, list[Overrides]]:
+def _models(parameters: SpeedDeviationParameters) -> list[Overrides]:
+    """The wrong models that laws begin with."""
+    ends = (1 - parameters.model_error, 1 + parameters.model_error)
+    return [{"model_natural_frequency": 1038.0 * w, "model_damping": 0.804 * z} for w, z in product(ends, ends)]
+
+
+def settings(parameters: SpeedDeviationParameters) -> dict[str, list[Overrides]]:
     """Parameters of the learning controller by law; several where the worst counts."""
     lead, q = parameters.t0_ms * 1e-3, parameters.q_us * 1e-6
     delay = 0.36e-3  # of the drive: all that an inverse leaves to the lead
@@ -159,8 +165,6 @@ def _settings(parameters: SpeedDeviationParameters) -> dict[str, list[Overrides]
         "soft_start": 1.0,
     }
     plain: Overrides = {"lead_time": lead, "q_time": q}
-    ends = (1 - parameters.model_error, 1 + parameters.model_error)
-    models = [{"model_natural_frequency": 1038.0 * w, "model_damping": 0.804 * z} for w, z in product(ends, ends)]
     return {
         "time_periodic": [{**plain, "law": "time_periodic"}],
         "constant_lead": [{**plain, "lead_law": "constant_angle"}],
@@ -170,8 +174,7 @@ def _settings(parameters: SpeedDeviationParameters) -> dict[str, list[Overrides]
         "second_order_inverse_dynamic": [{**inverse, "correction": _DYNAMIC}],
         "exact_preview": [{**inverse, "correction": _DYNAMIC, "lead_law": "exact_preview"}],
         "exact_invariance": [{**plain, "correction": "exact", "lead_law": "exact_preview"}],
-        "adaptive_inverse": [{**adaptive, **model} for model in models],
-        OURS: [{**model, "model_delay": delay} for model in models],
+        "adaptive_inverse": [{**adaptive, **model} for model in _models(parameters)],
     }
 
 
@@ -225,9 +228,9 @@ def run(parameters: SpeedDeviationParameters, track: Track = untracked) -> Speed
     largest: dict[str, list[float]] = {law: [] for law in LAWS}
     rms: dict[str, list[float]] = {law: [] for law in LAWS}
     traces: dict[str, list[tuple[Array, Array]]] = {law: [] for law in _TRACES}
-    settings = _settings(parameters)
+    of = {**settings(parameters), OURS: _models(parameters)}
     for wd, law in track(list(product(parameters.wd, LAWS))):
-        runs = [_run_cell(parameters, wd, law, controller) for controller in settings[law]]
+        runs = [_run_cell(parameters, wd, law, controller) for controller in of[law]]
         turns, error = max(runs, key=lambda run: float(np.abs(run[1]).max()))
         largest[law].append(float(np.abs(error).max()))
         rms[law].append(float(np.sqrt(np.mean(error**2))))

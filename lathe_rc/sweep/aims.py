@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a tuning wants of a cell: goals, subjects, and over which share of the cells.
+
+A goal is a column of a row (`lathe_rc.sweep.row`): as small as it can be, with a minus before it as large as it can be.
+A subject is a limit of a column. What counts of several cells, plants and spindles, is the worst of them or a
+percentile; a cell that was refused, that diverged or failed is as bad as none.
+"""
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stages.learner import Learner
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError, shown
+from lathe_rc.names import instead
+from lathe_rc.sweep import row
+from lathe_rc.sweep.row import Measure
+
+_SUBJECT = re.compile(r"(?P<column>.+?)\s*(?P<sense>>=|<=)\s*(?P<bound>\S+)")
+
+
+class Goal(NamedTuple):
+    """A column, and whether it shall be as large as it can be in place of as small."""
+
+    column: str
+    largest: bool
+
+    @property
+    def sign(self) -> float:
+        """Of the column in the cost, of which less is better."""
+        return -1.0 if self.largest else 1.0
+
+
+class Subject(NamedTuple):
+    """A limit of a column, from below or from above."""
+
+    column: str
+    below: bool
+    bound: float
+
+    def violation(self, value: float) -> float:
+        """How far a value is beyond, in parts of the limit; up to 0 if it is within."""
+        beyond = self.bound - value if self.below else value - self.bound
+        return beyond / (abs(self.bound) or 1.0)
+
+
+class Score(NamedTuple):
+    """What came of the cells of a trial.
+
+    Attributes:
+        costs: of the goals, less is better; infinite where a cell that counts has no value.
+        violations: of "it runs to its end" and of the subjects; up to 0 if it is met.
+        margin: see `lathe_rc.sweep.row`, of the cell that counts; NaN: no cell learns.
+    """
+
+    costs: tuple[float, ...]
+    violations: tuple[float, ...]
+    margin: float
+
+    @property
+    def feasible(self) -> bool:
+        """Whether everything is met."""
+        return all(violation <= 0.0 for violation in self.violations)
+
+
+@dataclass(frozen=True)
+class Aims:
+    """What is wanted.
+
+    Attributes:
+        goals: one, or two and more to be traded off.
+        subjects: that have to be met.
+        percentile: that counts of the cells; 100: the worst.
+        measures: columns of goals and subjects beside those of all rows.
+    """
+
+    goals: Sequence[Goal]
+    subjects: Sequence[Subject]
+    percentile: float
+    measures: Sequence[Measure]
+
+    @property
+    def columns(self) -> list[str]:
+        """Columns that a score is made of."""
+        named = [goal.column for goal in self.goals] + [subject.column for subject in self.subjects]
+        return list(dict.fromkeys(["status", "margin", *named]))
+
+    def score(self, rows: Iterable[Mapping[str, Any]]) -> Score:
+        """What came of the cells of a trial.
+
+        Args:
+            rows: with `columns`, one or more.
+        """
+        cells = list(rows)
+        costs = [self._counts(_cost(cell, goal) for cell in cells) for goal in self.goals]
+        violations = [self._counts(_stops(cell, self.goals) for cell in cells)]
+        violations += [self._counts(_violation(cell, subject) for cell in cells) for subject in self.subjects]
+        margins = [-cell["margin"] for cell in cells if cell["margin"] is not None]
+        margin = -self._counts(margins) if margins else math.nan
+        return Score(tuple(costs), tuple(violations), margin)
+
+    def _counts(self, values: Iterable[float]) -> float:
+        """Of the cells' values, of which less is better: the value of one of them."""
+        return float(np.percentile(list(values), self.percentile, method="inverted_cdf"))
+
+
+def _known(value: float | None) -> bool:
+    return value is not None and math.isfinite(value)
+
+
+def _cost(cell: Mapping[str, Any], goal: Goal) -> float:
+    value = cell[goal.column]
+    return goal.sign * value if cell["status"] == row.DONE and _known(value) else math.inf
+
+
+def _stops(cell: Mapping[str, Any], goals: Sequence[Goal]) -> float:
+    """How far a cell is from running to its end with a value of each goal: by its margin, if it is refused for that."""
+    if cell["status"] == row.DONE:
+        return 0.0 if all(_known(cell[goal.column]) for goal in goals) else 1.0
+    margin = cell["margin"]
+    return -margin if _known(margin) and margin < 0.0 else 1.0
+
+
+def _violation(cell: Mapping[str, Any], subject: Subject) -> float:
+    """A refused cell may have a margin all the same; what it does not tell is for `_stops` to say."""
+    value = cell[subject.column]
+    if _known(value):
+        return subject.violation(value)
+    return 0.0 if cell["status"] != row.DONE else 1.0
+
+
+def aims(
+    scenario: Scenario,
+    goals: Sequence[str],
+    subjects: Sequence[str] = (),
+    *,
+    measures: Sequence[str] = (),
+    percentile: float = 100.0,
+) -> Aims:
+    """What texts want.
+
+    Args:
+        scenario: that is tuned.
+        goals: ``COLUMN`` or ``-COLUMN``; a column may be ``TOPIC.FIELD:STATISTIC``.
+        subjects: ``COLUMN>=NUMBER`` or ``COLUMN<=NUMBER``.
+        measures: further columns.
+        percentile: see `Aims`.
+
+    Raises:
+        InputError: no goal, no such column, or no limit.
+    """
+    if not goals:
+        raise InputError(f"no goal; allowed: --goal COLUMN, of {', '.join(row.NUMBERS)} or TOPIC.FIELD:STATISTIC")
+    if not 0.0 < percentile <= 100.0:
+        raise InputError(f"percentile {percentile:g}; allowed: above 0 up to 100, which is the worst")
+    wanted = [Goal(text.strip().removeprefix("-"), text.strip().startswith("-")) for text in goals]
+    limits = [_subject(text) for text in subjects]
+    measured = dict.fromkeys(row.measure(text, scenario) for text in measures)
+    cell = Cell(scenario.nodes)
+    missing = {
+        **({} if any(isinstance(stage, Learner) for stage in cell.stages.values()) else {"margin": "nobody learns"}),
+        **(
+            {}
+            if any(source.type == messages.TOOL for source in cell.dense.values())
+            else {name: "there is no tool" for name in row.NUMBERS if name.startswith("tool.")}
+        ),
+    }
+    for what, column in [("goal", goal.column) for goal in wanted] + [("subject", limit.column) for limit in limits]:
+        if ":" in column:
+            measured[row.measure(column, scenario)] = None
+        elif column not in row.NUMBERS:
+            raise InputError(f"{what} {shown(column)!r}: no such column; {_instead(column)}")
+        elif column in missing:
+            raise InputError(
+                f"{what} {column}: {missing[column]} in {scenario.name}; allowed: TOPIC.FIELD:STATISTIC, such as "
+                f"{next(iter(cell.dense))}.FIELD:rms"
+            )
+    if len({goal.column for goal in wanted}) < len(wanted):
+        raise InputError("a goal is given twice; allowed: each once")
+    return Aims(wanted, limits, percentile, list(measured))
+
+
+def _instead(column: str) -> str:
+    told = instead(column, row.NUMBERS)
+    return told if told.startswith("allowed") else f"{told} (or TOPIC.FIELD:STATISTIC)"
+
+
+def _subject(text: str) -> Subject:
+    found = _SUBJECT.fullmatch(text.strip())
+    allowed = "allowed: COLUMN>=NUMBER or COLUMN<=NUMBER, such as margin>=0.2"
+    if not found:
+        raise InputError(f"subject {shown(text)!r}; {allowed}")
+    try:
+        bound = float(found["bound"])
+    except ValueError:
+        bound = math.nan
+    if not math.isfinite(bound):
+        raise InputError(f"subject {shown(text)!r}: {shown(found['bound'])!r} is no number; {allowed}")
+    return Subject(found["column"], found["sense"] == ">=", bound)

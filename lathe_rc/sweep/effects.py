@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the rows of a sweep say of a goal: which parameter it depends on, how much, and how many cells keep to it.
+
+With y the goal of the n cells that have one and the parameter's values in m bins b of n_b cells each,
+
+    between = Σ n_b·(mean_b(y) - mean(y))²      within = Σ_b Σ (y - mean_b(y))²      total = between + within
+    share   = (between - (m - 1)·within/(n - m)) / total
+
+is the part of the variance of y that the parameter explains by itself (first order; ε², Kelley 1935): what m bins of
+pure chance would explain is taken off, so that it may fall a little below 0. In a complete grid nothing is chance, and
+share = between/total with a bin a value is exact: the main effect.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+Samples = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_MOST_BINS = 32  # of a variance share
+LEAST = 8  #: cells below which nothing is said of what depends on what
+_WIDE = 30.0  # largest by smallest value from which on a logarithm shows more
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """A parameter and its values.
+
+    Attributes:
+        name: its target.
+        label: with the unit.
+        values: of the cells, shape (n,); of a text, its place in ``texts``; NaN where there is none.
+        log: whether it was varied on a log range.
+        texts: that stand for 0, 1, ...; empty: the values are numbers.
+        tied: whether a formula gives it.
+    """
+
+    name: str
+    label: str
+    values: Samples
+    log: bool = False
+    texts: Sequence[str] = ()
+    tied: bool = False
+
+    @property
+    def distinct(self) -> Samples:
+        """The values, ascending, each once."""
+        return np.unique(self.values[np.isfinite(self.values)])
+
+
+@dataclass(frozen=True, eq=False)
+class Bins:
+    """The values of an axis in bins.
+
+    Attributes:
+        index: bin of each cell; -1 where it has no value.
+        low, mid, high: ends and middle of the bins.
+    """
+
+    index: Index
+    low: Samples
+    mid: Samples
+    high: Samples
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return self.mid.size
+
+
+def is_wide(values: Samples) -> bool:
+    """Whether numbers span so much that their logarithm shows more."""
+    known = values[np.isfinite(values)]
+    return bool(known.size and known.min() > 0.0 and known.max() > _WIDE * known.min())
+
+
+def bins(axis: Axis, exact: int, most: int) -> Bins:
+    """A bin a value where there are at most ``exact`` of them, else at most ``most`` bins of equal width.
+
+    On a log range the width is that of the logarithm.
+    """
+    distinct = axis.distinct
+    scaled = np.log(distinct) if axis.log else distinct
+    if distinct.size <= exact or axis.texts:
+        index = np.where(np.isfinite(axis.values), np.searchsorted(distinct, axis.values), -1)
+        middle = scaled
+        step = np.diff(middle) if middle.size > 1 else np.array([1.0])
+        edges = np.concatenate(
+            [[middle[0] - step[0] / 2], middle[:-1] + np.diff(middle) / 2, [middle[-1] + step[-1] / 2]]
+        )
+        low, high = edges[:-1], edges[1:]
+    else:
+        edges = np.linspace(scaled[0], scaled[-1], most + 1)
+        with np.errstate(invalid="ignore"):
+            place = np.searchsorted(edges, np.log(axis.values) if axis.log else axis.values, side="right") - 1
+        index = np.where(np.isfinite(axis.values), np.minimum(place, most - 1), -1)
+        low, high = edges[:-1], edges[1:]
+        middle = (low + high) / 2
+    if axis.log:
+        low, middle, high = np.exp(low), np.exp(middle), np.exp(high)
+    return Bins(index.astype(np.int64), low, middle, high)
+
+
+def is_grid(axes: Sequence[Axis], goal: Samples) -> bool:
+    """Whether the cells are all combinations of the values, each equally often, and each has a goal."""
+    free = [axis for axis in axes if not axis.tied]
+    if not free or not np.isfinite(goal).all() or not all(np.isfinite(axis.values).all() for axis in free):
+        return False
+    if float(np.prod([float(axis.distinct.size) for axis in free])) > goal.size:
+        return False
+    combinations, counts = np.unique(np.stack([axis.values for axis in free]), axis=1, return_counts=True)
+    whole = int(np.prod([axis.distinct.size for axis in free]))
+    return combinations.shape[1] == whole and bool((counts == counts[0]).all())
+
+
+def _quantile_bins(values: Samples, count: int) -> Index:
+    """Bins of about as many cells each; equal values share one."""
+    place = np.searchsorted(np.sort(values), values, side="left")
+    return np.unique(place * count // values.size, return_inverse=True)[1].astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What a parameter does to a goal.
+
+    Attributes:
+        share: of the goal's variance that it explains by itself; None: too few cells, or a goal that does not vary.
+        rank: Spearman's correlation, -1 to 1; None also for texts that have no order.
+    """
+
+    share: float | None
+    rank: float | None
+
+
+def effect(axis: Axis, goal: Samples, *, exact: bool = False) -> Effect:
+    """What a parameter does to a goal.
+
+    Args:
+        axis: the parameter.
+        goal: shape (n,); NaN where a cell has none.
+        exact: whether the cells are a complete grid, see `is_grid`.
+    """
+    known = np.isfinite(goal) & np.isfinite(axis.values)
+    y, x = goal[known], axis.values[known]
+    levels = np.unique(x).size
+    if y.size < LEAST or levels < 2 or np.ptp(y) == 0.0:
+        return Effect(None, None)
+    limit = int(np.clip(np.sqrt(y.size) / 2.0, 2, _MOST_BINS))
+    exact = exact and not axis.tied
+    whole = exact or bool(axis.texts) or levels <= limit
+    index = np.unique(x, return_inverse=True)[1] if whole else _quantile_bins(x, limit)
+    counts = np.bincount(index)
+    means = np.bincount(index, weights=y) / counts
+    total = float(((y - y.mean()) ** 2).sum())
+    between = float((counts * (means - y.mean()) ** 2).sum())
+    if not exact:
+        if counts.size >= y.size:
+            return Effect(None, None)
+        between -= (counts.size - 1) * max(total - between, 0.0) / (y.size - counts.size)
+    ordered = not axis.texts or set(axis.texts) == {"false", "true"}
+    rank = float(scipy.stats.spearmanr(x, y).statistic) if ordered else None
+    return Effect(between / total, rank)
+
+
+@dataclass(frozen=True, eq=False)
+class Yield:
+    """How many cells keep to a limit of the goal.
+
+    Attributes:
+        goal: of the cells that have one, ascending.
+        cells: all of them: who came to nothing keeps to no limit.
+        above: the goal is to be large, not small.
+    """
+
+    goal: Samples
+    cells: int
+    above: bool = False
+
+    def share(self, limit: float) -> float:
+        """Of all cells, whose goal is at most, or at least, a limit."""
+        return self._within(limit) / self.cells
+
+    def interval(self, limit: float) -> tuple[float, float]:
+        """Between which the share of all such cells is, with 95 % confidence, if these are a random sample (Wilson)."""
+        found = scipy.stats.binomtest(self._within(limit), self.cells).proportion_ci(0.95, method="wilson")
+        return float(found.low), float(found.high)
+
+    def _within(self, limit: float) -> int:
+        if self.above:
+            return int(self.goal.size - np.searchsorted(self.goal, limit, side="left"))
+        return int(np.searchsorted(self.goal, limit, side="right"))
+
+    def point(self, share: float) -> float | None:
+        """The tightest limit that this share of all cells keeps to; None: not as many came to a goal."""
+        needed = int(np.ceil(share * self.cells - 1e-9))
+        if not 0 < needed <= self.goal.size:
+            return None
+        return float(self.goal[self.goal.size - needed] if self.above else self.goal[needed - 1])
+
+    def curve(self, most: int) -> tuple[Samples, Samples]:
+        """Limits and shares, at most so many points, the first and the last cell among them."""
+        place = np.unique(np.linspace(0, self.goal.size - 1, min(most, self.goal.size)).round().astype(np.int64))
+        kept = self.goal.size - place if self.above else place + 1
+        return self.goal[place], kept / self.cells

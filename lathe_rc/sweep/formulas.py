@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What formulas give for the parameters of a cell, to compare a search with.
+
+Of a learning controller (`lathe_rc.analysis.learning`), with Q, drive and interpolators as they run:
+
+- ``learning_gain``: γ = 1, as in paper 001, eqs 1-5;
+- ``q_time``: the shortest with sup|Q - γZ| <= 1 - margin, since what is left grows with it: (1 - Q)/(γZ + 1 - Q);
+- ``lead_time``: the lag of the drive at low frequencies, with which no slow change of the form is late; where no Q
+  keeps the margin with it, the lead that allows the shortest ``q_time``; where Q is not free, the one with the least
+  sup|Q - γZ|.
+
+Of a force controller (`lathe_rc.analysis.pid_tuning`): the PID with the highest crossover that keeps 60° and 6 dB. Its
+plant is the longitudinal slide W with the cut at the last set point F0: (1 - mc)·F0/v0·p·W/(1 + p·T), v0 the velocity
+that makes F0; the feedback delay is in it, limits, the elasticity and keyways are not.
+"""
+
+import math
+from collections.abc import Callable, Collection
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from lathe_rc.analysis.pid_tuning import fastest
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stages.cutting_process import CuttingProcessParameters
+from lathe_rc.cell.stages.feed_drive import FeedDriveParameters
+from lathe_rc.cell.stages.force_controller import ForceController
+from lathe_rc.cell.stages.learning_controller import LearningController
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError
+from lathe_rc.plants.cutting_force import SpecificForce
+from lathe_rc.transfer import TransferFunction
+
+_PID = ("proportional", "integral", "derivative", "derivative_filter")
+_PHASE_MARGIN, _GAIN_MARGIN = 60.0, 2.0  # [°], factor
+_BAND = (0.1, 1e3)  # [rad/s] of its crossover
+MARGIN = 0.05  #: that is kept where none is asked for
+_SHORTEST, _LONGEST = 1e-6, 1e-3  # [s] of q_time
+_NONE = 1.0  # [s]: in place of a q_time that there is not
+_HALVINGS = 16
+_LEADS = 20  # that are looked at before the best is refined
+_FAR = 2.0  # the longest of them, in lags of the drive
+
+
+class Found(NamedTuple):
+    """What a formula gives.
+
+    Attributes:
+        value: of the parameter.
+        formula: in words.
+    """
+
+    value: float
+    formula: str
+
+
+def settings(scenario: Scenario, targets: Collection[str], margin: float = MARGIN) -> dict[str, Found]:
+    """What formulas give for those of some parameters for which there is one.
+
+    Args:
+        scenario: of the cell; what is not among the targets stays as it says.
+        targets: ``NODE.PARAM``.
+        margin: that learning is to keep, 1 - sup|Q - γZ|.
+    """
+    cell = Cell(scenario.nodes)
+    found: dict[str, Found] = {}
+    for name, stage in cell.stages.items():
+        free = {target.rpartition(".")[2] for target in targets if target.rpartition(".")[0] == name}
+        if isinstance(stage, ForceController) and free & set(_PID):
+            found |= {f"{name}.{key}": value for key, value in _force(scenario, stage).items()}
+        if isinstance(stage, LearningController) and free & {"lead_time", "q_time", "learning_gain"}:
+            found |= {f"{name}.{key}": value for key, value in _learning(cell, stage, free, margin).items()}
+    return {target: found[target] for target in targets if target in found}
+
+
+def _learning(cell: Cell, stage: LearningController, free: Collection[str], margin: float) -> dict[str, Found]:
+    learned, speeds = cell.learned(stage), stage.checked_speeds(*cell.master.speed_range())
+    if not learned or stage.parameters.q_filter == "fir":
+        return {}
+    gain = 1.0 if "learning_gain" in free else stage.parameters.learning_gain
+
+    def factor(lead: float, q_time: float) -> float:
+        """sup|Q - γZ|; infinite where the memory cannot hold Q."""
+        changed = {"lead_time": lead, "q_time": q_time, "learning_gain": gain}
+        try:
+            other = LearningController(stage.name, stage.parameters.model_copy(update=changed))
+        except InputError:
+            return math.inf
+        return max(other.worst(response, speed)[0] for response, _ in learned for speed in speeds)
+
+    found: dict[str, Found] = {}
+    lead, q_time = stage.parameters.lead_time, stage.parameters.q_time
+    if "lead_time" in free:
+        lag = max(_lag(response) for response, _ in learned)
+        if "q_time" not in free:
+            lead = _least(lambda each: factor(each, q_time), _FAR * lag)
+            found["lead_time"] = Found(lead, "T0 with the least sup|Q - γZ|")
+        elif _shortest(partial(factor, lag), margin) < _NONE:
+            lead = lag
+            found["lead_time"] = Found(lead, "T0 = lag of the drive")
+        else:
+            lead = _least(lambda each: _shortest(partial(factor, each), margin), _FAR * lag)
+            found["lead_time"] = Found(lead, "T0 that allows the shortest q_time")
+    if "q_time" in free:
+        q_time = _shortest(partial(factor, lead), margin)
+        if q_time == _NONE:
+            return {}
+        found["q_time"] = Found(q_time, f"shortest with sup|Q - γZ| <= {1.0 - margin:.4g}")
+    if "learning_gain" in free:
+        found["learning_gain"] = Found(gain, "γ = 1 (paper 001, eqs 1-5)")
+    return found
+
+
+def _force(scenario: Scenario, stage: ForceController) -> dict[str, Found]:
+    slides = [table for table in scenario.nodes.values() if isinstance(table, FeedDriveParameters)]
+    slides = [table for table in slides if table.axis == "longitudinal" and table.model == "dc_screw"]
+    cuts = [table for table in scenario.nodes.values() if isinstance(table, CuttingProcessParameters)]
+    table = stage.parameters
+    force = table.set_point[-1] if table.set_point else 0.0
+    if len(slides) != 1 or len(cuts) != 1 or not force > 0.0 or not cuts[0].depth > 0.0:
+        return {}
+    (slide,), (cut,) = slides, cuts
+    material = SpecificForce(cut.kc1, cut.mc, cut.wear_factor)
+    velocity = material.feed_for(force / cut.depth, cut.wear) * table.nominal_speed / (2.0 * math.pi)
+    way = slide.transfer()
+    plant = TransferFunction(way.numerator, way.denominator[:-1])  # velocity in place of the way
+    plant *= TransferFunction(((1.0 - cut.mc) * force / velocity,), (cut.lag, 1.0) if cut.lag else (1.0,))
+    margins = {"phase_margin": math.radians(_PHASE_MARGIN), "gain_margin": _GAIN_MARGIN}
+    try:
+        gains = fastest(plant, band=_BAND, **margins, wait=table.feedback_delay * table.step)
+    except InputError:  # no PID keeps these margins: no formula for this plant
+        return {}
+    values = (gains.proportional, gains.integral, gains.derivative, gains.filter)
+    return {name: Found(value, "PID of 60° and 6 dB") for name, value in zip(_PID, values, strict=True)}
+
+
+def _lag(response: Callable[[np.ndarray], np.ndarray]) -> float:
+    """Delay of a drive at low frequencies [s]."""
+    low = 1.0
+    return float(-np.angle(response(np.array([low])))[0] / low)
+
+
+def _least(cost: Callable[[float], float], longest: float) -> float:
+    """The lead with the least cost."""
+    leads = np.linspace(0.0, longest, _LEADS + 1)[1:]
+    best = int(np.argmin([cost(float(lead)) for lead in leads]))
+    ends = float(leads[max(best - 1, 0)]), float(leads[min(best + 1, _LEADS - 1)])
+    found = scipy.optimize.minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 1e-8})
+    return float(found.x)
+
+
+def _shortest(factor: Callable[[float], float], margin: float) -> float:
+    """The shortest time of Q with which the factor is at most 1 - margin; `_NONE` if there is none."""
+    longest = _LONGEST
+    while factor(longest) > 1.0 - margin:  # also where the memory cannot hold Q
+        longest /= 2.0
+        if longest < _SHORTEST:
+            return _NONE
+    low, high = math.log(_SHORTEST), math.log(longest)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if factor(math.exp(middle)) <= 1.0 - margin else (middle, high)
+    return math.exp(high)

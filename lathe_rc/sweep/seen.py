@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is looked at of a sweep: its parameters as axes, its goals, and what the cells came to."""
+
+from functools import cached_property
+from typing import cast
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from lathe_rc.cell.stages.tool import ToolParameters
+from lathe_rc.errors import InputError, shown
+from lathe_rc.names import instead
+from lathe_rc.sweep import row
+from lathe_rc.sweep.effects import Axis
+from lathe_rc.sweep.figures import Goal, said
+from lathe_rc.sweep.folder import Folder
+
+GOAL = "tool.max_error"
+_LARGE = ("margin",)  # goals that are better the larger they are
+_UNITS = {"tool.in_tolerance_from": "revolutions"}
+_MOST_TEXTS = 24  # that are told apart
+
+
+class Seen:
+    """The rows of a sweep, as they are looked at.
+
+    Args:
+        folder: of the sweep.
+        goal: column by which the cells are judged.
+
+    Attributes:
+        folder: see above.
+        goals: columns by which they could be, those that have a value in some cell.
+        goal: the one that was chosen.
+        axes: parameters that differ between the cells.
+        cells: numbers of the cells.
+        table: the rows, without those of each revolution.
+
+    Raises:
+        InputError: no such goal.
+    """
+
+    def __init__(self, folder: Folder, goal: str = GOAL) -> None:
+        known = [*row.NUMBERS, *(each.name for each in folder.measures)]
+        if goal not in known:
+            raise InputError(
+                f"--goal {shown(goal)!r}: no such number in a row of {folder.path}; {instead(goal, known)}"
+            )
+        self.folder = folder
+        self.table = folder.table(["cell", "status", "reason", "limits", "seed", *folder.targets, *known])
+        self.cells: NDArray[np.int64] = self.table.column("cell").to_numpy()
+        found = [self._goal(name) for name in known]
+        self.goal = found[known.index(goal)]
+        self.goals = [each for each in found if np.isfinite(each.values).any()]
+        axes = [self._axis(target) for target in folder.targets]
+        self.axes = [axis for axis in axes if axis.distinct.size > 1]
+
+    def _goal(self, name: str) -> Goal:
+        values = self.table.column(name).to_numpy().astype(np.float64)
+        length = name.startswith("tool.") and name.endswith("_error")
+        values = np.where(np.isfinite(values), values * (1e6 if length else 1.0), np.nan)
+        unit = "µm" if length else _UNITS.get(name, "")
+        return Goal(name, f"{name} [{unit}]" if unit else name, unit, values, name in _LARGE)
+
+    def _axis(self, target: str) -> Axis:
+        column = self.table.column(target)
+        found = column.to_pylist()
+        if pa.types.is_list(column.type) and all(value is None or len(value) == 1 for value in found):
+            found = [None if value is None else value[0] for value in found]
+        tied = any(target in space.ties for space in self.folder.spaces)
+        unit = self.folder.scenario.parameter(target).unit
+        label = target if unit in ("", "1") else f"{target} [{unit}]"
+        if all(value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in found):
+            values = np.array([np.nan if value is None else value for value in found], dtype=np.float64)
+            log = any(told.endswith(":log") for told in self._told(target)) and bool(np.nanmin(values) > 0.0)
+            return Axis(target, label, values, log=log, tied=tied)
+        texts = [None if value is None else text_of(value) for value in found]
+        names = list(dict.fromkeys(text for text in texts if text is not None))
+        names = sorted(names) if set(names) <= {"true", "false"} else names
+        if len(names) > _MOST_TEXTS:
+            names = [*names[: _MOST_TEXTS - 1], f"{len(names) - _MOST_TEXTS + 1} others"]
+        place = {name: float(index) for index, name in enumerate(names)}
+        values = np.array([np.nan if text is None else place.get(text, _MOST_TEXTS - 1.0) for text in texts])
+        return Axis(target, target, values, texts=names, tied=tied)
+
+    def _told(self, target: str) -> list[str]:
+        """How a target was asked for, in each space."""
+        found: list[str] = []
+        for space in self.folder.spaces:
+            if (axis := space.grid.get(target)) is not None:
+                found.append(axis if isinstance(axis, str) else ", ".join(text_of(value) for value in axis))
+            if target in space.sampled:
+                found.append(space.sampled[target])
+            if target in space.ties:
+                found.append(f"= {space.ties[target]}")
+            if any(target in cell for cell in space.given):
+                found.append("cell by cell")
+        return list(dict.fromkeys(found))
+
+    def asked(self) -> list[list[str]]:
+        """A row a target: its name with the unit, how it was asked for, from, to, how many values, the scenario's."""
+        found = []
+        axes = {axis.name: axis for axis in self.axes}
+        for target in self.folder.targets:
+            told, own = "; ".join(self._told(target)), text_of(self.folder.scenario.value(target))
+            axis = axes.get(target)
+            if axis is None:
+                found.append([target, told, "", "", "1", own])
+                continue
+            ends = ["", ""] if axis.texts else [said(float(axis.distinct[0])), said(float(axis.distinct[-1]))]
+            found.append([axis.label, told, *ends, str(axis.distinct.size), own])
+        return found
+
+    @cached_property
+    def seeds(self) -> int:
+        """How many different ones there are."""
+        return len(set(self.table.column("seed").to_pylist()) - {None})
+
+    @property
+    def is_sampled(self) -> bool:
+        """Whether points of a sample are all that differs, so that shares are those of what was drawn."""
+        return all(space.sample and not space.grid and not space.given for space in self.folder.spaces)
+
+    @property
+    def tolerance(self) -> float | None:
+        """Of the form, in the unit of the goal; None: there is none, it is varied itself, or the goal is another."""
+        scenario = self.folder.scenario
+        if self.goal.name != GOAL or any(target.endswith(".tolerance") for target in self.folder.targets):
+            return None
+        tools = [cast("ToolParameters", scenario.nodes[node]) for node in scenario.of_kind("tool")]
+        return tools[0].tolerance * 1e6 if tools and tools[0].tolerance else None
+
+
+def text_of(value: object) -> str:
+    """A value as it is shown."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return shown(value) if value != "" else "(empty)"

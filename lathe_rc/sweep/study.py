@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A tuning on the disk: Optuna's study, and what came of the cells of its trials.
+
+Trials are asked for a batch at a time. Each is drawn with a random generator of its own, from the seed and its number,
+and what came of a batch is told in the order of the numbers: the same search, whoever computes it and when.
+"""
+
+import uuid
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import distributed
+import filelock
+import numpy as np
+import optuna
+import pyarrow as pa
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+from optuna.study import StudyDirection
+from optuna.trial import FrozenTrial, TrialState
+
+from lathe_rc.cell.parameters import Value
+from lathe_rc.errors import LatheError, shown
+from lathe_rc.sweep import formulas
+from lathe_rc.sweep.aims import Score, aims
+from lathe_rc.sweep.folder import Folder, writing
+from lathe_rc.sweep.formulas import Found
+from lathe_rc.sweep.free import frees
+from lathe_rc.sweep.space import Space
+from lathe_rc.sweep.sweep import Key, Watch, keep, order_of
+from lathe_rc.sweep.tuned import Trial, Tuning
+from lathe_rc.sweep.workers import Job, rows
+
+BATCH = 8  #: trials that are asked for at once
+_STUDY = "tuning"
+_POPULATION = 3 * BATCH  # of NSGA-II
+_UNKNOWN = 1e9  # what the samplers are told in place of a cost that there is not: beyond all that there are
+_BY, _SCORE = "by", "score"  # attributes of a trial: who computes it, what came of it
+
+
+class _Lock(JournalFileOpenLock):
+    """Of the journal. The system releases it when who holds it dies; Optuna's own would have to be waited for."""
+
+    def __init__(self, path: Path) -> None:
+        self._lock = filelock.FileLock(path)
+
+    def acquire(self) -> bool:
+        """See `JournalFileOpenLock`."""
+        self._lock.acquire()
+        return True
+
+    def release(self) -> None:
+        """See `JournalFileOpenLock`."""
+        self._lock.release()
+
+
+def _opened(path: Path, goals: int) -> tuple[JournalStorage, optuna.Study]:
+    """The journal, and the study in it.
+
+    Raises:
+        LatheError: it cannot be read.
+    """
+    try:
+        storage = JournalStorage(JournalFileBackend(str(path), _Lock(path.with_suffix(".lock"))))
+        directions = [StudyDirection.MINIMIZE] * goals
+        return storage, optuna.create_study(
+            study_name=_STUDY, storage=storage, directions=directions, load_if_exists=True
+        )
+    except (ValueError, KeyError) as error:
+        raise LatheError(
+            f"{path}: no journal of Optuna ({shown(error)}); allowed: as it was written, or a new folder"
+        ) from None
+
+
+class Study:
+    """A tuning on the disk: Optuna's study, and the rows of its trials.
+
+    Attributes:
+        count: cells of a trial.
+    """
+
+    def __init__(self, folder: Folder) -> None:
+        assert folder.tuning is not None, "a tuning"
+        self._folder, told = folder, folder.tuning
+        scenario = folder.scenario
+        measures = [each.name for each in folder.measures]
+        self._aims = aims(scenario, told["goals"], told["subjects"], measures=measures, percentile=told["percentile"])
+        self._free = frees(scenario, told["free"])
+        self._over = Space(**told["over"])
+        self.count = self._over.count(scenario)
+        self._told = told
+        self._formulas = self._by_formula() if told["formulas"] else {}
+        self._key = Key(folder)
+        self._known: dict[str, dict[str, Any]] = {}
+        self._take(folder.table(["key", *self._aims.columns]))
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
+        with writing(folder.path), folder.locked(wait=True):
+            self._storage, self._study = _opened(folder.path / "trials.log", len(self._aims.goals))
+            if not self._study.get_trials(deepcopy=False):
+                self._enqueue()
+
+    def _by_formula(self) -> dict[str, Found]:
+        asked = [each.bound for each in self._aims.subjects if each.column == "margin" and each.below]
+        return formulas.settings(self._folder.scenario, list(self._free), *asked[:1])
+
+    def _enqueue(self) -> None:
+        """The start, and what the formulas give."""
+        start = {target: self._folder.scenario.value(target) for target in self._free}
+        given = {**start, **{target: found.value for target, found in self._formulas.items()}}
+        for values in [start, given] if given != start else [start]:
+            if all(free.holds(values[target]) for target, free in self._free.items()):
+                self._study.enqueue_trial({target: free.told(values[target]) for target, free in self._free.items()})
+
+    @contextmanager
+    def present(self) -> Iterator[str]:
+        """Be known to be computing; yields one's name."""
+        place = self._folder.path / "running"
+        me = uuid.uuid4().hex
+        with writing(self._folder.path):
+            place.mkdir(exist_ok=True)
+            lock = filelock.FileLock(place / me)
+            lock.acquire()
+        try:
+            yield me
+        finally:
+            lock.release()
+            (place / me).unlink(missing_ok=True)
+
+    def _gone(self, trial: FrozenTrial, me: str) -> bool:
+        """Whether nobody computes a trial."""
+        by = trial.user_attrs.get(_BY)
+        path = self._folder.path / "running" / str(by)
+        if by is None or not path.exists():
+            return True
+        if by == me:
+            return False
+        lock = filelock.FileLock(path)
+        try:
+            lock.acquire(blocking=False)
+        except filelock.Timeout:
+            return False
+        lock.release()
+        path.unlink(missing_ok=True)
+        return True
+
+    def finished(self) -> int:
+        """How many trials are computed."""
+        return len(self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
+
+    def ask(self, me: str, most: int) -> list[FrozenTrial]:
+        """The next batch: trials that somebody has left, filled up with new ones to ``most`` in all."""
+        with writing(self._folder.path), self._folder.locked(wait=True), _quiet():
+            there = self._study.get_trials(deepcopy=False)
+            asked = [trial for trial in there if trial.state != TrialState.WAITING]
+            left = [trial.number for trial in asked if trial.state == TrialState.RUNNING and self._gone(trial, me)]
+            number, batch = len(asked), int(self._told["batch"])
+            missing = batch - number % batch if number % batch or not left else 0
+            for _ in range(max(0, min(missing, most - number))):
+                self._study.sampler = self._sampler(number)
+                left.append(self._study.ask().number)
+                number += 1
+            left = left[:batch]
+            for each in left:
+                self._study.sampler = self._sampler(each)
+                trial = self._trial(each)
+                trial.set_user_attr(_BY, me)
+                for target, free in self._free.items():  # who was stopped in the middle may have left some out
+                    free.suggest(trial, target)
+            return [trial for trial in self._study.get_trials() if trial.number in left]
+
+    def _trial(self, number: int) -> optuna.Trial:
+        study = self._storage.get_study_id_from_name(_STUDY)
+        return optuna.Trial(self._study, self._storage.get_trial_id_from_study_id_trial_number(study, number))
+
+    def _sampler(self, number: int) -> optuna.samplers.BaseSampler:
+        """Of a trial."""
+        seed = int(np.random.SeedSequence([self._told["seed"], number]).generate_state(1)[0])
+        if self._told["sampler"] == "cmaes":
+            start = {target: self._folder.scenario.value(target) for target in self._free}
+            return optuna.samplers.CmaEsSampler(x0=start, seed=seed)
+        if self._told["sampler"] == "nsga2":
+            return optuna.samplers.NSGAIISampler(population_size=_POPULATION, seed=seed)
+        return optuna.samplers.TPESampler(multivariate=True, seed=seed)
+
+    def compute(self, crew: distributed.Client, asked: Sequence[FrozenTrial], watch: Watch) -> None:
+        """Compute the cells of a batch, and tell what came of it."""
+        jobs = {trial.number: self._jobs(trial) for trial in asked}
+        missing = {job.key: job for each in jobs.values() for job in each if job.key not in self._known}
+        keep(
+            self._folder,
+            rows(crew, order_of(self._folder), missing.values(), len(missing)),
+            watch,
+            self._take,
+        )
+        with writing(self._folder.path), self._folder.locked(wait=True), _quiet():
+            for number, each in jobs.items():
+                self._tell(number, self._aims.score(self._known[job.key] for job in each))
+        tuning = self.tuning()
+        if best := tuning.best:
+            tuning.write(best, self._folder.path / "best.yaml")
+        watch({"event": "told", "tuning": tuning})
+
+    def _take(self, table: pa.Table) -> None:
+        for found in table.select(["key", *self._aims.columns]).to_pylist():
+            self._known[found.pop("key")] = found
+
+    def _values(self, trial: FrozenTrial) -> dict[str, Value]:
+        return {target: free.value(trial.params[target]) for target, free in self._free.items()}
+
+    def _jobs(self, trial: FrozenTrial) -> list[Job]:
+        values = self._values(trial)
+        given = [{**values, **each} for each in self._over.given or ({},)]
+        cells = replace(self._over, given=given).cells(self._folder.scenario)
+        first = trial.number * self.count
+        return [Job(first + place, self._key.of(each), each) for place, each in enumerate(cells)]
+
+    def _tell(self, number: int, score: Score) -> None:
+        trial = self._trial(number)
+        trial.set_user_attr(_SCORE, [list(score.costs), list(score.violations), score.margin])
+        for place, violation in enumerate(score.violations):
+            trial.set_constraint(str(place), violation)
+        known = [min(cost, _UNKNOWN) for cost in score.costs]
+        if self._told["sampler"] == "cmaes" and not score.feasible:  # it knows no constraints: the nearer the better
+            known = [_UNKNOWN * (1.0 + sum(max(violation, 0.0) for violation in score.violations))]
+        self._study.sampler = self._sampler(number)
+        self._study.tell(number, known)
+
+    def tuning(self) -> Tuning:
+        """What is there."""
+        found = []
+        for trial in self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+            costs, violations, margin = cast("tuple[list[float], list[float], float]", trial.user_attrs[_SCORE])
+            found.append(Trial(trial.number, self._values(trial), Score(tuple(costs), tuple(violations), margin)))
+        return Tuning(self._folder, self._aims, self._over, found, self._formulas)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Optuna's warnings of what it may change one day."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Formulas that tie parameters of a cell to others."""
+
+import ast
+import math
+from collections.abc import Mapping
+from graphlib import CycleError, TopologicalSorter
+from typing import Any, cast
+
+import simpleeval
+
+from lathe_rc.cell.parameters import Value
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.errors import InputError, shown
+
+_FUNCTIONS = {"sqrt": math.sqrt, "exp": math.exp, "log": math.log, "sin": math.sin, "cos": math.cos}
+
+
+def _names(formula: str) -> set[str]:
+    """The targets that a formula names."""
+    try:
+        tree = ast.parse(formula.strip(), mode="eval")
+    except SyntaxError:
+        raise InputError(f"formula {shown(formula)!r}; allowed: targets and numbers with + - * / ** ( )") from None
+    inner = {node.value for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    called = {node.func for node in ast.walk(tree) if isinstance(node, ast.Call)}
+    named = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute | ast.Name)]
+    return {ast.unparse(node) for node in named if node not in inner and node not in called} - {"pi"}
+
+
+def ordered(ties: Mapping[str, str]) -> list[str]:
+    """The tied targets, each after those that it depends on.
+
+    Raises:
+        InputError: they depend on one another in a circle.
+    """
+    depends = {target: _names(formula) & ties.keys() for target, formula in ties.items()}
+    try:
+        return list(TopologicalSorter(depends).static_order())
+    except CycleError as error:
+        raise InputError(
+            f"{' -> '.join(error.args[1])}: tied in a circle; allowed: formulas of other targets"
+        ) from None
+
+
+class Formulas:
+    """Adds what is tied to the values of a cell."""
+
+    def __init__(self, scenario: Scenario, ties: Mapping[str, str]) -> None:
+        self._scenario, self._ties = scenario, {target: ties[target] for target in ordered(ties)}
+        for formula in ties.values():
+            for name in _names(formula):
+                scenario.parameter(name)
+        self._named = {target: _names(formula) for target, formula in ties.items()}
+        self._evaluator = simpleeval.SimpleEval(functions=_FUNCTIONS)
+        self._parsed = {target: self._evaluator.parse(formula) for target, formula in ties.items()}
+
+    def add_to(self, values: dict[str, Value]) -> dict[str, Value]:
+        """Values by target, the tied ones among them.
+
+        Raises:
+            InputError: a formula has no value.
+        """
+        for target, formula in self._ties.items():
+            known: dict[str, Any] = {"pi": math.pi}
+            for name in self._named[target]:
+                node, dot, of = name.partition(".")
+                found = values.get(name, self._scenario.value(name))
+                if isinstance(found, list):
+                    found = cast("Value", [values.get(f"{name}[{k}]", each) for k, each in enumerate(found)])
+                if dot:
+                    known.setdefault(node, {})[of] = found
+                else:
+                    known[node] = found
+            self._evaluator.names = known
+            try:
+                found = self._evaluator.eval(formula, previously_parsed=self._parsed[target])
+            except (simpleeval.InvalidExpression, ArithmeticError, ValueError, TypeError) as error:
+                raise InputError(f"{target} = {shown(formula)}: {shown(error)}") from None
+            row = self._scenario.parameter(target)
+            whole = row.type is int and isinstance(found, float) and found == round(found)
+            values[target] = round(found) if whole else float(found) if row.type is float else found
+        return values

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tuning: parameters of a cell searched by Optuna, its trials computed by the workers of a sweep; see `run`.
+
+DIR/trials.log       Optuna's journal: what was asked, and what came of it
+DIR/running/         a lock for each program that computes; who died is known by it
+DIR/best.yaml        the cell with the best trial's parameters
+DIR/front/           of several goals, the cells of all trials that no other is better than
+DIR, the rest        see `lathe_rc.sweep.folder`: cell n of trial m is the row m * (cells of a trial) + n
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+
+import distributed
+
+from lathe_rc.cell.ahead import compile_ahead
+from lathe_rc.cell.parameters import Value
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError
+from lathe_rc.names import instead
+from lathe_rc.sweep.aims import Aims, aims
+from lathe_rc.sweep.folder import Folder, writing
+from lathe_rc.sweep.free import Free, frees
+from lathe_rc.sweep.space import Space
+from lathe_rc.sweep.study import BATCH, Study
+from lathe_rc.sweep.sweep import Watch, ignore
+from lathe_rc.sweep.tuned import Tuning
+from lathe_rc.sweep.workers import client_of
+
+SAMPLERS = ("tpe", "cmaes", "nsga2")
+
+
+def run(
+    scenario: Scenario,
+    free: Mapping[str, str | Sequence[Value]],
+    goals: Sequence[str],
+    folder: Path,
+    *,
+    subjects: Sequence[str] = (),
+    over: Space | None = None,
+    percentile: float = 100.0,
+    trials: int = 100,
+    sampler: str = "tpe",
+    seed: int = 0,
+    batch: int = BATCH,
+    ask_formulas: bool = True,
+    measures: Sequence[str] = (),
+    scheduler: str | None = None,
+    workers: int | None = None,
+    client: distributed.Client | None = None,
+    watch: Watch = ignore,
+) -> Tuning:
+    """Search parameters of a cell; what the folder has already is not computed again.
+
+    Args:
+        scenario: the cell; its own parameters are the start, trial 0. It needs a number of revolutions.
+        free: what is searched, by ``NODE.PARAM``: ``LOW:HIGH``, ``LOW:HIGH:log``, or values: ``A,B,C`` or a list.
+        goals: columns of a row, see `lathe_rc.sweep.aims`; several are traded off.
+        folder: of the results. Several programs, on this machine or others, may compute into it at the same time.
+        subjects: what has to be met.
+        over: plants and spindles; what counts is the worst of them, or a percentile. None: the scenario's own.
+        percentile: see `over`; 100: the worst.
+        trials: so many in all, those that are there already among them.
+        sampler: ``tpe``; ``cmaes`` for one goal and ranges alone; ``nsga2`` for several goals and many trials.
+        seed: of the search.
+        batch: trials that are asked for before the first of them is told.
+        ask_formulas: let trial 1 be what `lathe_rc.sweep.formulas` gives, if it is within the ranges.
+        measures: further columns, ``TOPIC.FIELD:STATISTIC``.
+        scheduler: see `lathe_rc.sweep.sweep.run`, as the next two.
+        workers: processes of this machine.
+        client: of Dask, in place of both.
+        watch: called with the events of `lathe_rc.sweep.sweep.run`, ``began`` with the trials that are there, and with
+            ``told`` (tuning: what is there), after each batch.
+
+    Raises:
+        InputError: what is asked for cannot be, or the folder holds something else.
+        LatheError: workers died, or the disk is full; what was computed is kept.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from lathe_rc import harness, resources
+        >>> from lathe_rc.cell import scenario
+        >>> start = ["spindle_encoder.revolutions=10", "learning_controller.lead_time=1.0e-3"]
+        >>> piston = scenario.load(resources.find(Path("piston.yaml")), start)
+        >>> free = {"learning_controller.lead_time": "0.8e-3:1.6e-3"}
+        >>> tuning = harness.tune(piston, free, ["tool.rms_error"], Path("lead"), subjects=["margin>=0.05"], trials=8)
+        >>> tuning
+        <Tuning of piston in lead: 8 trials, tool.rms_error = ... in trial ...>
+    """
+    over = Space(**(over or Space()).to_json())
+    wanted = aims(scenario, goals, subjects, measures=measures, percentile=percentile)
+    found = frees(scenario, free)
+    if twice := [target for target in found if target in over.targets()]:
+        raise InputError(f"{twice[0]}: free, and what the goal is over as well; allowed: one of both")
+    over.check(scenario)
+    _check_sampler(sampler, wanted, found)
+    for name, number in (("trials", trials), ("batch", batch)):
+        if number < 1:
+            raise InputError(f"{name} = {number}; allowed: from 1")
+    told = {
+        "targets": list(dict.fromkeys([*found, *over.targets()])),
+        "free": {target: told if isinstance(told, str) else list(told) for target, told in free.items()},
+        "goals": list(goals),
+        "subjects": list(subjects),
+        "percentile": percentile,
+        "over": over.to_json(),
+        "sampler": sampler,
+        "seed": seed,
+        "batch": batch,
+        "formulas": ask_formulas,
+    }
+    kept = Folder.begin(folder, scenario, None, wanted.measures, json.loads(json.dumps(told)))
+    state = Study(kept)
+    with state.present() as me:
+        asked = state.ask(me, trials)
+        there = state.finished()
+        watch({"event": "began", "cells": trials * state.count, "computed": there * state.count, "trials": there})
+        if asked:
+            for stages in compile_ahead(Cell(scenario.nodes).stages.values()):
+                watch({"event": "compiling", "nodes": stages})
+            with nullcontext(client) if client else client_of(scheduler, workers) as crew:
+                watch({"event": "ready", "dashboard": crew.dashboard_link})
+                while asked:
+                    state.compute(crew, asked, watch)
+                    asked = state.ask(me, trials)
+    tuning = state.tuning()
+    if len(goals) > 1:
+        _write_front(tuning)
+    return tuning
+
+
+def _write_front(tuning: Tuning) -> None:
+    place = tuning.folder.path / "front"
+    with writing(tuning.folder.path):
+        place.mkdir(exist_ok=True)
+        for path in place.glob("*.yaml"):
+            path.unlink(missing_ok=True)
+    for trial in tuning.front:
+        tuning.write(trial, place / f"trial-{trial.number}.yaml")
+
+
+def _check_sampler(name: str, wanted: Aims, found: Mapping[str, Free]) -> None:
+    if name not in SAMPLERS:
+        raise InputError(f"sampler {name!r}; {instead(name, SAMPLERS)}")
+    if name == "cmaes":
+        lists = [target for target, each in found.items() if each.choices is not None]
+        if len(wanted.goals) > 1 or lists or len(found) < 2:
+            goals = f"{len(wanted.goals)} goals" if len(wanted.goals) > 1 else ""
+            why = goals or (f"the list of {lists[0]}" if lists else "one parameter")
+            raise InputError(f"sampler cmaes with {why}; allowed: one goal and two or more ranges; or tpe, nsga2")
+
+
+def load(path: Path) -> Tuning:
+    """The tuning of a folder.
+
+    Raises:
+        InputError: it holds none.
+    """
+    folder = Folder(path)
+    if folder.tuning is None:
+        raise InputError(f"{path} holds a sweep; allowed: a folder that lathe tune has written")
+    return Study(folder).tuning()

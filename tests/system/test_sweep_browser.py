@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a sweep in a real browser: every figure is drawn, can be chosen and brushed, and nobody is asked."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from test_report_browser import Visit
+from test_sweep_page import LAW, LEAD, Q, Shown, bowl, swept
+
+from lathe_rc.sweep import page
+from lathe_rc.sweep.space import Space
+
+pytestmark = pytest.mark.system
+
+# Runs in the page once its figures stand: chooses another pair, drags along the first axis, and tells what is there.
+_HAND = """<script>
+const VIEWS = {}, embed = vegaEmbed;
+vegaEmbed = async (place, ...rest) => (VIEWS[place.id] = await embed(place, ...rest));
+addEventListener("load", async () => {
+  const rest = () => new Promise(done => setTimeout(done, 400));
+  await rest();
+  const tell = text => document.title += " | " + text;
+  document.title = "told";
+  for (const name of Object.keys(SPECS)) {
+    const drawn = document.querySelector(`#${name} canvas, #${name} svg`);
+    tell(`${name} ${drawn ? drawn.clientWidth : 0}`);
+  }
+  const choice = document.querySelectorAll('select[data-figure="heat-map"]');
+  choice[0].value = "1"; choice[0].dispatchEvent(new Event("change")); await rest();
+  tell("same: " + document.getElementById("heat-map").textContent.trim());
+  choice[1].value = "0"; choice[1].dispatchEvent(new Event("change")); await rest();
+  tell("chosen: " + CHOSEN["heat-map"] + " " + !!document.querySelector("#heat-map svg"));
+  const view = VIEWS["parallel-coordinates"].view, canvas = document.querySelector("#parallel-coordinates canvas");
+  const box = canvas.getBoundingClientRect(), { left, top } = view.padding();
+  const at = (kind, target, share) => target.dispatchEvent(new PointerEvent(kind, {
+    bubbles: true, clientX: box.left + left + share * view.width(), clientY: box.top + top + 1 }));
+  const kept = () => (view.data("inside")[0] || { count: 0 }).count;
+  tell("all: " + kept());
+  at("pointerdown", canvas, 0.02); at("pointermove", canvas, 0.2); at("pointerup", canvas, 0.2);
+  await view.runAsync();
+  tell("brushed: " + kept());
+});
+</script>"""
+
+
+def test_figures_are_drawn_chosen_and_brushed(tmp_path):
+    """Of seven leads with a result each has 14 cells; the brush lies over the second of them."""
+    space = Space(grid={LEAD: "1e-3:3e-3:9", Q: "1e-5:1e-3:7:log", LAW: ["fixed", "variable"]})
+    written = page.write(swept(tmp_path / "sweep", space, bowl))
+    text = written.page.read_text(encoding="utf-8")
+    library = text.index("</script>") + len("</script>")
+    driven = tmp_path / "driven.html"
+    driven.write_text(text[:library] + _HAND + text[library:], encoding="utf-8")
+    visit = Visit(driven, tmp_path, "--window-size=900,900")
+    assert visit.console == []
+    assert visit.requests == []
+    told = re.search(r"<title>(.*)</title>", visit.document)[1]
+    for name in Shown(written.page).specs:
+        assert int(re.search(rf"\| {name} (\d+)", told)[1]) > 500, told
+    assert "same: Choose two different parameters. | chosen: 1-0 true" in told
+    assert "all: 98 | brushed: 14" in told

@@ -1,0 +1,461 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tuning: what is searched and wanted, that the search is the same however it is computed, and what it gives."""
+
+import json
+import math
+from pathlib import Path
+
+import distributed
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lathe_rc import cli, harness, resources
+from lathe_rc.analysis.pid_tuning import evaluate
+from lathe_rc.cell import batch, scenario
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.commands import sweep as command
+from lathe_rc.control.decoupler import PAPER
+from lathe_rc.control.pid import PidGains
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.sweep import formulas, history, row, tune
+from lathe_rc.sweep.aims import aims
+from lathe_rc.sweep.free import Free, frees
+from lathe_rc.sweep.space import Space
+from lathe_rc.sweep.study import Study
+
+LEAD, Q = "learning_controller.lead_time", "learning_controller.q_time"
+FREE = {LEAD: "0.8e-3:2e-3", Q: "40e-6:300e-6:log"}
+ERROR = "longitudinal/command.error:rms"
+PID = [f"force_controller.{name}" for name in ("proportional", "integral", "derivative", "derivative_filter")]
+
+
+def load(name, revolutions, *overrides):
+    path = resources.find(Path(f"{name}.yaml"))
+    return scenario.load(path, [f"spindle_encoder.revolutions={revolutions}", *overrides])
+
+
+@pytest.fixture(scope="module")
+def piston():
+    return load("piston", 3, f"{LEAD}=0.9e-3", f"{Q}=200e-6")
+
+
+@pytest.fixture(scope="module")
+def client():
+    options = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.Client(**options, set_as_default=False) as made:
+        yield made
+
+
+def told(tuning):
+    return [(trial.number, dict(trial.values), trial.score) for trial in tuning.trials]
+
+
+def same(one, other):
+    """NaN is NaN here."""
+    return repr(told(one)) == repr(told(other))
+
+
+class TestAsking:
+    @pytest.mark.parametrize(
+        ("free", "said"),
+        [
+            ({}, "nothing is free"),
+            ({"learning_controller.lead_tim": "1:2"}, "unknown parameter; did you mean lead_time"),
+            ({LEAD: "2e-3:1e-3"}, "an empty range; allowed: LOW below HIGH"),
+            ({LEAD: "1e-3:1e-3"}, "an empty range"),
+            ({LEAD: "0.0:2e-3:log"}, "ends above 0"),
+            ({LEAD: "1e-3:2e-3:5"}, "allowed: LOW:HIGH, LOW:HIGH:log, or values between commas"),
+            ({LEAD: "0.9e-3"}, "one value is no choice"),
+            ({LEAD: "1.2e-3:2e-3"}, "= 0.0009 is where the search starts, outside of 1.2e-3:2e-3"),
+            ({LEAD: "-1.0:2e-3"}, "lead_time = -1.0; allowed: a finite number"),
+            ({"learning_controller.lead_law": "variable,late"}, "lead_law = 'late'; allowed: one of"),
+            ({"learning_controller.points_per_revolution": "512.5:2048"}, "allowed: whole numbers"),
+        ],
+    )
+    def test_what_cannot_be_searched_is_refused_in_one_line(self, piston, free, said):
+        with pytest.raises(InputError, match=said) as refused:
+            frees(piston, free)
+        assert "\n" not in str(refused.value)
+
+    def test_a_range_in_percent_is_of_the_start(self, piston):
+        found = frees(piston, {LEAD: "50%:200%"})[LEAD].distribution
+        assert (found.low, found.high) == pytest.approx((0.45e-3, 1.8e-3))
+
+    @pytest.mark.parametrize(
+        ("goals", "subjects", "said"),
+        [
+            ([], [], "no goal; allowed: --goal COLUMN"),
+            (["tool.max_eror"], [], "no such column; did you mean tool.max_error"),
+            (["tool.max_error", "-tool.max_error"], [], "a goal is given twice"),
+            (["coarse/state.effort:top"], [], "no statistic 'top'; allowed: max"),
+            (["tool.max_error"], ["margin=0.2"], "allowed: COLUMN>=NUMBER or COLUMN<=NUMBER"),
+            (["tool.max_error"], ["margin>=much"], "'much' is no number"),
+            (["tool.max_error"], ["margn>=0.2"], "no such column; did you mean margin"),
+        ],
+    )
+    def test_what_cannot_be_wanted_is_refused_in_one_line(self, piston, goals, subjects, said):
+        with pytest.raises(InputError, match=said):
+            aims(piston, goals, subjects)
+
+    @pytest.mark.parametrize(("goal", "why"), [("tool.max_error", "there is no tool"), ("-margin", "nobody learns")])
+    def test_a_column_that_a_cell_never_has_is_refused(self, goal, why):
+        with pytest.raises(InputError, match=f"{why} in interrupted_cut"):
+            aims(load("interrupted_cut", 3), [goal])
+
+    def test_the_command_refuses_in_one_line(self, tmp_path):
+        asked = ["tune", "piston", "--free", f"{LEAD}=1e-3:2e-3", "--goal", "margin", "--out", str(tmp_path / "x")]
+        refused = CliRunner().invoke(cli.main, [*asked, "--worst"])
+        assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
+        assert "--worst of one cell; allowed: with --over or --seeds" in refused.stderr
+
+    @pytest.mark.parametrize(
+        ("more", "said"),
+        [
+            ({"sampler": "cma"}, "sampler 'cma'; did you mean cmaes"),
+            ({"sampler": "cmaes", "goals": ["tool.max_error", "-margin"]}, "cmaes with 2 goals"),
+            ({"trials": 0}, "trials = 0; allowed: from 1"),
+            ({"over": Space(grid={LEAD: "1e-3,2e-3"})}, "free, and what the goal is over as well"),
+            ({"percentile": 0.0}, "percentile 0; allowed: above 0 up to 100"),
+        ],
+    )
+    def test_a_search_that_cannot_be_is_refused_before_anything_is_written(self, piston, tmp_path, more, said):
+        goals = more.pop("goals", ["tool.max_error"])
+        with pytest.raises(InputError, match=said):
+            harness.tune(piston, FREE, goals, tmp_path / "x", **more)
+        assert not (tmp_path / "x").exists()
+
+
+class TestScore:
+    def cells(self, *errors, margin=0.3):
+        return [{"status": row.DONE, "tool.max_error": error, "margin": margin} for error in errors]
+
+    def test_the_worst_or_a_percentile_of_the_cells_counts(self, piston):
+        cells = self.cells(*(1e-6 * k for k in range(1, 101)))
+        for percentile, cost in ((100.0, 100e-6), (95.0, 95e-6), (50.0, 50e-6)):
+            score = aims(piston, ["tool.max_error"], percentile=percentile).score(cells)
+            assert score.costs == pytest.approx((cost,))
+
+    def test_a_goal_with_a_minus_is_to_be_large_and_its_smallest_counts(self, piston):
+        cells = self.cells(1e-6, margin=0.3) + self.cells(1e-6, margin=0.1)
+        score = aims(piston, ["-margin"]).score(cells)
+        assert (score.costs, score.margin) == ((-0.1,), 0.1)
+
+    def test_refused_and_diverged_cells_are_infeasible_the_more_the_farther_they_are(self, piston):
+        wanted = aims(piston, ["tool.max_error"], ["margin>=0.2"])
+        near, far = (
+            wanted.score([{"status": row.REFUSED, "tool.max_error": None, "margin": margin}, *self.cells(1e-6)])
+            for margin in (-0.01, -0.5)
+        )
+        assert near.costs == far.costs == (math.inf,)
+        assert not near.feasible
+        assert all(a < b for a, b in zip(near.violations, far.violations, strict=True))
+        assert wanted.score(self.cells(1e-6)).feasible
+
+    def test_a_percentile_leaves_out_so_many_that_are_refused(self, piston):
+        refused = [{"status": row.REFUSED, "tool.max_error": None, "margin": -1.0}]
+        wanted = aims(piston, ["tool.max_error"], ["margin>=0.2"], percentile=95.0)
+        assert wanted.score(self.cells(*[1e-6] * 95) + refused * 5).feasible
+        assert not wanted.score(self.cells(*[1e-6] * 94) + refused * 6).feasible
+
+    def test_a_cell_without_a_value_of_its_goal_is_infeasible(self, piston):
+        score = aims(piston, ["tool.in_tolerance_from"]).score(
+            [{**cell, "tool.in_tolerance_from": None} for cell in self.cells(1e-6)]
+        )
+        assert not score.feasible
+
+
+@pytest.fixture(scope="module")
+def tuned(piston, client, tmp_path_factory):
+    """A search that nothing interrupted."""
+    folder = tmp_path_factory.mktemp("tune") / "whole"
+    return harness.tune(
+        piston, FREE, ["tool.rms_error"], folder, subjects=["margin>=0.1"], trials=20, batch=4, client=client
+    )
+
+
+class TestSearch:
+    def test_the_best_is_better_than_start_and_formulas_and_meets_the_subjects(self, tuned):
+        start, formula, best = tuned.start, tuned.by_formula, tuned.best
+        assert best.score.feasible
+        assert best.score.margin >= 0.1
+        assert best.score.costs <= min(start.score.costs, formula.score.costs)
+        assert start.values == {LEAD: 0.9e-3, Q: 200e-6}
+        feasible = [trial.score.costs[0] for trial in tuned.trials if trial.score.feasible]
+        assert best.score.costs[0] == min(feasible)
+
+    def test_each_trial_is_a_row_that_runs_again_to_its_digest(self, tuned):
+        table = tuned.sweep.table()
+        assert table.column("cell").to_pylist() == list(range(20))
+        for trial in tuned.trials:
+            found = tuned.sweep.row(trial.number)
+            assert {target: found[target] for target in FREE} == trial.values
+        best = tuned.best.number
+        again = harness.run(tuned.sweep.scenario(best))
+        assert row.digest(again.recording, []) == tuned.sweep.row(best)["digest"]
+
+    def test_best_yaml_is_the_best_cell(self, tuned):
+        written = scenario.load(tuned.folder.path / "best.yaml")
+        assert written.identity == tuned.scenario(tuned.best).identity
+
+    def test_the_same_call_computes_nothing_and_gives_the_same(self, tuned, piston, client):
+        events = []
+        again = harness.tune(
+            piston,
+            FREE,
+            ["tool.rms_error"],
+            tuned.folder.path,
+            subjects=["margin>=0.1"],
+            trials=20,
+            batch=4,
+            client=client,
+            watch=lambda event: events.append(event["event"]),
+        )
+        assert events == ["began"]
+        assert same(again, tuned)
+        assert same(tune.load(tuned.folder.path), tuned)
+
+    def test_stopped_anywhere_and_begun_again_it_is_the_same_search(self, tuned, piston, client, tmp_path, monkeypatch):
+        """It is stopped after some rows, and in the middle of asking; what was computed is kept."""
+        seen = []
+        suggest = Free.suggest
+
+        def stop(free, trial, target):
+            seen.append("asked")
+            if seen.count("asked") in {3, 20, 30}:
+                raise KeyboardInterrupt
+            suggest(free, trial, target)
+
+        monkeypatch.setattr(Free, "suggest", stop)
+
+        def watch(event):
+            seen.append(event["event"])
+            if event["event"] == "rows" and seen.count("rows") in {2, 7, 12}:
+                raise KeyboardInterrupt
+
+        def go():
+            return harness.tune(
+                piston,
+                FREE,
+                ["tool.rms_error"],
+                tmp_path / "stopped",
+                subjects=["margin>=0.1"],
+                trials=20,
+                batch=4,
+                client=client,
+                watch=watch,
+            )
+
+        for _ in range(6):
+            with pytest.raises(KeyboardInterrupt):
+                go()
+        assert same(go(), tuned)
+        rows = tuned.sweep.table().drop_columns(["seconds"])
+        assert tune.load(tmp_path / "stopped").sweep.table().drop_columns(["seconds"]).equals(rows)
+
+    def test_more_trials_go_on_from_those_that_are_there(self, tuned, piston, client, tmp_path):
+        for trials in (4, 8):
+            found = harness.tune(
+                piston,
+                FREE,
+                ["tool.rms_error"],
+                tmp_path / "more",
+                subjects=["margin>=0.1"],
+                trials=trials,
+                batch=4,
+                client=client,
+            )
+            assert told(found) == told(tuned)[:trials]
+
+    def test_trials_of_who_is_gone_are_taken_over_those_of_others_are_left(self, tuned, piston, client, tmp_path):
+        def go(folder, trials):
+            return harness.tune(piston, FREE, ["margin"], folder, trials=trials, batch=4, client=client)
+
+        go(tmp_path / "shared", 4)
+        state = Study(tune.Folder(tmp_path / "shared"))
+        with state.present() as other:
+            asked = [trial.number for trial in state.ask(other, 8)]
+            assert asked == [4, 5, 6, 7]
+            beside = go(tmp_path / "shared", 12)
+            assert [trial.number for trial in beside.trials] == [0, 1, 2, 3, 8, 9, 10, 11]
+        after = go(tmp_path / "shared", 12)
+        assert [trial.number for trial in after.trials] == list(range(12))
+
+    def test_a_journal_that_cannot_be_read_is_one_line(self, tuned, tmp_path):
+        for name in ("sweep.json", "scenario.yaml"):
+            (tmp_path / name).write_bytes((tuned.folder.path / name).read_bytes())
+        (tmp_path / "trials.log").write_text("{broken\n" * 2, encoding="utf-8")
+        with pytest.raises(LatheError, match=r"trials\.log: no journal of Optuna"):
+            tune.load(tmp_path)
+
+    def test_a_folder_holds_one_tuning_and_no_sweep(self, tuned, piston, client):
+        path = tuned.folder.path
+        with pytest.raises(InputError, match="holds a tuning; allowed: a new folder"):
+            harness.sweep(piston, Space(grid={LEAD: [1e-3]}), path, client=client)
+        with pytest.raises(InputError, match=r'holds a tuning with goals \["tool.rms_error"\], not \["margin"\]'):
+            harness.tune(piston, FREE, ["margin"], path, client=client)
+
+    def test_choices_and_whole_numbers_are_searched(self, piston, client, tmp_path):
+        free = {
+            "learning_controller.lead_law": "constant_angle,variable",
+            "learning_controller.points_per_revolution": "1024,2048",
+            "learning_controller.soft_start": [0.0, 1.0],
+            "learning_controller.feedback_delay": "2000:3200",
+        }
+        found = harness.tune(piston, free, ["tool.rms_error"], tmp_path / "x", trials=8, client=client)
+        values = found.trials[-1].values
+        assert [type(values[target]) for target in free] == [str, int, float, int]
+        assert found.start.score.feasible
+        assert len({repr(trial.values) for trial in found.trials}) > 4
+
+    @pytest.mark.parametrize("sampler", ["cmaes", "nsga2"])
+    def test_other_samplers_go_on_where_they_were_stopped(self, piston, client, tmp_path, sampler):
+        def go(folder, trials):
+            return harness.tune(
+                piston, FREE, ["tool.rms_error"], tmp_path / folder, sampler=sampler, trials=trials, client=client
+            )
+
+        whole = go("whole", 24)
+        go("parts", 8)
+        assert same(go("parts", 24), whole)
+        assert whole.best.score.costs < whole.start.score.costs
+
+    def test_two_goals_give_a_front_and_a_file_of_each(self, piston, client, tmp_path):
+        found = harness.tune(piston, FREE, ["tool.rms_error", "-margin"], tmp_path / "x", trials=24, client=client)
+        front = found.front
+        assert len(front) > 1
+        for trial in front:
+            written = scenario.load(tmp_path / "x" / "front" / f"trial-{trial.number}.yaml")
+            assert written.identity == found.scenario(trial).identity
+        costs = np.array([trial.score.costs for trial in front])
+        assert (np.diff(costs[:, 0]) > 0).all()
+        assert (np.diff(costs[:, 1]) < 0).all()
+        feasible = [trial.score.costs for trial in found.trials if trial.score.feasible]
+        assert not any(a <= c and b <= d and (a, b) != (c, d) for c, d in costs for a, b in feasible)
+        assert found.best in front
+
+    def test_the_goal_over_plants_is_that_of_the_worst(self, piston, client, tmp_path):
+        over = Space(sampled={"electrodynamic_actuator.natural_frequency": "uniform:90%:110%"}, sample="sobol:4")
+        found = harness.tune(piston, FREE, ["tool.rms_error"], tmp_path / "x", over=over, trials=3, client=client)
+        errors = found.sweep.table().column("tool.rms_error").to_pylist()
+        assert len(errors) == 12
+        for trial in found.trials:
+            cells = errors[4 * trial.number : 4 * trial.number + 4]
+            worst = math.inf if None in cells else max(cells)
+            assert trial.score.costs == (worst,)
+        plants = found.sweep.table().column("electrodynamic_actuator.natural_frequency").to_pylist()
+        assert plants[:4] == plants[4:8] == plants[8:]
+
+    def test_a_cell_without_a_tool_is_tuned_by_what_is_measured_in_its_last_revolution(self, client, tmp_path):
+        cut = load("interrupted_cut", 4, f"{PID[0]}=1e-3")
+        found = harness.tune(cut, {PID[0]: "1e-4:0.05:log"}, [ERROR], tmp_path / "x", trials=3, client=client)
+        again = harness.run(found.sweep.scenario(2))
+        kept = found.sweep.row(2)
+        assert row.digest(again.recording, found.folder.measures) == kept["digest"]
+        turned = again.recording.dense["/encoder"]["angle_true"]
+        error = again.recording.dense["/longitudinal/command"]["error"]
+        last = error[(turned >= 6 * np.pi) & (turned < 8 * np.pi)]
+        assert kept[ERROR] == pytest.approx(math.sqrt(np.mean(last**2)), rel=1e-3)
+
+
+class TestFormulas:
+    @pytest.mark.parametrize("margin", [0.05, 0.2])
+    def test_q_time_keeps_the_margin_and_is_the_shortest_that_does(self, piston, margin):
+        found = formulas.settings(piston, [LEAD, Q, "learning_controller.learning_gain"], margin)
+        values = {target: each.value for target, each in found.items()}
+        assert values["learning_controller.learning_gain"] == 1.0
+
+        def margin_with(q_time):
+            cell = Cell(piston.varied({**values, Q: q_time}).nodes)
+            cell.check()
+            return 1.0 - cell.factors["learning_controller"]
+
+        assert margin_with(values[Q]) == pytest.approx(margin, abs=1e-4)
+        assert margin_with(0.98 * values[Q]) < margin
+
+    def test_the_lead_is_the_drive_s_lag(self, piston):
+        drive = piston.nodes["electrodynamic_actuator"]
+        lag = 2.0 * drive.damping / drive.natural_frequency + drive.delay
+        assert formulas.settings(piston, [LEAD, Q])[LEAD].value == pytest.approx(lag, rel=1e-3)
+
+    def test_with_a_given_q_the_lead_has_the_largest_margin(self, piston):
+        lead = formulas.settings(piston, [LEAD])[LEAD].value
+
+        def factor(value):
+            cell = Cell(piston.varied({LEAD: value}).nodes)
+            cell.check()
+            return cell.factors["learning_controller"]
+
+        assert factor(lead) < min(factor(0.97 * lead), factor(1.03 * lead))
+
+    def test_the_force_loop_has_the_margins_that_are_said(self):
+        """With W1 as paper 004 prints it, and a feedback delay of 1 ms."""
+        found = formulas.settings(load("force_turning", 3), PID)
+        loop = evaluate(PAPER.w1, PidGains(*(found[target].value for target in PID)), 64 / 64_000)
+        assert loop.stable
+        assert math.degrees(loop.phase_margin) == pytest.approx(60.0, abs=3.0)
+        assert loop.gain_margin > 2.0
+
+    def test_there_is_none_for_what_they_do_not_know(self, piston):
+        assert formulas.settings(piston, ["tool.feed", "learning_controller.soft_start"]) == {}
+
+
+def test_the_robust_setting_of_the_page_is_twice_as_good_on_the_worst_plant_as_the_nominal_one():
+    """A setting tuned over 64 plants leaves less than half of what the nominal optimum does on the worst of them."""
+    two_channel = load("two_channel", 30)
+    plants = Space(
+        sampled={
+            "electrodynamic_actuator.natural_frequency": "uniform:90%:110%",
+            "electrodynamic_actuator.damping": "uniform:90%:110%",
+            "piezo_actuator.natural_frequency": "uniform:95%:105%",
+            "piezo_actuator.damping": "uniform:90%:110%",
+        },
+        sample="sobol:64",
+    )
+    names = (LEAD, Q, "fine_controller.lead_time", "fine_controller.q_time")
+    nominal = dict(zip(names, (1.28459e-3, 216.231e-6, 91.674e-6, 13.5154e-6), strict=True))
+    robust = dict(zip(names, (1.7713e-3, 139.249e-6, 92.5337e-6, 9.94758e-6), strict=True))
+
+    def worst(setting):
+        cells = (two_channel.varied({**setting, **plant}) for plant in plants.cells(two_channel))
+        return max(outcome.kept.largest[-1] for outcome in batch.run(cells, batch.Errors))
+
+    assert worst(robust) < 0.5 * worst(nominal)
+
+
+def test_the_command_shows_and_writes_what_it_found(tmp_path, monkeypatch, client):
+    monkeypatch.setattr(tune, "client_of", lambda *_: tune.nullcontext(client))
+    folder = tmp_path / "x"
+    asked = ["tune", "piston", "--revolutions", "3", "--set", f"{LEAD}=0.9e-3", "--free", f"{LEAD}=0.8e-3:2e-3"]
+    asked += ["--goal", "tool.max_error", "--over", "electrodynamic_actuator.damping=uniform:95%:105%"]
+    asked += ["--over", "seed=0,1", "--sample", "sobol:2", "--percentile", "50", "--trials", "3", "--out", str(folder)]
+    shown = CliRunner().invoke(cli.main, asked)
+    assert shown.exit_code == 0, shown.output
+    assert "by formula, learning_controller.lead_time: T0 with the least sup|Q - γZ|" in shown.stdout
+    assert f"best:    lathe run {folder / 'best.yaml'}" in shown.stdout
+    assert (folder / "history.png").read_bytes().startswith(b"\x89PNG")
+    page = (folder / "history.html").read_text(encoding="utf-8")
+    assert "https://cdn" not in page
+    told = json.loads(CliRunner().invoke(cli.main, [*asked, "--json"]).stdout)
+    assert (told["trials"], told["cells"], told["best"]["feasible"]) == (3, 4, True)
+    assert told["best"]["goals"]["tool.max_error"] <= told["start"]["goals"]["tool.max_error"]
+
+
+def test_where_nothing_runs_the_command_says_why(tmp_path, monkeypatch, client):
+    monkeypatch.setattr(tune, "client_of", lambda *_: tune.nullcontext(client))
+    monkeypatch.setattr(history, "write", lambda found: found.folder.path / "history.png")
+    asked = ["tune", "piston", "--set", "spindle_encoder.revolutions=0.0", "--free", f"{LEAD}=1e-3:2e-3"]
+    shown = CliRunner().invoke(
+        cli.main, [*asked, "--goal", "tool.max_error", "--trials", "2", "--out", str(tmp_path / "x")]
+    )
+    assert "nothing meets all subjects; allowed: wider ranges" in shown.stdout
+    assert "2 cells did not run to their end, as this one: spindle_encoder" in shown.stdout
+
+
+def test_ctrl_c_says_what_is_kept(tmp_path, monkeypatch, client):
+    monkeypatch.setattr(tune, "client_of", lambda *_: tune.nullcontext(client))
+    monkeypatch.setattr(command.Watch, "describe", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    asked = ["tune", "piston", "--revolutions", "3", "--free", f"{LEAD}=0.8e-3:2e-3", "--goal", "tool.max_error"]
+    stopped = CliRunner().invoke(cli.main, [*asked, "--trials", "20", "--batch", "2", "--out", str(tmp_path / "x")])
+    assert stopped.exit_code == 130
+    assert f"lathe: stopped; 2 of 20 trials are in {tmp_path / 'x'}: the same command goes on" in stopped.stderr
