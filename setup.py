@@ -69,7 +69,7 @@ setup(
     data_files=shared_files(),
     python_requires=">=3.10",
     install_requires=requirements("runtime"),
-    extras_require={name: requirements(name) for name in ("notebook", "view")},
+    extras_require={name: requirements(name) for name in ("notebook", "sweep", "view")},
     entry_points={
         "console_scripts": [
             "lathe = lathe_rc.cli:main",

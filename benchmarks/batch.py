@@ -24,7 +24,7 @@ from lathe_rc.cell.wiring import Cell
 
 _REVOLUTIONS = 20.0
 _CELLS = {"two_channel": 1000, "full_cell": 200}
-_READY = 40  # cells that stand ready at a time: they take memory
+READY = 40  # cells that stand ready at a time: they take memory
 _TARGETS = {"target_prepared_c_ratio": 0.9, "target_c_ratio": 0.7}
 _CORES = os.cpu_count() or 1
 
@@ -57,12 +57,12 @@ def _whole(name: str, count: int) -> float:
     return time * _CORES / count / samples
 
 
-def _prepared(name: str, count: int) -> float:
+def prepared(name: str, count: int) -> float:
     """The same of the computing alone."""
     total, samples = 0.0, 0
     with ThreadPoolExecutor(_CORES) as pool:
-        for _ in range(0, count, _READY):
-            engines = [Engine(Cell(each.nodes), ()) for each in variations(name, _READY)]
+        for _ in range(0, count, READY):
+            engines = [Engine(Cell(each.nodes), ()) for each in variations(name, READY)]
             samples += sum(engine.samples for engine in engines)
             total += seconds(partial(_run, pool, engines))
     return total * _CORES / samples
@@ -90,7 +90,7 @@ def measure(*, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
         before = _taken()
         _whole(name, count)
         grown = _taken() - before
-        turns = {"batch": partial(_whole, name, count), "prepared": partial(_prepared, name, count), "c": c}
+        turns = {"batch": partial(_whole, name, count), "prepared": partial(prepared, name, count), "c": c}
         times = alternate(turns, rounds)
         found[name] = {
             "cells": count,

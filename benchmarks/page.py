@@ -19,6 +19,7 @@ GROWTH_IMAGE = "img/growth.png"  #: of the page, in docs/
 _TITLES = {
     "engine": "Offline engine",
     "batch": "Batches",
+    "sweep": "Sweeps",
     "ros": "Over ROS",
     "real_time": "Real time",
     "supervisor": "Supervisor",
@@ -298,7 +299,7 @@ def page(result: Mapping[str, Any]) -> str:
         "",
         *_targets(result),
     ]
-    for part in ("engine", "batch", "ros", "real_time", "supervisor", "resimulation", "start"):
+    for part in ("engine", "batch", "sweep", "ros", "real_time", "supervisor", "resimulation", "start"):
         if part in result:
             lines += [f"## {_TITLES[part]}", "", *_about(part)]
             lines += _ros(result[part]) if part == "ros" else _part(part, result[part])

@@ -14,6 +14,7 @@ from typing import Any
 PARTS = (
     "engine",
     "batch",
+    "sweep",
     "ros",
     "real_time",
     "supervisor",

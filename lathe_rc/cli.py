@@ -16,6 +16,7 @@ from lathe_rc.errors import LatheError, shown
 COMMANDS = {
     "bag": "Ask bags what is in them; check and recover them; take a tachogram out.",
     "bench": "Measure how fast lathe_rc is here.",
+    "budget": "Tell what the form error of a scenario is made of.",
     "container": "Run several nodes in one process.",
     "demo": "Turn a piston with ROS 2 processes and draw it.",
     "export": "Export a recording as CSV, Parquet or NPZ.",
@@ -31,6 +32,7 @@ COMMANDS = {
     "resim": "Run a recorded cell again, also with changes.",
     "run": "Run a scenario to its end.",
     "study": "Compute a table or figure of the papers.",
+    "sweep": "Compute many variations of a scenario into a table.",
     "view": "Show a bag in Rerun.",
 }  #: their summaries
 _BESIDES = {"container": "node"}  # commands in the module of another one

@@ -16,6 +16,10 @@ class InputError(LatheError):
     exit_code: ClassVar[int] = 2
 
 
+class DivergedError(LatheError):
+    """A run grew beyond what it may: beyond all numbers, or beyond a law's ``stop_ratio``."""
+
+
 class LossyRunError(LatheError):
     """A free-running cell lost blocks; the message counts and names them."""
 

@@ -28,11 +28,14 @@ from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Literal
 
 from lathe_rc import part, starting
+from lathe_rc.analysis.budget import Budget
 from lathe_rc.analysis.metrology import FormErrors, Measurement
+from lathe_rc.analysis.tolerance import Verdict
 from lathe_rc.bag import reader, recover
 from lathe_rc.bag.check import write_digests
 from lathe_rc.bag.record import OfflineRecorder, begin, begin_snapshots, recorder_of
 from lathe_rc.bag.writer import refuse_existing
+from lathe_rc.cell import budget as budgets
 from lathe_rc.cell import messages
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.collect import Collector, Finite, check_room
@@ -53,6 +56,9 @@ from lathe_rc.starting import Child, Start
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from lathe_rc.sweep.space import Space
+    from lathe_rc.sweep.sweep import Sweep
 
 Mode = Literal["offline", "composed", "processes"]
 Event = Mapping[str, Any]
@@ -164,6 +170,11 @@ class Result:
         """The part as the workshop measures it; see `lathe_rc.part`."""
         return part.measured(self.recording)
 
+    @property
+    def verdict(self) -> Verdict | None:
+        """Whether the part is in tolerance; None if the scenario's tool has no ``tolerance``."""
+        return part.verdict(self.scenario, self.recording)
+
     @cached_property
     def digest(self) -> dict[str, str]:
         """Digest of each signal topic."""
@@ -176,7 +187,7 @@ class Result:
 
     def summary(self) -> dict[str, object]:
         """What ``lathe run --json`` prints."""
-        errors, step = self.errors, self.scenario.shared.step
+        errors, step, verdict = self.errors, self.scenario.shared.step, self.verdict
 
         def of(revolution: int) -> dict[str, Any] | None:
             return part.numbers(self.part, revolution) if errors.rms.size else None
@@ -205,6 +216,7 @@ class Result:
                 "per_revolution_peak_to_valley": (errors.peak_to_valley * 1e6).tolist(),
                 "per_revolution_ront": (self.part.roundness.peak_to_valley * 1e6).tolist() if errors.rms.size else [],
             },
+            "tolerance_um": verdict.summary() if verdict else None,
             "bag": str(self.bag) if self.bag else None,
             "snapshots": [str(path) for path in self.snapshots],
             "digest": self.digest,
@@ -281,6 +293,45 @@ def run(
     if result.bag is not None:
         write_digests(result.bag, result.digest)
     return result
+
+
+def sweep(scenario: Scenario, space: "Space", folder: Path, **options: Any) -> "Sweep":
+    """Compute variations of a cell into a table; the arguments are those of `lathe_rc.sweep.sweep.run`."""
+    from lathe_rc.sweep import sweep
+
+    return sweep.run(scenario, space, folder, **options)
+
+
+def budget(
+    scenario: Scenario, *, threads: int | None = None, watch: Callable[[int, int], None] | None = None
+) -> Budget:
+    """What the form error of a scenario is made of, in its last ten revolutions; see `lathe_rc.analysis.budget`.
+
+    It runs offline, as a batch, with one cause after the other switched off: some ten runs, or some thirty if causes
+    act together.
+
+    Args:
+        scenario: of the whole; its spindle must have a number of revolutions.
+        threads: that compute; None: one for each core.
+        watch: called after each run with how many there have been and how many there will be, as far as is known.
+
+    Raises:
+        InputError: the scenario cannot work, has no tool, or turns no complete revolution.
+        LatheError: a run failed.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from lathe_rc import harness, resources
+        >>> from lathe_rc.cell import scenario
+        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=60"])
+        >>> for found in harness.budget(piston).causes:
+        ...     print(f"{found.name}: {found.percent()} %")
+        Q floor: -0.3 %
+        speed: 83.5 %
+        lead: 0.0 %
+        feed: 16.9 %
+    """
+    return budgets.budget(scenario, threads=threads, watch=watch)
 
 
 def _run(

@@ -9,10 +9,14 @@ import numpy as np
 
 from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.metrology import FormErrors, Measurement, form_errors, measure, turns_before
+from lathe_rc.analysis.tolerance import Verdict, judge
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals, full
+from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recording import Recording
+from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError
 
 _CUTOFF = 50.0  # of the filters for roundness and roughness [undulations per revolution]
@@ -38,6 +42,21 @@ def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
     if not found.form.rms.size:
         raise InputError("nothing to measure: the recording has no complete revolution; let it run longer")
     return found
+
+
+def tolerances(scenario: Scenario) -> dict[str, float]:
+    """Tolerance [m] by relative topic of each tool that has one."""
+    tools = [table for table in scenario.nodes.values() if isinstance(table, ToolParameters)]
+    return {remapped(table, "tool"): table.tolerance for table in tools if table.tolerance}
+
+
+def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
+    """Whether the part that a run of a scenario has turned is in tolerance; None if its tool has no tolerance."""
+    topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
+    for of, allowed in tolerances(scenario).items():
+        if topic.endswith(f"/{of}"):
+            return judge(recording.errors.largest, allowed)
+    return None
 
 
 def numbers(found: Measurement, revolution: int) -> dict[str, Any]:

@@ -8,16 +8,19 @@ import pytest
 from lathe_rc import frames, harness
 from lathe_rc.bag import reader
 from lathe_rc.cell import batch, recording, scenario
+from lathe_rc.sweep import sweep
 
 SHOWN = {
     "lathe_rc.harness.run": harness.run,
     "lathe_rc.harness.Result": harness.Result,
+    "lathe_rc.harness.budget": harness.budget,
     "lathe_rc.cell.scenario.load": scenario.load,
     "lathe_rc.cell.scenario.Scenario.varied": scenario.Scenario.varied,
     "lathe_rc.cell.recording.Recording": recording.Recording,
     "lathe_rc.cell.batch.run": batch.run,
     "lathe_rc.bag.reader.read": reader.read,
     "lathe_rc.frames.frame": frames.frame,
+    "lathe_rc.sweep.sweep.run": sweep.run,
 }
 
 

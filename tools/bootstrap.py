@@ -50,7 +50,9 @@ def needed(arguments: Sequence[str]) -> Sequence[str]:
             if name not in GROUPS:
                 raise RefusalError(f"setup {name}; allowed: {', '.join(GROUPS)}, or nothing more")
         return arguments[1:]
-    return {"test": ["test", "view"], "view": ["view"]}.get(next(iter(arguments), ""), [])
+    sweeps = {name: ["sweep"] for name in ("bench", "sweep", "tune")}
+    wanted = {**sweeps, "test": ["sweep", "test", "view"], "view": ["view"]}
+    return wanted.get(next(iter(arguments), ""), [])
 
 
 def set_up(ros: SourcedRos | None, groups: Sequence[str]) -> Changes:

@@ -46,6 +46,7 @@ class Group(NamedTuple):
 
 GROUPS = {
     "notebook": Group("notebook.in", "10 s, 300 MB", sourced=True),
+    "sweep": Group("sweep.in", "5 s, 150 MB", sourced=True),
     "test": Group("test.in", "5 s, 300 MB", sourced=True),
     "view": Group("view.in", "10 s, 400 MB", sourced=False),
 }

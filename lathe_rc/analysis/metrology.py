@@ -9,7 +9,6 @@ Undulations per revolution are UPR. Terms are those of ISO 12181-1 (roundness) a
 is that of ISO 16610-21 for closed profiles.
 """
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,7 +75,9 @@ def form_errors(angle: Array, error: Array, first: int = 0) -> FormErrors:
     if angle.size < 2:
         return FormErrors(np.empty(0), np.empty(0), np.empty(0), np.zeros(1, dtype=np.int64))
     turns = angle / (2.0 * np.pi)
-    step = np.diff(turns, append=2 * turns[-1] - turns[-2])
+    step = np.empty_like(turns)
+    np.subtract(turns[1:], turns[:-1], out=step[:-1])
+    step[-1] = 2 * turns[-1] - turns[-2] - turns[-1]
     starts = _starts(turns, step, first)
     whole = starts.size - 1
     edges = starts[:-1]
@@ -86,10 +87,9 @@ def form_errors(angle: Array, error: Array, first: int = 0) -> FormErrors:
         # reduceat runs its last piece to the end of the array; the rest belongs to no complete revolution.
         last = slice(starts[-2], starts[-1])
         squares[-1], weight[-1] = np.sum(error[last] ** 2 * step[last]), np.sum(step[last])
-    revolutions = [error[a:b] for a, b in itertools.pairwise(starts)]
-    largest = np.array([np.abs(revolution).max() for revolution in revolutions])
-    peak_to_valley = np.array([np.ptp(revolution) for revolution in revolutions])
-    return FormErrors(np.sqrt(squares / weight), largest, peak_to_valley, starts)
+    inside = error[: starts[-1]]
+    highest, lowest = (of.reduceat(inside, edges) if whole else np.empty(0) for of in (np.maximum, np.minimum))
+    return FormErrors(np.sqrt(squares / weight), np.maximum(highest, -lowest), highest - lowest, starts)
 
 
 def evenly(angle: Array, values: Array, points: int = POINTS) -> Array:

@@ -4,6 +4,7 @@
 import base64
 import contextlib
 import json
+import math
 import platform
 import re
 from collections.abc import Mapping, Sequence
@@ -12,11 +13,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from lathe_rc import __version__, extensions
+from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario, kind_of
 from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError, shown
 from lathe_rc.files import contents
 
@@ -173,6 +176,21 @@ def namespace(about: Mapping[str, str]) -> str:
     except (ValueError, TypeError, RecursionError, KeyError):
         return ""
     return next((topic.removesuffix("/cell_state") for topic in topics if topic.endswith("/cell_state")), "")
+
+
+def tolerances(about: Mapping[str, str]) -> dict[str, float]:
+    """Tolerance [m] by relative topic of each tool that has one, as the scenario of a bag says; empty if there is none.
+
+    Raises:
+        InputError: the bag's scenario is no parameter file.
+    """
+    found: dict[str, float] = {}
+    for node, values in ros_yaml.parse(about[SCENARIO], f"{SCENARIO} of the bag").items() if SCENARIO in about else ():
+        allowed, remap = values.get("tolerance", 0.0), values.get("remap", [])
+        if str(values.get("stage") or node) == Tool.kind and isinstance(allowed, float) and 0.0 < allowed < math.inf:
+            rules = [str(rule).partition(":=") for rule in remap] if isinstance(remap, list) else []
+            found[next((new for old, _, new in rules if old == "tool"), "tool")] = allowed
+    return found
 
 
 def _versions() -> dict[str, str]:

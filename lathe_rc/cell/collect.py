@@ -15,7 +15,7 @@ from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import NotFiniteError, check_finite
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import DivergedError, InputError
 from lathe_rc.jit import kernel
 from lathe_rc.names import instead
 
@@ -39,7 +39,7 @@ class Finite:
         """See `lathe_rc.cell.engine.Sink`.
 
         Raises:
-            LatheError: a sample is NaN or infinite; names the first.
+            DivergedError: a sample is NaN or infinite; names the first.
         """
         if not any(
             array.dtype == np.float64 and _not_finite(array) for signals in dense.values() for array in signals.values()
@@ -52,7 +52,7 @@ class Finite:
                     check_finite(self._sources[topic], name, array, first)
                 except NotFiniteError as error:
                     found.append((error.index, len(found), f"/{topic}: {error}"))
-        raise LatheError(min(found)[2])
+        raise DivergedError(min(found)[2])
 
 
 def _free_memory() -> int:

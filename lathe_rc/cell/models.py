@@ -59,6 +59,13 @@ def _model(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters
     return {name: values.get(name, cast("Quantity", rows[name].default)) for name in missing}
 
 
+def given(table: NodeParameters) -> NodeParameters:
+    """The same table, whose models count as given."""
+    made = table.model_copy()
+    made.model_fields_set.update(_marked(type(table)))
+    return made
+
+
 def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
     """The tables of a cell by node, with the models that nobody has given; they count as not given still.
 
@@ -72,3 +79,14 @@ def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
             made[node] = table.model_copy(update=values)
             made[node].model_fields_set.difference_update(values)
     return made
+
+
+def of_drives(node: str, tables: Mapping[str, NodeParameters]) -> dict[str, Quantity]:
+    """The model of a node as if nobody had given one: the values of the parameters by name.
+
+    Raises:
+        InputError: see `resolved`.
+    """
+    bare = tables[node].model_copy()
+    bare.model_fields_set.difference_update(_marked(type(bare)))
+    return _model(node, bare, {**tables, node: bare})

@@ -4,6 +4,7 @@
 ROS descriptors, validation, help and the documentation are made from these tables.
 """
 
+import copy
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -87,6 +88,12 @@ class Row:
             elif isinstance(limit, MinLen):
                 words.append("not empty")
         self.limits = " ".join(words)
+
+    def element(self) -> "Row":
+        """The row of one element of a list."""
+        found = copy.copy(self)
+        found.is_list = False
+        return found
 
     def allowed(self) -> str:
         """What the parameter accepts, in words."""
@@ -209,9 +216,14 @@ class SharedParameters(Table):
 
 
 class NodeParameters(SharedParameters):
-    """What every node has."""
+    """What every node has.
+
+    Attributes:
+        judging: parameters that change no sample and no message of a run, but what is said of it.
+    """
 
     listing: ClassVar[str] = "lathe node {} --help"
+    judging: ClassVar[frozenset[str]] = frozenset()
 
     stage: str = parameter("", "what the node is; empty: its name says it")
     remap: list[str] = parameter([], "topic names to replace, as old:=new")

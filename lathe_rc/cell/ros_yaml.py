@@ -18,6 +18,7 @@ from lathe_rc.cell.parameters import Value
 from lathe_rc.errors import InputError
 
 _MAX_BYTES = 1 << 20
+_TOO_LARGE = f"larger than {_MAX_BYTES >> 20} MiB; not a parameter file"
 _MAX_DEPTH = 32
 _TRUE = {"Y", "y", "yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON"}
 _FALSE = {"N", "n", "no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF"}
@@ -150,6 +151,22 @@ def parse_value(text: str, source: str) -> Value:
     return "" if node is None else _value(node, source)
 
 
+def rows(text: str, source: str) -> list[dict[str, Value]]:
+    """A list of maps of values, each by the same rules.
+
+    Raises:
+        InputError: it is none.
+    """
+    root = _compose(text, source)
+    items = root.value if isinstance(root, yaml.SequenceNode) else []
+    if not items or not all(isinstance(item, yaml.MappingNode) for item in items):
+        raise InputError(f"{source}: no list of maps; allowed: '- {{NODE.PARAM: VALUE, ...}}', a line a cell")
+    found: list[dict[str, Value]] = [{} for _ in items]
+    for number, item in enumerate(items):
+        _flatten(item, f"{source}: row {number + 1}", "", found[number])
+    return found
+
+
 def read(path: Path) -> dict[str, dict[str, Value]]:
     """Parameters by node and name, in the order of the file.
 
@@ -162,19 +179,30 @@ def read(path: Path) -> dict[str, dict[str, Value]]:
         text = files.contents(path, _MAX_BYTES).decode()
     except OSError as error:
         if error.errno == errno.EFBIG:
-            raise InputError(f"{path}: larger than {_MAX_BYTES >> 20} MiB; not a parameter file") from None
+            raise InputError(f"{path}: {_TOO_LARGE}") from None
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; allowed: YAML in UTF-8") from None
-    root = _compose(text, str(path))
+    return parse(text, str(path))
+
+
+def parse(text: str, source: str) -> dict[str, dict[str, Value]]:
+    """The same as `read` of a text; ``source`` is where it is from.
+
+    Raises:
+        InputError: it is larger than 1 MiB, or not a ROS 2 parameter file.
+    """
+    if len(text) > _MAX_BYTES:
+        raise InputError(f"{source}: {_TOO_LARGE}")
+    root = _compose(text, source)
     if not isinstance(root, yaml.MappingNode):
-        raise InputError(f"{path}: no nodes; allowed: 'NODE: {{ros__parameters: ...}}'")
+        raise InputError(f"{source}: no nodes; allowed: 'NODE: {{ros__parameters: ...}}'")
     nodes: dict[str, dict[str, Value]] = {}
     for key, item in root.value:
-        full_name = _name(key, str(path))
+        full_name = _name(key, source)
         name = "/**" if full_name == "/**" else full_name.removeprefix("/**/").removeprefix("/")
         entries = item.value if isinstance(item, yaml.MappingNode) else []
         if [entry[0].value for entry in entries] != ["ros__parameters"]:
-            raise InputError(f"{path}:{key.start_mark.line + 1}: {full_name} does not hold ros__parameters alone")
-        _flatten(entries[0][1], f"{path}: {name}", "", nodes.setdefault(name, {}))
+            raise InputError(f"{source}:{key.start_mark.line + 1}: {full_name} does not hold ros__parameters alone")
+        _flatten(entries[0][1], f"{source}: {name}", "", nodes.setdefault(name, {}))
     return nodes

@@ -3,15 +3,17 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import cast
 
 import yaml
 
 from lathe_rc import files
 from lathe_rc.cell import models, ros_yaml
-from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Value
+from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Value
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stages import MASTERS, STAGES
@@ -49,6 +51,7 @@ class _Tables(Mapping[str, type[NodeParameters]]):
 TABLES = _Tables()
 
 _EVERYONE = "/**"
+_ELEMENT = re.compile(r"(.*\S)\[(\d+)\]")
 # What changes neither a sample nor a message of a run, and so not its identity.
 _HOST_PARAMETERS = {
     *("run_id", "speed_factor", "window", "members", "processes", "autostart"),
@@ -156,11 +159,49 @@ class Scenario:
             seen.add(name)
         return split + [[name] for name in self.nodes if name not in seen]
 
+    @property
+    def identity(self) -> str:
+        """A hash of all that changes a run: its nodes and their parameters, and what the files hold that they name."""
+        return _hash(self.fingerprints)
+
+    def parameter(self, target: str) -> Row:
+        """The row of a parameter in its node's table.
+
+        Args:
+            target: ``NODE.PARAM``, or ``PARAM`` for a shared parameter, with ``[K]`` for an element of a list.
+
+        Raises:
+            InputError: there is none.
+        """
+        kinds = {node: self.kind(node) for node in self.nodes}
+        whole, element = _element(target)
+        node, name = _target(whole, kinds, shown(target))
+        rows = SharedParameters.rows() if node == _EVERYONE else TABLES[kinds[node]].rows()
+        if name not in rows:
+            known = instead(name, sorted(rows), listing=NodeParameters.listing.format(kinds[node]))
+            raise InputError(f"{shown(target)}: unknown parameter; {known}")
+        if element is None:
+            return rows[name]
+        _with_element(target, getattr(self.nodes[node], name), element, 0.0)
+        return rows[name].element()
+
+    def value(self, target: str) -> Value:
+        """What a parameter is; see `parameter`."""
+        whole, element = _element(target)
+        node, _, name = whole.rpartition(".")
+        found = getattr(self.nodes[node] if node else self.shared, name)
+        return cast("Value", found if element is None else found[element])
+
+    def with_models_given(self) -> "Scenario":
+        """The same cell, whose controllers keep their models of the drives when the drives are varied."""
+        tables = {node: models.given(table) for node, table in self.nodes.items()}
+        return Scenario(self.name, tables, self.fingerprints)
+
     def varied(self, values: Mapping[str, Value]) -> "Scenario":
         """The same cell with other values, without reading its file again.
 
         Args:
-            values: by ``NODE.PARAM``, or ``PARAM`` for a shared parameter.
+            values: by ``NODE.PARAM``, or ``PARAM`` for a shared parameter; ``NODE.PARAM[K]`` is element K of a list.
 
         Raises:
             InputError: one line for the first thing that is wrong.
@@ -181,9 +222,15 @@ class Scenario:
         """
         changes: dict[str, dict[str, Value]] = {}
         for target, value in values.items():
-            node, name = _target(target, {node: self.kind(node) for node in self.nodes}, target)
+            whole, element = _element(target)
+            node, name = _target(whole, {node: self.kind(node) for node in self.nodes}, target)
             for each in [node] if node != _EVERYONE else self.nodes:
-                changes.setdefault(each, {})[name] = _absolute(self.kind(each), name, value, Path())
+                found = changes.setdefault(each, {})
+                if element is not None:
+                    before = found.get(name, getattr(self.nodes[each], name, None))
+                    found[name] = _with_element(target, before, element, value)
+                else:
+                    found[name] = _absolute(self.kind(each), name, value, Path())
         tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
         given = "run_id" in values or self.shared.run_id != _identity(fingerprints)
         for node, changed in changes.items():
@@ -195,13 +242,37 @@ class Scenario:
             tables = {node: table.model_copy(update={"run_id": ""}) for node, table in tables.items()}
         return _agreed(self.name, tables, fingerprints)
 
-    def to_yaml(self) -> str:
-        """The complete parameter file; empty lists are left out, since rcl cannot read them."""
+    def to_yaml(self, *, given: bool = False) -> str:
+        """The complete parameter file; empty lists are left out, since rcl cannot read them.
+
+        Args:
+            given: what was given alone; read again, the rest takes its defaults, and models follow their drives.
+        """
         tree = {}
+        left_out = {"run_id"} if given and self.shared.run_id == _identity(self.fingerprints) else None
         for name, table in self.nodes.items():
-            values = {key: _quoted(value) for key, value in table.model_dump().items() if value != []}
+            kept = table.model_dump(exclude_unset=given, exclude=left_out)
+            values = {key: _quoted(value) for key, value in kept.items() if value != []}
             tree[f"/**/{name}"] = {"ros__parameters": values}
         return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=None)
+
+
+def _element(target: str) -> tuple[str, int | None]:
+    """A target without ``[K]``, and K."""
+    match = _ELEMENT.fullmatch(target.strip())
+    return (match[1], int(match[2])) if match else (target, None)
+
+
+def _with_element(target: str, values: object, element: int, value: Value) -> Value:
+    """A list with one element replaced.
+
+    Raises:
+        InputError: it has no such element.
+    """
+    if not isinstance(values, list) or element >= len(values):
+        has = f"a list of {len(values)}" if isinstance(values, list) else "no list"
+        raise InputError(f"{shown(target)}: the scenario has {has} there; allowed: an element of a list")
+    return cast("Value", [*values[:element], value, *values[element + 1 :]])
 
 
 def _target(text: str, kinds: Mapping[str, str], what: str) -> tuple[str, str]:
@@ -252,7 +323,7 @@ def _absolute(kind: str, name: str, value: Value, folder: Path) -> Value:
     return str((folder / value).resolve())
 
 
-def _content(path: Path) -> str:
+def content(path: Path) -> str:
     """A hash of a file's content; its name if it is none, longer than any reader takes, or cannot be read."""
     try:
         return hashlib.sha256(files.contents(path)).hexdigest()
@@ -264,17 +335,21 @@ def _fingerprint(table: NodeParameters) -> str:
     """A hash of what a table says of a run; empty if that changes none."""
     if isinstance(table, RecorderParameters):
         return ""
-    values = table.model_dump(exclude=_HOST_PARAMETERS)
+    values = table.model_dump(exclude=_HOST_PARAMETERS | table.judging)
     for row in type(table).rows().values():
         if row.is_path and values[row.name]:
-            values[row.name] = _content(Path(values[row.name]))
+            values[row.name] = content(Path(values[row.name]))
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def _identity(fingerprints: Mapping[str, str]) -> str:
     """A run id that names the scenario's content: two runs of it give the same messages."""
+    return _hash(fingerprints)[:16]
+
+
+def _hash(fingerprints: Mapping[str, str]) -> str:
     said = {node: fingerprint for node, fingerprint in fingerprints.items() if fingerprint}
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
 def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mapping[str, str]) -> Scenario:

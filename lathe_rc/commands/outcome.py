@@ -10,6 +10,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from lathe_rc import harness, part
+from lathe_rc.analysis.budget import Budget, Part
 from lathe_rc.cell.durations import Lateness
 
 _MOST_EVENTS = 12  # that are told of a run
@@ -45,9 +46,10 @@ def _events(result: harness.Result) -> RichTable:
 
 
 def facts(result: harness.Result) -> list[str]:
-    """What was sent and lost, how fast, and who was refused."""
+    """Whether the part is in tolerance, what was sent and lost, how fast, and who was refused."""
     refused = [f"{count} messages refused from {sender}" for sender, count in result.refused.items()]
     return [
+        *([result.verdict.told()] if result.verdict else []),
         f"{result.blocks} blocks sent, {result.dropped} lost; {result.errors.rms.size} revolutions",
         f"{result.simulated_s:.2f} s simulated in {result.wall_s:.2f} s: {result.real_time_factor:.1f}x real time",
         *(_lateness(result.lateness) if result.lateness else []),
@@ -64,8 +66,27 @@ def _lateness(told: Lateness) -> list[str]:
     ]
 
 
-def show(result: harness.Result, further: Mapping[str, Path], *, told: str = "") -> None:
-    """Print a run: its part, what happened, how it went, and the files that it left."""
+def budget_table(found: Budget) -> RichTable:
+    """Cause by cause."""
+    table = RichTable(show_edge=False, header_style="bold", title_justify="left")
+    for column in ("cause", "share of the power [%]", "RMS [µm]", "maximum [µm]"):
+        table.add_column(column, justify="right" if table.columns else "left")
+    whole = Part(f"form error, {found.revolutions} revolutions", 1.0, found.rms, found.largest)
+    for each in (*found.rows, whole):
+        table.add_row(each.name, each.percent(), f"{each.rms * 1e6:.3g}", f"{each.largest * 1e6:.3g}")
+    return table
+
+
+def show_budget(found: Budget) -> None:
+    """Print a budget."""
+    console = Console()
+    console.print(budget_table(found))
+    for name, why in found.left_out.items():
+        console.print(f"not switched off: {name}: {why}", highlight=False)
+
+
+def show(result: harness.Result, further: Mapping[str, Path], *, told: str = "", budget: Budget | None = None) -> None:
+    """Print a run: its part, what happened, how it went, what its error is made of, and the files that it left."""
     console = Console()
     if result.errors.rms.size:
         console.print(table(result))
@@ -73,6 +94,8 @@ def show(result: harness.Result, further: Mapping[str, Path], *, told: str = "")
         console.print(_events(result))
     for fact in [*facts(result), *filter(None, [told])]:
         console.print(fact, highlight=False)
+    if budget is not None:
+        show_budget(budget)
     files = [("bag", result.bag), *(("snapshot", path) for path in result.snapshots), *further.items()]
     for name, path in files:
         if path:

@@ -11,11 +11,12 @@ import click
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True, help="HTML file"
 )
-def report(bag: Path, output: Path) -> None:
+@click.option("--budget", is_flag=True, help="what the form error is made of, by some ten runs of the bag's scenario")
+def report(bag: Path, output: Path, *, budget: bool) -> None:
     """Tell what a recording holds on one page: result, figures, what was lost; it opens without network."""
     from lathe_rc.view import report as reporting
 
-    told = reporting.write(bag, output)
+    told = reporting.write(bag, output, with_budget=budget)
     if not told.complete:
         click.echo(f"incomplete recording{': ' + told.stopped if told.stopped else ''}", err=True)
     click.echo(f"report: {output}")

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 @click.option("--domain", type=click.IntRange(0, 232), help="ROS domain, for others to listen; default: a free one")
 @click.option("--namespace", help="of the nodes, for two cells in one domain; default: /")
 @options.start
+@click.option("--require-tolerance", is_flag=True, help="exit with 1 unless the run ends within the tool's tolerance")
+@click.option("--budget", is_flag=True, help="tell what the form error is made of as well, by some ten further runs")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def run(
     scenario: str,
@@ -42,6 +44,8 @@ def run(
     namespace: str | None,
     start: "Start | None",
     *,
+    require_tolerance: bool,
+    budget: bool,
     as_json: bool,
 ) -> None:
     """Run a SCENARIO, a ROS 2 parameter file, to its end."""
@@ -62,5 +66,7 @@ def run(
         domain,
         namespace,
         start,
+        require_tolerance=require_tolerance,
+        budget=budget,
         as_json=as_json,
     )

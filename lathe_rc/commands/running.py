@@ -10,10 +10,10 @@ from rich.console import Console
 from lathe_rc import harness, part
 from lathe_rc.bag.record import recorder_of
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.commands import outcome, picture
+from lathe_rc.commands import budgeting, outcome, picture
 from lathe_rc.commands import scenario as scenarios
 from lathe_rc.commands.progress import Watch
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place
 from lathe_rc.starting import Start
 
@@ -51,21 +51,24 @@ def run(
     namespace: str | None,
     start: Start | None,
     *,
+    require_tolerance: bool,
+    budget: bool,
     as_json: bool,
 ) -> None:
     """See `lathe_rc.commands.run`."""
-    loaded = scenarios.load(scenario, overrides)
-    asked = {"revolutions": revolutions, "speed_factor": speed_factor}
-    given = {name: value for name, value in asked.items() if value is not None}
-    changes = [f"{node}.{n}={v!r}" for node in loaded.masters for n, v in given.items()]
-    if changes:
-        loaded = scenarios.load(scenario, [*overrides, *changes])
+    loaded = scenarios.load(scenario, overrides, revolutions=revolutions, speed_factor=speed_factor)
     split = scenarios.split(loaded, groups)
     if groups and mode != "processes":
         raise InputError(f"--group with --mode {mode}; allowed: --mode processes")
     for option, value in (("--domain", domain), ("--namespace", namespace), ("--start", start)):
         if value is not None and mode == "offline":
             raise InputError(f"{option} {value} with --mode offline; allowed: --mode processes or composed")
+    if require_tolerance and not part.tolerances(loaded):
+        tools = loaded.of_kind("tool") or ["tool"]
+        raise InputError(
+            f"--require-tolerance without {tools[0]}.tolerance; allowed: a scenario that has one, or --set "
+            f"{tools[0]}.tolerance=2e-6"
+        )
     if figure:
         picture.check_place(figure)
     if profile:
@@ -83,13 +86,17 @@ def run(
         part.write_profile(profile, result.recording, result.part, [result.errors.rms.size - 1])
     if figure:
         picture.save(result.plot(), figure)
+    found = budgeting.shown(loaded) if budget else None
     if as_json:
-        click.echo(json.dumps(result.summary()))
-        return
-    asks_for_snapshots = recorder_of(loaded)[1].mode != "continuous"
-    told = _NO_SNAPSHOTS if asks_for_snapshots and not bag else ""
-    files = {name: path for name, path in (("profile", profile), ("figure", figure)) if path}
-    outcome.show(result, files, told=told)
+        click.echo(json.dumps(result.summary() | ({"budget": found.summary()} if found else {})))
+    else:
+        asks_for_snapshots = recorder_of(loaded)[1].mode != "continuous"
+        told = _NO_SNAPSHOTS if asks_for_snapshots and not bag else ""
+        files = {name: path for name, path in (("profile", profile), ("figure", figure)) if path}
+        outcome.show(result, files, told=told, budget=found)
+    if require_tolerance and result.verdict and not result.verdict.in_tolerance:
+        hint = "" if found else f"; lathe budget {scenario} tells why"
+        raise LatheError(f"{loaded.name} is {result.verdict.told()}; allowed: no more than the tolerance{hint}")
 
 
 def demo(name: str, announcement: str, title: str, revolutions: float, folder: Path) -> None:

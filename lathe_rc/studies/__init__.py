@@ -6,9 +6,11 @@ from typing import Any
 from lathe_rc.extensions import Objects
 from lathe_rc.studies import (
     angle_domain,
+    best_law,
     coupling,
     decoupling,
     drive_models,
+    drive_tolerance,
     invariance,
     multichannel,
     piston,
@@ -23,6 +25,7 @@ _OWN: dict[str, Study[Any]] = {
     for module in (
         invariance,
         speed_deviation,
+        best_law,
         multichannel,
         piston,
         angle_domain,
@@ -30,6 +33,7 @@ _OWN: dict[str, Study[Any]] = {
         saturation,
         sampled_servo,
         decoupling,
+        drive_tolerance,
         coupling,
     )
 }

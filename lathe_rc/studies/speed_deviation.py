@@ -29,18 +29,18 @@ Overrides = Mapping[str, object]
 _CYCLES = 50  # learned at constant speed
 _SHOWN = 1.0  # [s] of deviation, at least a period and a half
 _DYNAMIC = "second_order_inverse_dynamic"
-_COLOURS = {
+COLOURS = {
     "time_periodic": "#7f7f7f",
     "constant_lead": "#c0392b",
     "variable_lead": "#e08e0b",
-    "variable_lead_second_order": "#b7950b",
+    "variable_lead_second_order": "#6e2c00",
     "second_order_inverse": "#7d3c98",
     "second_order_inverse_dynamic": "#2874a6",
     "exact_preview": "#148f77",
     "exact_invariance": "#73c6b6",
     "adaptive_inverse": "#111111",
 }
-LAWS = tuple(_COLOURS)
+LAWS = tuple(COLOURS)
 _TRACES = ("constant_lead", "variable_lead", "adaptive_inverse")
 
 
@@ -116,13 +116,13 @@ class SpeedDeviationResult:
         for axes, (place, wd) in zip(panels, shown, strict=True):
             for law in _TRACES:
                 turns, error = self.traces[law][place]
-                axes.plot(turns, error, color=_COLOURS[law], lw=0.8, label=law.replace("_", " "))
+                axes.plot(turns, error, color=COLOURS[law], lw=0.8, label=law.replace("_", " "))
             axes.set(xlabel="revolutions since the deviation began", ylabel="form error [µm]")
             axes.set_title(f"deviation at {wd:g} rad/s", fontsize=10)
         order = np.argsort(given.wd)
         for law in LAWS:
             overview.loglog(
-                np.array(given.wd)[order], np.array(self.largest[law])[order], ".-", color=_COLOURS[law],
+                np.array(given.wd)[order], np.array(self.largest[law])[order], ".-", color=COLOURS[law],
                 label=law.replace("_", " "), lw=1.0,
             )  # fmt: skip
         overview.set(xlabel="frequency of the deviation [rad/s]", ylabel="largest form error [µm]")
@@ -136,7 +136,7 @@ def _figure(value: float) -> str:
     return f"{value:.3g}"
 
 
-def _settings(parameters: SpeedDeviationParameters) -> dict[str, list[Overrides]]:
+def settings(parameters: SpeedDeviationParameters) -> dict[str, list[Overrides]]:
     """Parameters of the learning controller by law; several where the worst counts."""
     lead, q = parameters.t0_ms * 1e-3, parameters.q_us * 1e-6
     delay = 0.36e-3  # of the drive: all that an inverse leaves to the lead
@@ -216,9 +216,9 @@ def run(parameters: SpeedDeviationParameters, track: Track = untracked) -> Speed
     largest: dict[str, list[float]] = {law: [] for law in LAWS}
     rms: dict[str, list[float]] = {law: [] for law in LAWS}
     traces: dict[str, list[tuple[Array, Array]]] = {law: [] for law in _TRACES}
-    settings = _settings(parameters)
+    of = settings(parameters)
     for wd, law in track(list(product(parameters.wd, LAWS))):
-        runs = [_run_cell(parameters, wd, controller) for controller in settings[law]]
+        runs = [_run_cell(parameters, wd, controller) for controller in of[law]]
         turns, error = max(runs, key=lambda run: float(np.abs(run[1]).max()))
         largest[law].append(float(np.abs(error).max()))
         rms[law].append(float(np.sqrt(np.mean(error**2))))

@@ -7,6 +7,7 @@ characters that do not print.
 
 import json
 import shlex
+import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -17,8 +18,11 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from lathe_rc import __version__
-from lathe_rc.bag.story import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS, origins
+from lathe_rc.analysis.budget import TOLD, Budget
+from lathe_rc.analysis.tolerance import Verdict
+from lathe_rc.bag.story import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS, origins, scenario_of
 from lathe_rc.cell import messages
+from lathe_rc.cell.budget import budget
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place, replacing
 from lathe_rc.view import report_figures as figures
@@ -206,6 +210,7 @@ def _losses(told: Gathered) -> list[str]:
     found += [f"{name} lost {count} blocks" for name, count in host.lost_blocks.items()]
     found += host.errors
     found += [f"{form.tool}: {form.refused}" for form in told.forms if form.refused]
+    found += [f"no tolerance is known: {told.unjudged}"] if told.unjudged else []
     if told.about.get(RECOVERED):
         found.append(f"the bag was cut off and has been recovered: {told.about[RECOVERED]}")
     if host.unreadable:
@@ -290,9 +295,45 @@ def _about(told: Gathered) -> Grid | None:
     return Grid(("key", "text"), _cut(rows, len(given)), caption, "docs/bags.md", ("key", "text"))
 
 
+def _judged(found: Verdict) -> list[Fact]:
+    """Whether a form is in tolerance."""
+    tolerance = f"±{found.tolerance * 1e6:.4g} µm"
+    if found.in_tolerance:
+        facts = [Fact(f"{tolerance}, from revolution {found.since} on", "in tolerance", "good")]
+        return [*facts, Fact("to spare at the end", f"{_number(found.spare * 1e6)} µm", "good")]
+    facts = [Fact(f"{tolerance}, in the last revolution", "not in tolerance", "bad")]
+    return [*facts, Fact("too much", f"{_number(-found.spare * 1e6)} µm", "bad")]
+
+
+def _budget(found: Budget) -> Grid:
+    rows = [[part.name, part.percent(), _number(part.rms * 1e6), _number(part.largest * 1e6)] for part in found.rows]
+    rows.append(["form error", "100.0", _number(found.rms * 1e6), _number(found.largest * 1e6)])
+    caption = (
+        f"Form error of the last {found.revolutions} revolutions, from runs of the bag's scenario offline with causes "
+        "switched off: share in its power, and size of each part by itself. Causes, rest and interactions add up; "
+        f"pairs of causes are parts of the interactions, those below {TOLD:.0%} are left out."
+    )
+    left_out = "".join(f" Not switched off: {name}: {printable(why)}." for name, why in found.left_out.items())
+    return Grid(
+        ("cause", "share [%]", "RMS [µm]", "max [µm]"), rows, caption + left_out, "docs/metrology.md", ("cause",)
+    )
+
+
+def _budgeted(told: Gathered) -> Budget:
+    """The budget of the scenario that a bag holds."""
+    with tempfile.TemporaryDirectory(prefix="lathe-report-") as folder:
+        return budget(scenario_of(told.about, Path(folder)))
+
+
 def _facts(told: Gathered) -> list[Fact]:
     whole = Fact("recording", "complete", "good") if told.complete else Fact("recording", "incomplete", "bad")
-    facts = [whole, Fact("simulated", f"{told.seconds:.4g} s"), Fact("samples", f"{told.samples:,}".replace(",", " "))]
+    judged = [fact for form in told.forms[:1] if form.verdict for fact in _judged(form.verdict)]
+    facts = [
+        *judged,
+        whole,
+        Fact("simulated", f"{told.seconds:.4g} s"),
+        Fact("samples", f"{told.samples:,}".replace(",", " ")),
+    ]
     for form in told.forms[:1]:
         if form.first and form.last:
             facts.append(Fact("revolutions", str(form.rms.size)))
@@ -303,13 +344,14 @@ def _facts(told: Gathered) -> list[Fact]:
     return facts
 
 
-def render(told: Gathered, name: str, command: str) -> str:
+def render(told: Gathered, name: str, command: str, made_of: Budget | None = None) -> str:
     """The page.
 
     Args:
         told: what was gathered.
         name: of the bag.
         command: that makes the page again.
+        made_of: what the form error is made of; None: nobody has asked.
     """
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
@@ -330,6 +372,7 @@ def render(told: Gathered, name: str, command: str) -> str:
         command=printable(command),
         version=__version__,
         facts=_facts(told),
+        budget=_budget(made_of) if made_of else None,
         forms=forms,
         signals=signals,
         timing=timing,
@@ -346,23 +389,25 @@ def render(told: Gathered, name: str, command: str) -> str:
     return text
 
 
-def write(bag: Path, page: Path) -> Gathered:
+def write(bag: Path, page: Path, *, with_budget: bool = False) -> Gathered:
     """Write the report of a bag; an older one of the same name is replaced once the new one is whole.
 
     Args:
         bag: the bag.
         page: the HTML file.
+        with_budget: tell what the form error is made of, by runs of the bag's scenario.
 
     Raises:
-        InputError: not a bag, or no place for a page.
-        LatheError: the disk does not take it.
+        InputError: not a bag, or no place for a page; with a budget, a bag without a scenario that can run offline.
+        LatheError: the disk does not take it, or a run of the budget failed.
     """
     if page.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"-o {page}; allowed: a file name that ends in .html")
     check_place("-o", page)
     told = gather(bag)
-    command = shlex.join(["lathe", "report", str(bag), "-o", str(page)])
-    text = render(told, bag.resolve().name, command)
+    found = _budgeted(told) if with_budget else None
+    command = shlex.join(["lathe", "report", str(bag), *(["--budget"] if with_budget else []), "-o", str(page)])
+    text = render(told, bag.resolve().name, command, found)
     try:
         with replacing(page) as file:
             file.write(text.encode("utf-8", "replace"))

@@ -9,6 +9,7 @@ import numpy as np
 
 from lathe_rc import part
 from lathe_rc.analysis.metrology import POINTS, Measurement, measure
+from lathe_rc.analysis.tolerance import Judge, Verdict
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
@@ -43,6 +44,7 @@ class Form:
     Args:
         encoder: topic with the angle.
         tool: topic with the form error.
+        tolerance: form error that is allowed to each side [m]; 0: none.
 
     Attributes:
         tool: see above.
@@ -52,8 +54,9 @@ class Form:
         refused: why the form, or its rest, is not measured; empty if it is.
     """
 
-    def __init__(self, encoder: str, tool: str) -> None:
-        self._encoder, self.tool = encoder, tool
+    def __init__(self, encoder: str, tool: str, tolerance: float = 0.0) -> None:
+        self._encoder, self.tool, self._tolerance = encoder, tool, tolerance
+        self._judge: Judge | None = None
         self._angle, self._error = np.empty(0), np.empty(0)
         self._done = 0  # revolutions measured; the arrays go back to a margin before the next
         self.first: Revolution | None = None
@@ -72,6 +75,11 @@ class Form:
             self._angle = np.concatenate([self._angle, dense[self._encoder]["angle_true"]])
             self._error = np.concatenate([self._error, dense[self.tool]["error"]])
             self._measure(_MARGIN)
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Whether the form is in tolerance; None if it has none, or cannot be measured to its end."""
+        return self._judge.verdict() if self._judge and not self.refused else None
 
     def finish(self) -> None:
         """Measure what is left."""
@@ -129,6 +137,9 @@ class Form:
         rms = found.form.rms[:whole]
         self.rms.add(rms)
         self.largest.add(found.form.largest[:whole])
+        if self._tolerance:
+            self._judge = self._judge or Judge(self._tolerance, self._done)
+            self._judge.add(found.form.largest[:whole])
         if self.first is None:
             self.first = self._revolution(found, 0)
         best = int(np.argmin(rms))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lathe_rc import happened
+from lathe_rc.bag import story
 from lathe_rc.bag.snapshot import first_sample, span_of
 from lathe_rc.bag.source import Source
 from lathe_rc.bag.stream import Feeder
@@ -15,7 +16,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder
-from lathe_rc.errors import LatheError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.happened import HAPPENED, Happening
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_host import TYPES as HOST_TYPES
@@ -110,6 +111,7 @@ class Gathered:
         curves: signals and cycles.
         host: what the host topics say.
         stopped: why the bag was not read to its end; empty if it was.
+        unjudged: why nothing is known of tolerances; empty if it is.
     """
 
     about: Mapping[str, str]
@@ -121,6 +123,7 @@ class Gathered:
     step_ns: int = 0
     run_id: str = ""
     stopped: str = ""
+    unjudged: str = ""
 
     @property
     def complete(self) -> bool:
@@ -140,6 +143,19 @@ class Gathered:
         return place * (self.step_ns * 1e-9)
 
 
+def _tolerances(about: Mapping[str, str]) -> tuple[Mapping[str, float], str]:
+    """Tolerances by relative topic of the tool, and why they cannot be had."""
+    try:
+        return story.tolerances(about), ""
+    except InputError as error:
+        return {}, str(error)
+
+
+def _of(tool: str, allowed: Mapping[str, float]) -> float:
+    """The tolerance of a tool by its fully qualified topic [m]; 0: none."""
+    return next((value for topic, value in allowed.items() if tool.endswith(f"/{topic}")), 0.0)
+
+
 def gather(path: Path) -> Gathered:
     """Read a bag once.
 
@@ -149,9 +165,12 @@ def gather(path: Path) -> Gathered:
     with Source(path) as source:
         types = {topic: found.type for topic, found in source.topics.items()}
         encoders = of_type(types, messages.ENCODER)
-        forms = [Form(encoders[0], tool) for tool in of_type(types, messages.TOOL)] if encoders else []
+        allowed, unjudged = _tolerances(source.about)
+        tools = of_type(types, messages.TOOL) if encoders else []
+        forms = [Form(encoders[0], tool, _of(tool, allowed)) for tool in tools]
         curves = Curves(types)
         told = Gathered(source.about, {topic: Tally(kind) for topic, kind in sorted(types.items())}, forms, curves)
+        told.unjudged = unjudged
         first = first_sample(source.about)
         feeder = Feeder(types, [*forms, curves], _PIECE, first)
         try:

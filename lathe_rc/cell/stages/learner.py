@@ -15,7 +15,7 @@ from lathe_rc.cell.stages.obedience import Obedience
 from lathe_rc.cell.stages.retraction import BoundedParameters
 from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Takeover
-from lathe_rc.errors import LatheError
+from lathe_rc.errors import DivergedError
 
 
 class LearnerParameters(ObedientParameters, BoundedParameters, RestartParameters):
@@ -92,10 +92,10 @@ class Learner(Stage):
         takeover = Takeover(bounds, parameters.retract_position, parameters.step, reach=reach)
         return Obedience(self.name, takeover, settled=settled)
 
-    def _diverged(self, index: int, rms: float, first: float) -> LatheError:
+    def _diverged(self, index: int, rms: float, first: float) -> DivergedError:
         """Why a run is stopped: a cycle's RMS error and what it is compared with [m]."""
         ratio = rms / first if first > 0.0 else np.inf
-        return LatheError(
+        return DivergedError(
             f"sample {index}: the error grows: {rms * 1e6:.4g} µm RMS in a cycle, {ratio:.3g} times {first * 1e6:.4g} "
             f"µm; allowed: stop_ratio = {self.parameters.stop_ratio:g} (a smaller gain, or another law)"
         )

@@ -36,6 +36,11 @@ class ToolParameters(FormParameters):
         "deflects: delay of the feedback edge from the cut, at least a block; 0 where the cut does not read the tool",
         "sample",
     )
+    tolerance: Annotated[float, Ge(0)] = parameter(
+        0.0, "form error that is allowed to each side, for the verdict on a run; 0: none is given", "m"
+    )
+
+    judging = frozenset({"tolerance"})
 
 
 class Memory(NamedTuple):

@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the form error of a scenario is made of: its runs with causes switched off, offline and as a batch."""
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lathe_rc.analysis.budget import TOLD, Budget, Causes, Decomposition
+from lathe_rc.analysis.metrology import evenly
+from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.cell import batch, messages, models
+from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.parameters import NodeParameters, Value
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.form import FormParameters
+from lathe_rc.cell.stages.learning_controller import LearningController
+from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
+from lathe_rc.cell.stages.speed_law import SpeedLawParameters
+from lathe_rc.cell.stages.tool import ToolParameters
+from lathe_rc.cell.stages.vibration import VibrationParameters
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError, LatheError
+
+_TURN = 2.0 * np.pi
+_PREFIXES = ("", "coarse_", "fine_")  # of the parameters of a drive; those of a series drive have one
+_FACTOR = 0.9  # of a cycle, which a flat Q may have; or what the scenario's own has, if that is more
+_BANDS = np.geomspace(60_000.0, 500.0, 32)  # [rad/s] where the flat Q may end, the widest that converges is taken
+_STOP = 2.0  # its stop band begins at so many times that
+_RIPPLE = 1e-6
+
+#: Parameters that are a cause in whatever node they stand, with the value that switches it off.
+_ANYWHERE: Mapping[str, Mapping[str, Value]] = {
+    "noise": {"noise_rms": 0.0},
+    "quantisation": {"counts_per_revolution": 0, "resolution": 0.0, "adc_step": 0.0, "dac_step": 0.0},
+    "hysteresis": {"hysteresis": "none", "linearisation": "none", "creep_per_decade": 0.0},
+    "backlash": {"backlash": 0.0},
+    "limits": {"command_stroke": 0.0, "command_velocity": 0.0, "command_acceleration": 0.0, "command_jerk": 0.0},
+    "faults": {"faults": []},
+}
+#: The same in nodes with certain parameters.
+_SOMEWHERE: Mapping[str, tuple[type[NodeParameters], Mapping[str, Value]]] = {
+    "force": (ToolParameters, {"deflects": False, "cross_slide": False}),
+    "vibration": (
+        VibrationParameters,
+        {"random_rms": 0.0, "line_amplitude": [], "line_frequency": [], "line_phase": []},
+    ),
+}
+_SPEED = [name for name in SpeedLawParameters.model_fields if name not in NodeParameters.model_fields]
+
+
+@dataclass(frozen=True)
+class Cause:
+    """What may be switched off.
+
+    Attributes:
+        off: the values that do it, by NODE.PARAM.
+        needs: cause without which it does nothing; empty: none.
+    """
+
+    off: Mapping[str, Value]
+    needs: str = ""
+
+
+@dataclass(frozen=True)
+class _Tail:
+    """The last revolutions of a run.
+
+    Attributes:
+        whole: complete revolutions of the run.
+        error: form error over even angles [m], shape (revolutions, points).
+        height: of the tool along the part [m], shape (samples,).
+    """
+
+    whole: int
+    error: Samples
+    height: Samples
+
+
+@dataclass
+class _Keep:
+    """Keeps the last revolutions of a run; see `lathe_rc.cell.batch.Keeper`."""
+
+    cell: Cell
+    samples: int
+    heard: Collection[str] = ()
+    _kept: dict[str, Samples] = field(init=False)
+
+    def __post_init__(self) -> None:
+        named = {source.type: topic for topic, source in reversed(self.cell.dense.items())}
+        if not {messages.ENCODER, messages.TOOL} <= named.keys():
+            raise InputError("no form error to budget: the cell has no encoder and tool; allowed: a scenario with both")
+        self._fields = {
+            "angle": (named[messages.ENCODER], "angle_true"),
+            "error": (named[messages.TOOL], "error"),
+            "height": (named[messages.TOOL], "height"),
+        }
+        self._kept = {name: np.empty(self.samples) for name in self._fields}
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        for name, (topic, of) in self._fields.items():
+            self._kept[name][first : first + samples] = dense[topic][of]
+
+    def kept(self) -> _Tail:
+        """Of the last complete revolutions."""
+        angle = self._kept["angle"]
+        if angle.size < 2:
+            return _Tail(0, np.empty((0, 0)), angle)
+        # One more than is told of, for the spline; the last may be short of two samples.
+        before = max(int((angle[-1] + 2.0 * (angle[-1] - angle[-2])) / _TURN) - LAST - 1, 0)
+        begin = int(np.searchsorted(angle, before * _TURN))
+        error = evenly(angle[begin:] - before * _TURN, self._kept["error"][begin:])
+        return _Tail(before + error.shape[0], error[-LAST:], self._kept["height"][begin:])
+
+
+def _not_yet(scenario: Scenario, values: Mapping[str, Value]) -> dict[str, Value]:
+    """Those of some values that the scenario has not."""
+    parts = {target: target.partition(".") for target in values}
+    return {t: v for t, v in values.items() if getattr(scenario.nodes[parts[t][0]], parts[t][2]) != v}
+
+
+def _simple(scenario: Scenario) -> dict[str, Cause]:
+    """The causes that are a value of some parameters."""
+    found: dict[str, Cause] = {}
+    for name, (kind, values) in _SOMEWHERE.items():
+        nodes = [node for node, table in scenario.nodes.items() if isinstance(table, kind)]
+        found[name] = Cause({f"{node}.{each}": value for node in nodes for each, value in values.items()})
+    for name, values in _ANYWHERE.items():
+        targets = {
+            f"{node}.{prefix}{each}": value
+            for node, table in scenario.nodes.items()
+            for prefix in _PREFIXES
+            for each, value in values.items()
+            if f"{prefix}{each}" in type(table).model_fields
+        }
+        found[name] = Cause(targets)
+    return found
+
+
+def _learners(scenario: Scenario) -> dict[str, LearningControllerParameters]:
+    return {node: table for node, table in scenario.nodes.items() if isinstance(table, LearningControllerParameters)}
+
+
+def _speed(scenario: Scenario) -> dict[str, Cause]:
+    """A speed that varies, and how the lead follows it: off is the exact preview of the speed law."""
+    (master,) = scenario.masters
+    law, learners = scenario.nodes[master], _learners(scenario)
+    if not isinstance(law, SpeedLawParameters):
+        return {}
+    rows = type(law).rows()
+    steady = {name: rows[name].default for name in _SPEED}
+    if all(getattr(law, name) == value for name, value in steady.items()):
+        return {}
+    followed = {f"{node}.{name}": getattr(law, name) for node in learners for name in _SPEED}
+    followed |= {f"{node}.law": "angle_domain" for node in learners}
+    followed |= {f"{node}.lead_law": "exact_preview" for node in learners}
+    everywhere = {f"{node}.{name}": value for node in (master, *learners) for name, value in steady.items()}
+    return {"speed": Cause(everywhere), "lead": Cause(followed, needs="speed")}
+
+
+def _feed(scenario: Scenario, height: Samples) -> dict[str, Cause]:
+    """A form that changes along the part: off, the tool stays at the middle of the heights that are told of."""
+    forms = {node: table for node, table in scenario.nodes.items() if isinstance(table, FormParameters)}
+    off: dict[str, Value] = {}
+    for node, table in forms.items():
+        still = not (isinstance(table, ToolParameters) and table.reference == "topic")
+        if still and not table.part_revolutions and np.ptp(height) > 0.0:
+            middle = max(float(height.min() + height.max()) / 2.0, 0.0)
+            off |= {f"{node}.height_from": "feed", f"{node}.feed": 0.0, f"{node}.start_height": middle}
+    return {"feed": Cause(off)}
+
+
+def _model(scenario: Scenario) -> dict[str, Cause]:
+    """A correction that takes the drive for another than it is."""
+    off: dict[str, Value] = {}
+    for node, table in _learners(scenario).items():
+        if table.correction not in ("none", "lead_lag"):
+            off |= {f"{node}.{name}": value for name, value in models.of_drives(node, scenario.nodes).items()}
+    return {"model": Cause(off)}
+
+
+def _flat(stage: LearningController, speeds: Collection[float], cell: Cell) -> dict[str, Value] | None:
+    """The widest flat Q with which a channel converges; None if there is none."""
+    responses = [response for response, _ in cell.learned(stage)]
+
+    def factor(of: LearningController) -> float:
+        return max((of.worst(response, speed)[0] for response in responses for speed in speeds), default=np.inf)
+
+    allowed = max(factor(stage), _FACTOR)
+    for band in _BANDS:
+        values: dict[str, Value] = {
+            "q_filter": "fir",
+            "q_pass": float(band),
+            "q_stop": float(_STOP * band),
+            "q_ripple": _RIPPLE,
+        }
+        try:
+            other = type(stage)(stage.name, stage.parameters.model_copy(update=values))
+        except InputError:  # the grid, or the memory, has no room for it
+            continue
+        if factor(other) <= allowed:
+            return {f"{stage.name}.{name}": value for name, value in values.items()}
+    return None
+
+
+def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
+    """What Q forgets: off, each Q is 1 as far as its channel converges with it."""
+    off: dict[str, Value] = {}
+    low, high = cell.master.speed_range()
+    for stage in cell.stages.values():
+        if isinstance(stage, LearningController):
+            flat = _flat(stage, stage.checked_speeds(low, high), cell)
+            if flat is None:
+                left_out["Q floor"] = f"{stage.name} converges with no flat Q"
+                return {}
+            off |= flat
+    return {"Q floor": Cause(off)}
+
+
+def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[str, str]]:
+    """What may be switched off in a scenario.
+
+    Args:
+        scenario: that can work.
+        height: of the tool along the part in the revolutions that are told of [m].
+
+    Returns:
+        The causes, each after the one that it needs; and those that cannot be switched off, with the reason.
+    """
+    left_out: dict[str, str] = {}
+    found = {
+        **_q_floor(Cell(scenario.nodes), left_out),
+        **_model(scenario),
+        **_speed(scenario),
+        **_feed(scenario, height),
+        **_simple(scenario),
+    }
+    kept: dict[str, Cause] = {}
+    for name, cause in found.items():
+        off = _not_yet(scenario, cause.off)
+        if not off or cause.needs not in ("", *kept):
+            continue
+        try:
+            Cell(scenario.varied(off).nodes).check()
+        except InputError as error:
+            left_out[name] = str(error)
+        else:
+            kept[name] = Cause(off, cause.needs)
+    return kept, left_out
+
+
+def _with(scenario: Scenario, found: Mapping[str, Cause], acting: Causes) -> Scenario:
+    """The scenario with some causes alone; what needs one that is off need not be switched off."""
+    off: dict[str, Value] = {}
+    for name, cause in found.items():
+        if name not in acting and (not cause.needs or cause.needs in acting):
+            off |= cause.off
+    return scenario.varied(off)
+
+
+def _compared(scenario: Scenario, runs: Mapping[Causes, _Tail]) -> dict[Causes, Samples]:
+    """The form errors of the same revolutions."""
+    if len({tail.whole for tail in runs.values()}) > 1:
+        (master,) = scenario.masters
+        raise InputError(
+            f"budget of {scenario.name}: its runs end with another revolution each, a sample or two before it is "
+            f"complete; allowed: a whole number of {master}.revolutions"
+        )
+    return {acting: tail.error for acting, tail in runs.items()}
+
+
+def budget(
+    scenario: Scenario, *, threads: int | None = None, watch: Callable[[int, int], None] | None = None
+) -> Budget:
+    """See `lathe_rc.harness.budget`."""
+    done = 0
+
+    def run(sets: Iterable[Causes], made: Mapping[str, Cause]) -> dict[Causes, _Tail]:
+        nonlocal done
+        order = sorted(sets, key=sorted)
+        known = done + len(order)
+        outcomes = batch.run((_with(scenario, made, acting) for acting in order), _Keep, threads=threads)
+        tails: dict[Causes, _Tail] = {}
+        for acting, outcome in zip(order, outcomes, strict=True):
+            done += 1
+            if watch is not None:
+                watch(done, known)
+            if outcome.error is not None:
+                without = ", ".join(name for name in made if name not in acting)
+                about = f"budget of {scenario.name} without {without}: " if without else ""
+                kind = InputError if isinstance(outcome.error, InputError) else LatheError
+                raise kind(f"{about}{outcome.error}")
+            assert outcome.kept is not None, "it has not failed"
+            tails[acting] = outcome.kept
+        return tails
+
+    (whole,) = run([frozenset()], {}).values()
+    if not whole.error.size:
+        raise InputError(f"budget of {scenario.name}: no complete revolution; allowed: a longer run")
+    found, left_out = causes(scenario, whole.height)
+    split = Decomposition({name: cause.needs for name, cause in found.items()})
+    runs = {frozenset(found): whole}
+    runs |= run(split.alone() - runs.keys(), found)
+    told = split.split(_compared(scenario, runs), left_out)
+    if abs(told.interactions.share) >= TOLD:
+        runs |= run(split.together() - runs.keys(), found)
+        told = split.split(_compared(scenario, runs), left_out)
+    return told

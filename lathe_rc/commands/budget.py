@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``lathe budget``: what the form error of a scenario is made of."""
+
+import json
+
+import click
+
+from lathe_rc.commands import options
+
+
+@click.command()
+@click.argument("scenario")
+@click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of the runs")
+@options.overrides
+@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+def budget(scenario: str, revolutions: float | None, overrides: tuple[str, ...], *, as_json: bool) -> None:
+    """Tell what causes make of the form error of a SCENARIO: it runs offline with one after the other switched off."""
+    from lathe_rc.commands import budgeting, outcome
+    from lathe_rc.commands import scenario as scenarios
+
+    loaded = scenarios.load(scenario, overrides, revolutions=revolutions)
+    found = budgeting.shown(loaded)
+    if as_json:
+        click.echo(json.dumps({"scenario": loaded.name, **found.summary()}))
+        return
+    outcome.show_budget(found)

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folder of a sweep: the cell that is varied, the spaces that were asked for, and the rows as a Parquet data set.
+
+DIR/scenario.yaml    the cell, as it was given
+DIR/sweep.json       its identity, what is measured, the spaces
+DIR/rows/*.parquet   a row a cell, see `lathe_rc.sweep.row`
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import filelock
+import pyarrow as pa
+import pyarrow.compute
+import pyarrow.dataset
+import pyarrow.parquet
+
+from lathe_rc import files
+from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.parameters import Value
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.sweep import row
+from lathe_rc.sweep.row import Measure
+from lathe_rc.sweep.space import Space
+
+_FORMAT = 1
+
+
+class Folder:
+    """A sweep on the disk.
+
+    Args:
+        path: its folder.
+
+    Attributes:
+        path: see above.
+        scenario: the cell that is varied.
+        measures: what is measured of each, beside the rest.
+        spaces: that were asked for, in order.
+
+    Raises:
+        InputError: it holds no sweep.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            told = json.loads(files.contents(path / "sweep.json"))
+        except (OSError, ValueError):
+            raise InputError(f"{path} holds no sweep; allowed: a folder that lathe sweep has written") from None
+        if told.get("format") != _FORMAT:
+            raise InputError(f"{path}: format {told.get('format')} of another lathe_rc; allowed: {_FORMAT}")
+        self.scenario = replace(scenarios.load(path / "scenario.yaml"), name=told["name"])
+        if self.scenario.identity != told["identity"]:
+            raise InputError(
+                f"{path}: its scenario has changed, or a file that it names; allowed: as it was, or a new folder"
+            )
+        self.measures = [Measure(*each) for each in told["measures"]]
+        self.spaces = [Space(**each) for each in told["spaces"]]
+
+    @staticmethod
+    def begin(path: Path, scenario: Scenario, space: Space, measures: Sequence[Measure]) -> "Folder":
+        """The sweep of a folder, which is made if it is not there, with one more space.
+
+        Raises:
+            InputError: it holds something else.
+            LatheError: it cannot be written.
+        """
+        new = not (path / "sweep.json").exists()
+        if new and path.exists() and (not path.is_dir() or any(each.name != "lock" for each in path.iterdir())):
+            raise InputError(f"{path} holds something else than a sweep; allowed: a new folder, or that of a sweep")
+        spaces = [] if new else Folder(path).spaces
+        space = Space(**space.to_json())
+        if not new:
+            there = Folder(path)
+            if there.scenario.to_yaml(given=True) != scenario.to_yaml(given=True):
+                raise InputError(f"{path} holds a sweep of another cell ({there.scenario.name}); allowed: a new folder")
+            if there.measures != list(measures):
+                named = ", ".join(each.name for each in there.measures) or "nothing"
+                raise InputError(f"{path}: measures {named} beside the rest; allowed: the same, or a new folder")
+        if space not in spaces:
+            spaces.append(space)
+        told = {
+            "format": _FORMAT,
+            "name": scenario.name,
+            "identity": scenario.identity,
+            "measures": [list(each) for each in measures],
+            "spaces": [each.to_json() for each in spaces],
+        }
+        with _writing(path):
+            (path / "rows").mkdir(parents=True, exist_ok=True)
+            if new:
+                with files.replacing(path / "scenario.yaml") as stream:
+                    stream.write(scenario.to_yaml(given=True).encode())
+            with files.replacing(path / "sweep.json") as stream:
+                stream.write(json.dumps(told, indent=1).encode())
+        return Folder(path)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep others from computing into the folder.
+
+        Raises:
+            InputError: somebody does already.
+        """
+        lock = filelock.FileLock(self.path / "lock")
+        try:
+            lock.acquire(blocking=False)
+        except filelock.Timeout:
+            raise InputError(f"{self.path}: another sweep computes into it; allowed: one at a time") from None
+        try:
+            yield
+        finally:
+            lock.release()
+
+    @property
+    def targets(self) -> list[str]:
+        """What differs between the cells."""
+        return list(dict.fromkeys(target for space in self.spaces for target in space.targets() if target != "seed"))
+
+    @property
+    def schema(self) -> pa.Schema:
+        """Columns of the rows."""
+        return row.schema(self.scenario, self.targets, self.measures)
+
+    def keys(self) -> set[str]:
+        """Of the cells that are computed."""
+        return set(self._read(["key"]).column("key").to_pylist())
+
+    def table(self, columns: Sequence[str] | None = None) -> pa.Table:
+        """The rows, in the order of the cells.
+
+        Args:
+            columns: that are read; None: all.
+        """
+        found = self._read(None if columns is None else ["cell", *columns])
+        for target in self.targets:
+            # A cell that was computed before a target was varied has the scenario's own value.
+            if target in found.column_names and found.column(target).null_count:
+                base = pa.scalar(self.scenario.value(target), found.schema.field(target).type)
+                filled = [base.as_py() if value is None else value for value in found.column(target).to_pylist()]
+                place = found.column_names.index(target)
+                found = found.set_column(place, found.schema.field(target), pa.array(filled, base.type))
+        found = found.sort_by("cell")
+        return found if columns is None else found.select(list(columns))
+
+    def _read(self, columns: Sequence[str] | None) -> pa.Table:
+        files_ = sorted(str(path) for path in (self.path / "rows").glob("*.parquet"))
+        if not files_:
+            whole = self.schema.empty_table()
+            return whole if columns is None else whole.select(list(columns))
+        try:
+            return pyarrow.dataset.dataset(files_, schema=self.schema).to_table(columns=columns)
+        except (pa.ArrowException, OSError) as error:
+            raise LatheError(f"{self.path}: {shown(error)}") from None
+
+    def row(self, number: int) -> dict[str, Any]:
+        """The row of a cell, by column.
+
+        Raises:
+            InputError: there is no such cell, or it is not computed.
+        """
+        found = self.table().filter(pyarrow.compute.field("cell") == number).to_pylist()
+        if not found:
+            last = max(self._read(["cell"]).column("cell").to_pylist(), default=None)
+            known = f"0 to {last}, of those that are computed" if last is not None else "none: nothing is computed"
+            raise InputError(f"cell {number} of {self.path}; allowed: {known}")
+        return cast("dict[str, Any]", found[0])
+
+    def values(self, number: int) -> dict[str, Value]:
+        """What was varied in a cell.
+
+        Raises:
+            InputError: there is no such cell, or it is not computed.
+        """
+        found = self.row(number)
+        values = {target: found[target] for target in self.targets}
+        return values if found["seed"] in (None, self.scenario.shared.seed) else {**values, "seed": found["seed"]}
+
+    def write(self, rows: Sequence[pa.Table]) -> None:
+        """Add rows, as one file.
+
+        Raises:
+            LatheError: it cannot be written; what was written before is there still.
+        """
+        place = self.path / "rows"
+        taken = [int(path.stem) for path in place.glob("*.parquet") if path.stem.isdigit()]
+        with _writing(self.path), files.replacing(place / f"{max(taken, default=-1) + 1:06d}.parquet") as stream:
+            pyarrow.parquet.write_table(pa.concat_tables(rows), cast("Any", stream), compression="zstd")
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        told = error.strerror or shown(error)
+        raise LatheError(
+            f"{path}: {told}; what was written before is kept: once there is room, the same command goes on from it"
+        ) from None

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a sweep keeps of a cell: one row of its table.
+
+| column | what |
+|---|---|
+| cell | number within the sweep |
+| key | identity of the cell: a hash of the whole scenario and of what is measured |
+| status, reason | done; refused by the check before the start; diverged; failed on the way: and why |
+| NODE.PARAM | what differs between the cells |
+| tool.max_error, tool.rms_error | largest and RMS form error of the last revolution [m] |
+| tool.first_max_error, tool.first_rms_error | those of the first [m] |
+| tool.max_errors, tool.rms_errors | those of each revolution [m] |
+| tool.in_tolerance_from | first revolution from which on the largest error is within `tool.tolerance`; none if never |
+| margin | 1 less the largest factor of a cycle over all frequencies (sup|Q - γZ|): below 0 learning diverges |
+| limits | nodes that came to a limit of a command or a way |
+| TOPIC.FIELD:STATISTIC | what was asked to be measured, over the last revolution |
+| revolutions, samples, seconds | computed, and how long that took |
+| seed, version, digest | of the random parts; of lathe_rc; SHA-256 of the form error of all samples, little-endian |
+"""
+
+import hashlib
+import math
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from lathe_rc.analysis.metrology import FormErrors
+from lathe_rc.analysis.tolerance import judge
+from lathe_rc.cell import messages
+from lathe_rc.cell.batch import Errors
+from lathe_rc.cell.collect import Finite
+from lathe_rc.cell.engine import Engine
+from lathe_rc.cell.messages import Signals
+from lathe_rc.cell.parameters import Value
+from lathe_rc.cell.recording import Recording
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.command_limits import LIMITED
+from lathe_rc.cell.stages.obedience import OUT_OF_REACH
+from lathe_rc.cell.stages.tool import Tool
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import DivergedError, InputError, LatheError
+from lathe_rc.names import instead
+from lathe_rc.sweep.revision import revision
+
+DONE, REFUSED, DIVERGED, FAILED = "done", "refused", "diverged", "failed"
+LIMITS = (LIMITED, OUT_OF_REACH)  # how events of a limit begin
+
+Samples = NDArray[np.float64]
+
+STATISTICS: Mapping[str, Callable[[Samples], float]] = {
+    "max": lambda samples: float(np.abs(samples).max()),
+    "rms": lambda samples: math.sqrt(float(np.mean(samples * samples))),
+    "mean": lambda samples: float(samples.mean()),
+    "peak_to_valley": lambda samples: float(np.ptp(samples)),
+}  #: what can be said of a signal in the last revolution
+
+_ARROW = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
+_HEAD = {"cell": pa.int64(), "key": pa.string(), "status": pa.string(), "reason": pa.string()}
+_FOUND = {
+    "tool.max_error": pa.float64(),
+    "tool.rms_error": pa.float64(),
+    "tool.first_max_error": pa.float64(),
+    "tool.first_rms_error": pa.float64(),
+    "tool.in_tolerance_from": pa.int64(),
+    "margin": pa.float64(),
+    "limits": pa.string(),
+}
+_TAIL = {
+    "tool.max_errors": pa.list_(pa.float64()),
+    "tool.rms_errors": pa.list_(pa.float64()),
+    "revolutions": pa.int64(),
+    "samples": pa.int64(),
+    "seconds": pa.float64(),
+    "seed": pa.int64(),
+    "version": pa.string(),
+    "digest": pa.string(),
+}
+NUMBERS = [name for name, kind in _FOUND.items() if kind != pa.string()]  #: what goals and pages can be made of
+
+
+class Measure(NamedTuple):
+    """A statistic of a field of a topic over the last revolution."""
+
+    topic: str
+    field: str
+    statistic: str
+
+    @property
+    def name(self) -> str:
+        """Of its column."""
+        return f"{self.topic}.{self.field}:{self.statistic}"
+
+
+def measure(text: str, scenario: Scenario) -> Measure:
+    """What ``TOPIC.FIELD:STATISTIC`` asks for.
+
+    Raises:
+        InputError: the scenario has no such topic, the topic no such field, or there is no such statistic.
+    """
+    place, colon, statistic = text.partition(":")
+    topic, dot, field = place.removeprefix("/").rpartition(".")
+    if not colon or not dot:
+        raise InputError(f"measure {text!r}; allowed: TOPIC.FIELD:STATISTIC, such as coarse/state.effort:max")
+    dense = Cell(scenario.nodes).dense
+    if topic not in dense:
+        raise InputError(f"measure {text!r}: no topic {topic!r} in the cell; {instead(topic, dense)}")
+    fields = messages.sample_fields(dense[topic].type)
+    if field not in fields:
+        raise InputError(f"measure {text!r}: no field {field!r} in {topic}; {instead(field, fields)}")
+    if statistic not in STATISTICS:
+        raise InputError(f"measure {text!r}: no statistic {statistic!r}; {instead(statistic, STATISTICS)}")
+    return Measure(topic, field, statistic)
+
+
+def schema(scenario: Scenario, targets: Sequence[str], measures: Sequence[Measure]) -> pa.Schema:
+    """Columns of the rows of a sweep."""
+    columns = dict(_HEAD)
+    for target in targets:
+        row = scenario.parameter(target)
+        columns[target] = pa.list_(_ARROW[row.type]) if row.is_list else _ARROW[row.type]
+    columns |= _FOUND | {each.name: pa.float64() for each in measures} | _TAIL
+    return pa.schema(list(columns.items()))
+
+
+class _Keeper(Errors):
+    """Keeps the form error, which nodes came to a limit, and what is to be measured."""
+
+    def __init__(self, cell: Cell, samples: int, measures: Sequence[Measure]) -> None:
+        super().__init__(cell, samples)
+        self.heard: Collection[str] = [topic for topic, source in cell.sparse.items() if source.type == messages.EVENT]
+        self.limited: set[str] = set()
+        self.tolerance = next(
+            (stage.parameters.tolerance for stage in cell.stages.values() if isinstance(stage, Tool)), 0.0
+        )
+        self._measures = [(each, np.empty(samples)) for each in measures]
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        super().chunk(first, samples, dense, sparse)
+        for topic in self.heard:
+            if any(message.values["action"].startswith(LIMITS) for message in sparse.get(topic, ())):
+                self.limited.add(topic.removesuffix("/events"))
+        for asked, kept in self._measures:
+            kept[first : first + samples] = dense[asked.topic][asked.field]
+
+    def measured(self, errors: FormErrors) -> dict[str, float]:
+        """By column; over the whole run, if there is no complete revolution."""
+        last = slice(*errors.starts[-2:]) if errors.rms.size else slice(None)
+        return {asked.name: STATISTICS[asked.statistic](kept[last]) for asked, kept in self._measures}
+
+    @property
+    def digest(self) -> str:
+        """See `digest`."""
+        return _digest(self._error)
+
+
+def digest(recording: Recording) -> str | None:
+    """What stands in the row of a cell that was run again; None without a tool or a complete revolution."""
+    has_errors = recording.errors.rms.size
+    return _digest(recording.of_type(messages.TOOL)["error"]) if has_errors else None
+
+
+def _digest(error: Samples) -> str:
+    return hashlib.sha256(error.astype("<f8", copy=False).data).hexdigest()
+
+
+def compute(
+    base: Scenario, values: Mapping[str, Value], targets: Sequence[str], measures: Sequence[Measure]
+) -> dict[str, Any]:
+    """The row of a cell but for its number and key; whatever is wrong with the cell stands in it."""
+    start = time.perf_counter()
+    row: dict[str, Any] = {"status": DONE, "version": revision()}
+    row |= {target: values[target] for target in targets if target in values}
+    cell: Cell | None = None
+    started = False
+    try:
+        scenario = base.varied(values)
+        row["seed"] = scenario.shared.seed
+        cell = Cell(scenario.nodes)
+        cell.check()
+        keeper = _Keeper(cell, cell.samples, measures)
+        engine = Engine(cell, keeper.heard)
+        started = True
+        engine.run([Finite(cell), keeper])
+        row |= _found(cell, keeper)
+    except LatheError as error:
+        refused = isinstance(error, InputError) and not started
+        row["status"] = REFUSED if refused else DIVERGED if isinstance(error, DivergedError) else FAILED
+        row["reason"] = str(error)
+    if cell is not None and cell.factors:
+        row["margin"] = 1.0 - max(cell.factors.values())
+    row["seconds"] = time.perf_counter() - start
+    return row
+
+
+def _found(cell: Cell, keeper: _Keeper) -> dict[str, Any]:
+    errors = keeper.kept()
+    found: dict[str, Any] = {
+        "limits": ", ".join(sorted(keeper.limited)),
+        "samples": cell.samples,
+        "revolutions": errors.rms.size,
+        **keeper.measured(errors),
+    }
+    if errors.rms.size:
+        found |= {
+            "tool.max_errors": errors.largest,
+            "tool.rms_errors": errors.rms,
+            "tool.first_max_error": errors.largest[0],
+            "tool.first_rms_error": errors.rms[0],
+            "tool.max_error": errors.largest[-1],
+            "tool.rms_error": errors.rms[-1],
+            "digest": keeper.digest,
+        }
+    if keeper.tolerance:
+        found["tool.in_tolerance_from"] = judge(errors.largest, keeper.tolerance).since or None
+    return found

@@ -1,0 +1,408 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which variations of a cell: grids, lists, samples, draws, ties, seeds.
+
+    space = Space(
+        grid={"learning_controller.lead_time": "1.3e-3:1.5e-3:9"},
+        sampled={"electrodynamic_actuator.damping": "normal:5%"},
+        sample="sobol:512",
+    )
+    for values in space.cells(scenario):
+        ...
+
+The cells are the product of the grids, the points of the sample, the given cells and the seeds, in an order that
+depends on nothing else; the values of the last grid change first. All of them are text, as on the command line, or
+values: see `Space`.
+"""
+
+import ast
+import csv
+import itertools
+import json
+import math
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import scipy
+import simpleeval
+from numpy.typing import NDArray
+
+from lathe_rc import files
+from lathe_rc.cell import ros_yaml
+from lathe_rc.cell.parameters import Row, Value
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.errors import InputError, shown
+
+SAMPLERS = ("sobol", "halton", "latin", "random")
+_MOST_POINTS = 2**24
+_PIECE = 2**12  # points of a sample that are drawn in one go
+_LONG = 40  # values of one axis that a message quotes
+
+
+class Drawn(NamedTuple):
+    """How a value is drawn from a number between 0 and 1.
+
+    Attributes:
+        law: ``uniform``, ``log`` (uniform in the logarithm) or ``normal``.
+        first, second: ends, or mean and standard deviation.
+    """
+
+    law: str
+    first: float
+    second: float
+
+    def at(self, quantile: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values at quantiles, shape (n,)."""
+        if self.law == "normal":
+            return np.asarray(scipy.stats.norm.ppf(quantile, self.first, self.second))
+        if self.law == "log":
+            low, high = math.log(self.first), math.log(self.second)
+            return np.exp(low + (high - low) * quantile)
+        return self.first + (self.second - self.first) * quantile
+
+
+@dataclass(frozen=True)
+class Space:
+    """Variations of a cell.
+
+    Targets are ``NODE.PARAM``, ``NODE.PARAM[K]`` for an element of a list, or ``PARAM`` for a shared parameter. A
+    number that ends in ``%`` is that part of the scenario's value.
+
+    Attributes:
+        grid: values by target: a list, or a text: ``LOW:HIGH:COUNT`` (ends included), ``LOW:HIGH:COUNT:log``, or
+            values between commas.
+        sampled: laws by target, one value a point of the sample: ``LOW:HIGH``, ``LOW:HIGH:log``,
+            ``uniform:LOW:HIGH``, ``normal:MEAN:DEVIATION``, or ``normal:DEVIATION`` about the scenario's value.
+        ties: formulas by target, such as ``fine_controller.q_time * 1.1``; names are targets, with + - * / **,
+            brackets, ``sqrt``, ``exp``, ``log``, ``sin``, ``cos`` and ``pi``.
+        sample: ``sobol:N``, ``halton:N``, ``latin:N`` or ``random:N``; empty if nothing is sampled.
+        seeds: cells that differ in their seed alone, from that of the scenario on, for each of the others.
+        given: cells one by one, values by target.
+        sample_seed: of the sample itself.
+    """
+
+    grid: Mapping[str, str | Sequence[Value]] = field(default_factory=dict)
+    sampled: Mapping[str, str] = field(default_factory=dict)
+    ties: Mapping[str, str] = field(default_factory=dict)
+    sample: str = ""
+    seeds: int = 1
+    given: Sequence[Mapping[str, Value]] = ()
+    sample_seed: int = 0
+
+    def to_json(self) -> dict[str, Any]:
+        """What ``Space(**told)`` makes the same space of."""
+        return cast("dict[str, Any]", json.loads(json.dumps(asdict(self), default=list)))
+
+    def targets(self) -> list[str]:
+        """What differs between the cells, in the order of the columns."""
+        seed = ["seed"] if self.seeds > 1 else []
+        named = [name for cell in self.given for name in cell]
+        return list(dict.fromkeys([*named, *self.grid, *self.sampled, *self.ties, *seed]))
+
+    def count(self, scenario: Scenario) -> int:
+        """How many cells there are."""
+        axes = [len(_axis(scenario, target, told)) for target, told in self.grid.items()]
+        return math.prod(axes) * max(self._points(), 1) * max(len(self.given), 1) * self.seeds
+
+    def check(self, scenario: Scenario) -> None:
+        """Refuse what is no space of a scenario, before anything is computed.
+
+        Raises:
+            InputError: names the target, the value and what is allowed.
+        """
+        twice = [target for target in self.grid if target in self.sampled or target in self.ties]
+        twice += [target for target in self.sampled if target in self.ties]
+        if twice:
+            raise InputError(f"{twice[0]}: varied, drawn or tied twice; allowed: once")
+        if self.seeds < 1:
+            raise InputError(f"seeds = {self.seeds}; allowed: from 1")
+        for target in self.targets():
+            scenario.parameter(target)
+        for cell in self.given:
+            for target, value in cell.items():
+                _check_type(target, scenario.parameter(target), value)
+        if any(dict(first) == dict(second) for first, second in itertools.pairwise(sorted(self.given, key=canonical))):
+            raise InputError("two of the given cells are the same; allowed: each once")
+        if self.sampled and not self.sample:
+            raise InputError(f"{next(iter(self.sampled))}: drawn, and no sample says how often; allowed: {_samples()}")
+        if self.sample and not self.sampled:
+            raise InputError(f"sample {self.sample!r}, and nothing is drawn; allowed: LOW:HIGH or a law for a target")
+        self._points()
+        for target, told in self.sampled.items():
+            _drawn(scenario, target, told)
+        _ordered(self.ties)
+        next(self.cells(scenario))
+
+    def cells(self, scenario: Scenario) -> Iterator[dict[str, Value]]:
+        """The values of each cell, by target."""
+        axes = {target: _axis(scenario, target, told) for target, told in self.grid.items()}
+        first_seed = scenario.shared.seed
+        formulas = _Formulas(scenario, self.ties)
+        for given in self.given or ({},):
+            for combination in itertools.product(*axes.values()):
+                fixed = {**given, **dict(zip(axes, combination, strict=True))}
+                for drawn in self._draws(scenario):
+                    for seed in range(self.seeds):
+                        values = {**fixed, **drawn}
+                        if self.seeds > 1:
+                            values["seed"] = first_seed + seed
+                        yield formulas.add_to(values)
+
+    def _points(self) -> int:
+        """Of the sample; 0 if there is none."""
+        if not self.sample:
+            return 0
+        name, _, number = self.sample.partition(":")
+        count = int(number) if number.isascii() and number.isdigit() else 0
+        if name not in SAMPLERS or not 0 < count <= _MOST_POINTS:
+            raise InputError(f"sample {self.sample!r}; allowed: {_samples()}")
+        return count
+
+    def _draws(self, scenario: Scenario) -> Iterator[dict[str, float]]:
+        """Values by target, of each point of the sample."""
+        if not self.sampled:
+            yield {}
+            return
+        laws = {target: _drawn(scenario, target, told) for target, told in self.sampled.items()}
+        for quantiles in _sample(self.sample.partition(":")[0], self._points(), len(laws), self.sample_seed):
+            columns = [law.at(column) for law, column in zip(laws.values(), quantiles.T, strict=True)]
+            for row in zip(*(column.tolist() for column in columns), strict=True):
+                yield dict(zip(laws, row, strict=True))
+
+
+def _samples() -> str:
+    return "sobol:N, halton:N, latin:N or random:N"
+
+
+def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArray[np.float64]]:
+    """Points in the unit cube, piece by piece, shape (n, dimensions); more points begin with the same ones."""
+    if name == "latin":  # needs all at once, and others of them for another count
+        yield scipy.stats.qmc.LatinHypercube(dimensions, rng=seed).random(count)
+        return
+    generator = np.random.default_rng(seed)
+    draws: dict[str, Callable[[int], NDArray[np.float64]]] = {
+        "sobol": scipy.stats.qmc.Sobol(dimensions, rng=seed).random,
+        "halton": scipy.stats.qmc.Halton(dimensions, rng=seed).random,
+        "random": lambda count: generator.random((count, dimensions)),
+    }
+    for first in range(0, count, _PIECE):
+        yield draws[name](min(_PIECE, count - first))
+
+
+def _number(scenario: Scenario, target: str, text: str) -> float:
+    """A number, or a part of the scenario's value."""
+    plain = text.strip()
+    found = ros_yaml.scalar(plain.removesuffix("%"))
+    if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
+        raise InputError(
+            f"{target}: {shown(text)!r} is no number; allowed: numbers, or parts of the scenario's value in %"
+        )
+    if not plain.endswith("%"):
+        return float(found)
+    base = scenario.value(target)
+    if isinstance(base, bool | str | list):
+        raise InputError(f"{target} = {base!r} has no parts in %; allowed: values")
+    return float(found) / 100.0 * base
+
+
+def _axis(scenario: Scenario, target: str, told: str | Sequence[Value]) -> Sequence[Value]:
+    """The values of a grid, each once.
+
+    Raises:
+        InputError: a text that tells none.
+    """
+    row = scenario.parameter(target)
+    if isinstance(told, str):
+        found = _told(scenario, target, told)
+    else:
+        found = [_value(scenario, target, row, each) if isinstance(each, str) else each for each in told]
+    for value in found:
+        _check_type(target, row, value)
+    if not found:
+        raise InputError(f"{target}: no value; allowed: one or more")
+    return list({canonical({target: value}): value for value in found}.values())
+
+
+def _told(scenario: Scenario, target: str, told: str) -> Sequence[Value]:
+    row = scenario.parameter(target)
+    parts = told.split(":")
+    if row.is_list or row.type not in (int, float) or len(parts) == 1:
+        return [_value(scenario, target, row, text) for text in _split(told)]
+    log = parts[3:] == ["log"]
+    if len(parts) not in (3, 4) or (len(parts) == 4 and not log) or not parts[2].strip().isdigit() or int(parts[2]) < 1:
+        raise InputError(
+            f"{target}={shown(told)}; allowed: LOW:HIGH:COUNT, LOW:HIGH:COUNT:log, or values between commas"
+        )
+    low, high = (_number(scenario, target, text) for text in parts[:2])
+    if log and not min(low, high) > 0.0:
+        raise InputError(f"{target}={shown(told)}; allowed on a log range: ends above 0")
+    count = int(parts[2])
+    found: list[Value] = (np.geomspace(low, high, count) if log else np.linspace(low, high, count)).tolist()
+    if row.type is int:
+        if any(value != round(cast("float", value)) for value in found):
+            few = ", ".join(f"{value:g}" for value in found)[:_LONG]
+            raise InputError(f"{target}={shown(told)} gives {few}; allowed: whole numbers")
+        found = [round(cast("float", value)) for value in found]
+    return found
+
+
+def _split(text: str) -> list[str]:
+    """At commas that stand in no brackets and no quotes."""
+    parts, depth, quote = [""], 0, ""
+    for letter in text:
+        quote = ("" if letter == quote else quote) if quote else (letter if letter in "'\"" else "")
+        depth += (letter in "[(") - (letter in "])") if not quote else 0
+        if letter == "," and not depth and not quote:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return [part.strip() for part in parts]
+
+
+def _value(scenario: Scenario, target: str, row: Row, text: str) -> Value:
+    if not row.is_list and row.type is str:
+        return text.strip("'\"")
+    if not row.is_list and row.type in (int, float) and text.endswith("%"):
+        found = _number(scenario, target, text)
+        return found if row.type is float else round(found)
+    return ros_yaml.parse_value(text, target)
+
+
+def _check_type(target: str, row: Row, value: Value) -> None:
+    """Refuse what can be no value of a parameter; whether it is in range is for the cell to say, in its row."""
+    kinds = (int, float) if row.type is float else row.type
+    items = value if isinstance(value, list) else [value]
+    wrong = [item for item in items if not isinstance(item, kinds) or (row.type is not bool and isinstance(item, bool))]
+    if wrong or row.is_list != isinstance(value, list):
+        raise InputError(f"{target} = {shown(repr(value))}; allowed: {row.allowed()}")
+
+
+def _drawn(scenario: Scenario, target: str, told: str) -> Drawn:
+    """The law that a text tells."""
+    row = scenario.parameter(target)
+    if row.is_list or row.type is not float:
+        raise InputError(f"{target}: drawn, and is {row.allowed()}; allowed: parameters that are one real number")
+    name, *rest = told.split(":")
+    if name not in ("normal", "uniform"):
+        name, rest = "uniform", [name, *rest]
+    if name == "uniform" and rest[2:] == ["log"]:
+        name, rest = "log", rest[:2]
+    if name == "normal" and len(rest) == 1:
+        rest = ["100%", *rest]
+    if len(rest) != 2:
+        raise InputError(
+            f"{target}={shown(told)}; allowed: LOW:HIGH, LOW:HIGH:log, uniform:LOW:HIGH, normal:MEAN:DEVIATION or "
+            "normal:DEVIATION"
+        )
+    first, second = (_number(scenario, target, text) for text in rest)
+    if name == "normal" and second < 0.0:
+        raise InputError(f"{target}={shown(told)}; allowed: a deviation from 0")
+    if name == "log" and not min(first, second) > 0.0:
+        raise InputError(f"{target}={shown(told)}; allowed on a log range: ends above 0")
+    return Drawn(name, first, second)
+
+
+_FUNCTIONS = {"sqrt": math.sqrt, "exp": math.exp, "log": math.log, "sin": math.sin, "cos": math.cos}
+
+
+def _names(formula: str) -> set[str]:
+    """The targets that a formula names."""
+    try:
+        tree = ast.parse(formula.strip(), mode="eval")
+    except SyntaxError:
+        raise InputError(f"formula {shown(formula)!r}; allowed: targets and numbers with + - * / ** ( )") from None
+    inner = {node.value for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    called = {node.func for node in ast.walk(tree) if isinstance(node, ast.Call)}
+    named = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute | ast.Name)]
+    return {ast.unparse(node) for node in named if node not in inner and node not in called} - {"pi"}
+
+
+def _ordered(ties: Mapping[str, str]) -> list[str]:
+    """The tied targets, each after those that it depends on.
+
+    Raises:
+        InputError: they depend on one another in a circle.
+    """
+    from graphlib import CycleError, TopologicalSorter
+
+    depends = {target: _names(formula) & ties.keys() for target, formula in ties.items()}
+    try:
+        return list(TopologicalSorter(depends).static_order())
+    except CycleError as error:
+        raise InputError(
+            f"{' -> '.join(error.args[1])}: tied in a circle; allowed: formulas of other targets"
+        ) from None
+
+
+class _Formulas:
+    """Adds what is tied to the values of a cell."""
+
+    def __init__(self, scenario: Scenario, ties: Mapping[str, str]) -> None:
+        self._scenario, self._ties = scenario, {target: ties[target] for target in _ordered(ties)}
+        for formula in ties.values():
+            for name in _names(formula):
+                scenario.parameter(name)
+        self._named = {target: _names(formula) for target, formula in ties.items()}
+        power = {**simpleeval.DEFAULT_OPERATORS, ast.Pow: operator.pow}
+        self._evaluator = simpleeval.SimpleEval(operators=power, functions=_FUNCTIONS)
+        self._parsed = {target: self._evaluator.parse(formula) for target, formula in ties.items()}
+
+    def add_to(self, values: dict[str, Value]) -> dict[str, Value]:
+        """Values by target, the tied ones among them.
+
+        Raises:
+            InputError: a formula has no value.
+        """
+        for target, formula in self._ties.items():
+            known: dict[str, Any] = {"pi": math.pi}
+            for name in self._named[target]:
+                node, dot, of = name.partition(".")
+                found = values.get(name, self._scenario.value(name))
+                if isinstance(found, list):
+                    found = cast("Value", [values.get(f"{name}[{k}]", each) for k, each in enumerate(found)])
+                if dot:
+                    known.setdefault(node, {})[of] = found
+                else:
+                    known[node] = found
+            self._evaluator.names = known
+            try:
+                found = self._evaluator.eval(formula, previously_parsed=self._parsed[target])
+            except (simpleeval.InvalidExpression, ArithmeticError, ValueError, TypeError) as error:
+                raise InputError(f"{target} = {shown(formula)}: {shown(error)}") from None
+            row = self._scenario.parameter(target)
+            whole = row.type is int and isinstance(found, float) and found == round(found)
+            values[target] = round(found) if whole else float(found) if row.type is float else found
+        return values
+
+
+def given(path: Path) -> list[dict[str, Value]]:
+    """The cells of a file: CSV with targets in its first row, or a YAML list of ``{TARGET: VALUE, ...}``.
+
+    Raises:
+        InputError: it cannot be read, or is neither.
+    """
+    try:
+        text = files.contents(path).decode()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({shown(error)})") from None
+    if path.suffix.lower() != ".csv":
+        return ros_yaml.rows(text, str(path))
+    header, *lines = list(csv.reader(text.splitlines())) or [[]]
+    for number, line in enumerate(lines, 2):
+        if len(line) != len(header):
+            raise InputError(f"{path}:{number}: {len(line)} values; allowed: {len(header)}, as in the first row")
+    return [
+        {
+            target.strip(): ros_yaml.parse_value(value, f"{path}: {target}")
+            for target, value in zip(header, line, strict=True)
+        }
+        for line in lines
+    ]
+
+
+def canonical(values: Mapping[str, Value]) -> str:
+    """The same text for the same values, whatever their order."""
+    return json.dumps(dict(values), sort_keys=True)

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A sweep from its space to its table; see `run`."""
+
+import hashlib
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import distributed
+import pyarrow as pa
+
+from lathe_rc.cell.ahead import compile_ahead
+from lathe_rc.cell.parameters import Value
+from lathe_rc.cell.scenario import Scenario, content
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.sweep import row
+from lathe_rc.sweep.folder import Folder
+from lathe_rc.sweep.space import Space, canonical
+from lathe_rc.sweep.workers import Job, Order, client_of, rows
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Models = Literal["follow", "nominal"]
+Watch = Callable[[Mapping[str, Any]], None]
+
+_WRITE = 10.0  # [s] between writes of what has come
+
+
+@dataclass(frozen=True, repr=False)
+class Sweep:
+    """What a sweep gave.
+
+    Attributes:
+        folder: where it is.
+    """
+
+    folder: Folder
+
+    def __repr__(self) -> str:
+        """What it is of, and how many cells came to what."""
+        told = ", ".join(f"{count} {status}" for status, count in self.statuses().items())
+        return f"<Sweep of {self.folder.scenario.name} in {self.folder.path}: {told or 'nothing computed'}>"
+
+    def table(self) -> pa.Table:
+        """The rows, in the order of the cells; see `lathe_rc.sweep.row`."""
+        return self.folder.table()
+
+    def frame(self) -> "pd.DataFrame":
+        """The same for pandas."""
+        return self.table().to_pandas()
+
+    def statuses(self) -> dict[str, int]:
+        """How many cells came to what."""
+        return dict(Counter(self.folder.table(["status"]).column("status").to_pylist()).most_common())
+
+    def row(self, number: int) -> dict[str, Any]:
+        """The row of a cell, by column; raises as `scenario` does."""
+        return self.folder.row(number)
+
+    def scenario(self, number: int) -> Scenario:
+        """The scenario of a cell, to run it again.
+
+        Raises:
+            InputError: there is no such cell, or it is not computed; it was refused.
+        """
+        return self.folder.scenario.varied(self.folder.values(number))
+
+
+def _ignore(event: Mapping[str, Any]) -> None:
+    """Watch nothing."""
+
+
+def run(
+    scenario: Scenario,
+    space: Space,
+    folder: Path,
+    *,
+    measures: Sequence[str] = (),
+    models: Models = "follow",
+    scheduler: str | None = None,
+    workers: int | None = None,
+    client: distributed.Client | None = None,
+    watch: Watch = _ignore,
+) -> Sweep:
+    """Compute the cells of a space that are not in the folder yet.
+
+    Args:
+        scenario: the cell that is varied; it needs a number of revolutions.
+        space: which variations.
+        folder: of the results; a sweep goes on where it was stopped, and takes more spaces.
+        measures: further columns, ``TOPIC.FIELD:STATISTIC``.
+        models: of drives that controllers have, and that the scenario does not give: ``follow`` the drives that are
+            varied, or stay ``nominal``, as when one controller is to serve many drives.
+        scheduler: address of a scheduler of Dask; None: workers of this machine.
+        workers: processes of this machine; None: one for each core.
+        client: of Dask, in place of both.
+        watch: called with the events ``began`` (cells; computed: those of them that are there already),
+            ``compiling`` (nodes), ``ready`` (dashboard: address of Dask's) and ``rows`` (statuses: how many cells came
+            to what).
+
+    Raises:
+        InputError: no space of this scenario, the folder holds something else, or nobody is at the address.
+        LatheError: workers died, or the disk is full; what was computed is kept.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from lathe_rc import harness, resources
+        >>> from lathe_rc.cell import scenario
+        >>> from lathe_rc.sweep.space import Space
+        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=10"])
+        >>> space = Space(grid={"learning_controller.lead_time": [1.3e-3, 1.425e-3, 3e-3]})
+        >>> harness.sweep(piston, space, Path("leads"))
+        <Sweep of piston in leads: 2 done, 1 refused>
+    """
+    asked = [row.measure(text, scenario) for text in measures]
+    space = Space(**space.to_json())
+    scenario = scenario.with_models_given() if models == "nominal" else scenario
+    space.check(scenario)
+    kept = Folder.begin(folder, scenario, space, asked)
+    with kept.locked():
+        there, total = kept.keys(), space.count(scenario)
+        left = total - sum(1 for job in _jobs(kept, space) if job.key in there) if there else total
+        watch({"event": "began", "cells": total, "computed": total - left})
+        if left:
+            for stages in compile_ahead(Cell(scenario.nodes).stages.values()):
+                watch({"event": "compiling", "nodes": stages})
+            with nullcontext(client) if client else client_of(scheduler, workers) as crew:
+                watch({"event": "ready", "dashboard": crew.dashboard_link})
+                jobs = (job for job in _jobs(kept, space) if job.key not in there)
+                with closing(rows(crew, _order(kept), jobs, left)) as found:
+                    _keep(kept, found, watch)
+    return Sweep(kept)
+
+
+def _order(folder: Folder) -> Order:
+    scenario = folder.scenario
+    text = scenario.to_yaml(given=True)
+    return Order(scenario.name, text, scenario.identity, folder.targets, folder.measures, folder.schema)
+
+
+def _keep(folder: Folder, found: Iterator[pa.Table], watch: Watch) -> None:
+    """Write rows as they come, a file now and then; those that have come when something ends it, too."""
+    waiting: list[pa.Table] = []
+    written = time.monotonic()
+    try:
+        for table in found:
+            waiting.append(table)
+            watch({"event": "rows", "statuses": Counter(table.column("status").to_pylist())})
+            if time.monotonic() > written + _WRITE:
+                some, waiting = waiting, []
+                folder.write(some)
+                written = time.monotonic()
+    finally:
+        if waiting:
+            folder.write(waiting)
+
+
+def _jobs(folder: Folder, space: Space) -> Iterator[Job]:
+    """All cells of a space, numbered through all spaces of the folder in the order in which they were asked for."""
+    key = _Key(folder)
+    if folder.spaces == [space]:
+        for number, values in enumerate(space.cells(folder.scenario)):
+            yield Job(number, key.of(values), values)
+        return
+    numbers: dict[str, int] = {}
+    for each in folder.spaces:
+        for values in each.cells(folder.scenario):
+            found = key.of(values)
+            number = numbers.setdefault(found, len(numbers))
+            if each == space:
+                yield Job(number, found, values)
+
+
+class _Key:
+    """Identity of a cell: that of the scenario, what is measured, and the values that are not the scenario's own."""
+
+    def __init__(self, folder: Folder) -> None:
+        scenario = folder.scenario
+        self._base = {target: scenario.value(target) for target in [*folder.targets, "seed"]}
+        self._files = {target for target in folder.targets if scenario.parameter(target).is_path}
+        measured = [each.name for each in folder.measures]
+        self._start = hashlib.sha256("\n".join([scenario.identity, *sorted(measured)]).encode())
+
+    def of(self, values: Mapping[str, Value]) -> str:
+        """In hexadecimal digits."""
+        own = {target: value for target, value in values.items() if value != self._base[target]}
+        for target in self._files & own.keys():
+            own[target] = content(Path(str(own[target])))
+        found = self._start.copy()
+        found.update(canonical(own).encode())
+        return found.hexdigest()[:32]

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verdict of a run: in tolerance from which revolution on, and what says so."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cells import scenario
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lathe_rc import harness
+from lathe_rc.analysis.tolerance import LAST, Judge, judge
+from lathe_rc.bag import story
+from lathe_rc.cell.scenario import load
+from lathe_rc.cli import main
+from lathe_rc.errors import InputError
+from lathe_rc.resources import find
+
+errors = st.lists(st.sampled_from([0.5, 1.0, 1.5, 3.0]), max_size=30)
+SHORT = ("run", "piston", "--revolutions", "5")
+
+
+def lathe(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+# --- the rule
+
+
+@given(errors)
+def test_in_tolerance_from_the_revolution_after_the_last_that_is_not(largest):
+    found = judge(np.array(largest), 1.0)
+    since = max((number for number, value in enumerate(largest, 1) if value > 1.0), default=0) + 1
+    assert found.revolutions == len(largest)
+    assert found.in_tolerance == (since <= len(largest))
+    if found.in_tolerance:
+        assert found.since == since
+        assert found.spare == 1.0 - max(largest[since - 1 :][-LAST:])
+    elif largest:
+        assert (found.since, found.spare) == (0, 1.0 - largest[-1])
+
+
+@given(errors, st.integers(1, 7))
+def test_in_pieces_the_verdict_is_the_same(largest, piece):
+    judging = Judge(1.0)
+    for start in range(0, len(largest), piece):
+        judging.add(np.array(largest[start : start + piece]))
+    assert repr(judging.verdict()) == repr(judge(np.array(largest), 1.0))  # NaN is not equal to itself
+
+
+def test_revolutions_before_the_first_that_is_there_count():
+    judging = Judge(1.0, before=40)
+    judging.add(np.array([3.0, 0.5]))
+    assert judging.verdict().since == 42
+
+
+# --- the result
+
+
+def test_a_result_has_the_verdict_and_its_summary_as_well():
+    result = harness.run(scenario(spindle_encoder={"revolutions": 5.0}, tool={"tolerance": 2e-6}))
+    found, largest = result.verdict, result.errors.largest
+    assert 1 < found.since <= 5
+    assert largest[found.since - 2] > 2e-6 >= largest[found.since - 1 :].max()
+    assert found.spare == 2e-6 - largest[found.since - 1 :].max()
+    assert result.summary()["tolerance_um"] == {
+        "allowed": 2.0,
+        "in_tolerance": True,
+        "from_revolution": found.since,
+        "largest": found.largest * 1e6,
+        "spare": found.spare * 1e6,
+    }
+
+
+def test_without_a_tolerance_there_is_no_verdict():
+    result = harness.run(scenario())
+    assert result.verdict is None
+    assert result.summary()["tolerance_um"] is None
+
+
+def test_a_tolerance_is_that_of_the_tool_whose_error_is_told():
+    renamed = scenario(learning_controller={"remap": ["tool:=part"]}, tool={"remap": ["tool:=part"], "tolerance": 2e-6})
+    assert harness.run(renamed).verdict.tolerance == 2e-6
+
+
+def test_a_tolerance_changes_neither_bits_nor_identity():
+    path = find(Path("piston.yaml"))
+    short = ["spindle_encoder.revolutions=2"]
+    one, other = (load(path, [*short, f"tool.tolerance={value}"]) for value in (0.0, 1e-6))
+    assert one.shared.run_id == other.shared.run_id
+    assert harness.run(one).digest == harness.run(other).digest
+
+
+# --- the command
+
+
+def test_the_terminal_and_json_tell_it():
+    told = lathe(*SHORT, "--set", "tool.tolerance=2e-6")
+    assert re.search(r"(?m)^in tolerance \(±2 µm\) from revolution 4 on, [\d.]+ µm to spare at the end$", told.stdout)
+    assert json.loads(lathe(*SHORT, "--json").stdout)["tolerance_um"]["from_revolution"] == 4
+
+
+@pytest.mark.parametrize(("tolerance", "code"), [("2e-6", 0), ("0.1e-6", 1)])
+def test_who_requires_the_tolerance_gets_it_as_an_exit_code(tolerance, code):
+    done = lathe(*SHORT, "--json", "--require-tolerance", "--set", f"tool.tolerance={tolerance}")
+    assert done.exit_code == code
+    assert json.loads(done.stdout)["tolerance_um"]["in_tolerance"] == (not code)
+    refusals = [line for line in done.stderr.splitlines() if line.startswith("lathe: ")]
+    assert len(refusals) == code
+    for line in refusals:
+        assert "piston is not in tolerance (±0.1 µm): " in line
+        assert "allowed: " in line
+
+
+def test_a_run_without_a_revolution_is_not_in_tolerance():
+    done = lathe("run", "piston", "--revolutions", "0.5", "--require-tolerance")
+    assert done.exit_code == 1
+    assert "not in tolerance (±2 µm): no complete revolution" in done.stderr
+
+
+def test_a_tolerance_that_nobody_gave_cannot_be_required():
+    done = lathe(*SHORT, "--require-tolerance", "--set", "tool.tolerance=0.0")
+    assert done.exit_code == 2
+    assert done.stderr.startswith("lathe: --require-tolerance without tool.tolerance; allowed: ")
+
+
+# --- the report
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory):
+    """Bags of the same run, one with a tolerance that it keeps, one with a tolerance that it does not."""
+    made = {}
+    for name, tolerance in (("kept", 2e-6), ("missed", 0.1e-6)):
+        made[name] = tmp_path_factory.mktemp("turned") / name
+        harness.run(scenario(spindle_encoder={"revolutions": 5.0}, tool={"tolerance": tolerance}), bag=made[name])
+    return made
+
+
+@pytest.mark.parametrize(("name", "said"), [("kept", "in tolerance"), ("missed", "not in tolerance")])
+def test_a_report_begins_with_it(turned, tmp_path, name, said):
+    page = tmp_path / "page.html"
+    assert lathe("report", turned[name], "-o", page).exit_code == 0
+    text = page.read_text(encoding="utf-8")
+    first = re.search(r'<div class="facts">\s*<div class="(\w*)"><b>([^<]*)</b>', text)
+    assert first.groups() == ("good" if name == "kept" else "bad", said)
+    assert "made of</h2>" not in text, "nobody has asked for a budget"
+
+
+def test_a_report_shows_the_budget_if_it_is_asked_for(turned, tmp_path):
+    page = tmp_path / "page.html"
+    assert lathe("report", turned["kept"], "--budget", "-o", page).exit_code == 0
+    section = page.read_text(encoding="utf-8").partition("<h2>What the form error is made of</h2>")[2]
+    rows = re.findall(r'<tr><td class="text">([^<]*)</td><td>([^<]*)</td>', section.partition("<h2>")[0])
+    assert [name for name, _ in rows] == ["Q floor", "rest", "interactions", "form error"]
+    assert sum(float(share) for _, share in rows[:-1]) == pytest.approx(100.0, abs=0.2)
+
+
+def test_a_bag_whose_scenario_is_none_has_no_tolerance_but_a_reason():
+    with pytest.raises(InputError, match=r"^lathe_rc\.scenario of the bag: no nodes; allowed: "):
+        story.tolerances({story.SCENARIO: "[1, 2]"})
+    assert story.tolerances({}) == {}
+    assert story.tolerances({story.SCENARIO: "tool: {ros__parameters: {tolerance: .inf}}"}) == {}
+    text = "edge: {ros__parameters: {stage: tool, tolerance: 1e-6, remap: ['tool:=part']}}"
+    assert story.tolerances({story.SCENARIO: text}) == {"part": 1e-6}
