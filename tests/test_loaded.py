@@ -371,6 +371,18 @@ def test_a_current_loop_that_cannot_work_is_refused():
     )
 
 
+def test_a_tool_breaks_as_in_a_cut_of_its_own():
+    values = {"allow_faults": True, "faults": ["sample 8000: cut tool_broken length=0.2e-3"], "cut_gap_start": []}
+    run = harness.run(together("loaded_drive", **values, cut_gap_width=[], cut_regeneration=0.0)).recording.dense
+    before, after = (run["/cut"]["force"][n] for n in (7900, 9500))
+    assert after == pytest.approx(before / 3, rel=0.3)
+
+
+def test_what_is_wrong_with_the_cut_is_named_as_it_was_given():
+    with pytest.raises(InputError, match=r"loaded_drive\.cut_gap_start, cut_gap_width: 2 and 1; give as many of each"):
+        harness.run(together("loaded_drive", cut_gap_start=[1.0, 2.0]))
+
+
 def test_what_a_limited_coil_cannot_is_said():
     limits = {"coarse_loop": "current", "coarse_voltage_limit": 0.1, "cut_depth": 0.0}
     events = harness.run(together("loaded_drive", **limits)).recording.sparse["/loaded_drive/events"]

@@ -6,8 +6,8 @@ from typing import Any
 from lathe_rc.extensions import Objects
 from lathe_rc.studies import (
     angle_domain,
-    coupling,
     best_law,
+    coupling,
     decoupling,
     drive_models,
     drive_tolerance,
@@ -37,8 +37,8 @@ _OWN: dict[str, Study[Any]] = {
         saturation,
         sampled_servo,
         decoupling,
-        coupling,
         drive_tolerance,
+        coupling,
     )
 }
 

@@ -27,8 +27,8 @@ from lathe_rc.extensions import Registry
 
 _OWN: tuple[type[Stage], ...] = (
     SpindleEncoder,
-    LoadedSpindleStage,
     EncoderDevice,
+    LoadedSpindleStage,
     LearningController,
     DisturbanceController,
     CompoundController,

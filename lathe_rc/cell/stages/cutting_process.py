@@ -251,6 +251,7 @@ class CutStage(Stage):
     """
 
     devices = ("cut",)
+    failure = staticmethod(failure)  #: why it cannot go on
 
     def __init__(self, name: str, parameters: NodeParameters, table: CuttingProcessParameters, prefix: str) -> None:
         super().__init__(name, parameters)
@@ -294,10 +295,10 @@ class CutStage(Stage):
         """See `Stage`.
 
         Raises:
-            LatheError: there is no cut.
+            LatheError: it cannot go on.
         """
         encoder, cut = inputs[0], outputs[-1]
-        raise failure(reason, encoder["angle_true"][reached], encoder["speed_true"][reached], cut["feed"][reached])
+        raise self.failure(reason, encoder["angle_true"][reached], encoder["speed_true"][reached], cut["feed"][reached])
 
 
 class CuttingProcessStage(CutStage):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tool drives that feel the cutting force: drives and cut as one stage, for no block may cut what couples them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ from pydantic import create_model
 
 from lathe_rc.analysis.learning import Response
 from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedCommand, limited, remembered
@@ -253,6 +253,7 @@ class LoadedDriveStage(CutStage, Drive):
     kind = "loaded_drive"
     Parameters = LoadedDriveParameters
     announces = (LIMITED, FREE)
+    failure = staticmethod(failure)
     rooms = 9
     step = staticmethod(step)
 
@@ -355,17 +356,6 @@ class LoadedDriveStage(CutStage, Drive):
         super().prepare(first, samples)
         self._noise.draw(samples)
         self._sensor.draw(samples)
-
-    def serve(
-        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
-    ) -> list[Sparse]:
-        """See `Stage`.
-
-        Raises:
-            LatheError: drives and cut cannot go on.
-        """
-        encoder, cut = inputs[0], outputs[-1]
-        raise failure(reason, encoder["angle_true"][reached], encoder["speed_true"][reached], cut["feed"][reached])
 
     def tell(self, first: int, end: int) -> list[Sparse]:
         """See `Stage`."""

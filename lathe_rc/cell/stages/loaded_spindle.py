@@ -18,10 +18,11 @@ from lathe_rc.plants.spindle import Belt, LoadedSpindle, SpeedLoop, SpindleTable
 from lathe_rc.signals.encoder import EncoderTable, follow_law, read_off
 
 _TORQUE = "torque"  # whose limit is told
+_MOST_LAG = 0.9 * 2.0 * np.pi  # [rad] by which a run is longer than its law needs, at most
 
 
 class LoadedSpindleParameters(SpindleEncoderParameters):
-    """A speed law, and what the torque of the cut makes of it; the run is as long as the law says."""
+    """A speed law, and what the torque of the cut makes of it; a run is longer than the law by what that delays it."""
 
     inertia: Annotated[float, Gt(0)] = parameter(0.03, "of spindle, chuck and part", "kg*m^2")
     motor_inertia: Annotated[float, Gt(0)] = parameter(0.01, "of the motor, referred to the spindle", "kg*m^2")
@@ -111,6 +112,11 @@ class LoadedSpindleStage(SpindleEncoder):
     def _loads(self) -> Sequence[Input]:
         """See `SpindleEncoder`."""
         return [Input("cut", messages.CUT, ("force",), self._delay)]
+
+    def _lag(self) -> float:
+        """See `SpindleEncoder`: what the integral of the speed loop needs for the largest load; less than a turn."""
+        table = self.spindle.table
+        return min(table.largest_load / table.integral, _MOST_LAG) if table.radius else 0.0
 
     def speed_range(self) -> tuple[float, float]:
         """See `TimeMaster`."""

@@ -47,7 +47,8 @@ class SpindleEncoder(TimeMaster):
         self._law = self.law = parameters.speed_law(name)
         if parameters.revolutions:
             with about(name, f"revolutions = {parameters.revolutions:g}"):
-                self.samples = self._law.samples_until(2 * np.pi * parameters.revolutions, parameters.step)
+                end = 2 * np.pi * parameters.revolutions + self._lag()
+                self.samples = self._law.samples_until(end, parameters.step)
         self._check_end()
         self.place_triggers()
         self._encoder = Encoder(self._law, parameters.step, parameters.counts_per_revolution, parameters.speed_window)
@@ -58,6 +59,10 @@ class SpindleEncoder(TimeMaster):
     def _loads(self) -> Sequence[Input]:
         """What it reads of what loads it."""
         return ()
+
+    def _lag(self) -> float:
+        """By how much a load may hold it back behind its law [rad]."""
+        return 0.0
 
     def _check_end(self) -> None:
         """A law of others is known up to the end of its tachogram."""
