@@ -127,7 +127,7 @@ def test_file_without_shared_parameters_takes_them_from_the_command_line(cell):
         ("tool.feed={a: 1}", "--set tool.feed: neither a value nor a list"),
         ("tool.feed=[1.0", "--set tool.feed:1: not YAML"),
         ("tool.stage=fork", "tool: no stage 'fork'; allowed: spindle_encoder, encoder_device"),
-        ("tool.stage=learnin_controller", "no stage 'learnin_controller'; did you mean learning_controller, force_"),
+        ("tool.stage=learnin_controller", "no stage 'learnin_controller'; did you mean learning_controller, resonant_"),
         ("block_size=0", "/**.block_size = 0; allowed: an integer from 1 up to 8192 [sample]"),
         ("block_size=64.0", "/**.block_size = 64.0; allowed: an integer"),
         ("sample_rate=65536", "sample_rate = 65536 Hz: its step is not a whole number of ns"),
