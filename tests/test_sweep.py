@@ -321,7 +321,7 @@ def own_workers(client: distributed.Client, monkeypatch: pytest.MonkeyPatch) -> 
 def test_all_laws_are_compared_at_the_same_conditions(tmp_path: Path) -> None:
     asked = best_law.BestLawParameters(points=4, encoder_counts=[10_000], folder=str(tmp_path))
     found = best_law.run(asked)
-    assert set(found.error) == set(speed_deviation.LAWS)
+    assert set(found.error) == set(speed_deviation.LAWS) - {speed_deviation.OURS}  # that is another stage
     assert {error.shape for error in found.error.values()} == {(4,)}
     swept = Sweep(Folder(tmp_path / "speed_deviation"))
     for number, law in enumerate(found.error):
