@@ -10,12 +10,15 @@ from setuptools import find_packages, setup
 HERE = Path(__file__).resolve().parent
 NODES = [
     "spindle_encoder",
+    "loaded_spindle",
     "encoder_device",
     "profile",
     "learning_controller",
     "electrodynamic_actuator",
     "piezo_actuator",
     "series_drive",
+    "loaded_drive",
+    "loaded_series_drive",
     "vibration",
     "tool",
     "feed_drive",

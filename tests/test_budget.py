@@ -121,6 +121,15 @@ def test_where_causes_multiply_pairs_of_them_explain_it(name):
     assert sum(part.share for part in (*found.causes, found.rest, found.interactions)) == pytest.approx(1.0)
 
 
+def test_force_and_load_are_causes_where_drive_and_spindle_feel_them():
+    """The force alone is learned, and so is the speed; what they do together is not."""
+    found = budget("loaded_cutting", 25, "loaded_drive.coarse_slew_rate=1e5")
+    assert {"speed", "force", "load", "limits"} < {part.name for part in found.causes}
+    assert found.explained == pytest.approx(1.0, abs=0.1)
+    assert "speed with force" in [pair.name for pair in found.pairs if pair.share > 0.01]
+    assert list(found.left_out) == ["lead"]  # nobody knows the speed in advance
+
+
 def test_it_speaks_of_the_form_error_of_the_last_revolutions():
     cell = scenario(spindle_encoder={"revolutions": 15.0, **SWING})
     errors, found = harness.run(cell).errors, harness.budget(cell)

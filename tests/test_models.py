@@ -28,6 +28,7 @@ def sets(node, prefix=""):
         ("piston", "electrodynamic_actuator.", "learning_controller"),
         ("two_coarse", "fine_actuator.", "fine_controller"),  # by the topic of its command, not by its kind
         ("series", "series_drive.coarse_", "learning_controller"),
+        ("loaded_cutting", "loaded_drive.coarse_", "learning_controller"),
     ],
 )
 def test_a_drive_moves_its_model(name, drive, controller):

@@ -17,7 +17,7 @@ from lathe_rc.cell.stages.piezo_actuator import PiezoActuator, PiezoActuatorPara
 from lathe_rc.errors import InputError
 from lathe_rc.plants.hysteresis import WEIGHTS, BoucWen, PrandtlIshlinskii
 from lathe_rc.plants.linear import second_order
-from lathe_rc.plants.piezo import PiezoDrive, Stack
+from lathe_rc.plants.piezo import PiezoDrive, Stack, extend
 
 WN, ZETA, STROKE, VOLTS = 14600.0, 0.299, 15e-6, 100.0
 STEP = 1 / 64000
@@ -30,11 +30,12 @@ PAIRS = {
 }
 
 
-def make_drive(kind=None, *, linearised=True, scale=1.0, lag=0.0, creep=0.0, method="foh"):
+def make_drive(kind=None, *, linearised=True, scale=1.0, lag=0.0, slew=np.inf, creep=0.0, method="foh"):
     forward, inverse = PAIRS[kind](scale)
     stack = Stack(
         stroke=STROKE,
         amplifier_lag=lag,
+        slew_rate=slew,
         hysteresis=forward,
         inverse=inverse if linearised else None,
         creep_per_decade=creep,
@@ -103,6 +104,21 @@ def test_foh_is_exact_for_set_points_linear_between_samples():
     _, _, states = lsim((a, b[:, None], np.eye(2), np.zeros((2, 1))), fine, np.arange(fine.size) * STEP / 8)
     assert_allclose(position, states[8::8, 0][:300], atol=1e-9 * STROKE)
     assert_allclose(velocity, states[8::8, 1][:300], atol=1e-9 * STROKE * WN)
+
+
+@pytest.mark.parametrize("kind", PAIRS)
+def test_the_amplifier_changes_its_voltage_no_faster_than_its_slew_rate(kind):
+    """200 times full voltage in a second; what it cannot follow is counted, sample by sample as in a block."""
+    machine, other = (make_drive(kind, slew=200.0) for _ in range(2))
+    set_point = np.repeat([0.0, 0.8, -0.4], [10, 1000, 1000]) * STROKE
+    _, _, voltage = drive(machine, set_point)
+    slope = np.abs(np.diff(voltage)) / STEP
+    assert slope.max() == pytest.approx(200.0 * VOLTS, rel=1e-6)
+    assert machine.saturated == pytest.approx(np.sum(slope > 199.99 * VOLTS), abs=2)
+    assert voltage[-1] == pytest.approx(drive(make_drive(kind), set_point)[2][-1], rel=1e-9)
+    single = [extend(other.table.stack, other.table.memory, value) for value in set_point]
+    assert sum(cut for _, cut in single) == machine.saturated
+    assert np.array_equal(other.table.memory, machine.table.memory)
 
 
 def test_step_response_overshoots_as_its_damping_says():

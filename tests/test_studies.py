@@ -13,6 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from lathe_rc.analysis.loaded import compliance
+from lathe_rc.analysis.regeneration import Regeneration
 from lathe_rc.analysis.step_fit import SecondOrder
 from lathe_rc.cli import main
 from lathe_rc.commands import study as commands_study
@@ -24,6 +26,7 @@ from lathe_rc.studies import STUDIES, angle_domain, drive_models, invariance
 from lathe_rc.studies.angle_domain import AngleDomainParameters
 from lathe_rc.studies.drive_models import DriveModelsParameters
 from lathe_rc.studies.invariance import InvarianceParameters
+from lathe_rc.transfer import TransferFunction
 
 KEYS = {
     "invariance": [
@@ -45,6 +48,10 @@ KEYS = {
         "preset", "plant", "stability", "robustness", "single_loop", "cross", "noise", "delay", "engagement",
         "reduced_order", "figure",
     ],
+    "coupling": [
+        "delays", "position_difference", "invented_energy", "limits", "speed_deviation", "speed_difference",
+        "edge_difference", "angle", "force", "moved", "speed", "slowed", "figure",
+    ],
 }  # fmt: skip
 #: settings with which a study takes a moment only
 QUICK = {
@@ -54,6 +61,7 @@ QUICK = {
     "sampled-servo": ["t=0.16"],
     "saturation": ["periods=2", "step_ms=10"],
     "decoupling": ["seconds=4"],
+    "coupling": ["delays=16,64"],
 }
 
 
@@ -401,3 +409,16 @@ def test_step_test_has_no_half_step_of_latency():
         found = drive_models.run(DriveModelsParameters(natural_frequency=wn, damping=damping, delay=delay))
         assert_allclose(found.measured.response, true.step(found.measured.time), atol=2e-3)
         assert found.measured.rms(true) < 3e-4
+
+
+def test_a_delay_between_drive_and_cut_lowers_the_limit_of_chatter_and_brings_energy_in():
+    """Without a delay the limit is that of `Regeneration`; the error of the edge grows with the delay from 0 on."""
+    found = told("coupling", sets=["delays=1,16,64"])
+    give = compliance(natural_frequency=1038.0, damping=0.804, moving_mass=1.2)
+    radial = TransferFunction(tuple(0.4 * each for each in give.numerator), give.denominator)
+    assert found["limits"][0] == pytest.approx(Regeneration(radial).worst().stiffness, rel=1e-4)
+    assert found["limits"][3] < 0.5 * found["limits"][0]
+    edge = found["position_difference"]
+    assert edge[1] == pytest.approx(16 * edge[0], rel=0.02)
+    assert 0.0 < found["invented_energy"][0] < found["invented_energy"][1] < found["invented_energy"][2]
+    assert found["speed_difference"][0] == 0.0 < found["speed_difference"][1] < found["speed_difference"][2]

@@ -108,7 +108,10 @@ def test_malformed_remapping_is_refused(rule):
 
 def test_second_spindle_is_refused():
     other = {"stage": "spindle_encoder", "revolutions": 3.0, "remap": ["encoder:=other"]}
-    assert refusal(other=other) == "2 time masters in the scenario; allowed: 1, a spindle_encoder or encoder_device"
+    assert (
+        refusal(other=other)
+        == "2 time masters in the scenario; allowed: 1, a spindle_encoder or encoder_device or loaded_spindle"
+    )
 
 
 def test_event_in_revolutions_needs_the_spindle():

@@ -17,6 +17,8 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.form import FormParameters
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
+from lathe_rc.cell.stages.loaded_drive import LoadedParameters
+from lathe_rc.cell.stages.loaded_spindle import LoadedSpindleParameters
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.cell.stages.vibration import VibrationParameters
@@ -24,7 +26,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 
 _TURN = 2.0 * np.pi
-_PREFIXES = ("", "coarse_", "fine_")  # of the parameters of a drive; those of a series drive have one
+_PREFIXES = ("", "coarse_", "fine_", "cut_")  # of the parameters of a part; those of stages with several have one
 _FACTOR = 0.9  # of a cycle, which a flat Q may have; or what the scenario's own has, if that is more
 _BANDS = np.geomspace(60_000.0, 500.0, 32)  # [rad/s] where the flat Q may end, the widest that converges is taken
 _STOP = 2.0  # its stop band begins at so many times that
@@ -36,16 +38,25 @@ _ANYWHERE: Mapping[str, Mapping[str, Value]] = {
     "quantisation": {"counts_per_revolution": 0, "resolution": 0.0, "adc_step": 0.0, "dac_step": 0.0},
     "hysteresis": {"hysteresis": "none", "linearisation": "none", "creep_per_decade": 0.0},
     "backlash": {"backlash": 0.0},
-    "limits": {"command_stroke": 0.0, "command_velocity": 0.0, "command_acceleration": 0.0, "command_jerk": 0.0},
+    "limits": {
+        "command_stroke": 0.0,
+        "command_velocity": 0.0,
+        "command_acceleration": 0.0,
+        "command_jerk": 0.0,
+        "current_limit": 0.0,
+        "voltage_limit": 0.0,
+        "slew_rate": 0.0,
+        "torque_limit": 0.0,
+    },
     "faults": {"faults": []},
 }
 #: The same in nodes with certain parameters.
-_SOMEWHERE: Mapping[str, tuple[type[NodeParameters], Mapping[str, Value]]] = {
-    "force": (ToolParameters, {"deflects": False, "cross_slide": False}),
-    "vibration": (
-        VibrationParameters,
-        {"random_rms": 0.0, "line_amplitude": [], "line_frequency": [], "line_phase": []},
-    ),
+_SOMEWHERE: Mapping[str, Mapping[type[NodeParameters], Mapping[str, Value]]] = {
+    "force": {ToolParameters: {"deflects": False, "cross_slide": False}, LoadedParameters: {"radial_ratio": 0.0}},
+    "load": {LoadedSpindleParameters: {"part_radius": 0.0}},
+    "vibration": {
+        VibrationParameters: {"random_rms": 0.0, "line_amplitude": [], "line_frequency": [], "line_phase": []}
+    },
 }
 _SPEED = [name for name in SpeedLawParameters.model_fields if name not in NodeParameters.model_fields]
 
@@ -124,9 +135,15 @@ def _not_yet(scenario: Scenario, values: Mapping[str, Value]) -> dict[str, Value
 def _simple(scenario: Scenario) -> dict[str, Cause]:
     """The causes that are a value of some parameters."""
     found: dict[str, Cause] = {}
-    for name, (kind, values) in _SOMEWHERE.items():
-        nodes = [node for node, table in scenario.nodes.items() if isinstance(table, kind)]
-        found[name] = Cause({f"{node}.{each}": value for node in nodes for each, value in values.items()})
+    for name, kinds in _SOMEWHERE.items():
+        off = {
+            f"{node}.{each}": value
+            for kind, values in kinds.items()
+            for node, table in scenario.nodes.items()
+            if isinstance(table, kind)
+            for each, value in values.items()
+        }
+        found[name] = Cause(off)
     for name, values in _ANYWHERE.items():
         targets = {
             f"{node}.{prefix}{each}": value

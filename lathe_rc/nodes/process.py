@@ -30,6 +30,7 @@ from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stage import compile_kernels
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.encoder_device import EncoderDevice
+from lathe_rc.cell.stages.loaded_spindle import LoadedSpindleStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import arguments, dds, declare
@@ -56,6 +57,7 @@ def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellN
     classes: dict[str, type[CellNode]] = {
         RECORDER: RecorderNode,
         SpindleEncoder.kind: SpindleNode,
+        LoadedSpindleStage.kind: SpindleNode,
         EncoderDevice.kind: EncoderNode,
     }
     try:

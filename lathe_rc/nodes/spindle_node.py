@@ -145,6 +145,8 @@ class SpindleNode(StageNode):
         self._schedule = self._heard = self._looked = time.monotonic()
         self._members_moved = dict.fromkeys(self._member_names, self._heard)
         form(self, cell)
+        if self.chain is None and self._inputs:
+            self._join(0)
         self.release()
 
     # ---- run ----------------------------------------------------------------------------------------
@@ -194,16 +196,18 @@ class SpindleNode(StageNode):
         return 1 if self._pace.speed_factor else min(self._credit(), self.together)
 
     def _possible(self) -> int:
-        """Samples to let go at once; 0 while others in its chain wait for an input."""
+        """Samples to let go at once; 0 while it, or others in its chain, wait for an input."""
         samples = self.table.block_size * self._at_once()
-        ready = self.chain.ready() if self.chain is not None else (samples, False)
+        if self.chain is None and not self._inputs:
+            return samples
+        ready = self.chain.ready() if self.chain is not None else self.next()
         return min(samples, ready[0]) if ready else 0
 
     def _let_go(self, samples: int, *, last: bool) -> None:
         if self.chain is not None:
             self.chain.compute(samples, last=last)
         else:
-            self.compute(samples, [], last=last)
+            self.compute(samples, self.read(samples), last=last)
 
     def release(self) -> None:
         """Let go every block that credit and pace allow."""
@@ -259,6 +263,8 @@ class SpindleNode(StageNode):
         """Take what members in this process have told: not at once, the block that they tell of may be under way."""
         while self._told:
             self._on_progress(self._told.popleft())
+        if self._inputs and self.chain is None:
+            self.release()  # what has come from the cut may let blocks go
 
     def ended(self) -> None:
         """Its last block is out; the run ends when all members have completed it."""

@@ -453,16 +453,20 @@ class StageNode(CellNode):
             if ready is None:
                 return
             samples, last = ready
-            taken = {queue.topic: self._taken(queue, samples) for queue in self._shared}
-            inputs: list[Signals] = []
-            for queue, track, delay in self._inputs:
-                if queue.topic in taken:
-                    inputs.append(taken[queue.topic])
-                    continue
-                if not delay:
-                    self._load(queue, track, self.samples + samples)
-                inputs.append(track.view(self.samples - delay, samples))
-            self.compute(samples, inputs, last=last)
+            self.compute(samples, self.read(samples), last=last)
+
+    def read(self, samples: int) -> list[Signals]:
+        """The next samples of all inputs, which are there."""
+        taken = {queue.topic: self._taken(queue, samples) for queue in self._shared}
+        inputs: list[Signals] = []
+        for queue, track, delay in self._inputs:
+            if queue.topic in taken:
+                inputs.append(taken[queue.topic])
+                continue
+            if not delay:
+                self._load(queue, track, self.samples + samples)
+            inputs.append(track.view(self.samples - delay, samples))
+        return inputs
 
     def _goes_out(self, topic: str) -> bool:
         """Whether to publish: unless all who read the topic are in this process."""

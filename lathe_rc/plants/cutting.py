@@ -43,7 +43,7 @@ _TURN = 2.0 * np.pi
 # Places in the state: VB, the last angle's place on the grid, what is remembered of it, the next grid point.
 _WEAR, _PLACE, _LEFT, _NEXT = 0, 1, 2, 3
 # Why the kernel stopped, and what it counts.
-_DONE, _STANDS, _TURNS_BACK, _DRAWN_IN = 0, 1, 2, 3
+_DONE, _STANDS, _TURNS_BACK, DRAWN_IN = 0, 1, 2, 3
 _APART, _BACKWARDS = 0, 1
 
 
@@ -295,6 +295,82 @@ class CutTable(NamedTuple):
     counts: npt.NDArray[np.int64]
 
 
+@inlined
+def meet(
+    cut: CutTable, place: float, speed: float, height: float, angle: float, feed_velocity: float
+) -> tuple[int, float, float, float]:
+    """What the edge meets at ``place`` [grid point]: why it cannot go on, feed, K, and σ·c; nothing changes."""
+    process, state = cut.process, cut.state
+    if not speed > 0.0:
+        return _STANDS, 0.0, 0.0, 0.0
+    if (
+        process.overlap > 0.0
+        and not 0.0 <= place - (place if np.isnan(state[_PLACE]) else state[_PLACE]) < process.grid
+    ):
+        return _TURNS_BACK, 0.0, 0.0, 0.0
+    feed = max(feed_velocity * _TURN / speed, 0.0)
+    stiffness = cutting_stiffness(process.kc1, process.mc, process.wear_factor, feed, state[_WEAR])
+    stiffness *= _hardness(process.spots, angle, height)
+    return _DONE, feed, stiffness, process.sign * linear(process.heights, process.compliances, height)
+
+
+@inlined
+def held(cut: CutTable) -> float:
+    """Force [N] that a sample has without a chip: what the lag keeps."""
+    return _free(cut.process.lag, cut.lag_state)
+
+
+@inlined
+def chip_of(
+    cut: CutTable,
+    place: float,
+    angle: float,
+    cross_position: float,
+    displacement: float,
+    allowance: float,
+    stiffness: float,
+    compliance: float,
+    give: float,
+) -> float:
+    """Depth of cut [m] of a sample, negative where the edge is clear of the part; NaN: it is drawn in without end.
+
+    ``displacement`` of the tool drives is that with the force `held`, to which they give way by ``give`` [m/N] of what
+    the chip adds to it.
+    """
+    process, lag_now = cut.process, cut.process.lag_now
+    chip = process.depth + allowance - cross_position - displacement
+    if process.overlap > 0.0:
+        chip += process.overlap * _read(cut.surface, place - process.grid)
+    bend = process.mode_now * lag_now * stiffness * compliance + lag_now * stiffness * give
+    if not 1.0 + bend > 0.0:
+        return np.nan
+    chip -= compliance * (_free(process.mode, cut.mode_state) + process.mode_now * held(cut))
+    chip /= 1.0 + bend
+    for i in range(process.gaps.shape[0]):
+        if _within(angle, process.gaps[i, 0], process.gaps[i, 1]):
+            chip = 0.0
+    return float(chip)
+
+
+@inlined
+def press(cut: CutTable, chip: float, stiffness: float, compliance: float, speed: float) -> tuple[float, float]:
+    """Step force [N] and deflection [m] on by a sample with a chip of 0 or more; the tool wears."""
+    process, state = cut.process, cut.state
+    force = step(process.lag, cut.lag_state, stiffness * chip)
+    deflection = compliance * step(process.mode, cut.mode_state, force)
+    if chip > 0.0:
+        path = process.per_metre * process.radius * speed
+        state[_WEAR] += (path + process.per_second) * process.step
+    return force, deflection
+
+
+@inlined
+def leave(cut: CutTable, place: float, chip: float, edge: float) -> None:
+    """Remember where the edge [m] has been, if it is met again."""
+    if cut.process.overlap > 0.0:
+        _remember(cut.surface, cut.state, place, edge if chip > 0.0 else 0.0)
+
+
 @kernel
 def cut_along(
     cut: CutTable,
@@ -312,51 +388,23 @@ def cut_along(
     wear: Array,
 ) -> tuple[int, int]:
     """Step through a block, see `CuttingProcess.block`; returns the sample at which it stopped and why."""
-    process, lag_state, mode_state = cut.process, cut.lag_state, cut.mode_state
-    state, surface, counts = cut.state, cut.surface, cut.counts
-    per_radian = process.grid / _TURN
+    per_radian = cut.process.grid / _TURN
     for k in range(angle.size):
-        if not speed[k] > 0.0:
-            return k, _STANDS
         place = angle[k] * per_radian
-        if (
-            process.overlap > 0.0
-            and not 0.0 <= place - (place if np.isnan(state[_PLACE]) else state[_PLACE]) < process.grid
-        ):
-            return k, _TURNS_BACK
-        feed[k] = feed_velocity[k] * _TURN / speed[k]
-        if feed[k] < 0.0:
-            feed[k] = 0.0
-            counts[_BACKWARDS] += 1
-        wear[k] = state[_WEAR]
-        stiffness = cutting_stiffness(process.kc1, process.mc, process.wear_factor, feed[k], wear[k])
-        stiffness *= _hardness(process.spots, angle[k], height[k])
-        compliance = process.sign * linear(process.heights, process.compliances, height[k])
-
-        chip = process.depth + allowance[k] - cross_position[k] - displacement[k]
-        if process.overlap > 0.0:
-            chip += process.overlap * _read(surface, place - process.grid)
-        bend = process.mode_now * process.lag_now * stiffness * compliance
-        if not 1.0 + bend > 0.0:
-            return k, _DRAWN_IN
-        chip -= compliance * (_free(process.mode, mode_state) + process.mode_now * _free(process.lag, lag_state))
-        chip /= 1.0 + bend
-        for i in range(process.gaps.shape[0]):
-            if _within(angle[k], process.gaps[i, 0], process.gaps[i, 1]):
-                chip = 0.0
-        if chip < 0.0:
-            chip = 0.0
-            counts[_APART] += 1
-        depth_of_cut[k] = chip
-        force[k] = step(process.lag, lag_state, stiffness * chip)
-        deflection[k] = compliance * step(process.mode, mode_state, force[k])
-
-        if chip > 0.0:
-            path = process.per_metre * process.radius * speed[k]
-            state[_WEAR] += (path + process.per_second) * process.step
-        if process.overlap > 0.0:
-            edge = cross_position[k] + displacement[k] + deflection[k]
-            _remember(surface, state, place, edge if chip > 0.0 else 0.0)
+        reason, feed[k], stiffness, compliance = meet(cut, place, speed[k], height[k], angle[k], feed_velocity[k])
+        if reason != _DONE:
+            return k, reason
+        wear[k] = cut.state[_WEAR]
+        chip = chip_of(
+            cut, place, angle[k], cross_position[k], displacement[k], allowance[k], stiffness, compliance, 0.0
+        )
+        if np.isnan(chip):
+            return k, DRAWN_IN
+        cut.counts[_BACKWARDS] += feed_velocity[k] < 0.0
+        cut.counts[_APART] += chip < 0.0
+        depth_of_cut[k] = chip = max(chip, 0.0)
+        force[k], deflection[k] = press(cut, chip, stiffness, compliance, speed[k])
+        leave(cut, place, chip, cross_position[k] + displacement[k] + deflection[k])
     return angle.size, _DONE
 
 

@@ -39,6 +39,7 @@ class StackTable(NamedTuple):
         inverse, forward: linearisation and hysteresis.
         inverse_size: numbers in the state of the inverse.
         decay, now, before: the amplifier's lag, weights of its last output and of its inputs.
+        slew: largest change of its output in a sample, relative to full voltage.
         creep: the same of each lag of the creep, shape (n, 3).
         creep_gain: of each of them.
     """
@@ -50,6 +51,7 @@ class StackTable(NamedTuple):
     decay: float
     now: float
     before: float
+    slew: float
     creep: Array
     creep_gain: float
 
@@ -69,7 +71,8 @@ def extend(stack: StackTable, state: Array, set_point: float) -> tuple[float, bo
     forward = inverse + stack.inverse_size
     demand = advance(stack.inverse.kind, stack.inverse.table, state, inverse, within)
     applied = min(max(demand, -1.0), 1.0)
-    voltage = stack.decay * state[VOLTAGE] + stack.now * applied + stack.before * state[_DEMAND]
+    lagged = stack.decay * state[VOLTAGE] + stack.now * applied + stack.before * state[_DEMAND]
+    voltage = min(max(lagged, state[VOLTAGE] - stack.slew), state[VOLTAGE] + stack.slew)
     extension = stack.stroke * advance(stack.forward.kind, stack.forward.table, state, forward, voltage)
     crept = extension
     creep = stack.creep
@@ -78,7 +81,7 @@ def extend(stack: StackTable, state: Array, set_point: float) -> tuple[float, bo
         state[place] = creep[i, 0] * state[place] + creep[i, 1] * extension + creep[i, 2] * state[_EXTENSION]
         crept += stack.creep_gain * state[place]
     state[VOLTAGE], state[_DEMAND], state[_EXTENSION] = voltage, applied, extension
-    return crept, wanted != within or abs(demand) > 1.0 + _ROUNDING
+    return crept, wanted != within or abs(demand) > 1.0 + _ROUNDING or voltage != lagged
 
 
 @kernel
@@ -93,9 +96,10 @@ def _extend_along(stack: StackTable, state: Array, set_point: Array, extension: 
     advance_along(stack.inverse.kind, stack.inverse.table, state, inverse, extension, voltage)
     amplified, before, cut = state[VOLTAGE], state[_DEMAND], 0
     for k in range(set_point.size):
-        cut += set_point[k] / stack.stroke != extension[k] or abs(voltage[k]) > 1.0 + _ROUNDING
         applied = min(max(voltage[k], -1.0), 1.0)
-        amplified = stack.decay * amplified + stack.now * applied + stack.before * before
+        lagged = stack.decay * amplified + stack.now * applied + stack.before * before
+        amplified = min(max(lagged, amplified - stack.slew), amplified + stack.slew)
+        cut += set_point[k] / stack.stroke != extension[k] or abs(voltage[k]) > 1.0 + _ROUNDING or amplified != lagged
         before = applied
         voltage[k] = amplified
     state[VOLTAGE], state[_DEMAND] = amplified, before
@@ -130,6 +134,7 @@ class Stack:
     Args:
         stroke: displacement at full voltage, to each side [m].
         amplifier_lag: T [s]; 0 for none.
+        slew_rate: largest change of its output in a second, relative to full voltage [1/s]; inf for none.
         hysteresis: of the ceramics; None for none.
         inverse: what linearises it; None for nothing.
         creep_per_decade: c, relative creep in a decade of time; 0 for none.
@@ -151,6 +156,7 @@ class Stack:
         *,
         stroke: float,
         amplifier_lag: float,
+        slew_rate: float = np.inf,
         hysteresis: Hysteresis | None,
         inverse: Hysteresis | None,
         creep_per_decade: float,
@@ -173,6 +179,7 @@ class Stack:
             decay=amplifier[0],
             now=amplifier[1],
             before=amplifier[2],
+            slew=slew_rate * step,
             creep=creep,
             creep_gain=creep_per_decade,
         )

@@ -140,9 +140,9 @@ def advance(
     drive.counts[1] += saturated
 
 
-def _seen_at(plant: DiscretePlant, place: int) -> DiscretePlant:
+def seen_at(plant: DiscretePlant, place: int) -> DiscretePlant:
     """The same plant with another state as the first, whose response is asked for."""
-    order = np.roll(np.arange(4), -place)
+    order = np.roll(np.arange(plant.transition.shape[0]), -place)
     return DiscretePlant(
         plant.transition[np.ix_(order, order)], plant.weights[order], plant.delay, plant.fraction, plant.step
     )
@@ -261,16 +261,16 @@ class SeriesDrive:
 
     def _reaction(self, frequency: npt.ArrayLike) -> Complex:
         """Carriage over the piezo's set point, without feedback."""
-        return np.asarray(self._stack.response(frequency) * _seen_at(self._fine, _CARRIAGE).response(frequency))
+        return np.asarray(self._stack.response(frequency) * seen_at(self._fine, _CARRIAGE).response(frequency))
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
         """Wpk: tool over the piezo's set point at ``frequency`` [rad/s], with the feedback if there is one."""
-        alone = self._stack.response(frequency) * _seen_at(self._fine, _TOOL).response(frequency)
+        alone = self._stack.response(frequency) * seen_at(self._fine, _TOOL).response(frequency)
         return np.asarray(alone / (1.0 + self._reaction(frequency)) if self._feedback else alone)
 
     def coarse_response(self, frequency: npt.ArrayLike) -> Complex:
         """Carriage over its command at ``frequency`` [rad/s], with the feedback if there is one."""
-        alone = _seen_at(self._coarse, _CARRIAGE).response(frequency)
+        alone = seen_at(self._coarse, _CARRIAGE).response(frequency)
         return np.asarray(alone / (1.0 + self._reaction(frequency)) if self._feedback else alone)
 
     def block(

@@ -45,8 +45,28 @@ def encode(
     speed_true: Array,
 ) -> None:
     """Fill the samples from index ``first`` on, see `Encoder.block`."""
+    follow_law(encoder, first, angle_true, speed_true)
+    read_off(encoder, first, angle, speed, index_pulse, angle_true, speed_true)
+
+
+@kernel
+def follow_law(encoder: EncoderTable, first: int, angle_true: Array, speed_true: Array) -> None:
+    """Fill what the speed law says of the samples from index ``first`` on."""
+    evaluate_along(first, encoder.step, encoder.nominal, encoder.lines, encoder.tachogram, angle_true, speed_true)
+
+
+@kernel
+def read_off(
+    encoder: EncoderTable,
+    first: int,
+    angle: Array,
+    speed: Array,
+    index_pulse: npt.NDArray[np.uint8],
+    angle_true: Array,
+    speed_true: Array,
+) -> None:
+    """Fill what is measured of the true angle and speed."""
     step, counts, history, revolution = encoder.step, encoder.counts, encoder.history, encoder.revolution
-    evaluate_along(first, step, encoder.nominal, encoder.lines, encoder.tachogram, angle_true, speed_true)
     before = revolution[0]
     if counts == 0:
         for k in range(angle.size):

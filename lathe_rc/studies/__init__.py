@@ -7,6 +7,7 @@ from lathe_rc.extensions import Objects
 from lathe_rc.studies import (
     angle_domain,
     best_law,
+    coupling,
     decoupling,
     drive_models,
     drive_tolerance,
@@ -33,6 +34,7 @@ _OWN: dict[str, Study[Any]] = {
         sampled_servo,
         decoupling,
         drive_tolerance,
+        coupling,
     )
 }
 

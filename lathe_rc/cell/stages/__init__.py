@@ -9,6 +9,8 @@ from lathe_rc.cell.stages.encoder_device import EncoderDevice
 from lathe_rc.cell.stages.feed_drive import FeedDriveStage
 from lathe_rc.cell.stages.force_controller import ForceController
 from lathe_rc.cell.stages.learning_controller import LearningController
+from lathe_rc.cell.stages.loaded_drive import LoadedDriveStage, LoadedSeriesDrive
+from lathe_rc.cell.stages.loaded_spindle import LoadedSpindleStage
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuator
 from lathe_rc.cell.stages.position_controller import PositionController
 from lathe_rc.cell.stages.profile import ProfileStage
@@ -23,10 +25,13 @@ from lathe_rc.extensions import Registry
 _OWN: tuple[type[Stage], ...] = (
     SpindleEncoder,
     EncoderDevice,
+    LoadedSpindleStage,
     LearningController,
     ElectrodynamicActuator,
     PiezoActuator,
     SeriesDriveStage,
+    LoadedDriveStage,
+    LoadedSeriesDrive,
     Vibration,
     ProfileStage,
     Tool,

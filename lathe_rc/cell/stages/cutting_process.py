@@ -33,11 +33,12 @@ from lathe_rc.signals.allowance import Allowance, AllowanceTable, allow, mean_re
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
 _ELASTICITIES = {"rigid": RIGID, "paper": PAPER, "realistic": REALISTIC}
-_READ = {
+READ = {
     "tool": Input("tool", messages.TOOL, ("displacement", "reference", "height")),
     "cross": Input("cross/state", messages.STATE, ("position",)),
     "longitudinal": Input("longitudinal/state", messages.STATE, ("position", "velocity")),
 }
+TURNS = Input("encoder", messages.ENCODER, ("angle_true", "speed_true"))
 _HEIGHTS = 201  # places along a shaft between which its compliance is linear
 
 
@@ -96,14 +97,16 @@ class CuttingProcessParameters(NodeParameters):
     noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the force sensor, RMS; 0: none", "N")
     resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the force sensor; 0: none", "N")
 
-    def allowance(self, node: str) -> Allowance:
-        """The allowance of a node."""
+    def allowance(self, node: str, prefix: str = "") -> Allowance:
+        """The allowance of a node; ``prefix`` begins the parameters where they are part of a table."""
         if self.allowance_rms and self.allowance_rate:
-            raise InputError(f"{node}.allowance_rms and allowance_rate are both given; allowed: one of them")
+            raise InputError(
+                f"{node}.{prefix}allowance_rms and {prefix}allowance_rate are both given; allowed: one of them"
+            )
         walk = unbounded(self.allowance_rate, self.step)
         if not self.allowance_rate:
             walk = mean_reverting(self.allowance_rms, self.allowance_time, self.step)
-        with about(node, "run_out_order", "run_out_amplitude", "run_out_phase"):
+        with about(node, *(f"{prefix}run_out_{what}" for what in ("order", "amplitude", "phase"))):
             return Allowance(
                 walk,
                 order=np.array(self.run_out_order, dtype=float),
@@ -128,8 +131,8 @@ class CuttingProcessParameters(NodeParameters):
             modulus=self.shaft_modulus,
         )
 
-    def part(self, node: str) -> Part:
-        """The part of a node.
+    def part(self, node: str, prefix: str = "") -> Part:
+        """The part of a node; ``prefix`` begins the parameters where they are part of a table.
 
         Raises:
             InputError: lists of different lengths, or windows that are none.
@@ -143,19 +146,20 @@ class CuttingProcessParameters(NodeParameters):
         )
         if len(self.gap_start) != len(self.gap_width):
             raise InputError(
-                f"{node}.gap_start, gap_width: {len(self.gap_start)} and {len(self.gap_width)}; give as many of each"
+                f"{node}.{prefix}gap_start, {prefix}gap_width: {len(self.gap_start)} and {len(self.gap_width)}; give "
+                "as many of each"
             )
         if len({len(values) for values in spots}) > 1:
-            names = "hard_spot_start, hard_spot_width, hard_spot_bottom, hard_spot_top, hard_spot_factor"
+            names = ", ".join(f"{prefix}hard_spot_{what}" for what in ("start", "width", "bottom", "top", "factor"))
             raise InputError(f"{node}.{names}: of lengths {[len(v) for v in spots]}; give as many of each")
         heights = compliances = None
         shaft = self.flexible()
         if shaft is not None:
             heights = np.linspace(0.0, shaft.length, _HEIGHTS)
             compliances = shaft.compliance(heights)
-        with about(node, "hard_spot_start", "hard_spot_width", "hard_spot_bottom", "hard_spot_top"):
+        with about(node, *(f"{prefix}hard_spot_{what}" for what in ("start", "width", "bottom", "top"))):
             hard_spots = [HardSpot(*spot) for spot in zip(*spots, strict=True)]
-        with about(node, "gap_start", "gap_width"):
+        with about(node, f"{prefix}gap_start", f"{prefix}gap_width"):
             return Part(
                 radius=self.radius,
                 gaps=list(zip(self.gap_start, self.gap_width, strict=True)),
@@ -167,6 +171,21 @@ class CuttingProcessParameters(NodeParameters):
     def deflecting(self) -> Elasticity:
         """W3; of a shaft only the dynamics, since its compliance is the shaft's own."""
         return _ELASTICITIES["realistic" if self.shaft != "none" and self.elasticity == "rigid" else self.elasticity]
+
+    def process(self, node: str, prefix: str = "") -> CuttingProcess:
+        """The cut of a node, before its first sample; see `part`."""
+        part = self.part(node, prefix)
+        with about(node, f"{prefix}lag"):
+            return CuttingProcess(
+                material=SpecificForce(self.kc1, self.mc, self.wear_factor),
+                depth=self.depth,
+                lag=self.lag,
+                elasticity=self.deflecting(),
+                wear=Wear(self.wear, self.wear_per_metre, self.wear_per_second),
+                part=part,
+                overlap=self.regeneration,
+                step=self.step,
+            )
 
 
 class Memory(NamedTuple):
@@ -224,46 +243,24 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     return reached, DONE
 
 
-class CuttingProcessStage(Stage):
-    """See `lathe_rc.plants.cutting`.
+class CutStage(Stage):
+    """A stage with a cut, whose encoder is its first input and whose cut its last output.
 
     Attributes:
-        parameters: its table.
         cut: the machine.
     """
 
-    kind = "cutting_process"
-    Parameters = CuttingProcessParameters
     devices = ("cut",)
-    rooms = 4
-    step = staticmethod(step)
+    failure = staticmethod(failure)  #: why it cannot go on
 
-    def __init__(self, name: str, parameters: CuttingProcessParameters) -> None:
+    def __init__(self, name: str, parameters: NodeParameters, table: CuttingProcessParameters, prefix: str) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
-        moved = parameters.moved_by
-        if len(set(moved)) < len(moved):
-            raise InputError(f"{name}.moved_by = {moved}; allowed: each once")
-        self._allowance = parameters.allowance(name)
-        self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
-        part = parameters.part(name)
-        with about(name, "lag"):
-            self.cut = CuttingProcess(
-                material=SpecificForce(parameters.kc1, parameters.mc, parameters.wear_factor),
-                depth=parameters.depth,
-                lag=parameters.lag,
-                elasticity=parameters.deflecting(),
-                wear=Wear(parameters.wear, parameters.wear_per_metre, parameters.wear_per_second),
-                part=part,
-                overlap=parameters.regeneration,
-                step=parameters.step,
-            )
-        self._movers = moved
+        if len(set(table.moved_by)) < len(table.moved_by):
+            raise InputError(f"{name}.{prefix}moved_by = {table.moved_by}; allowed: each once")
+        self._allowance = table.allowance(name, prefix)
+        self._force_sensor = Sensor(table.noise_rms, table.resolution, table.seed, f"{name}{prefix and '/cut'}")
+        self.cut = table.process(name, prefix)
         self._damages = list[Fault]()
-        self.declare(
-            inputs=[Input("encoder", messages.ENCODER, ("angle_true", "speed_true")), *(_READ[name] for name in moved)],
-            outputs=[Output("cut", messages.CUT)],
-        )
 
     def damage(self, fault: Fault) -> None:
         """See `Stage`."""
@@ -287,28 +284,10 @@ class CuttingProcessStage(Stage):
         ]
         self.cut.damage(shorter=shorter, spots=spots)
 
-    @property
-    def memory(self) -> Memory:
-        """See `Stage`."""
-        parameters = self.parameters
-        places, place = dict.fromkeys(_READ, -1), 2
-        for name in self._movers:
-            places[name] = place
-            place += len(_READ[name].fields)
-        return Memory(
-            cut=self.cut.table,
-            allowance=self._allowance.table,
-            sensor=self._sensor.table,
-            **places,
-            even=parameters.blank == "form",
-            feed=parameters.feed / (2.0 * np.pi),
-            room=self.room,
-        )
-
     def prepare(self, first: int, samples: int) -> None:
         """See `Stage`."""
         self._allowance.draw(samples)
-        self._sensor.draw(samples)
+        self._force_sensor.draw(samples)
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
@@ -316,7 +295,46 @@ class CuttingProcessStage(Stage):
         """See `Stage`.
 
         Raises:
-            LatheError: there is no cut.
+            LatheError: it cannot go on.
         """
-        (encoder, *_), (cut,) = inputs, outputs
-        raise failure(reason, encoder["angle_true"][reached], encoder["speed_true"][reached], cut["feed"][reached])
+        encoder, cut = inputs[0], outputs[-1]
+        raise self.failure(reason, encoder["angle_true"][reached], encoder["speed_true"][reached], cut["feed"][reached])
+
+
+class CuttingProcessStage(CutStage):
+    """See `lathe_rc.plants.cutting`.
+
+    Attributes:
+        parameters: its table.
+    """
+
+    kind = "cutting_process"
+    Parameters = CuttingProcessParameters
+    rooms = 4
+    step = staticmethod(step)
+
+    def __init__(self, name: str, parameters: CuttingProcessParameters) -> None:
+        super().__init__(name, parameters, parameters, "")
+        self.parameters = parameters
+        self.declare(
+            inputs=[TURNS, *(READ[name] for name in parameters.moved_by)],
+            outputs=[Output("cut", messages.CUT)],
+        )
+
+    @property
+    def memory(self) -> Memory:
+        """See `Stage`."""
+        parameters = self.parameters
+        places, place = dict.fromkeys(READ, -1), 2
+        for name in parameters.moved_by:
+            places[name] = place
+            place += len(READ[name].fields)
+        return Memory(
+            cut=self.cut.table,
+            allowance=self._allowance.table,
+            sensor=self._force_sensor.table,
+            **places,
+            even=parameters.blank == "form",
+            feed=parameters.feed / (2.0 * np.pi),
+            room=self.room,
+        )

@@ -40,6 +40,9 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
     amplifier_lag: Annotated[float, Ge(0), Le(0.1)] = parameter(
         0.0, "time constant of the amplifier; 0: none; 40e-6 for a bare actuator", "s"
     )
+    slew_rate: Annotated[float, Ge(0)] = parameter(
+        0.0, "the amplifier changes its voltage no faster: its current over the capacity of the ceramics; 0: any", "V/s"
+    )
     discretisation: Discretisation = parameter("foh", "foh: exact for a command linear between samples; or tustin")
     stroke: Annotated[float, Gt(0)] = parameter(15e-6, "displacement at plus and minus full voltage", "m")
     full_voltage: Annotated[float, Gt(0)] = parameter(100.0, "voltage from the middle at the full stroke", "V")
@@ -130,6 +133,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
             return Stack(
                 stroke=self.stroke,
                 amplifier_lag=self.amplifier_lag,
+                slew_rate=self.slew_rate / self.full_voltage or np.inf,
                 hysteresis=hysteresis,
                 inverse=inverse,
                 creep_per_decade=self.creep_per_decade,

@@ -2,7 +2,7 @@
 """Piezo and tool on the coarse carriage: both drives as one stage, for no block may cut what couples them."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -11,9 +11,10 @@ from pydantic import create_model
 from lathe_rc.analysis.learning import Response
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples
-from lathe_rc.cell.parameters import NodeParameters, about, parameter
+from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, limited
+from lathe_rc.cell.stages.composed import ComposedParameters, prefixed
 from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters
@@ -22,51 +23,31 @@ from lathe_rc.cell.stages.set_point import SetPoint, sum_up
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import LimiterTable
 from lathe_rc.jit import kernel
-from lathe_rc.plants.linear import Discretisation
 from lathe_rc.plants.series import SeriesDrive, SeriesTable, advance
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
-
-T = TypeVar("T", bound=NodeParameters)
 
 _COARSE = "coarse"  # the displacement that the drive knows itself
 _FINE = "fine_"  # begins the parameters of the fine drive
 
-_SHARED = (*NodeParameters.model_fields, "discretisation")  # one value for both drives
 
-
-def _own(table: type[NodeParameters]) -> list[str]:
-    """The parameters of a drive that stand in the series drive's table under a prefix."""
-    return [name for name in table.model_fields if name not in _SHARED]
-
-
-class SeriesParameters(NodeParameters):
+class SeriesParameters(ComposedParameters):
     """What the series drive has beyond the parameters of both drives."""
 
     mass_ratio: Annotated[float, Ge(0), Le(1)] = parameter(0.1, "mass of the tool over coarse_moving_mass", "1")
-    discretisation: Discretisation = parameter("foh", "foh: exact for commands linear between samples; or tustin")
-
-    def _half(self, prefix: str, table: type[T]) -> T:
-        own = {name: getattr(self, prefix + name) for name in _own(table)}
-        return table(**own, **{name: getattr(self, name) for name in _SHARED})
 
     @property
     def coarse(self) -> ElectrodynamicActuatorParameters:
         """The table of the coarse drive."""
-        return self._half("coarse_", ElectrodynamicActuatorParameters)
+        return self.part("coarse_", ElectrodynamicActuatorParameters)
 
     @property
     def fine(self) -> PiezoActuatorParameters:
         """The table of the fine drive."""
-        return self._half(_FINE, PiezoActuatorParameters)
+        return self.part(_FINE, PiezoActuatorParameters)
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
         """See `NodeParameters`; each drive by itself, without what one does to the other."""
         return {**self.coarse.drive_models(), **self.fine.drive_models()}
-
-
-def _prefixed(prefix: str, table: type[NodeParameters]) -> dict[str, Any]:
-    fields = table.model_fields
-    return {prefix + name: (fields[name].annotation, fields[name]) for name in _own(table)}
 
 
 SeriesDriveParameters = create_model(
@@ -75,8 +56,8 @@ SeriesDriveParameters = create_model(
     __doc__="Both drives as one mechanical system (paper 001, Fig. 1b); the tool is at the sum of both states.",
     __module__=__name__,
     **{
-        **_prefixed("coarse_", ElectrodynamicActuatorParameters),
-        **_prefixed(_FINE, PiezoActuatorParameters),
+        **prefixed("coarse_", ElectrodynamicActuatorParameters),
+        **prefixed(_FINE, PiezoActuatorParameters),
         "coarse_moving_mass": (Annotated[float, Gt(0)], parameter(1.2, "carriage and coil, without the tool", "kg")),
     },
 )

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spindle and encoder: where time, angle and the run itself begin and end."""
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -8,13 +9,12 @@ import numpy as np
 from lathe_rc.cell import messages
 from lathe_rc.cell.native import Step
 from lathe_rc.cell.parameters import about
-from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.signals.encoder import Encoder, EncoderTable, encode
-from lathe_rc.signals.speed import SpeedLaw
 
 
 class SpindleEncoderParameters(TimeMasterParameters, SpeedLawParameters):
@@ -34,25 +34,35 @@ class SpindleEncoder(TimeMaster):
 
     Attributes:
         parameters: its table.
-        law: the speed law.
+        law: the speed law; None: a load changes it.
     """
 
     kind = "spindle_encoder"
     Parameters = SpindleEncoderParameters
     parameters: SpindleEncoderParameters
-    law: SpeedLaw
     step: ClassVar[Step | None] = staticmethod(step)
 
     def __init__(self, name: str, parameters: SpindleEncoderParameters) -> None:
         super().__init__(name, parameters)
-        self.law = parameters.speed_law(name)
+        self._law = self.law = parameters.speed_law(name)
         if parameters.revolutions:
             with about(name, f"revolutions = {parameters.revolutions:g}"):
-                self.samples = self.law.samples_until(2 * np.pi * parameters.revolutions, parameters.step)
+                end = 2 * np.pi * parameters.revolutions + self._lag()
+                self.samples = self._law.samples_until(end, parameters.step)
         self._check_end()
         self.place_triggers()
-        self._encoder = Encoder(self.law, parameters.step, parameters.counts_per_revolution, parameters.speed_window)
-        self.declare(outputs=[Output("encoder", messages.ENCODER, Joint("angle", "speed"))])
+        self._encoder = Encoder(self._law, parameters.step, parameters.counts_per_revolution, parameters.speed_window)
+        loads = self._loads()
+        outputs = [Output("encoder", messages.ENCODER, Joint("angle", "speed"))]
+        self.declare(inputs=loads, outputs=outputs, tells=bool(loads))
+
+    def _loads(self) -> Sequence[Input]:
+        """What it reads of what loads it."""
+        return ()
+
+    def _lag(self) -> float:
+        """By how much a load may hold it back behind its law [rad]."""
+        return 0.0
 
     def _check_end(self) -> None:
         """A law of others is known up to the end of its tachogram."""
@@ -65,15 +75,15 @@ class SpindleEncoder(TimeMaster):
 
     def sample_at(self, angle: float) -> int:
         """See `TimeMaster`."""
-        return self.law.samples_until(angle, self.parameters.step)
+        return self._law.samples_until(angle, self.parameters.step)
 
     def speed_range(self) -> tuple[float, float]:
         """See `TimeMaster`."""
-        return self.law.speed_range(np.inf if self.samples is None else self.samples * self.shared.step)
+        return self._law.speed_range(np.inf if self.samples is None else self.samples * self.shared.step)
 
     def largest_acceleration(self) -> float:
         """See `TimeMaster`."""
-        return self.law.largest_acceleration()
+        return self._law.largest_acceleration()
 
     @property
     def memory(self) -> tuple[Any, ...]:

@@ -31,8 +31,10 @@ class ToolParameters(FormParameters):
     deflects: bool = parameter(
         default=False, doc="the deflection by the cutting force is part of the form error; no drive's sensor sees it"
     )
-    deflection_delay: Annotated[int, Ge(1), Le(2**31 - 1)] = parameter(
-        64, "deflects: delay of the feedback edge from the cut, at least a block", "sample"
+    deflection_delay: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
+        64,
+        "deflects: delay of the feedback edge from the cut, at least a block; 0 where the cut does not read the tool",
+        "sample",
     )
     tolerance: Annotated[float, Ge(0)] = parameter(
         0.0, "form error that is allowed to each side, for the verdict on a run; 0: none is given", "m"

@@ -1,0 +1,378 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tool drives that feel the cutting force: drives and cut as one stage, for no block may cut what couples them."""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+from pydantic import create_model
+
+from lathe_rc.analysis.learning import Response
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Samples
+from lathe_rc.cell.parameters import about, parameter
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedCommand, limited, remembered
+from lathe_rc.cell.stages.composed import ComposedParameters, prefixed
+from lathe_rc.cell.stages.cutting_process import READ, TURNS, CutStage, CuttingProcessParameters
+from lathe_rc.cell.stages.drive import Drive, Limits
+from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
+from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters
+from lathe_rc.cell.stages.retraction import OwnRetraction, followed
+from lathe_rc.cell.stages.set_point import SetPoint, sum_up
+from lathe_rc.control.bounded import TakeoverTable
+from lathe_rc.control.limits import CommandLimits, LimiterTable, limiter
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+from lathe_rc.plants.cutting import CutTable
+from lathe_rc.plants.loaded import Coil, LoadedDrive, LoadedTable, Piezo, advance_loaded, failure
+from lathe_rc.signals.allowance import AllowanceTable, allow
+from lathe_rc.signals.noise import Sensor, SensorTable, measure
+
+_COARSE = "coarse"  # the displacement that the drive knows itself
+_FINE, _CUT = "fine_", "cut_"  # begin the parameters of the fine drive and of the cut
+_COIL = "coil"  # whose limits are told
+_NO_LIMITS = limiter(CommandLimits(np.inf, np.inf, np.inf, np.inf), 1.0, 1)
+_REFERENCE = Input("reference", messages.REFERENCE, ("reference", "height"))
+
+
+class LoadedCoarseParameters(ElectrodynamicActuatorParameters):
+    """The coarse drive with its current loop."""
+
+    loop: Literal["ideal", "current"] = parameter(
+        "ideal",
+        "ideal: the force of the position loop is there at once; current: a coil with its current loop makes it",
+    )
+    resistance: Annotated[float, Gt(0)] = parameter(2.0, "loop current: of the coil", "ohm")
+    inductance: Annotated[float, Gt(0)] = parameter(2e-3, "loop current: of the coil", "H")
+    bandwidth: Annotated[float, Gt(0)] = parameter(12e3, "loop current: bandwidth of the current loop", "rad/s")
+    back_emf: bool = parameter(
+        default=True, doc="loop current: the motion induces a voltage, force_constant · velocity"
+    )
+    current_limit: Annotated[float, Ge(0)] = parameter(0.0, "loop current: largest set point; 0: any", "A")
+    voltage_limit: Annotated[float, Ge(0)] = parameter(0.0, "loop current: of the amplifier; 0: any", "V")
+    slew_rate: Annotated[float, Ge(0)] = parameter(0.0, "loop current: the set point changes no faster; 0: any", "A/s")
+
+    def coil(self, node: str) -> Coil | None:
+        """The current loop, if there is one.
+
+        Raises:
+            InputError: a limit of what is not there.
+        """
+        if self.loop == "current":
+            return Coil(
+                resistance=self.resistance,
+                inductance=self.inductance,
+                bandwidth=self.bandwidth,
+                back_emf=self.back_emf,
+                current_limit=self.current_limit or np.inf,
+                voltage_limit=self.voltage_limit or np.inf,
+                slew_rate=self.slew_rate or np.inf,
+            )
+        for name in ("current_limit", "voltage_limit", "slew_rate"):
+            if value := getattr(self, name):
+                raise InputError(f"{node}.coarse_{name} = {value:g} with coarse_loop = ideal; allowed: 0, or current")
+        return None
+
+
+class LoadedFineParameters(PiezoActuatorParameters):
+    """The piezo drive with its preload."""
+
+    preload: Annotated[float, Ge(0)] = parameter(
+        0.0, "of the stack: a larger tension tears it off and ends the run; 0: it holds any", "N"
+    )
+
+
+class LoadedParameters(ComposedParameters):
+    """What drives under the cutting force have beyond the parameters of drives and cut."""
+
+    radial_ratio: Annotated[float, Ge(0), Le(2)] = parameter(
+        0.4, "radial part of the cutting force, which pushes the tool out of the part, over the main one"
+    )
+
+    @property
+    def coarse(self) -> LoadedCoarseParameters:
+        """The table of the coarse drive."""
+        return self.part("coarse_", LoadedCoarseParameters)
+
+    @property
+    def cut(self) -> CuttingProcessParameters:
+        """The table of the cut."""
+        return self.part(_CUT, CuttingProcessParameters)
+
+    def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
+        """See `NodeParameters`; without force and current loop."""
+        return self.coarse.drive_models()
+
+
+class LoadedSeriesParameters(LoadedParameters):
+    """The same of both drives in series."""
+
+    mass_ratio: Annotated[float, Gt(0), Le(1)] = parameter(
+        0.1, "mass of the tool over coarse_moving_mass; times that and fine_natural_frequency²: stiffness of the stack"
+    )
+
+    @property
+    def fine(self) -> LoadedFineParameters:
+        """The table of the fine drive."""
+        return self.part(_FINE, LoadedFineParameters)
+
+    def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
+        """See `NodeParameters`; each drive by itself, without force and current loop."""
+        return {**self.coarse.drive_models(), **self.fine.drive_models()}
+
+
+_OF_COARSE_AND_CUT = {
+    **prefixed("coarse_", LoadedCoarseParameters),
+    **prefixed(_CUT, CuttingProcessParameters),
+    "cut_moved_by": (
+        list[Literal["cross", "longitudinal"]],
+        parameter([], "what moves the edge beside the drives: the cross feed, the longitudinal feed"),
+    ),
+}
+
+LoadedDriveParameters = create_model(
+    "LoadedDriveParameters",
+    __base__=LoadedParameters,
+    __doc__="The electrodynamic drive and the cut as one mechanical system; a profile node publishes the form.",
+    __module__=__name__,
+    **_OF_COARSE_AND_CUT,
+)
+LoadedSeriesDriveParameters = create_model(
+    "LoadedSeriesDriveParameters",
+    __base__=LoadedSeriesParameters,
+    __doc__="Both drives in series (paper 001, Fig. 1b) and the cut as one mechanical system; a profile node publishes "
+    "the form, and the tool is at the sum of both states.",
+    __module__=__name__,
+    **{
+        **_OF_COARSE_AND_CUT,
+        **prefixed(_FINE, LoadedFineParameters),
+        "coarse_moving_mass": (Annotated[float, Gt(0)], parameter(1.2, "carriage and coil, without the tool", "kg")),
+    },
+)
+
+
+class Memory(NamedTuple):
+    """What the step works on.
+
+    Attributes:
+        retraction, limits, limits_fine: of the commands.
+        signs: of what makes the fine set point.
+        drive, cut: the machine.
+        noise, sensor: of the carriage's sensor, which the machine itself rounds, and of the piezo's.
+        allowance: of the blank.
+        force_sensor: of the force.
+        cross, longitudinal: number of the first input of each; -1: it does not move the edge.
+        even: whether the blank has the form that is wanted.
+        feed: unless the longitudinal slide makes it [m/rad].
+        room: for arrays of a block.
+    """
+
+    retraction: TakeoverTable
+    limits: LimiterTable
+    limits_fine: LimiterTable
+    signs: Samples
+    drive: LoadedTable
+    cut: CutTable
+    noise: SensorTable
+    sensor: SensorTable
+    allowance: AllowanceTable
+    force_sensor: SensorTable
+    cross: int
+    longitudinal: int
+    even: bool
+    feed: float
+    room: Samples
+
+
+# Places of the inputs: encoder, form, command; then what makes the set point of the piezo, and the slides.
+_ANGLE, _SPEED, _WANTED, _HEIGHT, _COMMAND, _MORE = range(6)
+
+
+@kernel
+def _advance(
+    memory: Memory, first: int, inputs: Fields, coarse: Fields, fine: Fields, of_cut: Fields
+) -> tuple[int, int]:
+    """The step of both stages; the fine drive's arrays are room where there is none."""
+    angle, speed, wanted, height, command = (
+        inputs[_ANGLE], inputs[_SPEED], inputs[_WANTED], inputs[_HEIGHT], inputs[_COMMAND],
+    )  # fmt: skip
+    position, velocity, effort, measured = coarse
+    extension, extension_velocity, voltage, fine_measured = fine
+    force, measured_force, depth_of_cut, feed, allowance, wear, deflection = of_cut
+    n, room = angle.size, memory.room
+    met, cross_position, feed_velocity, noise, still = room[0, :n], room[1, :n], room[2, :n], room[3, :n], room[4, :n]
+    met[:] = cross_position[:] = still[:] = 0.0
+    if memory.even:
+        met[:] = wanted
+    if memory.cross >= 0:
+        cross_position[:] = -inputs[memory.cross]
+    if memory.longitudinal >= 0:
+        height, feed_velocity = inputs[memory.longitudinal], inputs[memory.longitudinal + 1]
+    else:
+        feed_velocity[:] = speed * memory.feed
+    allow(memory.allowance, angle, allowance)
+    measure(memory.noise, still, noise)
+    given = limited(memory.limits, first, followed(memory.retraction, command))
+    set_point = limited(memory.limits_fine, first, sum_up(memory.signs, inputs, _MORE, n))
+    reached, reason = advance_loaded(
+        memory.drive, memory.cut, first, given, set_point, noise, met, angle, speed, height, cross_position,
+        feed_velocity, allowance, position, velocity, effort, measured, extension, extension_velocity, voltage, force,
+        deflection, depth_of_cut, feed, wear,
+    )  # fmt: skip
+    if reason != DONE:
+        return reached, reason
+    measure(memory.sensor, extension, fine_measured)
+    measure(memory.force_sensor, force, measured_force)
+    return reached, DONE
+
+
+@kernel
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
+    """See `lathe_rc.cell.stage`."""
+    n, room = inputs[_ANGLE].size, memory.room
+    fine = (room[5, :n], room[6, :n], room[7, :n], room[8, :n])
+    return _advance(memory, first, inputs, outputs[:4], fine, outputs[4:])
+
+
+@kernel
+def step_series(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
+    """See `lathe_rc.cell.stage`."""
+    return _advance(memory, first, inputs, outputs[:4], outputs[4:8], outputs[8:])
+
+
+class LoadedDriveStage(CutStage, Drive):
+    """See `lathe_rc.plants.loaded`.
+
+    Attributes:
+        parameters: its table.
+        drive: the machine.
+    """
+
+    kind = "loaded_drive"
+    Parameters = LoadedDriveParameters
+    announces = (LIMITED, FREE)
+    failure = staticmethod(failure)
+    rooms = 9
+    step = staticmethod(step)
+
+    def __init__(self, name: str, parameters: LoadedParameters) -> None:
+        super().__init__(name, parameters, parameters.cut, _CUT)
+        self.parameters, self._cut = parameters, parameters.cut
+        coarse, fine = parameters.coarse, None
+        coil = coarse.coil(name)
+        piezo = self._set_point = None
+        self._limited = [
+            LimitedCommand(name, coarse, "coarse" if isinstance(parameters, LoadedSeriesParameters) else "")
+        ]
+        if isinstance(parameters, LoadedSeriesParameters):
+            fine = parameters.fine
+            self._set_point = SetPoint(name, fine, inside=(_COARSE,), prefix=_FINE)
+            self._limited.append(LimitedCommand(name, fine, "fine"))
+            piezo = Piezo(
+                stack=fine.stack(name, _FINE),
+                tool_frequency=fine.natural_frequency,
+                tool_damping=fine.damping,
+                mass_ratio=parameters.mass_ratio,
+                full_voltage=fine.full_voltage,
+                feedback=_COARSE in fine.compensates,
+                preload=fine.preload or np.inf,
+            )
+        with about(name, "coarse_bandwidth" if coil else "mass_ratio", "sample_rate"):
+            self.drive = LoadedDrive(
+                carriage_frequency=coarse.natural_frequency,
+                carriage_damping=coarse.damping,
+                delay=coarse.delay,
+                carriage_stroke=coarse.stroke,
+                moving_mass=coarse.moving_mass,
+                force_constant=coarse.force_constant,
+                radial=parameters.radial_ratio,
+                coil=coil,
+                piezo=piezo,
+                resolution=coarse.resolution,
+                step=parameters.step,
+                method=parameters.discretisation,
+                kept=messages.MAX_BLOCK if coil else 1,
+            )
+        self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
+        self._retraction = OwnRetraction(coarse, coarse.stroke)
+        self._clipping = Clipping(name, parameters, _COIL) if coil else None
+        # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
+        self._noise = Sensor(coarse.noise_rms, 0.0, parameters.seed, f"{name}/coarse")
+        self._sensor = Sensor(
+            fine.noise_rms if fine else 0.0, fine.resolution if fine else 0.0, parameters.seed, f"{name}/fine"
+        )
+        inputs = [TURNS, _REFERENCE, Input("coarse/command", messages.COMMAND, ("position",))]
+        inputs += self._set_point.inputs if self._set_point else []
+        self._slides, place = dict.fromkeys(("cross", "longitudinal"), -1), sum(len(port.fields) for port in inputs)
+        for slide in self._cut.moved_by:
+            inputs.append(READ[slide])
+            self._slides[slide], place = place, place + len(READ[slide].fields)
+        outputs = [Output("coarse/state", messages.STATE, Joint("position", "velocity", "effort"))]
+        if fine:
+            outputs.append(Output("fine/state", messages.STATE))
+        outputs.append(Output("cut", messages.CUT))
+        self.declare(inputs=inputs, outputs=outputs, tells=bool(coil) or any(limited.on for limited in self._limited))
+
+    def responses(self) -> Mapping[str, Response]:
+        """See `Drive`; in air, and as long as nothing is limited."""
+        found: dict[str, Response] = {"coarse/command": self.drive.coarse_response}
+        if self._set_point:
+            found["fine/command"] = self.drive.fine_response
+        return found
+
+    def limits(self) -> Mapping[str, Limits]:
+        """See `Drive`."""
+        return {"coarse/state": self._limits}
+
+    def go_safe(self) -> None:
+        """See `Stage`; the carriage takes the tool out."""
+        self._retraction.begin()
+
+    @property
+    def memory(self) -> Memory:
+        """See `Stage`."""
+        cut = self._cut
+        return Memory(
+            retraction=self._retraction.table,
+            limits=self._limited[0].table,
+            limits_fine=self._limited[1].table if self._set_point else _NO_LIMITS,
+            signs=self._set_point.signs if self._set_point else np.empty(0),
+            drive=self.drive.table,
+            cut=self.cut.table,
+            noise=self._noise.table,
+            sensor=self._sensor.table,
+            allowance=self._allowance.table,
+            force_sensor=self._force_sensor.table,
+            **self._slides,
+            even=cut.blank == "form",
+            feed=cut.feed / (2.0 * np.pi),
+            room=self.room,
+        )
+
+    def prepare(self, first: int, samples: int) -> None:
+        """See `Stage`."""
+        super().prepare(first, samples)
+        self._noise.draw(samples)
+        self._sensor.draw(samples)
+
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """See `Stage`."""
+        found = [message for limited in self._limited for message in limited.tell(first, end)]
+        if self._clipping:
+            found += self._clipping.told(first, remembered(self.drive.table.coil.limited, first, end))
+        return found
+
+    def finish(self, index: int) -> list[Sparse]:
+        """See `Stage`."""
+        found = [message for limited in self._limited for message in limited.finish(index)]
+        return found + (self._clipping.finish(index) if self._clipping else [])
+
+
+class LoadedSeriesDrive(LoadedDriveStage):
+    """The same with the piezo and the tool on the carriage."""
+
+    kind = "loaded_series_drive"
+    Parameters = LoadedSeriesDriveParameters
+    step = staticmethod(step_series)

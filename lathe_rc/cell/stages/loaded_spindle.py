@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A spindle that the cut slows, with its encoder."""
+
+from collections.abc import Sequence
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
+
+from lathe_rc.cell import messages
+from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell.parameters import about, parameter
+from lathe_rc.cell.stage import DONE, Fields, Input, Reached, Sparse
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, remembered
+from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderParameters
+from lathe_rc.jit import kernel
+from lathe_rc.plants.spindle import Belt, LoadedSpindle, SpeedLoop, SpindleTable, failure, turn
+from lathe_rc.signals.encoder import EncoderTable, follow_law, read_off
+
+_TORQUE = "torque"  # whose limit is told
+_MOST_LAG = 0.9 * 2.0 * np.pi  # [rad] by which a run is longer than its law needs, at most
+
+
+class LoadedSpindleParameters(SpindleEncoderParameters):
+    """A speed law, and what the torque of the cut makes of it; a run is longer than the law by what that delays it."""
+
+    inertia: Annotated[float, Gt(0)] = parameter(0.03, "of spindle, chuck and part", "kg*m^2")
+    motor_inertia: Annotated[float, Gt(0)] = parameter(0.01, "of the motor, referred to the spindle", "kg*m^2")
+    belt_stiffness: Annotated[float, Ge(0)] = parameter(0.0, "referred to the spindle; 0: rigid", "N*m/rad")
+    belt_damping: Annotated[float, Ge(0)] = parameter(0.0, "referred to the spindle", "N*m*s/rad")
+    torque_limit: Annotated[float, Ge(0)] = parameter(0.0, "of the motor, referred to the spindle; 0: none", "N*m")
+    speed_bandwidth: Annotated[float, Gt(0)] = parameter(30.0, "speed loop: gain over both inertias", "rad/s")
+    speed_integral_time: Annotated[float, Gt(0)] = parameter(0.1, "speed loop: integral time", "s")
+    part_radius: Annotated[float, Ge(0)] = parameter(0.05, "at which the main cutting force acts", "m")
+    load_delay: Annotated[int, Ge(1), Le(2**31 - 1)] = parameter(
+        64, "delay of the feedback edge from the cut, at least a block: so late the spindle feels the force", "sample"
+    )
+    largest_load: Annotated[float, Gt(0)] = parameter(50.0, "a larger torque of the cut ends the run", "N*m")
+    largest_deviation: Annotated[float, Gt(0), Lt(1)] = parameter(
+        0.1, "a larger change of the speed by the load, relative to the nominal one, ends the run"
+    )
+
+    def spindle(self, node: str) -> LoadedSpindle:
+        """The machine of a node.
+
+        Raises:
+            InputError: a speed loop that oscillates.
+        """
+        belt = Belt(self.belt_stiffness, self.belt_damping) if self.belt_stiffness else None
+        with about(node, "speed_bandwidth", "speed_integral_time", "belt_stiffness"):
+            return LoadedSpindle(
+                inertia=self.inertia,
+                motor_inertia=self.motor_inertia,
+                belt=belt,
+                loop=SpeedLoop(self.speed_bandwidth, self.speed_integral_time, self.torque_limit or np.inf),
+                radius=self.part_radius,
+                largest_load=self.largest_load,
+                largest_deviation=self.largest_deviation * self.nominal_speed,
+                step=self.step,
+                kept=messages.MAX_BLOCK,
+            )
+
+
+class Memory(NamedTuple):
+    """What the step works on.
+
+    Attributes:
+        encoder: with the law.
+        spindle: the machine.
+        room: for the torque.
+    """
+
+    encoder: EncoderTable
+    spindle: SpindleTable
+    room: Samples
+
+
+@kernel
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
+    """See `lathe_rc.cell.stage`."""
+    angle, speed, index_pulse, angle_true, speed_true = outputs
+    follow_law(memory.encoder, first, angle_true, speed_true)
+    reached, reason = turn(memory.spindle, first, inputs[0], angle_true, speed_true, memory.room[0])
+    if reason != DONE:
+        return reached, reason
+    read_off(memory.encoder, first, angle, speed, index_pulse, angle_true, speed_true)
+    return reached, DONE
+
+
+class LoadedSpindleStage(SpindleEncoder):
+    """See `lathe_rc.plants.spindle`.
+
+    Attributes:
+        spindle: the machine.
+    """
+
+    kind = "loaded_spindle"
+    Parameters = LoadedSpindleParameters
+    announces = (LIMITED, FREE)
+    rooms = 1
+    step = staticmethod(step)
+
+    def __init__(self, name: str, parameters: LoadedSpindleParameters) -> None:
+        self.spindle = parameters.spindle(name)
+        self._largest = parameters.largest_deviation * parameters.nominal_speed
+        self._delay = parameters.load_delay
+        self._push = 2.0 * parameters.largest_load / parameters.inertia  # load and motor may push the same way
+        super().__init__(name, parameters)
+        self.law = None  # nobody knows in advance what the load will make of it
+        self._clipping = Clipping(name, parameters, _TORQUE)
+
+    def _loads(self) -> Sequence[Input]:
+        """See `SpindleEncoder`."""
+        return [Input("cut", messages.CUT, ("force",), self._delay)]
+
+    def _lag(self) -> float:
+        """See `SpindleEncoder`: what the integral of the speed loop needs for the largest load; less than a turn."""
+        table = self.spindle.table
+        return min(table.largest_load / table.integral, _MOST_LAG) if table.radius else 0.0
+
+    def speed_range(self) -> tuple[float, float]:
+        """See `TimeMaster`."""
+        low, high = super().speed_range()
+        return low - self._largest, high + self._largest
+
+    def largest_acceleration(self) -> float:
+        """See `TimeMaster`."""
+        return super().largest_acceleration() + self._push
+
+    @property
+    def memory(self) -> tuple[Any, ...]:
+        """See `Stage`."""
+        return Memory(self._encoder.table, self.spindle.table, self.room)
+
+    def serve(
+        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
+    ) -> list[Sparse]:
+        """See `Stage`.
+
+        Raises:
+            LatheError: the load is larger than allowed, or what it does.
+        """
+        angle, force = outputs[0]["angle_true"][reached], inputs[0]["force"][reached]
+        raise failure(reason, self.spindle.table, angle, force)
+
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """See `Stage`."""
+        return self._clipping.told(first, remembered(self.spindle.table.limited, first, end))
+
+    def finish(self, index: int) -> list[Sparse]:
+        """See `Stage`."""
+        return self._clipping.finish(index)

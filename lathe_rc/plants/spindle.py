@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A spindle that the cut slows: motor, belt and spindle, a speed loop, and the torque of the cutting force.
+
+The speed law is what the spindle would do without a load; here stands by how much it does something else. With the
+deviations δ of the spindle's angle and ϑ of the motor's, all referred to the spindle,
+
+    J·δ''  = B - r·F,       B = k·(ϑ - δ) + c·(ϑ' - δ')
+    Jm·ϑ'' = T - B,         T = Kp·(-ϑ') + Ki·∫(-ϑ')dt
+
+or, with a rigid belt, (J + Jm)·δ'' = T - r·F. The speed loop is sampled: the torque of a sample stands until the next
+one. The motor also accelerates both masses as the law says; its limit holds for the sum. While that is cut off, the
+integral stands. The load is linear between samples.
+
+A load of 0, or an inertia that no load can move, leaves the law as it is, to the bit.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.jit import kernel
+from lathe_rc.plants.linear import discretise
+
+Array = npt.NDArray[np.float64]
+
+_DONE, _OVERLOADED, _OUT_OF_SPEED = 0, 1, 2
+_INTEGRAL, _LOAD, _SPEED = 0, 1, 2  # places in the memory of the loop
+
+
+@dataclass(frozen=True)
+class Belt:
+    """Between motor and spindle; referred to the spindle.
+
+    Attributes:
+        stiffness: k [N·m/rad].
+        damping: c [N·m·s/rad].
+    """
+
+    stiffness: float
+    damping: float
+
+
+@dataclass(frozen=True)
+class SpeedLoop:
+    """PI control of the motor's speed.
+
+    Attributes:
+        bandwidth: Kp over both inertias [rad/s].
+        integral_time: Kp/Ki [s].
+        torque_limit: of the motor, referred to the spindle [N·m]; inf for none.
+    """
+
+    bandwidth: float
+    integral_time: float
+    torque_limit: float = np.inf
+
+    def gains(self, inertia: float) -> tuple[float, float]:
+        """Kp [N·m·s/rad] and Ki [N·m/rad] for the sum of the inertias [kg·m²]."""
+        proportional = self.bandwidth * inertia
+        return proportional, proportional / self.integral_time
+
+
+class SpindleTable(NamedTuple):
+    """A `LoadedSpindle` for its kernel.
+
+    Attributes:
+        step: [s].
+        transition: of δ, δ' and, with a belt, ϑ, ϑ', shape (m, m).
+        motor: weight of the motor's torque, shape (m,).
+        load: weights of the load of a sample and of the one before, shape (m, 2).
+        measured: place of the motor's speed.
+        proportional, integral: Kp, Ki.
+        inertia: of both masses [kg·m²].
+        torque_limit: [N·m].
+        radius: r [m].
+        largest_load, largest_deviation: what ends a run [N·m, rad/s].
+        state: shape (m,).
+        loop: integral of the loop, load and law's speed of the last sample.
+        limited: of each sample whether the torque was cut off; sample n stands at n modulo the size.
+    """
+
+    step: float
+    transition: Array
+    motor: Array
+    load: Array
+    measured: int
+    proportional: float
+    integral: float
+    inertia: float
+    torque_limit: float
+    radius: float
+    largest_load: float
+    largest_deviation: float
+    state: Array
+    loop: Array
+    limited: npt.NDArray[np.uint8]
+
+
+@kernel
+def turn(spindle: SpindleTable, first: int, force: Array, angle: Array, speed: Array, torque: Array) -> tuple[int, int]:
+    """Let the load act on a block of the law, see `LoadedSpindle.block`; returns where it stopped and why."""
+    state, loop, transition, step = spindle.state, spindle.loop, spindle.transition, spindle.step
+    order, new = state.size, np.empty(state.size)
+    for k in range(angle.size):
+        n = first + k
+        error = -state[spindle.measured]
+        integral = loop[_INTEGRAL] + error * step
+        asked = spindle.proportional * error + spindle.integral * integral
+        own = spindle.inertia * ((speed[k] - loop[_SPEED]) / step) if n > 0 else 0.0
+        wanted = asked + own
+        given = min(max(wanted, -spindle.torque_limit), spindle.torque_limit)
+        limited = given != wanted
+        torque[k] = given - own if limited else asked
+        if not limited:
+            loop[_INTEGRAL] = integral
+        spindle.limited[n & (spindle.limited.size - 1)] = limited
+        load = spindle.radius * force[k]
+        for i in range(order):
+            new[i] = spindle.motor[i] * torque[k] + spindle.load[i, 0] * load + spindle.load[i, 1] * loop[_LOAD]
+            for j in range(order):
+                new[i] += transition[i, j] * state[j]
+        state[:] = new
+        loop[_LOAD], loop[_SPEED] = load, speed[k]
+        angle[k] += state[0]
+        speed[k] += state[1]
+        if abs(load) > spindle.largest_load:
+            return k, _OVERLOADED
+        if abs(state[1]) > spindle.largest_deviation:
+            return k, _OUT_OF_SPEED
+    return angle.size, _DONE
+
+
+class LoadedSpindle:
+    """The spindle as a machine; at rest against its law before sample 0.
+
+    Args:
+        inertia: J of spindle, chuck and part [kg·m²].
+        motor_inertia: Jm, referred to the spindle [kg·m²].
+        belt: None: rigid.
+        loop: of the speed.
+        radius: r at which the main cutting force acts [m].
+        largest_load: torque of the cut beyond which the run ends [N·m].
+        largest_deviation: of the speed by the load, the same [rad/s].
+        step: sampling step [s].
+        kept: samples of which it is kept whether the torque was limited, a power of two.
+
+    Attributes:
+        table: for `turn`.
+
+    Raises:
+        InputError: the speed loop oscillates over the belt, or is too fast for the step.
+    """
+
+    def __init__(
+        self,
+        *,
+        inertia: float,
+        motor_inertia: float,
+        belt: Belt | None = None,
+        loop: SpeedLoop,
+        radius: float,
+        largest_load: float = np.inf,
+        largest_deviation: float = np.inf,
+        step: float,
+        kept: int = 1,
+    ) -> None:
+        whole = inertia + motor_inertia
+        a = np.array([[0.0, 1.0], [0.0, 0.0]])
+        drives, loads, measured = np.array([0.0, 1.0 / whole]), np.array([0.0, -1.0 / whole]), 1
+        if belt:
+            twist = np.array([-belt.stiffness, -belt.damping, belt.stiffness, belt.damping])
+            a = np.array([[0.0, 1.0, 0.0, 0.0], twist / inertia, [0.0, 0.0, 0.0, 1.0], -twist / motor_inertia])
+            drives, loads = np.array([0.0, 0.0, 0.0, 1.0 / motor_inertia]), np.array([0.0, -1.0 / inertia, 0.0, 0.0])
+            measured = 3
+        motor, load = (discretise(a, part, 0.0, step, "foh") for part in (drives, loads))
+        proportional, integral = loop.gains(whole)
+        self.table = SpindleTable(
+            step=step,
+            transition=motor.transition,
+            motor=motor.weights.sum(axis=1),  # the torque stands through a step
+            load=np.ascontiguousarray(load.weights[:, :2]),
+            measured=measured,
+            proportional=proportional,
+            integral=integral,
+            inertia=whole,
+            torque_limit=loop.torque_limit,
+            radius=radius,
+            largest_load=largest_load,
+            largest_deviation=largest_deviation,
+            state=np.zeros(a.shape[0]),
+            loop=np.zeros(3),
+            limited=np.zeros(kept, np.uint8),
+        )
+        radius_of_poles = self._largest_pole()
+        if not radius_of_poles < 1.0:
+            raise InputError(
+                f"speed loop of {loop.bandwidth:g} rad/s: largest pole {radius_of_poles:.6g}; allowed: below 1 (less "
+                "bandwidth, a longer integral time, or a belt that is stiffer or damps more)"
+            )
+
+    def _largest_pole(self) -> float:
+        """Of the loop without a limit; δ itself, which nothing brings back, is left out."""
+        table = self.table
+        order = table.state.size
+        row = np.zeros(order + 1)
+        row[table.measured], row[order] = -(table.proportional + table.integral * table.step), table.integral
+        closed = np.zeros((order + 1, order + 1))
+        closed[:order, :order] = table.transition
+        closed[:order] += np.outer(table.motor, row)
+        closed[order, table.measured], closed[order, order] = -table.step, 1.0
+        # With δ the integral of δ' is there twice: the twist of the belt takes the place of δ and ϑ.
+        if order > 2:
+            change = np.eye(order + 1)
+            change[2, 0] = -1.0
+            closed = change @ closed @ np.linalg.inv(change)
+        return float(np.abs(np.linalg.eigvals(closed[1:, 1:])).max())
+
+    def block(self, first: int, force: Array, angle: Array, speed: Array) -> Array:
+        """Let the load act from sample ``first`` on.
+
+        Args:
+            first: index of the first sample.
+            force: main cutting force [N], shape (n,).
+            angle: of the law [rad]; changed to the true one.
+            speed: of the law [rad/s]; changed to the true one.
+
+        Returns:
+            What the speed loop has added to the motor's torque up to each sample [N·m], shape (n,).
+
+        Raises:
+            LatheError: load or deviation are larger than allowed.
+        """
+        torque = np.empty_like(angle)
+        reached, reason = turn(self.table, first, force, angle, speed, torque)
+        if reason != _DONE:
+            raise failure(reason, self.table, angle[reached], force[reached])
+        return torque
+
+
+def failure(reason: int, spindle: SpindleTable, angle: float, force: float) -> LatheError:
+    """Why a spindle cannot go on, at an angle [rad] with a cutting force [N]."""
+    if reason == _OVERLOADED:
+        return LatheError(
+            f"the cut loads the spindle with {spindle.radius * force:.4g} N·m at {angle:.6g} rad; allowed: up to "
+            f"largest_load = {spindle.largest_load:g} N·m"
+        )
+    return LatheError(
+        f"the load changes the speed by {spindle.state[1]:.4g} rad/s at {angle:.6g} rad; allowed: up to "
+        f"{spindle.largest_deviation:.4g} rad/s (less force, more inertia, a faster speed loop, or a larger "
+        "largest_deviation)"
+    )
