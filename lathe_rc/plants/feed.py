@@ -2,6 +2,7 @@
 """Feed drive of a slide, cross or longitudinal: a linear model with limits, and a screw with backlash.
 
     command → sampling → ± limit, held → model with a limited speed → backlash → slide
+                                           ↑ friction (`lathe_rc.plants.friction`)
 
 Models, each the position over the command:
 
@@ -40,6 +41,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.placed import sized
 from lathe_rc.plants.backlash import follow
+from lathe_rc.plants.friction import LUGRE, NONE, STRIBECK, Friction, FrictionTable, bend, no_friction, slide
 from lathe_rc.plants.linear import discretise
 from lathe_rc.signals.noise import quantise
 from lathe_rc.transfer import TransferFunction
@@ -49,7 +51,7 @@ Complex = npt.NDArray[np.complex128]
 Feedback = Literal["motor", "load"]
 
 # Places in a drive's state, from the end; before them the motor's position, speed, … and room for their next values.
-_DISTURBANCE, _EFFORT, _LOAD = -3, -2, -1
+_BRISTLE, _DISTURBANCE, _EFFORT, _LOAD = -4, -3, -2, -1
 
 _UNDISTURBED = np.empty(0)
 _UNTOLD = np.empty(0, np.uint8)
@@ -113,6 +115,8 @@ class DriveTable(NamedTuple):
         needed: command that keeps that speed; infinite where none does.
         furthest: travel in a step at that speed [m].
         half: half the backlash [m].
+        friction: of the slide.
+        rubbed: what 1 N of friction, held over a step, takes from x, shape (m,).
     """
 
     transition: Array
@@ -123,6 +127,8 @@ class DriveTable(NamedTuple):
     needed: float
     furthest: float
     half: float
+    friction: FrictionTable
+    rubbed: Array
 
 
 class LimitTable(NamedTuple):
@@ -169,6 +175,24 @@ def load_of(state: Array) -> float:
 
 
 @inlined
+def _rub(table: DriveTable, state: Array) -> None:
+    """Take friction from the next values, which stand behind the present ones."""
+    order = table.weights.size
+    speed, free, gained = state[1], state[order + 1], table.rubbed[1]
+    force, rests = 0.0, False
+    if table.friction.law == STRIBECK:
+        force, rests = slide(table.friction, gained, speed, free)
+    elif table.friction.law == LUGRE:
+        force, state[_BRISTLE] = bend(table.friction, gained, speed, free, state[_BRISTLE])
+    for row in range(order):
+        state[order + row] -= table.rubbed[row] * force
+    if rests:
+        state[order + 1] = 0.0
+        if speed == 0.0:
+            state[order] = state[0]
+
+
+@inlined
 def move(table: DriveTable, state: Array) -> bool:
     """Step a drive with the command that it holds; returns whether it is at its greatest speed."""
     order = table.weights.size
@@ -178,6 +202,8 @@ def move(table: DriveTable, state: Array) -> bool:
         for column in range(order):
             total += table.transition[row, column] * state[column]
         state[order + row] = total
+    if table.friction.law != NONE:
+        _rub(table, state)
     for row in range(order):
         state[row] = state[order + row]
     travel, speed = state[0] - before, state[1]
@@ -284,6 +310,22 @@ def _realise(model: TransferFunction) -> tuple[Array, Array]:
     return a, np.asarray(markov[1:])
 
 
+def _rubbed(model: TransferFunction, friction: Friction, step: float) -> Array:
+    """What 1 N of friction, held over a step, takes from position, speed, …, shape (m,).
+
+    Raises:
+        InputError: the friction acts on a lag that the drive does not have.
+    """
+    lags, rest = np.polydiv(model.denominator, friction.mobility.denominator)
+    if np.abs(rest).max() > 1e-9 * np.abs(model.denominator).max():
+        raise InputError(
+            f"feed drive {model}: friction with a mobility {friction.mobility}; allowed: one whose poles the drive has"
+        )
+    a, b = _realise(TransferFunction(tuple(np.polymul(friction.mobility.numerator, lags)), model.denominator))
+    linear = discretise(a, b, 0.0, step, "foh")
+    return np.ascontiguousarray(linear.weights[:, 0] + linear.weights[:, 1])
+
+
 def _settles(model: TransferFunction) -> tuple[float, bool]:
     """What a command of 1 asks for, 0 if neither a position nor a speed, and whether it is a speed."""
     integrates = model.denominator[-1] == 0.0
@@ -323,6 +365,7 @@ class FeedDrive:
         resolution: of the position sensor [m]; 0 for none.
         feedback: where the position sensor is.
         limits: of the motion that the command asks for.
+        friction: of the slide; None: it has none.
 
     Attributes:
         table: its constants for `move` and `hold`.
@@ -331,8 +374,8 @@ class FeedDrive:
         integrates: whether the command stands for a speed.
 
     Raises:
-        InputError: a model whose speed would jump with the command, a value that is out of range, or limits for a
-            command that stands for neither a position nor a speed.
+        InputError: a model whose speed would jump with the command, a value that is out of range, limits for a
+            command that stands for neither a position nor a speed, or friction that does not fit the model.
     """
 
     def __init__(
@@ -347,6 +390,7 @@ class FeedDrive:
         resolution: float = 0.0,
         feedback: Feedback = "load",
         limits: CommandLimits = _FREE,
+        friction: Friction | None = None,
     ) -> None:
         for name, value, allowed in (
             ("divisor", divisor, divisor >= 1),
@@ -365,6 +409,11 @@ class FeedDrive:
         # A model that integrates needs a certain command for a certain speed.
         gain, self.integrates = _settles(model)
         needed = speed_limit / gain if self.integrates and gain > 0.0 else np.inf
+        if friction and np.isfinite(speed_limit) and held.size > 2:
+            raise InputError(
+                f"feed drive: speed limit = {speed_limit:g} m/s with friction and {held.size - 1} lags; allowed: one "
+                "lag, or one of both"
+            )
         self.table = DriveTable(
             transition=np.ascontiguousarray(linear.transition),
             weights=held,
@@ -374,8 +423,10 @@ class FeedDrive:
             needed=float(needed),
             furthest=float(speed_limit * step),
             half=backlash / 2.0,
+            friction=friction.table(step) if friction else no_friction(step),
+            rubbed=_rubbed(model, friction, step) if friction else np.zeros(held.size),
         )
-        self.state = np.zeros(2 * held.size + 3)
+        self.state = np.zeros(2 * held.size + 4)
         self._step = step
         self.whole = FeedTable(
             drive=self.table,
