@@ -314,7 +314,8 @@ def _feed(cell: Cell, name: str) -> _Structure:
     memory = _stage(cell, name, FeedDriveStage).memory
     table, drive = memory.drive, memory.drive.drive
     extras = drive.half, table.resolution, table.kept, memory.listens, memory.disturbance, drive.speed_limit < np.inf
-    assert not any((*extras, drive.friction.law)), "no backlash, friction, limits, disturbance, supervisor, resolution"
+    assert not any(extras), "no backlash, limits of motion, disturbance, supervisor or resolution"
+    assert not any((drive.friction.law, drive.screw.real)), "no friction and a perfect screw"
     return _Feed.of(drive, divisor=table.divisor, order=drive.weights.size)
 
 

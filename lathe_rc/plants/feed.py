@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feed drive of a slide, cross or longitudinal: a linear model with limits, and a screw with backlash.
 
-    command → sampling → ± limit, held → model with a limited speed → backlash → slide
-                                           ↑ friction (`lathe_rc.plants.friction`)
+    command → sampling → ± limit, held → model with a limited speed → screw → backlash → slide
+                                           ↑ friction
+
+Friction is in `lathe_rc.plants.friction`, errors of the screw in `lathe_rc.plants.screw`.
 
 Models, each the position over the command:
 
@@ -43,6 +45,7 @@ from lathe_rc.placed import sized
 from lathe_rc.plants.backlash import follow
 from lathe_rc.plants.friction import LUGRE, NONE, STRIBECK, Friction, FrictionTable, bend, no_friction, slide
 from lathe_rc.plants.linear import discretise
+from lathe_rc.plants.screw import Screw, ScrewTable, nut, nut_speed, warm
 from lathe_rc.signals.noise import quantise
 from lathe_rc.transfer import TransferFunction
 
@@ -51,11 +54,12 @@ Complex = npt.NDArray[np.complex128]
 Feedback = Literal["motor", "load"]
 
 # Places in a drive's state, from the end; before them the motor's position, speed, … and room for their next values.
-_BRISTLE, _DISTURBANCE, _EFFORT, _LOAD = -4, -3, -2, -1
+_WARMTH, _BRISTLE, _DISTURBANCE, _EFFORT, _LOAD = -5, -4, -3, -2, -1
 
 _UNDISTURBED = np.empty(0)
 _UNTOLD = np.empty(0, np.uint8)
 _FREE = CommandLimits()
+_PERFECT = Screw()
 
 APPROXIMATE_LAGS = (0.17, 0.22)  #: [s] of W1, 11.79/((0.17p+1)(0.22p+1)) (paper 004)
 FULL_LAGS = (0.11304, 0.2679, 0.01659, 0.01659)  #: [s] of the W1 that meets the step data printed in paper 004
@@ -117,6 +121,7 @@ class DriveTable(NamedTuple):
         half: half the backlash [m].
         friction: of the slide.
         rubbed: what 1 N of friction, held over a step, takes from x, shape (m,).
+        screw: between motor and slide.
     """
 
     transition: Array
@@ -129,6 +134,7 @@ class DriveTable(NamedTuple):
     half: float
     friction: FrictionTable
     rubbed: Array
+    screw: ScrewTable
 
 
 class LimitTable(NamedTuple):
@@ -215,7 +221,11 @@ def move(table: DriveTable, state: Array) -> bool:
             enough = min(max(effort, -table.needed), table.needed)
             for row in range(2, order):
                 state[row] = -table.jumps[row - 1] * enough
-    state[_LOAD] = follow(state[_LOAD], table.half, state[0])
+    place = state[0]
+    if table.screw.real:
+        state[_WARMTH] = warm(table.screw, state[_WARMTH], state[1])
+        place = nut(table.screw, state[_WARMTH], place)
+    state[_LOAD] = follow(state[_LOAD], table.half, place)
     return limited
 
 
@@ -283,7 +293,10 @@ def advance(
         state[_DISTURBANCE] = disturbance[k] if disturbance.size else 0.0
         motor[k], position[k], effort[k] = state[0], state[_LOAD], state[_EFFORT]
         # Within the gap the slide stands.
-        velocity[k] = state[1] if table.half == 0.0 or state[_LOAD] != before else 0.0
+        speed = state[1]
+        if table.screw.real:
+            speed = nut_speed(table.screw, state[_WARMTH], state[0], speed)
+        velocity[k] = speed if table.half == 0.0 or state[_LOAD] != before else 0.0
         seen = state[_LOAD] if feed.from_load else state[0]
         measured[k] = quantise(seen, feed.resolution)
     feed.counts[0] += saturated
@@ -366,6 +379,7 @@ class FeedDrive:
         feedback: where the position sensor is.
         limits: of the motion that the command asks for.
         friction: of the slide; None: it has none.
+        screw: between motor and slide; perfect by default.
 
     Attributes:
         table: its constants for `move` and `hold`.
@@ -391,6 +405,7 @@ class FeedDrive:
         feedback: Feedback = "load",
         limits: CommandLimits = _FREE,
         friction: Friction | None = None,
+        screw: Screw = _PERFECT,
     ) -> None:
         for name, value, allowed in (
             ("divisor", divisor, divisor >= 1),
@@ -425,8 +440,9 @@ class FeedDrive:
             half=backlash / 2.0,
             friction=friction.table(step) if friction else no_friction(step),
             rubbed=_rubbed(model, friction, step) if friction else np.zeros(held.size),
+            screw=screw.table(step),
         )
-        self.state = np.zeros(2 * held.size + 4)
+        self.state = np.zeros(2 * held.size + 5)
         self._step = step
         self.whole = FeedTable(
             drive=self.table,
@@ -478,7 +494,7 @@ class FeedDrive:
             position: of the slide [m].
             velocity: of the slide [m/s].
             effort: what the motor is given from this sample on: the command, sampled and cut off.
-            motor: position of the motor, on the slide's scale [m].
+            motor: position of the motor, on the slide's scale by a perfect screw [m].
             measured: that of the two which the sensor sees, as it reads it [m].
             disturbance: adds to the limited command, in its unit (f of paper 002, eq. 2); none if empty.
             clipped: filled with 1 where the command that is held is not what it was when it was taken; needed if there

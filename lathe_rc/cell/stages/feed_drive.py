@@ -27,6 +27,7 @@ from lathe_rc.jit import kernel
 from lathe_rc.plants import feed
 from lathe_rc.plants.feed import Feedback, FeedDrive, FeedTable, advance
 from lathe_rc.plants.friction import Friction, mobility
+from lathe_rc.plants.screw import Screw
 from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.example_002 import fill_disturbance
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
@@ -94,6 +95,17 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
     )
     friction_stiffness: Annotated[float, Gt(0)] = parameter(1e7, "lugre: stiffness of the bristles σ0", "N/m")
     friction_damping: Annotated[float, Ge(0)] = parameter(1e4, "lugre: their damping σ1", "N*s/m")
+    pitch_slope: float = parameter(0.0, "screw: error of its pitch all along, as a part of the way; 0: none")
+    pitch_amplitude: float = parameter(0.0, "screw: amplitude of the error that repeats with the lead; 0: none", "m")
+    pitch_lead: Annotated[float, Gt(0)] = parameter(10e-3, "screw: lead", "m")
+    pitch_phase: float = parameter(0.0, "screw: phase of that error at the place 0", "rad")
+    screw_heating: Annotated[float, Ge(0)] = parameter(
+        0.0, "screw: rise of its temperature in the end, by the speed of the nut; 0: none", "K*s/m"
+    )
+    screw_surroundings: float = parameter(0.0, "screw: rise of its temperature in the end at rest; 0: none", "K")
+    screw_time: Annotated[float, Gt(0)] = parameter(1800.0, "screw: time constant of that", "s")
+    screw_expansion: Annotated[float, Ge(0)] = parameter(11.5e-6, "screw: growth with the temperature; steel", "1/K")
+    screw_anchor: float = parameter(0.0, "screw: place of the bearing that it grows from", "m")
     feedback: Feedback = parameter("load", "where the position sensor is: at the motor or at the load")
     noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
     resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
@@ -136,6 +148,25 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
                 viscous=self.friction_viscous,
                 stiffness=self.friction_stiffness,
                 damping=self.friction_damping,
+            )
+
+    def screw(self, node: str) -> Screw:
+        """The screw of a node.
+
+        Raises:
+            InputError: see `Screw`.
+        """
+        with about(node, "pitch_slope", "pitch_amplitude", "pitch_lead"):
+            return Screw(
+                slope=self.pitch_slope,
+                lead=self.pitch_lead,
+                amplitude=self.pitch_amplitude,
+                phase=self.pitch_phase,
+                expansion=self.screw_expansion,
+                heating=self.screw_heating,
+                surroundings=self.screw_surroundings,
+                time=self.screw_time,
+                anchor=self.screw_anchor,
             )
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
@@ -219,7 +250,7 @@ class FeedDriveStage(Stage):
         super().__init__(name, parameters)
         self.parameters = parameters
         limits = parameters.command_limits()
-        rubbing = parameters.rubbing(name)
+        rubbing, screw = parameters.rubbing(name), parameters.screw(name)
         with about(name, *_COEFFICIENTS[parameters.model]):
             self.drive = FeedDrive(
                 parameters.transfer(),
@@ -231,6 +262,7 @@ class FeedDriveStage(Stage):
                 feedback=parameters.feedback,
                 limits=limits,
                 friction=rubbing,
+                screw=screw,
             )
         self._clipping = Clipping(name, parameters)
         cuts = limits.any or bool(parameters.command_limit)
