@@ -222,7 +222,7 @@ def _stage(cell: Cell, name: str, kind: type[S]) -> S:
 def _spindle(cell: Cell) -> _Structure:
     table = _stage(cell, "spindle_encoder", SpindleEncoder).memory
     assert isinstance(table, EncoderTable), "an encoder"
-    assert table.counts == 0, "an ideal encoder"
+    assert (table.counts, table.errors.real) == (0, False), "an ideal encoder"
     assert not table.tachogram.size, "no tachogram"
     amplitude, frequency, phase, start = table.lines
     return _Spindle.of(

@@ -12,7 +12,7 @@ from lathe_rc.errors import InputError
 NODE = "some_node"
 # Values that a table takes and a stage may not, by what else is chosen.
 CHOSEN = {
-    "spindle_encoder": [{"random_rms": 1e-3, "revolutions": 3.0}],
+    "spindle_encoder": [{"random_rms": 1e-3, "revolutions": 3.0}, {"signal_skew": 0.3}],
     "learning_controller": [{"q_filter": "fir"}, {"correction": "lead_lag"}, {"reaction_delay": 64}],
     "piezo_actuator": [
         {"hysteresis": "prandtl_ishlinskii", "amplifier_lag": 1e-5, "creep_per_decade": 0.01},
