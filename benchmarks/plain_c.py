@@ -289,6 +289,7 @@ def _cut(cell: Cell) -> _Structure:
     process, made = memory.cut.process, memory.allowance
     extras = process.spots.size, process.gaps.size, process.overlap, memory.sensor.rms, memory.sensor.resolution
     assert extras == (0, 0, 0.0, 0.0, 0.0), "an even part without regeneration, and an ideal sensor"
+    assert process.pressure == 0.0, "no process damping"
     assert process.compliances.size == 1, "the same compliance everywhere"
     order, amplitude, phase = made.run_out
     blank = _Allowance.of(made.walk, waves=order.size, order=order, amplitude=amplitude, phase=phase)
