@@ -277,6 +277,7 @@ def _fine(cell: Cell) -> _Structure:
 def _form(cell: Cell) -> _Structure:
     table = _stage(cell, "tool", Tool).memory.form
     assert not table.part, "one part without end"
+    assert table.alike, "controllers that are told where the tool has to be"
     return _Form.of(table, rows=table.heights.size, points=table.table.shape[1])
 
 

@@ -85,6 +85,7 @@ def test_every_refusal_names_node_and_parameter(kind):
         ("series_drive", {"fine_use_command": False}, "fine_use_command, fine_use_reference, fine_compensates: "),
         ("vibration", {"line_frequency": [1e9], "line_amplitude": [1e-6]}, "line_frequency: vibration at 1e+09 rad/s"),
         ("feed_drive", {"zero": 1.0}, "velocity_gain, lags, zero: feed drive"),
+        ("tool", {"tip_radius": 0.1, "profile": "polygon", "part_radius": 1e-3}, "tip_radius: the form is hollow"),
         ("feed_drive", {"pitch_slope": 1.0}, "pitch_slope, pitch_amplitude, pitch_lead: screw: pitch error"),
         ("feed_drive", {"friction": "lugre", "model": "fourth_order"}, "friction = lugre with model = fourth_order"),
         ("feed_drive", {"friction": "lugre", "friction_static": 1.0}, "friction_coulomb, friction_static: friction: "),

@@ -22,6 +22,7 @@ from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError
 from lathe_rc.safety.state_machine import Reaction
+from lathe_rc.signals.tip_path import steepest_fall
 
 
 @dataclass(frozen=True)
@@ -197,9 +198,9 @@ class Cell:
         """Refuse what cannot work, with the figures, before anything moves; `unchecked` says what was left out.
 
         Raises:
-            InputError: a block longer than a feedback delay, a profile that a drive cannot follow, a tool that is not
-                brought out of the part, a memory that would be read before it is learned, a learning loop that does
-                not converge.
+            InputError: a block longer than a feedback delay, a profile that a drive cannot follow, a flank of the tool
+                that would rub, a tool that is not brought out of the part, a memory that would be read before it is
+                learned, a learning loop that does not converge.
         """
         self.unchecked.clear()
         low, high = self.master.speed_range()
@@ -216,6 +217,7 @@ class Cell:
                     )
             if isinstance(stage, Tool):
                 self._check_profile(stage, high)
+                self._check_flank(stage)
             if isinstance(stage, Supervisor) and stage.parameters.drives:
                 self._check_obedience(stage)
                 self._check_retraction(stage)
@@ -383,6 +385,20 @@ class Cell:
                         f"{owner.name}.profile: {source.name} cannot follow it at {speed:.4g} rad/s: {what} "
                         f"{asked:.4g} {unit}; allowed: {allowed:.4g} {unit} (turn slower or change the form)"
                     )
+
+    def _check_flank(self, tool: Tool) -> None:
+        """The flank leaves the surface behind the edge free."""
+        owner = self._form(tool)
+        if owner is None or owner.form is None or not owner.parameters.clearance:
+            return
+        parameters = owner.parameters
+        fall = steepest_fall(owner.form.surface, parameters.part_radius, parameters.feed)
+        if fall.clearance >= parameters.clearance:
+            raise InputError(
+                f"{owner.name}.clearance = {parameters.clearance:g} rad: the tool's flank would rub, since the form "
+                f"falls by {fall.clearance:.4g} rad at {fall.angle:.4g} rad, height {fall.height:g} m; allowed: above "
+                "that, or a flatter form"
+            )
 
     def _form(self, tool: Tool) -> Tool | ProfileStage | None:
         """The stage that has the tool's desired form."""

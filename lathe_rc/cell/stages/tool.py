@@ -77,7 +77,9 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     return error.size, DONE
 
 
-_ELSEWHERE = FormTable(np.empty(0), np.empty((0, 0, 0)), slide=0, feed=0.0, start=0.0, part=0)
+_ELSEWHERE = FormTable(
+    np.empty(0), np.empty((0, 0, 0)), np.empty((0, 0, 0)), alike=True, slide=0, feed=0.0, start=0.0, part=0
+)
 
 
 class Tool(Stage):
