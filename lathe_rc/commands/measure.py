@@ -62,12 +62,21 @@ def _chosen(text: str, whole: int) -> list[int]:
     show_default=True,
     help="of the filters for roundness and roughness [undulations per revolution]",
 )
+@click.option(
+    "--nose-radius",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="MM",
+    help="radius of the tool's nose in the plane of the feed [mm]: tells the roughness along the part too",
+)
 @click.option("--profile", type=click.Path(path_type=Path), help="CSV file to write these revolutions' profiles to")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
-def measure(bag: Path, revolutions: str, cutoff: float, profile: Path | None, *, as_json: bool) -> None:
+def measure(
+    bag: Path, revolutions: str, cutoff: float, nose_radius: float | None, profile: Path | None, *, as_json: bool
+) -> None:
     """Measure the part that a recorded run has turned: form error, roundness, roughness by revolution."""
     recording = reader.read(bag)
     found = part.measured(recording, cutoff=cutoff)
+    surface = part.surface(recording, found, nose_radius * 1e-3) if nose_radius else None
     chosen = _chosen(revolutions, found.form.rms.size)
     if profile:
         part.write_profile(profile, recording, found, chosen)
@@ -77,11 +86,14 @@ def measure(bag: Path, revolutions: str, cutoff: float, profile: Path | None, *,
             "cutoff_upr": cutoff,
             "unit": "um",
             "revolutions": [part.numbers(found, k) for k in chosen],
+            "along": part.along(surface) if surface else None,
             "profile": str(profile) if profile else None,
         }
         click.echo(json.dumps(told))
         return
     console = Console()
     console.print(table(found, chosen))
+    if surface:
+        console.print(part.along_in_words(surface), highlight=False, soft_wrap=True)
     if profile:
         console.print(f"profile: {profile}", highlight=False, soft_wrap=True)

@@ -10,6 +10,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from lathe_rc import harness, part
+from lathe_rc.analysis.metrology import Lay
 from lathe_rc.cell.durations import Lateness
 
 _MOST_EVENTS = 12  # that are told of a run
@@ -47,7 +48,9 @@ def _events(result: harness.Result) -> RichTable:
 def facts(result: harness.Result) -> list[str]:
     """What was sent and lost, how fast, and who was refused."""
     refused = [f"{count} messages refused from {sender}" for sender, count in result.refused.items()]
+    surface = result.surface
     return [
+        *([part.along_in_words(surface) if isinstance(surface, Lay) else surface] if surface else []),
         f"{result.blocks} blocks sent, {result.dropped} lost; {result.errors.rms.size} revolutions",
         f"{result.simulated_s:.2f} s simulated in {result.wall_s:.2f} s: {result.real_time_factor:.1f}x real time",
         *(_lateness(result.lateness) if result.lateness else []),
