@@ -390,6 +390,8 @@ def test_run_and_bag_tell_the_roughness_along_the_part(tmp_path, monkeypatch):
     assert told["rt_errorless"] < told["rt"] < 2 * told["rt_errorless"]
     measured = CliRunner().invoke(cli.main, ["measure", "bag", "--nose-radius", "0.8", "--json"])
     assert json.loads(measured.output)["along"] == pytest.approx(told)
+    named = CliRunner().invoke(cli.main, ["measure", "bag", "--json"])
+    assert json.loads(named.output)["along"] == pytest.approx(told)
     assert (
         "last 8 revolutions at 100 µm/rev: Ra"
         in CliRunner().invoke(cli.main, ["measure", "bag", "--nose-radius", "0.8"]).output

@@ -4,6 +4,7 @@
 import base64
 import contextlib
 import json
+import math
 import platform
 import re
 from collections.abc import Mapping, Sequence
@@ -215,6 +216,15 @@ def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str]
     sets += _copied(scenarios.load(file, sets, complete=True), folder)
     loaded = scenarios.load(file, [*sets, *overrides], complete=True)
     return Scenario(about.get(NAME, "") or loaded.name, loaded.nodes)
+
+
+def nose_radius(about: Mapping[str, str]) -> float:
+    """Radius of the tool's nose that the scenario of a bag names [m]; 0 where it names none."""
+    for text in re.findall(r"\bnose_radius: ([\d.e+-]{1,30})(?![^\s,}])", about.get(SCENARIO, "")):
+        with contextlib.suppress(ValueError):
+            if 0.0 < float(text) < math.inf:
+                return float(text)
+    return 0.0
 
 
 def _copied(scenario: Scenario, folder: Path) -> list[str]:

@@ -10,6 +10,7 @@ import numpy as np
 from lathe_rc import happened
 from lathe_rc.bag.snapshot import first_sample, span_of
 from lathe_rc.bag.source import Source
+from lathe_rc.bag.story import nose_radius
 from lathe_rc.bag.stream import Feeder
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
@@ -149,7 +150,8 @@ def gather(path: Path) -> Gathered:
     with Source(path) as source:
         types = {topic: found.type for topic, found in source.topics.items()}
         encoders = of_type(types, messages.ENCODER)
-        forms = [Form(encoders[0], tool) for tool in of_type(types, messages.TOOL)] if encoders else []
+        nose = nose_radius(source.about)
+        forms = [Form(encoders[0], tool, nose) for tool in of_type(types, messages.TOOL)] if encoders else []
         curves = Curves(types)
         told = Gathered(source.about, {topic: Tally(kind) for topic, kind in sorted(types.items())}, forms, curves)
         first = first_sample(source.about)
