@@ -467,7 +467,10 @@ class FeedDrive:
         return int(self.whole.counts[1])
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Motor over command, as the difference equation has it, at ``frequency`` [rad/s]; limits and divisor apart."""
+        """Motor over command, as the difference equation has it, at ``frequency`` [rad/s].
+
+        Limits, divisor and friction are left out.
+        """
         z = np.exp(1j * np.asarray(frequency, dtype=np.float64) * self._step)
         weights = self.table.weights
         whole = z[..., None, None] * np.eye(weights.size) - self.table.transition
