@@ -216,8 +216,9 @@ class Cell:
                         f"{stage.shared.block_size}; allowed: a block no longer than the delay"
                     )
             if isinstance(stage, Tool):
-                self._check_profile(stage, high)
-                self._check_flank(stage)
+                owner = self._form(stage)
+                self._check_profile(stage, owner, high)
+                _check_flank(owner)
             if isinstance(stage, Supervisor) and stage.parameters.drives:
                 self._check_obedience(stage)
                 self._check_retraction(stage)
@@ -363,9 +364,9 @@ class Cell:
                 f"it the same deviation, tachogram and random parameters"
             )
 
-    def _check_profile(self, tool: Tool, speed: float) -> None:
-        """The first drive carries the profile; the others what it leaves."""
-        owner, drive = self._form(tool), tool.parameters.drives[0]
+    def _check_profile(self, tool: Tool, owner: Tool | ProfileStage | None, speed: float) -> None:
+        """The first drive carries the profile that ``owner`` has; the others what it leaves."""
+        drive = tool.parameters.drives[0]
         topic = remapped(tool.shared, f"{drive}/state")
         source = self._publisher(topic, f"whether {self.dense[topic].node} can follow the profile of {tool.name}")
         if owner is None or owner.form is None or not isinstance(source, Drive):
@@ -386,20 +387,6 @@ class Cell:
                         f"{asked:.4g} {unit}; allowed: {allowed:.4g} {unit} (turn slower or change the form)"
                     )
 
-    def _check_flank(self, tool: Tool) -> None:
-        """The flank leaves the surface behind the edge free."""
-        owner = self._form(tool)
-        if owner is None or owner.form is None or not owner.parameters.clearance:
-            return
-        parameters = owner.parameters
-        fall = steepest_fall(owner.form.surface, parameters.part_radius, parameters.feed)
-        if fall.clearance >= parameters.clearance:
-            raise InputError(
-                f"{owner.name}.clearance = {parameters.clearance:g} rad: the tool's flank would rub, since the form "
-                f"falls by {fall.clearance:.4g} rad at {fall.angle:.4g} rad, height {fall.height:g} m; allowed: above "
-                "that, or a flatter form"
-            )
-
     def _form(self, tool: Tool) -> Tool | ProfileStage | None:
         """The stage that has the tool's desired form."""
         if tool.form is not None:
@@ -408,6 +395,20 @@ class Cell:
             remapped(tool.shared, "reference"), f"whether a drive can follow what {tool.name} reads"
         )
         return source if isinstance(source, ProfileStage) else None
+
+
+def _check_flank(owner: Tool | ProfileStage | None) -> None:
+    """The flank leaves the surface behind the edge free."""
+    if owner is None or owner.form is None or not owner.parameters.clearance:
+        return
+    parameters = owner.parameters
+    fall = steepest_fall(owner.form.surface, parameters.part_radius, parameters.feed)
+    if fall.clearance >= parameters.clearance:
+        raise InputError(
+            f"{owner.name}.clearance = {parameters.clearance:g} rad: the tool's flank would rub, since the form falls "
+            f"by {fall.clearance:.4g} rad at {fall.angle:.4g} rad, height {fall.height:g} m; allowed: above that, or a "
+            "flatter form"
+        )
 
 
 def _check_factor(stage: Learner, drive: str, worst: tuple[float, float], speed: float) -> None:
