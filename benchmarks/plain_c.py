@@ -222,7 +222,7 @@ def _stage(cell: Cell, name: str, kind: type[S]) -> S:
 def _spindle(cell: Cell) -> _Structure:
     table = _stage(cell, "spindle_encoder", SpindleEncoder).memory
     assert isinstance(table, EncoderTable), "an encoder"
-    assert table.counts == 0, "an ideal encoder"
+    assert (table.counts, table.errors.real) == (0, False), "an ideal encoder"
     assert not table.tachogram.size, "no tachogram"
     amplitude, frequency, phase, start = table.lines
     return _Spindle.of(
@@ -277,6 +277,7 @@ def _fine(cell: Cell) -> _Structure:
 def _form(cell: Cell) -> _Structure:
     table = _stage(cell, "tool", Tool).memory.form
     assert not table.part, "one part without end"
+    assert table.alike, "controllers that are told where the tool has to be"
     return _Form.of(table, rows=table.heights.size, points=table.table.shape[1])
 
 
@@ -289,6 +290,7 @@ def _cut(cell: Cell) -> _Structure:
     process, made = memory.cut.process, memory.allowance
     extras = process.spots.size, process.gaps.size, process.overlap, memory.sensor.rms, memory.sensor.resolution
     assert extras == (0, 0, 0.0, 0.0, 0.0), "an even part without regeneration, and an ideal sensor"
+    assert process.pressure == 0.0, "no process damping"
     assert process.compliances.size == 1, "the same compliance everywhere"
     order, amplitude, phase = made.run_out
     blank = _Allowance.of(made.walk, waves=order.size, order=order, amplitude=amplitude, phase=phase)
@@ -315,6 +317,7 @@ def _feed(cell: Cell, name: str) -> _Structure:
     table, drive = memory.drive, memory.drive.drive
     extras = drive.half, table.resolution, table.kept, memory.listens, memory.disturbance, drive.speed_limit < np.inf
     assert not any(extras), "no backlash, limits of motion, disturbance, supervisor or resolution"
+    assert not any((drive.friction.law, drive.screw.real)), "no friction and a perfect screw"
     return _Feed.of(drive, divisor=table.divisor, order=drive.weights.size)
 
 

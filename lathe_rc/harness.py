@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from lathe_rc import part, starting
 from lathe_rc.analysis.budget import Budget
-from lathe_rc.analysis.metrology import FormErrors, Measurement
+from lathe_rc.analysis.metrology import FormErrors, Lay, Measurement
 from lathe_rc.analysis.tolerance import Verdict
 from lathe_rc.bag import reader, recover
 from lathe_rc.bag.check import write_digests
@@ -45,6 +45,7 @@ from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.extensions import search_path
@@ -177,6 +178,18 @@ class Result:
         return part.verdict(self.scenario, self.recording)
 
     @cached_property
+    def surface(self) -> Lay | str | None:
+        """The surface along the part, or why there is none; None: the scenario has no tool with a `nose_radius`."""
+        tools = [table for table in self.scenario.nodes.values() if isinstance(table, ToolParameters)]
+        radius = next((table.nose_radius for table in tools if table.nose_radius), 0.0)
+        if not radius or not self.errors.rms.size:
+            return None
+        try:
+            return part.surface(self.recording, self.part, radius)
+        except InputError as error:
+            return str(error)
+
+    @cached_property
     def digest(self) -> dict[str, str]:
         """Digest of each signal topic."""
         return self.recording.digests()
@@ -218,6 +231,7 @@ class Result:
                 "per_revolution_ront": (self.part.roundness.peak_to_valley * 1e6).tolist() if errors.rms.size else [],
             },
             "tolerance_um": verdict.summary() if verdict else None,
+            "along_um": part.along(self.surface) if isinstance(self.surface, Lay) else self.surface,
             "bag": str(self.bag) if self.bag else None,
             "snapshots": [str(path) for path in self.snapshots],
             "digest": self.digest,

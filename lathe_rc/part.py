@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.analysis import profile_csv
-from lathe_rc.analysis.metrology import FormErrors, Measurement, form_errors, measure, turns_before
+from lathe_rc.analysis.metrology import FormErrors, Lay, Measurement, evenly, form_errors, lay, measure, turns_before
 from lathe_rc.analysis.tolerance import Verdict, judge
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Signals, full
@@ -57,6 +57,41 @@ def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
         if topic.endswith(f"/{of}"):
             return judge(recording.errors.largest, allowed)
     return None
+
+
+def surface(recording: Recording, found: Measurement, nose_radius: float) -> Lay:
+    """The surface along the part that a run has turned; see `lathe_rc.analysis.metrology.lay`.
+
+    Args:
+        recording: of the run.
+        found: what `measured` has found in it.
+        nose_radius: of the tool in the plane of the feed [m].
+    """
+    angle = recording.of_type(messages.ENCODER)["angle_true"]
+    height = evenly(angle - 2.0 * np.pi * turns_before(angle), recording.of_type(messages.TOOL)["height"])
+    return lay(found.profile, height, nose_radius)
+
+
+def along(found: Lay) -> dict[str, Any]:
+    """What is told of the surface along the part; lengths in µm, the feed in µm a revolution."""
+    rt, ra = found.rt * 1e6, found.ra * 1e6
+    return {
+        "revolutions": found.revolutions,
+        "feed": found.feed * 1e6,
+        "ra": float(ra.mean()),
+        "rt": float(rt.mean()),
+        "rt_worst": float(rt.max()),
+        "rt_errorless": found.errorless * 1e6,
+    }
+
+
+def along_in_words(found: Lay) -> str:
+    """The same as a line."""
+    told = along(found)
+    return (
+        f"along the part, last {told['revolutions']} revolutions at {told['feed']:.4g} µm/rev: Ra {told['ra']:.3g} µm, "
+        f"Rt {told['rt']:.3g} µm (worst {told['rt_worst']:.3g}); without any error Rt {told['rt_errorless']:.3g} µm"
+    )
 
 
 def numbers(found: Measurement, revolution: int) -> dict[str, Any]:

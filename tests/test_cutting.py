@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.plants.cutting import PAPER, REALISTIC, RIGID, CuttingProcess, Elasticity, HardSpot, Part, Wear
+from lathe_rc.plants.cutting import PAPER, REALISTIC, RIGID, CuttingProcess, Elasticity, Flank, HardSpot, Part, Wear
 from lathe_rc.plants.cutting_force import STEEL, SpecificForce
 from lathe_rc.signals import speed as speeds
 from lathe_rc.signals.allowance import PAPER_RMS, Allowance, mean_reverting
@@ -241,6 +241,37 @@ def test_compliance_follows_the_height():
     assert_allclose(out["deflection"] / out["force"], [1e-7, 1e-7, 3e-7, 5e-7, 2e-7, 1e-7])
 
 
+# --- process damping
+
+
+def test_flank_presses_by_the_speed_of_the_edge_and_the_square_of_its_land():
+    """F = K·ap - Ksp·B·(W + VB)²/2·(dy/dt)/v where there is a chip, and nothing in a keyway."""
+    flank = Flank(pressure=4e13, width=0.3e-3, land=0.1e-3)
+    process = make(flank=flank, wear=Wear(0.1e-3), part=Part(radius=0.04, gaps=[(3.0, 1.0)]))
+    time = STEP * np.arange(8000)
+    away = 50e-6 * np.sin(2 * SPEED * time)
+    out = cut(process, 8000, displacement=away)
+    speed = np.diff(away, prepend=0.0) / STEP
+    damping = 4e13 * 0.3e-3 * 0.2e-3**2 / (2 * SPEED * 0.04)
+    assert flank.damping(SPEED * 0.04, 0.1e-3) == pytest.approx(damping)
+    there = (SPEED * time) % (2 * np.pi) - 3.0
+    gap = (there >= 0.0) & (there < 1.0)
+    expected = np.where(gap, 0.0, STIFFNESS * (DEPTH - away) - damping * speed)
+    assert_allclose(out["force"], expected, atol=1e-9)
+    assert damping * speed.max() > 0.2  # [N]
+
+
+def test_flank_pushes_a_springy_edge_back_at_once():
+    """The force, the deflection that it makes and the speed of the edge are those of the same sample."""
+    elasticity = Elasticity(1e-6, 0.0, 0.0, away=True)
+    flank = Flank(pressure=4e13, land=0.2e-3)
+    out = cut(make(elasticity=elasticity, flank=flank), 500, displacement=20e-6 * np.sin(np.arange(500) / 30.0))
+    edge = 20e-6 * np.sin(np.arange(500) / 30.0) + out["deflection"]
+    pressed = flank.damping(SPEED * 0.05) * np.diff(edge) / STEP
+    assert_allclose(out["deflection"], 1e-6 * out["force"], rtol=1e-12)
+    assert_allclose(out["force"][1:], (STIFFNESS * (DEPTH - edge))[1:] - pressed, rtol=1e-9)
+
+
 # --- remembered surface
 
 
@@ -328,6 +359,7 @@ def test_cuts_change_nothing(lengths, lag, elasticity, overlap):
         (lambda: make(lag=1e-9), "cutting: lag 1e-09 s at a step of 1.5625e-05 s; allowed: 0 or at least 1.5625e-08"),
         (lambda: make(overlap=1.1), "cutting: overlap 1.1; allowed: 0"),
         (lambda: make(grid=8), "cutting: 8 grid points"),
+        (lambda: Flank(pressure=-1.0), "Flank.* allowed: 0 or more each"),
     ],
 )
 def test_what_cannot_be_is_refused(wrong, message):

@@ -1,15 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Encoder: what is measured against what is true."""
 
+from pathlib import Path
+
 import numpy as np
+import pytest
 from cells import cuts, in_blocks, same
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.cell import messages
+from lathe_rc import harness
+from lathe_rc.analysis.metrology import undulations
+from lathe_rc.cell import messages, scenario
+from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
 from lathe_rc.signals.encoder import Encoder
+from lathe_rc.signals.encoder_errors import EncoderErrors
 
 TURN = 2 * np.pi
 STEP = 1 / 64000
@@ -19,10 +26,10 @@ laws = st.sampled_from([speed.constant(NOMINAL), swinging])
 counts = st.one_of(st.integers(1, 100), st.integers(101, 2**31 - 1))
 
 
-def measure(law, counts=0, window=64, lengths=(12000,)):
+def measure(law, counts=0, window=64, lengths=(12000,), errors=EncoderErrors()):  # noqa: B008 - it never changes
     """Signals of an encoder that works in blocks of ``lengths``."""
     signals = messages.allocate(messages.ENCODER, sum(lengths))
-    encoder = Encoder(law, STEP, counts, window)
+    encoder = Encoder(law, STEP, counts, window, errors)
     in_blocks(lengths, lambda first, *parts: encoder.block(first, **dict(zip(signals, parts, strict=True))),
               *signals.values())  # fmt: skip
     return signals
@@ -85,3 +92,93 @@ def test_measured_speed_lags_by_half_its_window():
 @given(laws, st.one_of(st.just(0), counts), st.integers(1, 400), cuts)
 def test_cuts_change_nothing(law, counts, window, lengths):
     assert same(measure(law, counts, window, lengths), measure(law, counts, window, [sum(lengths)]))
+
+
+# --- errors of the disc and the signals
+
+EVEN = speed.constant(TURN / (3840 * STEP))  # 3840 samples a revolution
+PERIODS = 32
+
+
+def misread(errors, counts=0, lengths=(3840,), law=EVEN):
+    """Signals of an encoder with errors."""
+    return measure(law, counts, lengths=lengths, errors=errors)
+
+
+def waves(signals):
+    """Amplitude of what is seen less what is true, by waves a revolution."""
+    error = (signals["angle"] - signals["angle_true"])[:3840]
+    return 2 * np.abs(np.fft.rfft(error)) / error.size
+
+
+def test_eccentric_disc_errs_once_a_revolution_by_its_eccentricity():
+    errors = EncoderErrors(eccentricity=2e-4, phase=0.6)
+    signals = misread(errors)
+    assert_allclose(
+        signals["angle"] - signals["angle_true"], 2e-4 * (np.sin(signals["angle_true"] + 0.6) - np.sin(0.6)), atol=1e-14
+    )
+    assert waves(signals)[1] == pytest.approx(2e-4, rel=1e-9)
+    assert waves(signals)[2:].max() < 1e-12
+    assert signals["index_pulse"].sum() == signals["index_pulse"][0] == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "wave", "amplitude"),
+    [
+        ({"cosine_offset": 3e-3, "sine_offset": -4e-3}, PERIODS, 5e-3 / PERIODS),
+        ({"mismatch": 6e-3, "skew": 8e-3}, 2 * PERIODS, 1e-2 / (2 * PERIODS)),
+    ],
+)
+def test_signals_that_are_no_circle_err_within_a_period(values, wave, amplitude):
+    """Heydemann's ellipse: offsets err once in a signal period, amplitudes and phase twice."""
+    found = waves(misread(EncoderErrors(periods=PERIODS, **values)))
+    assert found[wave] == pytest.approx(amplitude, rel=0.01)
+    found[[0, wave]] = 0.0
+    assert found.max() < 0.02 * amplitude
+
+
+ALL_WRONG = EncoderErrors(
+    eccentricity=1e-3, phase=-1.0, periods=PERIODS, cosine_offset=0.05, sine_offset=0.02, mismatch=-0.1, skew=0.1
+)
+
+
+def test_speed_is_the_rate_of_the_angle_that_is_seen():
+    signals = misread(ALL_WRONG, law=swinging)
+    rate = np.gradient(signals["angle"], STEP)
+    assert_allclose(signals["speed"][1:-1], rate[1:-1], rtol=1e-3)
+    assert np.ptp(signals["speed"] / signals["speed_true"]) > 0.2
+
+
+@given(counts, cuts)
+def test_counts_round_what_is_seen_and_cuts_change_nothing(count, lengths):
+    exact, rounded = misread(ALL_WRONG, 0, lengths), misread(ALL_WRONG, count, lengths)
+    lag = exact["angle"] - rounded["angle"]
+    assert -1e-13 <= lag.min() <= lag.max() < TURN / count + 1e-13
+    assert same(rounded, misread(ALL_WRONG, count, [sum(lengths)]))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"eccentricity": 0.6}, "encoder: eccentricity 0.6 rad; allowed: up to 0.5 rad"),
+        ({"periods": 0}, "encoder: 0 signal periods in a revolution; allowed: 1 or more"),
+        ({"mismatch": -0.3, "skew": 0.3}, "encoder: errors of the signals that come to 0.6; allowed: "),
+    ],
+)
+def test_errors_that_would_turn_the_angle_back_are_refused(values, message):
+    with pytest.raises(InputError, match=message):
+        EncoderErrors(**values)
+
+
+def test_learning_leaves_what_the_encoder_misreads():
+    """Of an oval A·sin 2φ an eccentric disc leaves A·e at 1 and at 3 undulations: no controller can see it."""
+    plain = ["spindle_encoder.revolutions=30.0", "spindle_encoder.deviation_amplitude=[]",
+             "spindle_encoder.deviation_frequency=[]", "tool.profile=harmonics"]  # fmt: skip
+    profiles = []
+    for eccentricity in (0.0, 2e-3):
+        config = Path(__file__).parents[1] / "config" / "piston.yaml"
+        loaded = scenario.load(config, [*plain, f"spindle_encoder.disc_eccentricity={eccentricity}"])
+        profiles.append(harness.run(loaded).part.profile[-1])
+    found = undulations((profiles[1] - profiles[0])[None, :], 6).amplitude[0]
+    assert_allclose(found[[1, 3]], 225e-6 * 2e-3, rtol=0.02)
+    assert max(found[2], *found[4:]) < 0.02 * found[1]

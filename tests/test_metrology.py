@@ -1,23 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """Form errors and roundness, revolution by revolution, and profiles as files."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from lathe_rc import cli, harness
 from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.metrology import (
     POINTS,
     evenly,
     form_errors,
     gaussian,
+    lay,
     measure,
     roughness,
     roundness,
     undulations,
 )
+from lathe_rc.cell import scenario
 from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
 from lathe_rc.signals.profile import Harmonics, read_csv
@@ -329,3 +336,65 @@ def test_profiles_that_cannot_be_written_are_refused(tmp_path):
     with pytest.raises(InputError, match="No such file"):
         profile_csv.write(tmp_path / "nowhere" / "profile.csv", np.zeros(8))
     assert list(tmp_path.iterdir()) == []
+
+
+# --- along the part
+
+FEED, NOSE = 0.1e-3, 0.8e-3
+
+
+def fed(offsets):
+    """Revolutions with an offset each, and the heights of a steady feed."""
+    turns = np.arange(len(offsets))[:, None] + np.arange(256) / 256
+    return np.repeat(np.asarray(offsets, dtype=float)[:, None], 256, axis=1), FEED * turns
+
+
+def test_nose_leaves_marks_of_f2_over_8r():
+    """Without any error Rt = f²/(8r), and Ra = f²/(18·√3·r), that of a row of parabolas."""
+    found = lay(*fed(np.zeros(12)), NOSE)
+    assert (found.revolutions, found.surface.shape[0]) == (8, 64)
+    assert found.feed == pytest.approx(FEED)
+    assert found.errorless == pytest.approx(FEED**2 / (8 * NOSE), rel=2e-3)
+    assert_allclose(found.rt, FEED**2 / (8 * NOSE), rtol=6e-3)
+    assert_allclose(found.ra, FEED**2 / (18 * np.sqrt(3) * NOSE), rtol=0.02)
+
+
+def test_deeper_revolution_stands_out_by_where_two_noses_meet():
+    """Every second one deeper by δ: Rt = (f/2 + r·δ/f)²/(2r); beyond f²/2r the others cut nothing."""
+    for deeper in (0.0, 0.5e-6, 3e-6):
+        found = lay(*fed([-deeper * (k % 2) for k in range(8)]), NOSE)
+        assert_allclose(found.rt, (FEED / 2 + NOSE * deeper / FEED) ** 2 / (2 * NOSE), rtol=0.02)
+    alone = lay(*fed([-20e-6 * (k % 2) for k in range(8)]), NOSE)
+    assert_allclose(alone.rt, (2 * FEED) ** 2 / (8 * NOSE), rtol=0.02)
+
+
+def test_only_the_last_revolutions_that_were_fed_one_way_count():
+    profile, height = fed(np.zeros(9))
+    height[4:] -= 4 * FEED
+    assert lay(profile, height, NOSE).revolutions == 5
+    assert lay(profile, -height, NOSE).feed == pytest.approx(FEED)
+    for still in (np.zeros_like(height), height[:2]):
+        with pytest.raises(InputError, match="revolutions that were fed one way; allowed: 3 or more"):
+            lay(profile[: still.shape[0]], still, NOSE)
+    with pytest.raises(InputError, match=r"feed of 0\.0001 m/rev and a nose of 4e-05 m; allowed: a feed"):
+        lay(profile, height, 0.4 * FEED)
+
+
+def test_run_and_bag_tell_the_roughness_along_the_part(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = Path(__file__).parents[1] / "config" / "piston.yaml"
+    changes = ["spindle_encoder.revolutions=14.0", "tool.nose_radius=0.8e-3"]
+    result = harness.run(scenario.load(config, changes), bag=Path("bag"))
+    told = result.summary()["along_um"]
+    assert told["rt_errorless"] == pytest.approx(1e6 * FEED**2 / (8 * NOSE), rel=1e-3)
+    assert told["rt_errorless"] < told["rt"] < 2 * told["rt_errorless"]
+    measured = CliRunner().invoke(cli.main, ["measure", "bag", "--nose-radius", "0.8", "--json"])
+    assert json.loads(measured.output)["along"] == pytest.approx(told)
+    named = CliRunner().invoke(cli.main, ["measure", "bag", "--json"])
+    assert json.loads(named.output)["along"] == pytest.approx(told)
+    assert (
+        "last 8 revolutions at 100 µm/rev: Ra"
+        in CliRunner().invoke(cli.main, ["measure", "bag", "--nose-radius", "0.8"]).output
+    )
+    short = harness.run(scenario.load(config, ["spindle_encoder.revolutions=2.0", *changes[1:]]))
+    assert "2 revolutions that were fed one way" in short.summary()["along_um"]

@@ -12,7 +12,7 @@ from lathe_rc.errors import InputError
 NODE = "some_node"
 # Values that a table takes and a stage may not, by what else is chosen.
 CHOSEN = {
-    "spindle_encoder": [{"random_rms": 1e-3, "revolutions": 3.0}],
+    "spindle_encoder": [{"random_rms": 1e-3, "revolutions": 3.0}, {"signal_skew": 0.3}],
     "learning_controller": [{"q_filter": "fir"}, {"correction": "lead_lag"}, {"reaction_delay": 64}],
     "piezo_actuator": [
         {"hysteresis": "prandtl_ishlinskii", "amplifier_lag": 1e-5, "creep_per_decade": 0.01},
@@ -20,7 +20,12 @@ CHOSEN = {
     ],
     "series_drive": [{"fine_compensates": ["coarse"]}],
     "tool": [{"profile": "polygon"}, {"profile": "csv"}],
-    "feed_drive": [{"model": "fourth_order", "command_velocity": 1.0}, {"model": "dc_screw", "zero": 1.0}],
+    "feed_drive": [
+        {"model": "fourth_order", "command_velocity": 1.0},
+        {"model": "dc_screw", "zero": 1.0},
+        {"friction": "lugre"},
+        {"friction": "lugre", "lags": [0.1, 0.2]},
+    ],
     "cutting_process": [{"allowance_rms": 1e-6}],
     "position_controller": [{"law": "sampled_link"}, {"law": "periodic_hyperstable"}, {"reaction_delay": 64}],
     "supervisor": [{"drives": ["coarse"]}],
@@ -80,6 +85,10 @@ def test_every_refusal_names_node_and_parameter(kind):
         ("series_drive", {"fine_use_command": False}, "fine_use_command, fine_use_reference, fine_compensates: "),
         ("vibration", {"line_frequency": [1e9], "line_amplitude": [1e-6]}, "line_frequency: vibration at 1e+09 rad/s"),
         ("feed_drive", {"zero": 1.0}, "velocity_gain, lags, zero: feed drive"),
+        ("tool", {"tip_radius": 0.1, "profile": "polygon", "part_radius": 1e-3}, "tip_radius: the form is hollow"),
+        ("feed_drive", {"pitch_slope": 1.0}, "pitch_slope, pitch_amplitude, pitch_lead: screw: pitch error"),
+        ("feed_drive", {"friction": "lugre", "model": "fourth_order"}, "friction = lugre with model = fourth_order"),
+        ("feed_drive", {"friction": "lugre", "friction_static": 1.0}, "friction_coulomb, friction_static: friction: "),
         ("cutting_process", {"hard_spot_start": [1.0]}, "hard_spot_start, hard_spot_width, "),
         ("cutting_process", {"run_out_order": [1]}, "run_out_order, run_out_amplitude, run_out_phase: run-out"),
         ("position_controller", {"law": "sampled_link", "link_gain": 1e6}, "link_gain, link_lag, divisor, feedback_"),

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Regeneration: the limit in formula, in the Nyquist plane and in the simulated cut."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from lathe_rc.analysis.regeneration import Regeneration, lobes
 from lathe_rc.errors import InputError
-from lathe_rc.plants.cutting import PAPER, REALISTIC, CuttingProcess, Elasticity
+from lathe_rc.plants.cutting import PAPER, REALISTIC, CuttingProcess, Elasticity, Flank
 from lathe_rc.plants.cutting_force import SpecificForce
 from lathe_rc.transfer import TransferFunction
 
@@ -95,7 +97,7 @@ def test_edge_that_is_drawn_in_runs_away_without_swinging(compliance, overlap):
 # --- the simulated cut
 
 
-def deflection(name, stiffness, period, duration, kick):
+def deflection(name, stiffness, period, duration, kick, flank=None):
     """Deflection [m] from a slow rise of the blank on, after which it kicks once; samples apart from then on."""
     elasticity, step = PRESETS[name]
     samples, engagement = round(duration / step), round(100 * 2 * np.pi * np.sqrt(elasticity.inertia) / step)
@@ -110,6 +112,7 @@ def deflection(name, stiffness, period, duration, kick):
         lag=0.0,
         elasticity=elasticity,
         overlap=1.0,
+        flank=flank,
         step=step,
     )
     out = {key: np.empty_like(speed) for key in ("force", "deflection", "depth_of_cut", "feed", "wear")}
@@ -145,6 +148,28 @@ def test_cut_is_stable_just_below_the_limit_and_unstable_just_above(name, factor
     assert [apart for _, apart in runs] == [0, 0]
     assert np.sign(root.real) == np.sign(factor - 1.0)
     assert growth(runs[0][0] - runs[1][0], step) == pytest.approx(root.real, rel=0.03)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_process_damping_raises_the_limit_as_a_damper_of_the_mode_does(name):
+    """A flank of damping C is W3 with b + c·C: where the growth changes its sign is that one's limit."""
+    elasticity, step = PRESETS[name]
+    plain = Regeneration(elasticity.transfer, elasticity.away).worst()
+    period = plain.period(1)
+    flank = Flank(pressure=4e13, width=0.2e-3, land=0.1e-3)
+    asked = elasticity.damping / elasticity.compliance / flank.damping(0.05 * 2 * np.pi / period)
+    damped = replace(elasticity, damping=2 * elasticity.damping)
+    cutting = Regeneration(damped.transfer, damped.away)
+    limit, found = cutting.at(period), []
+    assert limit.stiffness > 1.5 * plain.stiffness
+    for factor in (0.97, 1.03):
+        stiffness = factor * limit.stiffness
+        duration = 2.5 / abs(cutting.root(stiffness, period, 1j * limit.frequency).real)
+        ran = replace(flank, pressure=asked * flank.pressure)
+        kicked, still = (deflection(name, stiffness, period, duration, kick, ran)[0] for kick in (1e-7, 0.0))
+        found.append(growth(kicked - still, step))
+    assert found[0] < 0.0 < found[1]
+    assert 0.97 + 0.06 * found[0] / (found[0] - found[1]) == pytest.approx(1.0, abs=4e-3)
 
 
 def test_loss_of_contact_bounds_the_chatter():

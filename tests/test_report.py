@@ -136,6 +136,18 @@ class TestPage:
         assert (bag.parent / "page.html").read_text(encoding="utf-8") == page
 
 
+def test_surface_along_the_part_is_that_of_the_whole_run(tmp_path):
+    feeds = scenario(spindle_encoder={"revolutions": 11.2}, tool={"feed": 1e-4, "nose_radius": 0.8e-3})
+    surface = harness.run(feeds, bag=tmp_path / "bag").surface
+    told = gather(tmp_path / "bag").forms[0].surface
+    assert_allclose(told.surface, surface.surface, rtol=0, atol=1e-15)
+    assert_allclose(told.height, surface.height, rtol=0, atol=1e-15)
+    done = CliRunner().invoke(report, [str(tmp_path / "bag"), "-o", str(tmp_path / "page.html")])
+    assert done.exit_code == 0, done.output
+    page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
+    assert "Along the part, last 8 revolutions at 100 µm/rev: Ra " in page.text
+
+
 class TestForm:
     """The measurement by pieces against that of the whole run."""
 

@@ -20,6 +20,7 @@ from lathe_rc.errors import InputError
 Array = npt.NDArray[np.float64]
 
 POINTS = 4096  #: even angles in a revolution, about as many as the cell has samples at 1000 rpm
+_PER_MARK = 64  # places between revolutions
 _PER_UNDULATION = 7  # points that an undulation at the filter's cut-off needs
 
 
@@ -249,6 +250,94 @@ def roughness(profile: Array, cutoff: float) -> Roughness:
     """
     short = profile - gaussian(profile, cutoff)
     return Roughness(np.abs(short).mean(axis=-1), np.sqrt((short**2).mean(axis=-1)))
+
+
+def feed_mark(feed: float, nose_radius: float) -> float:
+    """Height of what a nose leaves standing between revolutions, r - √(r² - f²/4), nearly f²/(8r) [m].
+
+    Its mean deviation Ra is nearly f²/(18·√3·r).
+
+    Args:
+        feed: f [m/rev].
+        nose_radius: r, in the plane of the feed [m].
+
+    Raises:
+        InputError: a nose that would leave material between revolutions, or none.
+    """
+    if not 0.0 < abs(feed) <= 2.0 * nose_radius < np.inf:
+        raise InputError(
+            f"feed of {feed:g} m/rev and a nose of {nose_radius:g} m; allowed: a feed other than 0 and up to twice the "
+            "nose's radius"
+        )
+    return float(nose_radius - np.sqrt(nose_radius**2 - feed**2 / 4.0))
+
+
+@dataclass(frozen=True)
+class Lay:
+    """The surface along the part: what the nose leaves of revolution beside revolution.
+
+    Attributes:
+        height: places along the part [m], even, shape (places,).
+        surface: deviation of the radius from the desired form [m], shape (angles, places); angles are even, from 0 on.
+        revolutions: that it is made of.
+        feed: mean [m/rev].
+        errorless: height of the marks of an errorless path at this feed, see `feed_mark` [m].
+    """
+
+    height: Array
+    surface: Array
+    revolutions: int
+    feed: float
+    errorless: float
+
+    @property
+    def ra(self) -> Array:
+        """Ra of each trace, from its mean [m], shape (angles,)."""
+        return np.asarray(np.abs(self.surface - self.surface.mean(axis=-1, keepdims=True)).mean(axis=-1))
+
+    @property
+    def rt(self) -> Array:
+        """Rt of each trace, its total height [m], shape (angles,)."""
+        return np.asarray(np.ptp(self.surface, axis=-1))
+
+
+def lay(profile: Array, height: Array, nose_radius: float, *, revolutions: int = 8, angles: int = 64) -> Lay:
+    """The surface that a round nose leaves, along the part.
+
+    A nose at the height h, whose foremost point deviates by e, cuts down to e + r - √(r² - (z - h)²) at the place z; of
+    all revolutions the deepest cut remains. Noses further than their radius from a place do not reach it.
+
+    Args:
+        profile: deviation of each revolution [m], shape (revolutions, points), see `Measurement`.
+        height: of the nose [m], the same shape.
+        nose_radius: r, in the plane of the feed [m].
+        revolutions: the last so many are looked at, as far as the height moves one way.
+        angles: at which traces are taken; of the points every so many-th.
+
+    Raises:
+        InputError: see `feed_mark`; or less than three revolutions that were fed one way.
+    """
+    steps = np.diff(height, axis=0)
+    onward = np.all(steps > 0.0, axis=1) if steps.size and steps[-1, 0] > 0.0 else np.all(steps < 0.0, axis=1)
+    stops = np.flatnonzero(~onward)
+    count = min(revolutions, height.shape[0] - (int(stops[-1]) + 1 if stops.size else 0))
+    if count < 3:
+        raise InputError(
+            f"roughness along the part: {max(count, 0)} revolutions that were fed one way; allowed: 3 or more (a feed "
+            "above 0, a longer run)"
+        )
+    every = profile.shape[1] // min(angles, profile.shape[1])
+    apex, at = profile[-count:, ::every].T, height[-count:, ::every].T  # (angles, revolutions)
+    feed = float(np.abs(np.diff(at, axis=1)).mean())
+    errorless = feed_mark(feed, nose_radius)
+    low, high = at.min(axis=1).max(), at.max(axis=1).min()
+    place = np.linspace(low, high, _PER_MARK * (count - 2) + 1)
+    surface = np.full((at.shape[0], place.size), np.inf)
+    for k in range(count):
+        square = nose_radius**2 - (place[None, :] - at[:, k, None]) ** 2
+        cut = apex[:, k, None] + nose_radius - np.sqrt(np.maximum(square, 0.0))
+        surface = np.minimum(surface, np.where(square >= 0.0, cut, np.inf))
+    return Lay(place, surface, count, feed, errorless)
 
 
 @dataclass(frozen=True)

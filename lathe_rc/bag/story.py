@@ -235,6 +235,15 @@ def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str]
     return Scenario(about.get(NAME, "") or loaded.name, loaded.nodes)
 
 
+def nose_radius(about: Mapping[str, str]) -> float:
+    """Radius of the tool's nose that the scenario of a bag names [m]; 0 where it names none."""
+    for text in re.findall(r"\bnose_radius: ([\d.e+-]{1,30})(?![^\s,}])", about.get(SCENARIO, "")):
+        with contextlib.suppress(ValueError):
+            if 0.0 < float(text) < math.inf:
+                return float(text)
+    return 0.0
+
+
 def _copied(scenario: Scenario, folder: Path) -> list[str]:
     """Copy files from elsewhere that a scenario names to ``folder``; what to set so that it names these."""
     sets: list[str] = []

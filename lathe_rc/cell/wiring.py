@@ -22,6 +22,7 @@ from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError
 from lathe_rc.safety.state_machine import Reaction
+from lathe_rc.signals.tip_path import steepest_fall
 
 
 @dataclass(frozen=True)
@@ -200,9 +201,9 @@ class Cell:
         """Refuse what cannot work, with the figures, before anything moves; `unchecked` says what was left out.
 
         Raises:
-            InputError: a block longer than a feedback delay, a profile that a drive cannot follow, a tool that is not
-                brought out of the part, a memory that would be read before it is learned, a learning loop that does
-                not converge.
+            InputError: a block longer than a feedback delay, a profile that a drive cannot follow, a flank of the tool
+                that would rub, a tool that is not brought out of the part, a memory that would be read before it is
+                learned, a learning loop that does not converge.
         """
         self.unchecked.clear()
         self.factors.clear()
@@ -219,7 +220,9 @@ class Cell:
                         f"{stage.shared.block_size}; allowed: a block no longer than the delay"
                     )
             if isinstance(stage, Tool):
-                self._check_profile(stage, high)
+                owner = self._form(stage)
+                self._check_profile(stage, owner, high)
+                _check_flank(owner)
             if isinstance(stage, Supervisor) and stage.parameters.drives:
                 self._check_obedience(stage)
                 self._check_retraction(stage)
@@ -367,9 +370,9 @@ class Cell:
                 f"it the same deviation, tachogram and random parameters"
             )
 
-    def _check_profile(self, tool: Tool, speed: float) -> None:
-        """The first drive carries the profile; the others what it leaves."""
-        owner, drive = self._form(tool), tool.parameters.drives[0]
+    def _check_profile(self, tool: Tool, owner: Tool | ProfileStage | None, speed: float) -> None:
+        """The first drive carries the profile that ``owner`` has; the others what it leaves."""
+        drive = tool.parameters.drives[0]
         topic = remapped(tool.shared, f"{drive}/state")
         source = self._publisher(topic, f"whether {self.dense[topic].node} can follow the profile of {tool.name}")
         if owner is None or owner.form is None or not isinstance(source, Drive):
@@ -398,6 +401,20 @@ class Cell:
             remapped(tool.shared, "reference"), f"whether a drive can follow what {tool.name} reads"
         )
         return source if isinstance(source, ProfileStage) else None
+
+
+def _check_flank(owner: Tool | ProfileStage | None) -> None:
+    """The flank leaves the surface behind the edge free."""
+    if owner is None or owner.form is None or not owner.parameters.clearance:
+        return
+    parameters = owner.parameters
+    fall = steepest_fall(owner.form.surface, parameters.part_radius, parameters.feed)
+    if fall.clearance >= parameters.clearance:
+        raise InputError(
+            f"{owner.name}.clearance = {parameters.clearance:g} rad: the tool's flank would rub, since the form falls "
+            f"by {fall.clearance:.4g} rad at {fall.angle:.4g} rad, height {fall.height:g} m; allowed: above that, or a "
+            "flatter form"
+        )
 
 
 def _check_factor(stage: Learner, drive: str, worst: tuple[float, float], speed: float) -> None:

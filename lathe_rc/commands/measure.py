@@ -11,8 +11,10 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 from lathe_rc import part
-from lathe_rc.analysis.metrology import Measurement
-from lathe_rc.bag import reader
+from lathe_rc.analysis.metrology import Lay, Measurement
+from lathe_rc.bag import reader, story
+from lathe_rc.bag.source import Source
+from lathe_rc.cell.recording import Recording
 from lathe_rc.errors import InputError
 
 _SHOWN = 10  # revolutions, unless others are asked for
@@ -52,6 +54,22 @@ def _chosen(text: str, whole: int) -> list[int]:
     return chosen
 
 
+def _surface(bag: Path, recording: Recording, found: Measurement, nose_mm: float | None) -> Lay | str | None:
+    """The surface along the part, or why there is none; None: neither the command nor the bag names a nose.
+
+    Raises:
+        InputError: the command names one, and there is none.
+    """
+    if nose_mm:
+        return part.surface(recording, found, nose_mm * 1e-3)
+    with Source(bag) as source:
+        radius = story.nose_radius(source.about)
+    try:
+        return part.surface(recording, found, radius) if radius else None
+    except InputError as error:
+        return str(error)
+
+
 @click.command()
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("--revolutions", default="", metavar="LIST", help="like 1,4,10-12; default: some from all of the run")
@@ -62,26 +80,40 @@ def _chosen(text: str, whole: int) -> list[int]:
     show_default=True,
     help="of the filters for roundness and roughness [undulations per revolution]",
 )
+@click.option(
+    "--nose-radius",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="MM",
+    help="radius of the tool's nose in the plane of the feed [mm]: tells the roughness along the part too; default: "
+    "what the scenario in the bag says",
+)
 @click.option("--profile", type=click.Path(path_type=Path), help="CSV file to write these revolutions' profiles to")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
-def measure(bag: Path, revolutions: str, cutoff: float, profile: Path | None, *, as_json: bool) -> None:
+def measure(
+    bag: Path, revolutions: str, cutoff: float, nose_radius: float | None, profile: Path | None, *, as_json: bool
+) -> None:
     """Measure the part that a recorded run has turned: form error, roundness, roughness by revolution."""
     recording = reader.read(bag)
     found = part.measured(recording, cutoff=cutoff)
+    surface = _surface(bag, recording, found, nose_radius)
     chosen = _chosen(revolutions, found.form.rms.size)
     if profile:
         part.write_profile(profile, recording, found, chosen)
     if as_json:
-        told = {
+        summary = {
             "bag": str(bag),
             "cutoff_upr": cutoff,
             "unit": "um",
             "revolutions": [part.numbers(found, k) for k in chosen],
+            "along": part.along(surface) if isinstance(surface, Lay) else surface,
             "profile": str(profile) if profile else None,
         }
-        click.echo(json.dumps(told))
+        click.echo(json.dumps(summary))
         return
     console = Console()
     console.print(table(found, chosen))
+    if surface:
+        told = part.along_in_words(surface) if isinstance(surface, Lay) else surface
+        console.print(told, highlight=False, soft_wrap=True)
     if profile:
         console.print(f"profile: {profile}", highlight=False, soft_wrap=True)

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from lathe_rc import harness, part
 from lathe_rc.analysis.budget import Budget, Part
+from lathe_rc.analysis.metrology import Lay
 from lathe_rc.cell.durations import Lateness
 
 _MOST_EVENTS = 12  # that are told of a run
@@ -48,8 +49,10 @@ def _events(result: harness.Result) -> RichTable:
 def facts(result: harness.Result) -> list[str]:
     """Whether the part is in tolerance, what was sent and lost, how fast, and who was refused."""
     refused = [f"{count} messages refused from {sender}" for sender, count in result.refused.items()]
+    surface = result.surface
     return [
         *([result.verdict.told()] if result.verdict else []),
+        *([part.along_in_words(surface) if isinstance(surface, Lay) else surface] if surface else []),
         f"{result.blocks} blocks sent, {result.dropped} lost; {result.errors.rms.size} revolutions",
         f"{result.simulated_s:.2f} s simulated in {result.wall_s:.2f} s: {result.real_time_factor:.1f}x real time",
         *(_lateness(result.lateness) if result.lateness else []),

@@ -8,6 +8,10 @@
     F  = P/(1 + p·T)                          main cutting force Pz
     w  = F/(1 + b·p + a·p²)                   W3 is c·w
 
+With process damping the flank, worn to a land W, presses on the surface that the edge leaves where it moves into the
+part, and less where it moves out: F = P/(1 + p·T) - σ·Ksp·B·W²/2·(dy/dt)/v, as long as there is a chip. That is a
+damper; B is the width of the flank, v the cutting speed, W the land that it began with and VB.
+
 Displacements point out of the part: a positive one takes the edge away from it and makes the chip thinner. Paper 004
 has the cross feed the other way round, F = +W4·x, so its x is -x here; its y = x + W3·F draws the edge into the part
 (σ = -1), and the realistic y = x - W3·F pushes it away (σ = +1).
@@ -20,7 +24,8 @@ The part's surface is remembered over the angle, so that it is found again at an
 two samples goes to the grid points between their angles, and the chip reads it a revolution later. Where nothing is cut
 nothing is left to meet: the blank is there, which depth + d says already.
 
-Source: spec/feed-and-force.md, "Cutting process"; paper 004, W3 and W4.
+Source: spec/feed-and-force.md, "Cutting process"; paper 004, W3 and W4. Process damping: D. W. Wu, J. Engineering for
+Industry 111 (1989) 37 (force by the volume that is pressed in); E. Budak, L. T. Tunc, CIRP Annals 59 (2010).
 """
 
 from collections.abc import Sequence
@@ -40,8 +45,8 @@ Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 
-# Places in the state: VB, the last angle's place on the grid, what is remembered of it, the next grid point.
-_WEAR, _PLACE, _LEFT, _NEXT = 0, 1, 2, 3
+# Places in the state: VB, the last angle's place on the grid, what is remembered of it, the next grid point, the edge.
+_WEAR, _PLACE, _LEFT, _NEXT, _EDGE = 0, 1, 2, 3, 4
 # Why the kernel stopped, and what it counts.
 _DONE, _STANDS, _TURNS_BACK, DRAWN_IN = 0, 1, 2, 3
 _APART, _BACKWARDS = 0, 1
@@ -109,6 +114,37 @@ class Wear:
     def __post_init__(self) -> None:
         if min(self.initial, self.per_metre, self.per_second) < 0.0:
             raise InputError(f"{self}; allowed: 0 or more each, wear does not heal")
+
+
+@dataclass(frozen=True)
+class Flank:
+    """The flank that presses on the surface: process damping.
+
+    Attributes:
+        pressure: Ksp, force by the volume that is pressed in [N/m³]; 0: no process damping.
+        width: B, of the flank along the edge that faces the surface [m].
+        land: W of a new edge, to which the wear VB is added [m].
+
+    Raises:
+        InputError: a negative value.
+    """
+
+    pressure: float = 0.0
+    width: float = 0.2e-3
+    land: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.pressure < np.inf and 0.0 <= self.width < np.inf and 0.0 <= self.land < np.inf):
+            raise InputError(f"{self}; allowed: 0 or more each")
+
+    def damping(self, speed: float, wear: float = 0.0) -> float:
+        """Force on the edge by its speed out of the part [N·s/m].
+
+        Args:
+            speed: cutting speed [m/s].
+            wear: VB [m].
+        """
+        return self.pressure * self.width * (self.land + wear) ** 2 / (2.0 * speed)
 
 
 @dataclass(frozen=True)
@@ -200,6 +236,7 @@ class Process(NamedTuple):
         spots: shape (m, 5).
         heights, compliances: shape (m,).
         grid: points in a revolution.
+        pressure, width, land: see `Flank`.
     """
 
     step: float
@@ -221,6 +258,9 @@ class Process(NamedTuple):
     heights: Array
     compliances: Array
     grid: int
+    pressure: float
+    width: float
+    land: float
 
 
 @inlined
@@ -241,6 +281,25 @@ def _within(angle: float, start: float, width: float) -> bool:
     """Whether an angle lies in a window [rad]; windows may lie across the zero."""
     since = (angle - start) / _TURN
     return bool((since - np.floor(since)) * _TURN < width)
+
+
+@inlined
+def _missing(gaps: Array, angle: float) -> bool:
+    """Whether there is no material at an angle [rad]."""
+    missing = False
+    for i in range(gaps.shape[0]):
+        missing |= _within(angle, gaps[i, 0], gaps[i, 1])
+    return missing
+
+
+@inlined
+def _pressed(process: Process, speed: float, wear: float) -> float:
+    """What the flank's force takes for each metre that the edge moves out of the part in a sample [N/m], times σ."""
+    if process.pressure == 0.0:
+        return 0.0
+    land = process.land + wear
+    damping = process.pressure * process.width * land * land / (2.0 * process.radius * speed)
+    return float(process.sign * damping / process.step)
 
 
 @inlined
@@ -282,7 +341,8 @@ class CutTable(NamedTuple):
     Attributes:
         process: its constants.
         lag_state, mode_state: of F and w.
-        state: VB, the last angle's place on the grid, what is remembered of it, the next grid point.
+        state: VB, the last angle's place on the grid, what is remembered of it, the next grid point, and where the edge
+            was; NaN before the first sample.
         surface: the remembered surface.
         counts: see `CuttingProcess.apart` and `CuttingProcess.backwards`.
     """
@@ -321,6 +381,13 @@ def held(cut: CutTable) -> float:
 
 
 @inlined
+def _moved(cut: CutTable, base: float) -> float:
+    """How far the edge is from where it was a sample before, as far as the tool is not bent [m]."""
+    before = cut.state[_EDGE]
+    return 0.0 if np.isnan(before) else base - before
+
+
+@inlined
 def chip_of(
     cut: CutTable,
     place: float,
@@ -331,32 +398,41 @@ def chip_of(
     stiffness: float,
     compliance: float,
     give: float,
+    pressed: float,
 ) -> float:
     """Depth of cut [m] of a sample, negative where the edge is clear of the part; NaN: it is drawn in without end.
 
     ``displacement`` of the tool drives is that with the force `held`, to which they give way by ``give`` [m/N] of what
-    the chip adds to it.
+    the chip adds to it. ``pressed``: see `_pressed`; where it is not 0, ``give`` is.
     """
     process, lag_now = cut.process, cut.process.lag_now
     chip = process.depth + allowance - cross_position - displacement
     if process.overlap > 0.0:
         chip += process.overlap * _read(cut.surface, place - process.grid)
-    bend = process.mode_now * lag_now * stiffness * compliance + lag_now * stiffness * give
+    follows = 1.0 + process.mode_now * pressed * compliance
+    bend = (process.mode_now * lag_now * stiffness * compliance + lag_now * stiffness * give) / follows
     if not 1.0 + bend > 0.0:
         return np.nan
-    chip -= compliance * (_free(process.mode, cut.mode_state) + process.mode_now * held(cut))
+    lagging = held(cut) - pressed * _moved(cut, cross_position + displacement)
+    chip -= compliance * (_free(process.mode, cut.mode_state) + process.mode_now * lagging) / follows
     chip /= 1.0 + bend
-    for i in range(process.gaps.shape[0]):
-        if _within(angle, process.gaps[i, 0], process.gaps[i, 1]):
-            chip = 0.0
-    return float(chip)
+    return 0.0 if _missing(process.gaps, angle) else float(chip)
 
 
 @inlined
-def press(cut: CutTable, chip: float, stiffness: float, compliance: float, speed: float) -> tuple[float, float]:
-    """Step force [N] and deflection [m] on by a sample with a chip of 0 or more; the tool wears."""
+def press(
+    cut: CutTable, chip: float, stiffness: float, compliance: float, speed: float, base: float, pressed: float
+) -> tuple[float, float]:
+    """Step force [N] and deflection [m] on by a sample with a chip of 0 or more; the tool wears.
+
+    ``base``: place of the edge but for its deflection [m]; ``pressed``: see `_pressed`.
+    """
     process, state = cut.process, cut.state
+    free = _free(process.mode, cut.mode_state)
     force = step(process.lag, cut.lag_state, stiffness * chip)
+    if chip > 0.0 and pressed != 0.0:
+        follows = 1.0 + process.mode_now * pressed * compliance
+        force -= pressed * (_moved(cut, base) + compliance * (free + process.mode_now * force)) / follows
     deflection = compliance * step(process.mode, cut.mode_state, force)
     if chip > 0.0:
         path = process.per_metre * process.radius * speed
@@ -366,9 +442,10 @@ def press(cut: CutTable, chip: float, stiffness: float, compliance: float, speed
 
 @inlined
 def leave(cut: CutTable, place: float, chip: float, edge: float) -> None:
-    """Remember where the edge [m] has been, if it is met again."""
+    """Remember where the edge [m] is, and where it has been if that is met again."""
     if cut.process.overlap > 0.0:
         _remember(cut.surface, cut.state, place, edge if chip > 0.0 else 0.0)
+    cut.state[_EDGE] = edge
 
 
 @kernel
@@ -395,16 +472,18 @@ def cut_along(
         if reason != _DONE:
             return k, reason
         wear[k] = cut.state[_WEAR]
+        pressed = _pressed(cut.process, speed[k], wear[k])
         chip = chip_of(
-            cut, place, angle[k], cross_position[k], displacement[k], allowance[k], stiffness, compliance, 0.0
+            cut, place, angle[k], cross_position[k], displacement[k], allowance[k], stiffness, compliance, 0.0, pressed
         )
         if np.isnan(chip):
             return k, DRAWN_IN
         cut.counts[_BACKWARDS] += feed_velocity[k] < 0.0
         cut.counts[_APART] += chip < 0.0
         depth_of_cut[k] = chip = max(chip, 0.0)
-        force[k], deflection[k] = press(cut, chip, stiffness, compliance, speed[k])
-        leave(cut, place, chip, cross_position[k] + displacement[k] + deflection[k])
+        base = cross_position[k] + displacement[k]
+        force[k], deflection[k] = press(cut, chip, stiffness, compliance, speed[k], base, pressed)
+        leave(cut, place, chip, base + deflection[k])
     return angle.size, _DONE
 
 
@@ -425,6 +504,7 @@ class CuttingProcess:
         part: keyways, hard spots, compliance along the part.
         overlap: µ, how much of the last revolution's surface the edge meets again, 0 up to 1; 0: no regeneration.
         grid: points in a revolution at which the surface is remembered.
+        flank: process damping.
         step: sampling step [s].
 
     Attributes:
@@ -448,6 +528,7 @@ class CuttingProcess:
         part: Part | None = None,
         overlap: float = 0.0,
         grid: int = 4096,
+        flank: Flank | None = None,
         step: float,
     ) -> None:
         if not (lag == 0.0 or step / 1000.0 <= lag < np.inf):
@@ -458,7 +539,7 @@ class CuttingProcess:
             raise InputError(f"cutting: overlap {overlap:g}; allowed: 0 (no regeneration) up to 1")
         if grid < 16:
             raise InputError(f"cutting: {grid} grid points in a revolution; allowed: 16 or more")
-        part, wear = part or Part(), wear or Wear()
+        part, wear, flank = part or Part(), wear or Wear(), flank or Flank()
         following = discretise(TransferFunction((1.0,), (lag, 1.0)), step, "foh")
         mode = discretise(elasticity.shape, step, "foh")
         heights, compliances = part.heights, part.compliances
@@ -484,12 +565,15 @@ class CuttingProcess:
             heights=np.ascontiguousarray(heights, dtype=np.float64),
             compliances=np.ascontiguousarray(compliances, dtype=np.float64),
             grid=grid,
+            pressure=flank.pressure,
+            width=flank.width,
+            land=flank.land,
         )
         self.table = CutTable(
             process=self._whole,
             lag_state=rest(following),
             mode_state=rest(mode),
-            state=np.array([wear.initial, np.nan, 0.0, 0.0]),
+            state=np.array([wear.initial, np.nan, 0.0, 0.0, np.nan]),
             # A power of two, so that a mask wraps the index; a sample may be up to a revolution long.
             surface=np.zeros(1 << (2 * grid + 2).bit_length()),
             counts=np.zeros(2, dtype=np.int64),

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feed drive of a slide, cross or longitudinal: a linear model with limits, and a screw with backlash.
 
-    command → sampling → ± limit, held → model with a limited speed → backlash → slide
+    command → sampling → ± limit, held → model with a limited speed → screw → backlash → slide
+                                           ↑ friction
+
+Friction is in `lathe_rc.plants.friction`, errors of the screw in `lathe_rc.plants.screw`.
 
 Models, each the position over the command:
 
@@ -40,7 +43,9 @@ from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.placed import sized
 from lathe_rc.plants.backlash import follow
+from lathe_rc.plants.friction import LUGRE, NONE, STRIBECK, Friction, FrictionTable, bend, no_friction, slide
 from lathe_rc.plants.linear import discretise
+from lathe_rc.plants.screw import Screw, ScrewTable, nut, nut_speed, warm
 from lathe_rc.signals.noise import quantise
 from lathe_rc.transfer import TransferFunction
 
@@ -49,11 +54,12 @@ Complex = npt.NDArray[np.complex128]
 Feedback = Literal["motor", "load"]
 
 # Places in a drive's state, from the end; before them the motor's position, speed, … and room for their next values.
-_DISTURBANCE, _EFFORT, _LOAD = -3, -2, -1
+_WARMTH, _BRISTLE, _DISTURBANCE, _EFFORT, _LOAD = -5, -4, -3, -2, -1
 
 _UNDISTURBED = np.empty(0)
 _UNTOLD = np.empty(0, np.uint8)
 _FREE = CommandLimits()
+_PERFECT = Screw()
 
 APPROXIMATE_LAGS = (0.17, 0.22)  #: [s] of W1, 11.79/((0.17p+1)(0.22p+1)) (paper 004)
 FULL_LAGS = (0.11304, 0.2679, 0.01659, 0.01659)  #: [s] of the W1 that meets the step data printed in paper 004
@@ -113,6 +119,9 @@ class DriveTable(NamedTuple):
         needed: command that keeps that speed; infinite where none does.
         furthest: travel in a step at that speed [m].
         half: half the backlash [m].
+        friction: of the slide.
+        rubbed: what 1 N of friction, held over a step, takes from x, shape (m,).
+        screw: between motor and slide.
     """
 
     transition: Array
@@ -123,6 +132,9 @@ class DriveTable(NamedTuple):
     needed: float
     furthest: float
     half: float
+    friction: FrictionTable
+    rubbed: Array
+    screw: ScrewTable
 
 
 class LimitTable(NamedTuple):
@@ -169,6 +181,24 @@ def load_of(state: Array) -> float:
 
 
 @inlined
+def _rub(table: DriveTable, state: Array) -> None:
+    """Take friction from the next values, which stand behind the present ones."""
+    order = table.weights.size
+    speed, free, gained = state[1], state[order + 1], table.rubbed[1]
+    force, rests = 0.0, False
+    if table.friction.law == STRIBECK:
+        force, rests = slide(table.friction, gained, speed, free)
+    elif table.friction.law == LUGRE:
+        force, state[_BRISTLE] = bend(table.friction, gained, speed, free, state[_BRISTLE])
+    for row in range(order):
+        state[order + row] -= table.rubbed[row] * force
+    if rests:
+        state[order + 1] = 0.0
+        if speed == 0.0:
+            state[order] = state[0]
+
+
+@inlined
 def move(table: DriveTable, state: Array) -> bool:
     """Step a drive with the command that it holds; returns whether it is at its greatest speed."""
     order = table.weights.size
@@ -178,6 +208,8 @@ def move(table: DriveTable, state: Array) -> bool:
         for column in range(order):
             total += table.transition[row, column] * state[column]
         state[order + row] = total
+    if table.friction.law != NONE:
+        _rub(table, state)
     for row in range(order):
         state[row] = state[order + row]
     travel, speed = state[0] - before, state[1]
@@ -189,7 +221,11 @@ def move(table: DriveTable, state: Array) -> bool:
             enough = min(max(effort, -table.needed), table.needed)
             for row in range(2, order):
                 state[row] = -table.jumps[row - 1] * enough
-    state[_LOAD] = follow(state[_LOAD], table.half, state[0])
+    place = state[0]
+    if table.screw.real:
+        state[_WARMTH] = warm(table.screw, state[_WARMTH], state[1])
+        place = nut(table.screw, state[_WARMTH], place)
+    state[_LOAD] = follow(state[_LOAD], table.half, place)
     return limited
 
 
@@ -257,7 +293,10 @@ def advance(
         state[_DISTURBANCE] = disturbance[k] if disturbance.size else 0.0
         motor[k], position[k], effort[k] = state[0], state[_LOAD], state[_EFFORT]
         # Within the gap the slide stands.
-        velocity[k] = state[1] if table.half == 0.0 or state[_LOAD] != before else 0.0
+        speed = state[1]
+        if table.screw.real:
+            speed = nut_speed(table.screw, state[_WARMTH], state[0], speed)
+        velocity[k] = speed if table.half == 0.0 or state[_LOAD] != before else 0.0
         seen = state[_LOAD] if feed.from_load else state[0]
         measured[k] = quantise(seen, feed.resolution)
     feed.counts[0] += saturated
@@ -282,6 +321,22 @@ def _realise(model: TransferFunction) -> tuple[Array, Array]:
     impulse = np.eye(1, order + 1)[0]
     markov = scipy.signal.lfilter(np.concatenate((np.zeros(bottom.size - top.size), top)), bottom, impulse)
     return a, np.asarray(markov[1:])
+
+
+def _rubbed(model: TransferFunction, friction: Friction, step: float) -> Array:
+    """What 1 N of friction, held over a step, takes from position, speed, …, shape (m,).
+
+    Raises:
+        InputError: the friction acts on a lag that the drive does not have.
+    """
+    lags, rest = np.polydiv(model.denominator, friction.mobility.denominator)
+    if np.abs(rest).max() > 1e-9 * np.abs(model.denominator).max():
+        raise InputError(
+            f"feed drive {model}: friction with a mobility {friction.mobility}; allowed: one whose poles the drive has"
+        )
+    a, b = _realise(TransferFunction(tuple(np.polymul(friction.mobility.numerator, lags)), model.denominator))
+    linear = discretise(a, b, 0.0, step, "foh")
+    return np.ascontiguousarray(linear.weights[:, 0] + linear.weights[:, 1])
 
 
 def _settles(model: TransferFunction) -> tuple[float, bool]:
@@ -323,6 +378,8 @@ class FeedDrive:
         resolution: of the position sensor [m]; 0 for none.
         feedback: where the position sensor is.
         limits: of the motion that the command asks for.
+        friction: of the slide; None: it has none.
+        screw: between motor and slide; perfect by default.
 
     Attributes:
         table: its constants for `move` and `hold`.
@@ -331,8 +388,8 @@ class FeedDrive:
         integrates: whether the command stands for a speed.
 
     Raises:
-        InputError: a model whose speed would jump with the command, a value that is out of range, or limits for a
-            command that stands for neither a position nor a speed.
+        InputError: a model whose speed would jump with the command, a value that is out of range, limits for a
+            command that stands for neither a position nor a speed, or friction that does not fit the model.
     """
 
     def __init__(
@@ -347,6 +404,8 @@ class FeedDrive:
         resolution: float = 0.0,
         feedback: Feedback = "load",
         limits: CommandLimits = _FREE,
+        friction: Friction | None = None,
+        screw: Screw = _PERFECT,
     ) -> None:
         for name, value, allowed in (
             ("divisor", divisor, divisor >= 1),
@@ -365,6 +424,11 @@ class FeedDrive:
         # A model that integrates needs a certain command for a certain speed.
         gain, self.integrates = _settles(model)
         needed = speed_limit / gain if self.integrates and gain > 0.0 else np.inf
+        if friction and np.isfinite(speed_limit) and held.size > 2:
+            raise InputError(
+                f"feed drive: speed limit = {speed_limit:g} m/s with friction and {held.size - 1} lags; allowed: one "
+                "lag, or one of both"
+            )
         self.table = DriveTable(
             transition=np.ascontiguousarray(linear.transition),
             weights=held,
@@ -374,8 +438,11 @@ class FeedDrive:
             needed=float(needed),
             furthest=float(speed_limit * step),
             half=backlash / 2.0,
+            friction=friction.table(step) if friction else no_friction(step),
+            rubbed=_rubbed(model, friction, step) if friction else np.zeros(held.size),
+            screw=screw.table(step),
         )
-        self.state = np.zeros(2 * held.size + 3)
+        self.state = np.zeros(2 * held.size + 5)
         self._step = step
         self.whole = FeedTable(
             drive=self.table,
@@ -400,7 +467,10 @@ class FeedDrive:
         return int(self.whole.counts[1])
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Motor over command, as the difference equation has it, at ``frequency`` [rad/s]; limits and divisor apart."""
+        """Motor over command, as the difference equation has it, at ``frequency`` [rad/s].
+
+        Limits, divisor and friction are left out.
+        """
         z = np.exp(1j * np.asarray(frequency, dtype=np.float64) * self._step)
         weights = self.table.weights
         whole = z[..., None, None] * np.eye(weights.size) - self.table.transition
@@ -427,7 +497,7 @@ class FeedDrive:
             position: of the slide [m].
             velocity: of the slide [m/s].
             effort: what the motor is given from this sample on: the command, sampled and cut off.
-            motor: position of the motor, on the slide's scale [m].
+            motor: position of the motor, on the slide's scale by a perfect screw [m].
             measured: that of the two which the sensor sees, as it reads it [m].
             disturbance: adds to the limited command, in its unit (f of paper 002, eq. 2); none if empty.
             clipped: filled with 1 where the command that is held is not what it was when it was taken; needed if there

@@ -224,12 +224,12 @@ def _chip(
         x1 = _carriage(drive, free, e, kept)
         displacement = x1 + (displacement - x1)
     give = drive.radial * drive.load[tool, 0]
-    chip = chip_of(cut, place, angle, cross_position, displacement - met, allowance, stiffness, c, give)
+    chip = chip_of(cut, place, angle, cross_position, displacement - met, allowance, stiffness, c, give, 0.0)
     if not drive.series:
         x1 = free[0] + drive.load[0, 0] * (kept + drive.radial * cut.process.lag_now * stiffness * max(chip, 0.0))
         if abs(x1) > drive.carriage_stroke:  # an end stop holds it, and it does not give way
             x1 = drive.carriage_stroke if x1 > 0.0 else -drive.carriage_stroke
-            chip = chip_of(cut, place, angle, cross_position, x1 - met, allowance, stiffness, c, 0.0)
+            chip = chip_of(cut, place, angle, cross_position, x1 - met, allowance, stiffness, c, 0.0, 0.0)
     return chip
 
 
@@ -334,7 +334,7 @@ def advance_loaded(
         cut.counts[_BACKWARDS] += feed_velocity[k] < 0.0
         cut.counts[_APART] += chip < 0.0
         depth_of_cut[k] = chip = max(chip, 0.0)
-        force[k], deflection[k] = press(cut, chip, stiffness, c, speed[k])
+        force[k], deflection[k] = press(cut, chip, stiffness, c, speed[k], 0.0, 0.0)
         _settle(drive, free, e, drive.radial * force[k], noise[k])
         carriage[k], carriage_velocity[k], measured[k] = state[0], state[1], drive.reading[0]
         current[k] = (drive.spring * (delayed - state[0]) - drive.damper * state[1]) * drive.force_per_current

@@ -7,11 +7,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.jit import kernel
+from lathe_rc.signals.encoder_errors import EncoderErrors, ErrorsTable, rate, seen, seen_along
 from lathe_rc.signals.speed import SpeedLaw, evaluate_along
 
 Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
+_PERFECT = EncoderErrors()
 
 
 class EncoderTable(NamedTuple):
@@ -21,6 +23,7 @@ class EncoderTable(NamedTuple):
         step: sampling step [s].
         nominal, lines, tachogram: of the speed law.
         counts: per revolution; 0 for an ideal encoder.
+        errors: of its disc and signals.
         history: the last angles, shape (speed_window,); sample n stands at n modulo its length.
         revolution: of the last sample, shape (1,).
     """
@@ -30,6 +33,7 @@ class EncoderTable(NamedTuple):
     lines: Array
     tachogram: Array
     counts: int
+    errors: ErrorsTable
     history: Array
     revolution: Array
 
@@ -68,10 +72,16 @@ def read_off(
     """Fill what is measured of the true angle and speed."""
     step, counts, history, revolution = encoder.step, encoder.counts, encoder.history, encoder.revolution
     before = revolution[0]
-    if counts == 0:
+    if encoder.errors.real:
+        for k in range(angle.size):
+            angle[k] = seen(encoder.errors, angle_true[k])
+            speed[k] = speed_true[k] * rate(encoder.errors, angle_true[k])
+    else:
         for k in range(angle.size):
             angle[k], speed[k] = angle_true[k], speed_true[k]
-            whole = np.floor(angle_true[k] / _TURN)
+    if counts == 0:
+        for k in range(angle.size):
+            whole = np.floor(angle[k] / _TURN)
             index_pulse[k] = whole > before
             before = whole
     else:
@@ -79,7 +89,7 @@ def read_off(
         place = first % window
         for k in range(angle.size):
             # Whole revolutions apart, so that they are exact whatever the counts are.
-            count = np.floor(angle_true[k] * counts / _TURN)
+            count = np.floor(angle[k] * counts / _TURN)
             whole = np.floor(count / counts)
             angle[k] = whole * _TURN + (count - whole * counts) * _TURN / counts
             # The oldest angle of the ring stands where the new one goes.
@@ -97,19 +107,26 @@ class Encoder:
     Args:
         law: spindle speed law.
         step: sampling step [s].
-        counts: counts per revolution after quadrature; 0 for an ideal encoder, whose angle and speed are true.
+        counts: counts per revolution after quadrature; 0 for an encoder that does not round: without errors its
+            angle and speed are true.
         speed_window: samples over which the measured speed is a difference of the measured angle; it lags
             by half of them. Before sample 0 the spindle is taken to have turned at its nominal speed.
+        errors: of its disc and signals; none by default.
 
     Attributes:
         table: for `encode`.
     """
 
-    def __init__(self, law: SpeedLaw, step: float, counts: int, speed_window: int) -> None:
+    def __init__(
+        self, law: SpeedLaw, step: float, counts: int, speed_window: int, errors: EncoderErrors = _PERFECT
+    ) -> None:
         before = np.arange(-speed_window, 0, dtype=np.float64)
         # history[n % window] holds the angle of sample n; these are the samples before the first.
         history: Array = before * (law.nominal * step)
-        self.table = EncoderTable(step, law.nominal, law.lines, law.tachogram, counts, history, np.array([-1.0]))
+        table = errors.table
+        if table.real:
+            seen_along(table, history, history)
+        self.table = EncoderTable(step, law.nominal, law.lines, law.tachogram, counts, table, history, np.array([-1.0]))
 
     def block(
         self,

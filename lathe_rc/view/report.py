@@ -19,12 +19,14 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from lathe_rc import __version__
 from lathe_rc.analysis.budget import TOLD, Budget
+from lathe_rc.analysis.metrology import Lay
 from lathe_rc.analysis.tolerance import Verdict
 from lathe_rc.bag.story import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS, origins, scenario_of
 from lathe_rc.cell import messages
 from lathe_rc.cell.budget import budget
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place, replacing
+from lathe_rc.part import along_in_words
 from lathe_rc.view import report_figures as figures
 from lathe_rc.view.report_form import CUTOFF, Form
 from lathe_rc.view.report_gather import Gathered, gather
@@ -143,6 +145,12 @@ def _form(form: Form, cycles: Mapping[str, Envelope]) -> FormSection:
             f"{page}, docs/learning.md",
         ),
     ]
+    if isinstance(form.surface, Lay):
+        told = along_in_words(form.surface)
+        caption = f"{told[0].upper()}{told[1:]}. What nose and feed leave, by the tool's nose_radius."
+        pictures.append(Picture("Surface along the part", figures.along(form.surface), caption, page))
+    elif form.surface:
+        refused = f"{refused} {form.surface}".strip()
     return FormSection(printable(form.tool), refused, _metrics(form), pictures)
 
 

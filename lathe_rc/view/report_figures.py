@@ -12,6 +12,7 @@ from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 
+from lathe_rc.analysis.metrology import Lay
 from lathe_rc.cell.messages import Samples
 from lathe_rc.view.report_form import Form, Revolution
 from lathe_rc.view.report_gather import Gathered
@@ -84,6 +85,22 @@ def form_map(form: Form) -> str:
     bar.set_ticks([*-ticks[::-1], 0.0, *ticks], labels=[f"{tick:.3g}" for tick in (*-ticks[::-1], 0.0, *ticks)])
     bar.ax.minorticks_off()
     bar.set_label("radius deviation [µm]", fontsize=9)
+    return _svg(figure)
+
+
+def along(surface: Lay) -> str:
+    """The surface along the part over angle and height, and one trace of it."""
+    figure = _figure(3.2)
+    whole, trace = figure.subplots(1, 2, width_ratios=(3, 2))
+    closed = _um(np.concatenate((surface.surface, surface.surface[:1])))
+    place = np.clip(surface.height, -_MOST_LENGTH, _MOST_LENGTH) * 1e3
+    degrees = np.linspace(0, 360, closed.shape[0])
+    mesh = whole.pcolormesh(degrees, place, closed.T, shading="gouraud", cmap="viridis", rasterized=True)
+    whole.set(xlabel="spindle angle [°]", ylabel="height [mm]", xticks=range(0, 361, 90))
+    figure.colorbar(mesh, ax=whole, pad=0.01).set_label("radius deviation [µm]", fontsize=9)
+    trace.plot(place, closed[0], color=LAST, lw=1.0)
+    trace.set(xlabel="height [mm]", ylabel="radius deviation at 0° [µm]")
+    _grid(trace)
     return _svg(figure)
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The form of the part from a stream: measured revolution by revolution as soon as each is complete."""
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc import part
-from lathe_rc.analysis.metrology import POINTS, Measurement, measure
+from lathe_rc.analysis.metrology import POINTS, Lay, Measurement, evenly, lay, measure
 from lathe_rc.analysis.tolerance import Judge, Verdict
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.stage import Sparse
@@ -19,6 +20,7 @@ ACROSS = 512  #: angles of the map
 CUTOFF = 50.0  #: of the filters for roundness and roughness [UPR], as of `lathe measure`
 _MARGIN = 64  # samples on each side that a spline needs to be the one through the whole run, to a bit or two
 _AT_ONCE = 16  # revolutions
+_ALONG = 8  # revolutions that the surface along the part is made of
 _LONGEST = 2**22  # samples of one revolution
 _TURN = 2.0 * np.pi
 
@@ -45,19 +47,24 @@ class Form:
         encoder: topic with the angle.
         tool: topic with the form error.
         tolerance: form error that is allowed to each side [m]; 0: none.
+        nose_radius: of the tool in the plane of the feed [m]; 0: nobody asks for the surface along the part.
 
     Attributes:
         tool: see above.
         first, last, best: revolutions, the best by RMS; None before there is one.
         rms, largest: envelope by revolution [m].
         map: radius deviation [m], by revolution and angle.
+        surface: along the part, or why there is none; None if nobody asks.
         refused: why the form, or its rest, is not measured; empty if it is.
     """
 
-    def __init__(self, encoder: str, tool: str, tolerance: float = 0.0) -> None:
+    def __init__(self, encoder: str, tool: str, tolerance: float = 0.0, nose_radius: float = 0.0) -> None:
         self._encoder, self.tool, self._tolerance = encoder, tool, tolerance
+        self._nose_radius = nose_radius
         self._judge: Judge | None = None
-        self._angle, self._error = np.empty(0), np.empty(0)
+        self._angle, self._error, self._height = np.empty(0), np.empty(0), np.empty(0)
+        self._along = deque[tuple[Samples, Samples]](maxlen=_ALONG)  # profiles and heights
+        self.surface: Lay | str | None = None
         self._done = 0  # revolutions measured; the arrays go back to a margin before the next
         self.first: Revolution | None = None
         self.last: Revolution | None = None
@@ -74,6 +81,8 @@ class Form:
                 self._done = int(np.ceil(dense[self._encoder]["angle_true"][0] / _TURN))
             self._angle = np.concatenate([self._angle, dense[self._encoder]["angle_true"]])
             self._error = np.concatenate([self._error, dense[self.tool]["error"]])
+            if self._nose_radius:
+                self._height = np.concatenate([self._height, dense[self.tool]["height"]])
             self._measure(_MARGIN)
 
     @property
@@ -85,6 +94,13 @@ class Form:
         """Measure what is left."""
         if not self.refused:
             self._measure(0)
+        if self._nose_radius and self._along:
+            try:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    profiles, heights = (np.array(rows) for rows in zip(*self._along, strict=True))
+                    self.surface = lay(profiles, heights, self._nose_radius)
+            except InputError as error:
+                self.surface = str(error)
 
     def _measure(self, margin: int) -> None:
         """Measure the complete revolutions that end ``margin`` samples or more before the newest."""
@@ -95,7 +111,7 @@ class Form:
                     pass
         except InputError as error:
             self.refused = f"{error} (after revolution {self._done})"
-            self._angle = self._error = np.empty(0)
+            self._angle = self._error = self._height = np.empty(0)
 
     def _check(self) -> None:
         """Refuse what would take memory or give no form.
@@ -104,7 +120,7 @@ class Form:
             InputError: says why.
         """
         step = np.diff(self._angle)
-        if not (np.isfinite(self._angle).all() and np.isfinite(self._error).all()):
+        if not all(np.isfinite(signal).all() for signal in (self._angle, self._error, self._height)):
             raise InputError("samples that are not finite")
         if step.size and not (step.min() > 0.0 and step.max() < _TURN / 3):
             raise InputError("the angle does not increase, or by more than a third of a turn in a sample")
@@ -126,9 +142,12 @@ class Form:
         if not whole:
             return False
         self._take(found, whole)
+        if self._nose_radius:
+            heights = evenly(angle[:stop], self._height[:stop])
+            self._along.extend(zip(found.profile[:whole], heights[:whole], strict=True))
         self._done += whole
         keep = max(0, int(np.searchsorted(angle, whole * _TURN)) - _MARGIN)
-        self._angle, self._error = self._angle[keep:], self._error[keep:]
+        self._angle, self._error, self._height = self._angle[keep:], self._error[keep:], self._height[keep:]
         return True
 
     def _take(self, found: Measurement, whole: int) -> None:

@@ -11,6 +11,7 @@ from lathe_rc import happened
 from lathe_rc.bag import story
 from lathe_rc.bag.snapshot import first_sample, span_of
 from lathe_rc.bag.source import Source
+from lathe_rc.bag.story import nose_radius
 from lathe_rc.bag.stream import Feeder
 from lathe_rc.cell import messages
 from lathe_rc.cell.messages import Samples, Signals
@@ -166,8 +167,9 @@ def gather(path: Path) -> Gathered:
         types = {topic: found.type for topic, found in source.topics.items()}
         encoders = of_type(types, messages.ENCODER)
         allowed, unjudged = _tolerances(source.about)
+        nose = nose_radius(source.about)
         tools = of_type(types, messages.TOOL) if encoders else []
-        forms = [Form(encoders[0], tool, _of(tool, allowed)) for tool in tools]
+        forms = [Form(encoders[0], tool, _of(tool, allowed), nose) for tool in tools]
         curves = Curves(types)
         told = Gathered(source.about, {topic: Tally(kind) for topic, kind in sorted(types.items())}, forms, curves)
         told.unjudged = unjudged

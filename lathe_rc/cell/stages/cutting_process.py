@@ -21,6 +21,7 @@ from lathe_rc.plants.cutting import (
     CutTable,
     CuttingProcess,
     Elasticity,
+    Flank,
     HardSpot,
     Part,
     Wear,
@@ -60,6 +61,13 @@ class CuttingProcessParameters(NodeParameters):
     wear: Annotated[float, Ge(0)] = parameter(0.0, "wear VB at sample 0", "m")
     wear_per_metre: Annotated[float, Ge(0)] = parameter(0.0, "its growth with the cutting path", "1")
     wear_per_second: Annotated[float, Ge(0)] = parameter(0.0, "its growth with the time in the cut", "m/s")
+    flank_pressure: Annotated[float, Ge(0)] = parameter(
+        0.0, "process damping: force by the volume that the flank presses in; 4e13 for steel; 0: none", "N/m^3"
+    )
+    flank_width: Annotated[float, Gt(0)] = parameter(0.2e-3, "process damping: width of the flank along the edge", "m")
+    flank_land: Annotated[float, Ge(0)] = parameter(
+        0.05e-3, "process damping: land of a new edge, to which the wear VB adds", "m"
+    )
     lag: Annotated[float, Ge(0)] = parameter(0.075, "time constant of the force; 0: none", "s")
     allowance_rms: Annotated[float, Ge(0)] = parameter(
         0.0, "random allowance: RMS; 20.7e-6 is the 4.83 N RMS of paper 004; 0: none", "m"
@@ -184,6 +192,7 @@ class CuttingProcessParameters(NodeParameters):
                 wear=Wear(self.wear, self.wear_per_metre, self.wear_per_second),
                 part=part,
                 overlap=self.regeneration,
+                flank=Flank(self.flank_pressure, self.flank_width, self.flank_land),
                 step=self.step,
             )
 

@@ -22,9 +22,12 @@ from lathe_rc.cell.stages.obedience import (
     listens,
     piece,
 )
+from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants import feed
 from lathe_rc.plants.feed import Feedback, FeedDrive, FeedTable, advance
+from lathe_rc.plants.friction import Friction, mobility
+from lathe_rc.plants.screw import Screw
 from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.example_002 import fill_disturbance
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
@@ -78,6 +81,31 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
         0.0, "amplitude of f(t) = A·sin²(0.04πt s⁻¹), added to the limited command; 0.5 in eq. 18 of paper 002"
     )
     backlash: Annotated[float, Ge(0)] = parameter(0.0, "gap between motor and slide", "m")
+    friction: Literal["none", "stribeck", "lugre"] = parameter(
+        "none", "of the slide; lugre: with presliding; of a dc_screw or sampled drive, at its longest lag"
+    )
+    motor_force: Annotated[float, Gt(0)] = parameter(
+        1000.0, "friction: force of the motor on the slide at a command of 1, at rest", "N"
+    )
+    friction_coulomb: Annotated[float, Gt(0)] = parameter(200.0, "friction: force in motion, Fc", "N")
+    friction_static: Annotated[float, Gt(0)] = parameter(300.0, "friction: greatest force at rest, Fs", "N")
+    friction_speed: Annotated[float, Gt(0)] = parameter(1e-3, "friction: speed vs at which it has fallen to Fc", "m/s")
+    friction_viscous: Annotated[float, Ge(0)] = parameter(
+        0.0, "friction: growth with the speed Fv, beside what the lags contain", "N*s/m"
+    )
+    friction_stiffness: Annotated[float, Gt(0)] = parameter(1e7, "lugre: stiffness of the bristles σ0", "N/m")
+    friction_damping: Annotated[float, Ge(0)] = parameter(1e4, "lugre: their damping σ1", "N*s/m")
+    pitch_slope: float = parameter(0.0, "screw: error of its pitch all along, as a part of the way; 0: none")
+    pitch_amplitude: float = parameter(0.0, "screw: amplitude of the error that repeats with the lead; 0: none", "m")
+    pitch_lead: Annotated[float, Gt(0)] = parameter(10e-3, "screw: lead", "m")
+    pitch_phase: float = parameter(0.0, "screw: phase of that error at the place 0", "rad")
+    screw_heating: Annotated[float, Ge(0)] = parameter(
+        0.0, "screw: rise of its temperature in the end, by the speed of the nut; 0: none", "K*s/m"
+    )
+    screw_surroundings: float = parameter(0.0, "screw: rise of its temperature in the end at rest; 0: none", "K")
+    screw_time: Annotated[float, Gt(0)] = parameter(1800.0, "screw: time constant of that", "s")
+    screw_expansion: Annotated[float, Ge(0)] = parameter(11.5e-6, "screw: growth with the temperature; steel", "1/K")
+    screw_anchor: float = parameter(0.0, "screw: place of the bearing that it grows from", "m")
     feedback: Feedback = parameter("load", "where the position sensor is: at the motor or at the load")
     noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
     resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
@@ -93,6 +121,53 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
         if self.model == "sampled":
             return feed.sampled(self.sampled_gain, self.sampled_lag)
         return feed.dc_screw(self.velocity_gain, self.lags or [0.045], self.zero)
+
+    def rubbing(self, node: str) -> Friction | None:
+        """The friction of a node, if it has any.
+
+        Raises:
+            InputError: a model whose lag of the mechanics nobody knows, or see `Friction`.
+        """
+        if self.friction == "none":
+            return None
+        if self.model == "fourth_order":
+            raise InputError(
+                f"{node}.friction = {self.friction} with model = fourth_order, whose mechanics are not told from the "
+                "rest; allowed: dc_screw or sampled"
+            )
+        gain, lags = self.velocity_gain, self.lags or [0.045]
+        if self.model == "sampled":
+            gain, lags = self.sampled_gain, [self.sampled_lag]
+        with about(node, "friction_coulomb", "friction_static"):
+            return Friction(
+                self.friction,
+                mobility(gain, max(lags), self.motor_force),
+                coulomb=self.friction_coulomb,
+                static=self.friction_static,
+                speed=self.friction_speed,
+                viscous=self.friction_viscous,
+                stiffness=self.friction_stiffness,
+                damping=self.friction_damping,
+            )
+
+    def screw(self, node: str) -> Screw:
+        """The screw of a node.
+
+        Raises:
+            InputError: see `Screw`.
+        """
+        with about(node, "pitch_slope", "pitch_amplitude", "pitch_lead"):
+            return Screw(
+                slope=self.pitch_slope,
+                lead=self.pitch_lead,
+                amplitude=self.pitch_amplitude,
+                phase=self.pitch_phase,
+                expansion=self.screw_expansion,
+                heating=self.screw_heating,
+                surroundings=self.screw_surroundings,
+                time=self.screw_time,
+                anchor=self.screw_anchor,
+            )
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
         """See `NodeParameters`."""
@@ -175,6 +250,7 @@ class FeedDriveStage(Stage):
         super().__init__(name, parameters)
         self.parameters = parameters
         limits = parameters.command_limits()
+        rubbing, screw = parameters.rubbing(name), parameters.screw(name)
         with about(name, *_COEFFICIENTS[parameters.model]):
             self.drive = FeedDrive(
                 parameters.transfer(),
@@ -185,6 +261,8 @@ class FeedDriveStage(Stage):
                 backlash=parameters.backlash,
                 feedback=parameters.feedback,
                 limits=limits,
+                friction=rubbing,
+                screw=screw,
             )
         self._clipping = Clipping(name, parameters)
         cuts = limits.any or bool(parameters.command_limit)

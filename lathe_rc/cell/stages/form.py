@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc import resources
 from lathe_rc.cell import messages
@@ -28,6 +28,7 @@ from lathe_rc.signals.profile import (
     read_csv,
     tabulated,
 )
+from lathe_rc.signals.tip_path import TipPath
 
 _OWN = ("harmonics", "piston", "polygon", "csv")
 #: by name, those of other packages: ours have parameters of their own
@@ -64,6 +65,19 @@ class FormParameters(NodeParameters):
     start_height: Annotated[float, Ge(0)] = parameter(0.0, "where along the part the run begins", "m")
     part_revolutions: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
         0, "feed: after so many revolutions the next part begins at start_height; 0: one endless part", "rev"
+    )
+    part_radius: Annotated[float, Gt(0)] = parameter(
+        0.05, "radius that the form deviates from, for tip_radius and clearance", "m"
+    )
+    tip_radius: Annotated[float, Ge(0)] = parameter(
+        0.0, "radius of the tool's tip in the plane across the spindle; 0: a point, which follows the form", "m"
+    )
+    tip_correction: bool = parameter(
+        default=True,
+        doc="the controllers are told the path that makes the tip turn the form; otherwise the form itself",
+    )
+    clearance: Annotated[float, Ge(0), Lt(1.5)] = parameter(
+        0.0, "clearance angle of the tool; a form on which its flank would rub is refused; 0: not looked at", "rad"
     )
 
     def known(self) -> Mapping[str, Value]:
@@ -114,13 +128,17 @@ class FormTable(NamedTuple):
     """A `Form` for kernels.
 
     Attributes:
-        heights, table: see `lathe_rc.signals.profile.ProfileTable`.
+        heights, table: see `lathe_rc.signals.profile.ProfileTable`; of where the tool has to be.
+        told: table of what the controllers take that for.
+        alike: whether both are the same.
         slide: number of the first input of the longitudinal slide, if that makes the height; 0: it does not.
         feed, start, part: otherwise, see `lathe_rc.signals.profile.height_along`.
     """
 
     heights: Samples
     table: Samples
+    told: Samples
+    alike: bool
     slide: int
     feed: float
     start: float
@@ -151,11 +169,11 @@ def evaluate(
         position, measured = inputs[form.slide], inputs[form.slide + 1]
     _place(form, angle_true, position, height)
     deviation_along(form.heights, form.table, angle_true, height, reference)
-    if equal(angle, angle_true) and equal(position, measured):
+    if form.alike and equal(angle, angle_true) and equal(position, measured):
         expected[:] = reference
     else:
         _place(form, angle, measured, expected)
-        deviation_along(form.heights, form.table, angle, expected.copy(), expected)
+        deviation_along(form.heights, form.told, angle, expected.copy(), expected)
 
 
 class Form:
@@ -166,21 +184,30 @@ class Form:
         parameters: its table.
 
     Attributes:
-        profile: its table.
+        surface: table of the form of the part.
+        profile: table of what the drives have to follow: the form, or the path of a round tip.
         inputs: what it reads.
         table: for `evaluate`.
 
     Raises:
-        InputError: see `FormParameters.form`; or a slide that shall begin anew.
+        InputError: see `FormParameters.form`; a form that the tip does not get into; or a slide that shall begin anew.
     """
 
     def __init__(self, node: str, parameters: FormParameters) -> None:
-        self.profile = tabulated(parameters.form(node))
+        form = parameters.form(node)
+        self.surface = self.profile = path = tabulated(form)
+        if parameters.tip_radius:
+            with about(node, "tip_radius"):
+                path = tabulated(TipPath(form, parameters.part_radius, parameters.tip_radius))
+            if parameters.tip_correction:
+                self.profile = path
         self.inputs = [Input("encoder", messages.ENCODER, ("angle", "angle_true"))]
         slides = parameters.height_from == "slide"
         self.table = FormTable(
-            heights=self.profile.heights,
-            table=self.profile.table,
+            heights=path.heights,
+            table=path.table,
+            told=self.profile.table,
+            alike=self.profile is path,
             slide=2 if slides else 0,
             feed=parameters.feed,
             start=parameters.start_height,

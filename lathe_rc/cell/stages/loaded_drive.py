@@ -2,7 +2,7 @@
 """Tool drives that feel the cutting force: drives and cut as one stage, for no block may cut what couples them."""
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -90,6 +90,15 @@ class LoadedParameters(ComposedParameters):
     radial_ratio: Annotated[float, Ge(0), Le(2)] = parameter(
         0.4, "radial part of the cutting force, which pushes the tool out of the part, over the main one"
     )
+
+    def model_post_init(self, context: Any, /) -> None:
+        """Refuse process damping: the flank's force would have to be solved with drives that give way to it."""
+        super().model_post_init(context)
+        if pressure := getattr(self, f"{_CUT}flank_pressure", 0.0):
+            raise InputError(
+                f"{_CUT}flank_pressure = {pressure:g}: no process damping under drives that give way; allowed: "
+                "0, or a cutting_process with drives of their own"
+            )
 
     @property
     def coarse(self) -> LoadedCoarseParameters:

@@ -2,23 +2,54 @@
 """Spindle and encoder: where time, angle and the run itself begin and end."""
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from annotated_types import Ge, Le
 
 from lathe_rc.cell import messages
 from lathe_rc.cell.native import Step
-from lathe_rc.cell.parameters import about
+from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.signals.encoder import Encoder, EncoderTable, encode
+from lathe_rc.signals.encoder_errors import EncoderErrors
 
 
 class SpindleEncoderParameters(TimeMasterParameters, SpeedLawParameters):
     """Speed law, encoder, and, for the time master of a cell, length and pace of the run."""
+
+    disc_eccentricity: Annotated[float, Ge(0), Le(0.5)] = parameter(
+        0.0, "encoder: eccentricity of its disc over the radius of its track; error once a revolution; 0: none", "rad"
+    )
+    disc_phase: float = parameter(0.0, "encoder: phase of that error at the angle 0", "rad")
+    signal_periods: Annotated[int, Ge(1), Le(10_000_000)] = parameter(
+        1024, "encoder: signal periods a revolution, for the errors within one"
+    )
+    signal_cosine_offset: float = parameter(0.0, "encoder: offset of the cosine signal, as a part of its amplitude")
+    signal_sine_offset: float = parameter(0.0, "encoder: the same of the sine signal")
+    signal_mismatch: float = parameter(0.0, "encoder: by how much the sine is larger than the cosine, as a part of it")
+    signal_skew: float = parameter(0.0, "encoder: what the two signals lack of a right angle", "rad")
+
+    def errors(self, node: str) -> EncoderErrors:
+        """Errors of a node's encoder.
+
+        Raises:
+            InputError: see `EncoderErrors`.
+        """
+        with about(node, "signal_cosine_offset", "signal_sine_offset", "signal_mismatch", "signal_skew"):
+            return EncoderErrors(
+                eccentricity=self.disc_eccentricity,
+                phase=self.disc_phase,
+                periods=self.signal_periods,
+                cosine_offset=self.signal_cosine_offset,
+                sine_offset=self.signal_sine_offset,
+                mismatch=self.signal_mismatch,
+                skew=self.signal_skew,
+            )
 
 
 @kernel
@@ -51,7 +82,8 @@ class SpindleEncoder(TimeMaster):
                 self.samples = self._law.samples_until(end, parameters.step)
         self._check_end()
         self.place_triggers()
-        self._encoder = Encoder(self._law, parameters.step, parameters.counts_per_revolution, parameters.speed_window)
+        counts, window = parameters.counts_per_revolution, parameters.speed_window
+        self._encoder = Encoder(self._law, parameters.step, counts, window, parameters.errors(name))
         loads = self._loads()
         outputs = [Output("encoder", messages.ENCODER, Joint("angle", "speed"))]
         self.declare(inputs=loads, outputs=outputs, tells=bool(loads))

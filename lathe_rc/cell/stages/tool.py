@@ -29,6 +29,9 @@ class ToolParameters(FormParameters):
         default=False,
         doc="the cross slide, positive into the part, counts in the form error; no drive's sensor sees it",
     )
+    nose_radius: Annotated[float, Ge(0)] = parameter(
+        0.0, "radius of its nose in the plane of the feed: the result tells the roughness along the part; 0: not", "m"
+    )
     deflects: bool = parameter(
         default=False, doc="the deflection by the cutting force is part of the form error; no drive's sensor sees it"
     )
@@ -89,7 +92,9 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     return error.size, DONE
 
 
-_ELSEWHERE = FormTable(np.empty(0), np.empty((0, 0, 0)), slide=0, feed=0.0, start=0.0, part=0)
+_ELSEWHERE = FormTable(
+    np.empty(0), np.empty((0, 0, 0)), np.empty((0, 0, 0)), alike=True, slide=0, feed=0.0, start=0.0, part=0
+)
 
 
 class Tool(Stage):

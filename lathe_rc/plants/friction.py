@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Friction of a slide: what its force takes from the speed of the motor, within a step.
+
+    g(v) = Fc + (Fs - Fc)·e^{-(v/vs)²}                               Stribeck curve, of the dry part
+    stribeck   F = g(v)·sgn v + Fv·v; at rest what holds the slide, up to Fs
+    lugre      dz/dt = v - σ0·|v|/g(v)·z,  F = σ0·z + σ1·dz/dt + Fv·v
+
+z is the mean deflection of bristles between the surfaces. At a steady speed LuGre gives the Stribeck curve; below Fs
+the slide rests on a spring of σ0 (presliding).
+
+The force of a step is solved together with the speed at its end, which is linear in it: a slide that the force can hold
+stands still to the bit, and no stiffness makes the step unstable. Within a step g is that of the speed at its start.
+
+Sources: B. Armstrong-Hélouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994) 1083 (Stribeck curve); C. Canudas de
+Wit, H. Olsson, K. J. Åström, P. Lischinsky, IEEE Trans. Automatic Control 40 (1995) 419 (LuGre).
+"""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import inlined
+from lathe_rc.transfer import TransferFunction
+
+Law = Literal["stribeck", "lugre"]
+
+NONE, STRIBECK, LUGRE = 0, 1, 2  #: of a `FrictionTable`
+_LAWS = {"stribeck": STRIBECK, "lugre": LUGRE}
+
+
+class FrictionTable(NamedTuple):
+    """A `Friction` for kernels.
+
+    Attributes:
+        law: `NONE`, `STRIBECK` or `LUGRE`.
+        coulomb, static, speed, viscous, stiffness, damping: see `Friction`.
+        step: sampling step [s].
+    """
+
+    law: int
+    coulomb: float
+    static: float
+    speed: float
+    viscous: float
+    stiffness: float
+    damping: float
+    step: float
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Friction of a slide, as the motor feels it.
+
+    Attributes:
+        law: see the module.
+        mobility: motor position over a force on it [m/N]; see `mobility`.
+        coulomb: Fc [N].
+        static: Fs [N], not below Fc.
+        speed: vs [m/s].
+        viscous: Fv [N·s/m], beside what the lag of the drive contains.
+        stiffness: σ0 of the bristles [N/m], ``lugre``.
+        damping: σ1 of the bristles [N·s/m], ``lugre``.
+
+    Raises:
+        InputError: a value that is out of its range.
+    """
+
+    law: Law
+    mobility: TransferFunction
+    coulomb: float
+    static: float
+    speed: float
+    viscous: float = 0.0
+    stiffness: float = 1e7
+    damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in (("force", self.coulomb), ("speed", self.speed), ("stiffness", self.stiffness)):
+            if not 0.0 < value < np.inf:
+                raise InputError(f"friction: {name} = {value:g}; allowed: above 0")
+        for name, value in (("viscous", self.viscous), ("damping", self.damping)):
+            if not 0.0 <= value < np.inf:
+                raise InputError(f"friction: {name} = {value:g}; allowed: 0 or more")
+        if not self.coulomb <= self.static < np.inf:
+            raise InputError(
+                f"friction: {self.static:g} N at rest and {self.coulomb:g} N in motion; allowed: no less at rest"
+            )
+
+    def table(self, step: float) -> FrictionTable:
+        """For kernels, at a sampling step [s]."""
+        return FrictionTable(
+            _LAWS[self.law], self.coulomb, self.static, self.speed, self.viscous, self.stiffness, self.damping, step
+        )
+
+    def steady(self, speed: float) -> float:
+        """Force at a steady speed [N, m/s]; at rest 0."""
+        dry = self.coulomb + (self.static - self.coulomb) * np.exp(-((speed / self.speed) ** 2))
+        return float(dry * np.sign(speed) + self.viscous * speed)
+
+
+def mobility(velocity_gain: float, lag: float, motor_force: float) -> TransferFunction:
+    """Motor position over a force on it, (k/F1)/(p·(1 + T·p)) [m/N].
+
+    Args:
+        velocity_gain: k, speed at a command of 1 [m/s].
+        lag: T of the mechanics [s].
+        motor_force: F1 at a command of 1, at rest [N]. The mass that the motor moves is F1·T/k.
+    """
+    return TransferFunction((velocity_gain / motor_force,), (lag, 1.0, 0.0))
+
+
+def no_friction(step: float) -> FrictionTable:
+    """The table of none."""
+    return FrictionTable(NONE, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, step)
+
+
+@inlined
+def _dry(table: FrictionTable, speed: float) -> float:
+    """g(v) [N]."""
+    relative = speed / table.speed
+    return float(table.coulomb + (table.static - table.coulomb) * np.exp(-relative * relative))
+
+
+@inlined
+def slide(table: FrictionTable, gained: float, speed: float, free: float) -> tuple[float, bool]:
+    """Force of a step by the Stribeck curve [N], and whether it brings or keeps the slide at rest.
+
+    Args:
+        table: of the friction.
+        gained: speed that 1 N, held over the step, gives [m/(s·N)].
+        speed: at the beginning of the step [m/s].
+        free: at its end if there were no friction [m/s].
+    """
+    level = _dry(table, speed)
+    if abs(free) <= gained * level:
+        return free / gained, True
+    force = level if free > 0.0 else -level
+    return force + table.viscous * (free - gained * force) / (1.0 + gained * table.viscous), False
+
+
+@inlined
+def bend(table: FrictionTable, gained: float, speed: float, free: float, bristle: float) -> tuple[float, float]:
+    """Force of a step by LuGre [N], and the bristles at its end [m]; arguments as of `slide`, and z at its start."""
+    relaxed = 1.0 / (1.0 + table.step * table.stiffness * abs(speed) / _dry(table, speed))
+    hard = table.stiffness + table.damping / table.step
+    held = (hard * relaxed - table.damping / table.step) * bristle
+    coming = (free - gained * held) / (1.0 + gained * (hard * relaxed * table.step + table.viscous))
+    bent = relaxed * (bristle + table.step * coming)
+    return held + (hard * relaxed * table.step + table.viscous) * coming, bent

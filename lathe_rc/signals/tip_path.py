@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The path of a tool whose tip is round across the spindle axis, and the slope at which its flank would rub.
+
+A form of radius r = R + deviation falls or rises by the angle β, tan β = r'/r. A round tip of radius ρ touches it
+beside its foremost point, where both have the same normal. So its centre runs on the parallel curve of the form,
+
+    centre at the polar angle  φ + atan2(-ρ·sin β, r + ρ·cos β),  radius  √((r + ρ·cos β)² + (ρ·sin β)²)
+
+and the path is that radius less R + ρ. A tip that follows the form itself cuts ρ·(1/cos β - 1) too deep, where ρ is
+small against the radius of curvature.
+
+The flank behind the edge leaves the cut surface by the clearance angle. The surface that has just been cut lies behind
+the edge too, and is higher where the form falls towards the edge: the flank rubs where tan β < -tan(clearance).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from lathe_rc.errors import InputError
+from lathe_rc.signals.profile import Profile, ProfileTable
+
+Array = npt.NDArray[np.float64]
+
+_TURN = 2.0 * np.pi
+_POINTS = 8192  # of the form, between which its path is interpolated
+
+
+@dataclass(frozen=True)
+class TipPath:
+    """Where a round tip has to be to turn a form; itself a `Profile`.
+
+    Attributes:
+        form: of the part.
+        radius: R, from which the form deviates [m].
+        tip: ρ [m].
+
+    Raises:
+        InputError: a radius that is not positive; `deviation`: the form has a hollow that the tip does not get into.
+    """
+
+    form: Profile
+    radius: float
+    tip: float
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.radius < np.inf and 0.0 <= self.tip < np.inf):
+            raise InputError(
+                f"tip of {self.tip:g} m on a part of {self.radius:g} m radius; allowed: 0 or more, on above 0"
+            )
+
+    @property
+    def heights(self) -> Array:
+        """Those of the form."""
+        return self.form.heights
+
+    def deviation(self, angle: Array, height: float) -> Array:
+        """See `Profile`: displacement of the tip's foremost point from R."""
+        at = np.linspace(0.0, _TURN, _POINTS + 1)
+        values = self.form.deviation(at, height)
+        values[-1] = values[0]
+        spline = scipy.interpolate.CubicSpline(at, self.radius + values, bc_type="periodic")
+        r, slope, bend = spline(at), spline(at, 1), spline(at, 2)
+        long = np.hypot(r, slope)
+        hollow = -(r * r + 2.0 * slope * slope - r * bend) / long**3  # curvature, above 0 where the tip has to get in
+        if self.tip * hollow.max() >= 1.0:
+            worst = int(np.argmax(hollow))
+            raise InputError(
+                f"the form is hollow with a radius of {1.0 / hollow[worst]:.4g} m at {at[worst]:.4g} rad, and a tip of "
+                f"{self.tip:g} m does not get in; allowed: a smaller tip"
+            )
+        outwards, along = r + self.tip * r / long, -self.tip * slope / long
+        centre = at + np.arctan2(along, outwards)
+        path = np.hypot(outwards, along) - self.tip - self.radius
+        path[-1] = path[0]
+        traced = scipy.interpolate.CubicSpline(centre, path, bc_type="periodic")
+        return np.asarray(traced(centre[0] + np.mod(angle - centre[0], _TURN)))
+
+
+@dataclass(frozen=True)
+class Fall:
+    """Where a form falls most.
+
+    Attributes:
+        slope: -tan β, above 0 where it falls.
+        angle: [rad].
+        height: [m].
+    """
+
+    slope: float
+    angle: float
+    height: float
+
+    @property
+    def clearance(self) -> float:
+        """That a tool needs here [rad]."""
+        return math.atan(self.slope)
+
+
+def steepest_fall(form: ProfileTable, radius: float, feed: float) -> Fall:
+    """Where the form of a part of ``radius`` [m] falls most towards the edge, along a path of ``feed`` [m/rev]."""
+    points = form.table.shape[1]
+    value, slope = form.table[..., 3], form.table[..., 2] * points / _TURN
+    along = np.zeros_like(value)
+    if form.heights.size > 1:
+        steps = np.diff(value, axis=0) / np.diff(form.heights)[:, None]
+        along = np.minimum(np.concatenate((steps[:1], steps)), np.concatenate((steps, steps[-1:])))
+    falls = -(slope + along * feed / _TURN) / (radius + value)
+    row, place = np.unravel_index(np.argmax(falls), falls.shape)
+    return Fall(float(falls[row, place]), float(place * _TURN / points), float(form.heights[row]))
