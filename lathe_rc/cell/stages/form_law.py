@@ -14,13 +14,13 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc.cell.parameters import Value, parameter
-from lathe_rc.cell.stages.form import FORM, FormParameters
+from lathe_rc.cell.stages.form import FORM, Form, FormParameters
 from lathe_rc.cell.stages.law import Law, LawParameters
 from lathe_rc.control.angle_filter import AngleFilterTable, angle_filter
 from lathe_rc.control.disturbance import FormAhead
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-from lathe_rc.signals.profile import derivatives_at, tabulated
+from lathe_rc.signals.profile import derivatives_at
 
 
 class FormLawParameters(LawParameters, FormParameters):
@@ -67,7 +67,7 @@ class FormLaw(Law):
 
     Attributes:
         parameters: its table.
-        form: of the part.
+        form: what the drive has to follow.
 
     Raises:
         InputError: the height along the part is that of a slide, which nobody can look ahead along.
@@ -82,7 +82,7 @@ class FormLaw(Law):
             raise InputError(
                 f"{name}.height_from = {parameters.height_from}; allowed: feed, for the law looks ahead along it"
             )
-        profile = tabulated(parameters.form(name))
+        profile = Form(name, parameters).profile
         self.form = FormAhead(
             profile.heights, profile.table, parameters.feed, parameters.start_height, parameters.part_revolutions
         )
