@@ -83,7 +83,7 @@ def test_a_stored_result_is_shown_beside(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["engin"], "lathe bench engin; allowed: engine, batch, ros"),
+        (["engin"], "lathe bench engin; allowed: engine, batch, sweep"),
         (["--against", "no-such-commit"], "--against no-such-commit: no such file or stored commit"),
         (["--page", "no-such-commit"], "--page no-such-commit: no such file or stored commit"),
     ],

@@ -298,7 +298,9 @@ def test_the_viewer_stays_away_from_a_sourced_ros():
 @pytest.mark.parametrize(
     ("arguments", "groups"),
     [
-        (["test", "-k", "view"], ["test", "view"]),
+        (["test", "-k", "view"], ["sweep", "test", "view"]),
+        (["sweep", "piston"], ["sweep"]),
+        (["tune", "piston"], ["sweep"]),
         (["view", "bag"], ["view"]),
         (["setup", "view"], ["view"]),
         (["run", "view"], []),
@@ -310,7 +312,7 @@ def test_a_command_says_what_it_needs(arguments, groups):
 
 
 def test_setup_of_an_unknown_group_is_refused(copy):
-    assert_refused(lathe(copy, "setup", "viewer"), copy, "setup viewer; allowed: notebook, test, view, or nothing more")
+    assert_refused(lathe(copy, "setup", "viewer"), copy, "setup viewer; allowed: notebook, sweep, test, view, or nothing more")
 
 
 def test_what_is_set_for_pip_holds_for_uv_and_the_environment_comes_first():
