@@ -312,7 +312,9 @@ def test_a_command_says_what_it_needs(arguments, groups):
 
 
 def test_setup_of_an_unknown_group_is_refused(copy):
-    assert_refused(lathe(copy, "setup", "viewer"), copy, "setup viewer; allowed: notebook, sweep, test, view, or nothing more")
+    assert_refused(
+        lathe(copy, "setup", "viewer"), copy, "setup viewer; allowed: notebook, sweep, test, view, or nothing more"
+    )
 
 
 def test_what_is_set_for_pip_holds_for_uv_and_the_environment_comes_first():

@@ -12,10 +12,12 @@ from lathe_rc.bag.record import recorder_of
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.commands import budgeting, outcome, picture
 from lathe_rc.commands import scenario as scenarios
+from lathe_rc.commands.demo import Demo
 from lathe_rc.commands.progress import Watch
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place
 from lathe_rc.starting import Start
+from lathe_rc.view import figure as figure_of
 
 _NO_SNAPSHOTS = "no snapshots: no --bag was given"
 
@@ -99,20 +101,27 @@ def run(
         raise LatheError(f"{loaded.name} is {result.verdict.told()}; allowed: no more than the tolerance{hint}")
 
 
-def demo(name: str, announcement: str, title: str, revolutions: float, folder: Path) -> None:
+def demo(shown: Demo, revolutions: float, folder: Path) -> None:
     """See `lathe_rc.commands.demo`."""
     number = 1
     while (folder / f"demo-{number}").exists():
         number += 1
     place = folder / f"demo-{number}"
-    scenario = scenarios.load(name, [f"spindle_encoder.revolutions={revolutions!r}"])
+    length = f"spindle_encoder.revolutions={revolutions!r}"
+    scenario = scenarios.load(shown.scenario, [*shown.overrides, length])
     console = Console()
-    console.print(announcement, highlight=False)
+    console.print(shown.announcement, highlight=False)
     folder.mkdir(parents=True, exist_ok=True)
     result = _shown(scenario, mode="processes", bag=place)
+    beside = None
+    if shown.peer:
+        peer = harness.run(scenarios.load(shown.scenario, [*shown.overrides, *shown.peer, length]))
+        beside = (shown.peer_name, peer.recording)
     drawn = place.with_suffix(".png")
-    picture.save(result.plot(title), drawn)
+    picture.save(figure_of.draw(result.recording, shown.title, beside), drawn)
     console.print(outcome.table(result))
+    if beside:
+        console.print(f"{shown.peer_name}: {', '.join(peer.errors.told()[1:])}", highlight=False)
     for fact in outcome.facts(result):
         console.print(fact, highlight=False)
     console.print(f"bag:    {place}\nfigure: {drawn}", highlight=False, soft_wrap=True)

@@ -14,7 +14,7 @@ from lathe_rc.cell import messages
 from lathe_rc.cell.recording import Recording
 from lathe_rc.errors import InputError
 
-_FIRST, _LAST = "#c0392b", "#1f6f8b"
+_FIRST, _LAST, _PEER = "#c0392b", "#1f6f8b", "#e08e0b"
 _IN_NOTEBOOK = 72.0  # [dots per inch]
 
 
@@ -32,12 +32,13 @@ def png(figure: Figure) -> bytes:
     return image.getvalue()
 
 
-def draw(recording: Recording, title: str = "") -> Figure:
+def draw(recording: Recording, title: str = "", beside: tuple[str, Recording] | None = None) -> Figure:
     """Desired form, form error over angle in the first and the last revolution, and form error by revolution.
 
     Args:
         recording: of a run, with a tool.
         title: of the figure.
+        beside: name and recording of another run of the same part, whose errors are drawn as well.
 
     Returns:
         A figure that pyplot does not know: its ``savefig`` writes it, notebooks show it.
@@ -86,6 +87,12 @@ def draw(recording: Recording, title: str = "") -> Figure:
         degrees, span = revolution(number)
         label = f"revolution {before + number + 1}: {errors.rms[number] * 1e6:.3g} µm RMS"
         over_angle.plot(degrees, np.abs(tool["error"][span]) * 1e6, color=colour, lw=1.1, label=label)
+    if beside is not None:
+        name, peer = beside[0], beside[1]
+        span = slice(*(int(start) for start in peer.errors.starts[-2:]))
+        degrees = np.rad2deg(np.mod(peer.of_type(messages.ENCODER)["angle_true"][span], 2 * np.pi))
+        error = np.abs(peer.of_type(messages.TOOL)["error"][span]) * 1e6
+        over_angle.plot(degrees, error, color=_PEER, lw=1.1, label=f"{name}: {peer.errors.rms[-1] * 1e6:.3g} µm RMS")
     over_angle.set(
         xlabel="spindle angle [°]",
         ylabel="|form error| [µm]",
@@ -96,10 +103,25 @@ def draw(recording: Recording, title: str = "") -> Figure:
     over_angle.set_ylim(bottom=max(errors.largest[last] * 1e6 / 300, 1e-4))
     over_angle.set_title("form error over angle", fontsize=10)
     over_angle.grid(visible=True, which="major", alpha=0.3)
-    over_angle.legend(fontsize=8, loc="center", bbox_to_anchor=(0.5, 0.6))
+    if beside is None:
+        over_angle.legend(fontsize=8, loc="center", bbox_to_anchor=(0.5, 0.6))
+    else:
+        over_angle.set_ylim(top=over_angle.get_ylim()[1] * 30.0)
+        over_angle.legend(fontsize=8, loc="upper center")
 
     curve = figure.add_subplot(grid[2])
     _by_revolution(curve, errors, before)
+    if beside is not None:
+        curve.plot(
+            np.arange(1, peer.errors.rms.size + 1),
+            peer.errors.rms * 1e6,
+            ".-",
+            color=_PEER,
+            lw=1.0,
+            ms=4,
+            label=f"{name}, RMS",
+        )
+        curve.legend(fontsize=8)
     curve.set_title("learning, revolution by revolution", fontsize=10)
     return figure
 

@@ -24,9 +24,9 @@ from lathe_rc.jit import kernel
 class CompoundControllerParameters(FormLawParameters):
     """Input feed-forward and dynamic compensation from the model, and a PID on the measured error."""
 
-    proportional: Annotated[float, Ge(0)] = parameter(0.5, "Kp")
-    integral: Annotated[float, Ge(0)] = parameter(700.0, "Ki", "1/s")
-    derivative: Annotated[float, Ge(0)] = parameter(1.3e-3, "Kd", "s")
+    proportional: Annotated[float, Ge(0)] = parameter(0.5, "of the PID, Kp")
+    integral: Annotated[float, Ge(0)] = parameter(700.0, "of the PID, Ki", "1/s")
+    derivative: Annotated[float, Ge(0)] = parameter(1.3e-3, "of the PID, Kd", "s")
     derivative_bandwidth: Annotated[float, Gt(0)] = parameter(1600.0, "of its low-pass", "rad/s")
 
 
