@@ -87,12 +87,6 @@ def draw(recording: Recording, title: str = "", beside: tuple[str, Recording] | 
         degrees, span = revolution(number)
         label = f"revolution {before + number + 1}: {errors.rms[number] * 1e6:.3g} µm RMS"
         over_angle.plot(degrees, np.abs(tool["error"][span]) * 1e6, color=colour, lw=1.1, label=label)
-    if beside is not None:
-        name, peer = beside[0], beside[1]
-        span = slice(*(int(start) for start in peer.errors.starts[-2:]))
-        degrees = np.rad2deg(np.mod(peer.of_type(messages.ENCODER)["angle_true"][span], 2 * np.pi))
-        error = np.abs(peer.of_type(messages.TOOL)["error"][span]) * 1e6
-        over_angle.plot(degrees, error, color=_PEER, lw=1.1, label=f"{name}: {peer.errors.rms[-1] * 1e6:.3g} µm RMS")
     over_angle.set(
         xlabel="spindle angle [°]",
         ylabel="|form error| [µm]",
@@ -103,27 +97,28 @@ def draw(recording: Recording, title: str = "", beside: tuple[str, Recording] | 
     over_angle.set_ylim(bottom=max(errors.largest[last] * 1e6 / 300, 1e-4))
     over_angle.set_title("form error over angle", fontsize=10)
     over_angle.grid(visible=True, which="major", alpha=0.3)
-    if beside is None:
-        over_angle.legend(fontsize=8, loc="center", bbox_to_anchor=(0.5, 0.6))
-    else:
-        over_angle.set_ylim(top=over_angle.get_ylim()[1] * 30.0)
-        over_angle.legend(fontsize=8, loc="upper center")
+    over_angle.legend(fontsize=8, loc="center", bbox_to_anchor=(0.5, 0.6))
 
     curve = figure.add_subplot(grid[2])
     _by_revolution(curve, errors, before)
-    if beside is not None:
-        curve.plot(
-            np.arange(1, peer.errors.rms.size + 1),
-            peer.errors.rms * 1e6,
-            ".-",
-            color=_PEER,
-            lw=1.0,
-            ms=4,
-            label=f"{name}, RMS",
-        )
-        curve.legend(fontsize=8)
     curve.set_title("learning, revolution by revolution", fontsize=10)
+    if beside is not None:
+        _beside(over_angle, curve, *beside)
     return figure
+
+
+def _beside(over_angle: Axes, curve: Axes, name: str, peer: Recording) -> None:
+    """Add the errors of another run: over the angle in its last revolution, and by revolution."""
+    errors = peer.errors
+    span = slice(*(int(start) for start in errors.starts[-2:]))
+    degrees = np.rad2deg(np.mod(peer.of_type(messages.ENCODER)["angle_true"][span], 2 * np.pi))
+    error = np.abs(peer.of_type(messages.TOOL)["error"][span]) * 1e6
+    over_angle.plot(degrees, error, color=_PEER, lw=1.1, label=f"{name}: {errors.rms[-1] * 1e6:.3g} µm RMS")
+    over_angle.set_ylim(top=over_angle.get_ylim()[1] * 30.0)  # room for the legend
+    over_angle.legend(fontsize=8, loc="upper center")
+    turns = np.arange(1, errors.rms.size + 1)
+    curve.plot(turns, errors.rms * 1e6, ".-", color=_PEER, lw=1.0, ms=4, label=f"{name}, RMS")
+    curve.legend(fontsize=8)
 
 
 def learning(errors: FormErrors, before: int = 0) -> Figure:
