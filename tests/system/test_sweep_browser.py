@@ -50,7 +50,7 @@ addEventListener("load", async () => {
 
 def test_figures_are_drawn_chosen_and_brushed(tmp_path):
     """Of seven leads with a result each has 14 cells; the brush lies over the second of them."""
-    space = Space(grid={LEAD: "1e-3:3e-3:9", Q: "1e-5:1e-3:7:log", LAW: ["fixed", "variable"]})
+    space = Space(grid={LEAD: "1e-3:3e-3:9", Q: "1e-5:1e-3:7:log", LAW: ["constant_angle", "variable"]})
     written = page.write(swept(tmp_path / "sweep", space, bowl))
     text = written.page.read_text(encoding="utf-8")
     library = text.index("</script>") + len("</script>")
