@@ -144,6 +144,7 @@ class BestLawResult:
                     )
             upper[place].set(xscale="log", xlabel="frequency of the deviation [rad/s]", ylabel="deviation [%]")
             upper[place].set_title(f"the best law, {counts:,} counts", fontsize=10)
+            upper[place].set_ylim(0.0, 135.0 * self.parameters.largest_deviation)  # room for the legend
             upper[place].legend(fontsize=6, loc="upper left")
             shown = lower[place].scatter(
                 self.noise[of], 100.0 * (self.model[of] - 1.0), c=np.clip(ratio[of], -1.5, 1.5), s=9, cmap="RdYlGn",
