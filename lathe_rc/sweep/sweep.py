@@ -4,7 +4,7 @@
 import hashlib
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,8 +132,7 @@ def run(
             with nullcontext(client) if client else client_of(scheduler, workers) as crew:
                 watch({"event": "ready", "dashboard": crew.dashboard_link})
                 jobs = (job for job in _jobs(kept, space) if job.key not in there)
-                with closing(rows(crew, order_of(kept), jobs, left)) as found:
-                    keep(kept, found, watch)
+                keep(kept, rows(crew, order_of(kept), jobs, left), watch)
     return Sweep(kept)
 
 
@@ -145,31 +144,32 @@ def order_of(folder: Folder) -> Order:
 
 
 def keep(
-    folder: Folder, found: Iterator[pa.Table], watch: Watch, take: Callable[[pa.Table], None] | None = None
+    folder: Folder, found: Generator[pa.Table], watch: Watch, take: Callable[[pa.Table], None] | None = None
 ) -> None:
     """Write rows as they come, a file now and then; those that have come when something ends it, too.
 
     Args:
         folder: of the rows.
-        found: see `lathe_rc.sweep.workers.rows`.
+        found: see `lathe_rc.sweep.workers.rows`; it is closed, which takes back what is not computed yet.
         watch: see `run`.
         take: gets the rows as well, before they are written.
     """
     waiting: list[pa.Table] = []
     written = time.monotonic()
-    try:
-        for table in found:
-            waiting.append(table)
-            if take:
-                take(table)
-            watch({"event": "rows", "statuses": Counter(table.column("status").to_pylist())})
-            if time.monotonic() > written + _WRITE:
-                some, waiting = waiting, []
-                folder.write(some)
-                written = time.monotonic()
-    finally:
-        if waiting:
-            folder.write(waiting)
+    with closing(found):
+        try:
+            for table in found:
+                waiting.append(table)
+                if take:
+                    take(table)
+                watch({"event": "rows", "statuses": Counter(table.column("status").to_pylist())})
+                if time.monotonic() > written + _WRITE:
+                    some, waiting = waiting, []
+                    folder.write(some)
+                    written = time.monotonic()
+        finally:
+            if waiting:
+                folder.write(waiting)
 
 
 def _jobs(folder: Folder, space: Space) -> Iterator[Job]:
