@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import vl_convert
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from lathe_rc import __version__, files
 from lathe_rc.errors import LatheError, shown
@@ -26,6 +25,7 @@ from lathe_rc.sweep.figures import Goal, Rows, Spec, said
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.parallel import parallel
 from lathe_rc.sweep.seen import GOAL, Seen, text_of
+from lathe_rc.view.page_template import page_template
 
 PAGE, FIGURES = "page.html", "figures"
 
@@ -120,18 +120,11 @@ def write(folder: Folder, goal: str = GOAL) -> Written:
 
 
 def _text(seen: Seen, drawn: _Drawn) -> str:
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     done = Yield(np.sort(seen.goal.values[seen.goal.order]), len(seen.cells), seen.goal.above)
     sections: dict[str, Any] = {"nothing": _nothing(seen)}
     if not sections["nothing"]:
         sections |= _sections(seen, done, drawn)
-    return environment.get_template("page.html.j2").render(
+    return page_template(Path(__file__).with_name("page.html.j2")).render(
         title=f"Sweep of {seen.folder.scenario.name}",
         goal=seen.goal,
         cells=len(seen.cells),

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from lathe_rc import __version__
 from lathe_rc.analysis.budget import TOLD, Budget
@@ -28,6 +27,7 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place, replacing
 from lathe_rc.part import along_in_words
 from lathe_rc.view import report_figures as figures
+from lathe_rc.view.page_template import page_template
 from lathe_rc.view.report_form import CUTOFF, Form
 from lathe_rc.view.report_gather import Gathered, gather
 from lathe_rc.view.report_series import Envelope
@@ -361,13 +361,6 @@ def render(told: Gathered, name: str, command: str, made_of: Budget | None = Non
         command: that makes the page again.
         made_of: what the form error is made of; None: nobody has asked.
     """
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     with mpl.rc_context(figures.STYLE), np.errstate(over="ignore", invalid="ignore"):
         cycles = {f"{topic}: {field}": found for (topic, field), found in told.curves.cycles.items() if found.size}
         forms = [_form(form, cycles) for form in told.forms]
@@ -375,7 +368,7 @@ def render(told: Gathered, name: str, command: str, made_of: Budget | None = Non
         if cycles and not any(form.figures for form in forms):
             caption = "What each controller measured in its own cycles."
             signals.append(Picture("Convergence", figures.convergence(None, cycles), caption, "docs/learning.md"))
-    text: str = environment.get_template("report.html.j2").render(
+    text: str = page_template(Path(__file__).with_name("report.html.j2")).render(
         title=f"Report of {printable(name, 80)}",
         command=printable(command),
         version=__version__,
