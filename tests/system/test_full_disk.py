@@ -12,15 +12,7 @@ from lathe_rc.bag.check import check
 pytestmark = pytest.mark.system
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    place = tmp_path / "small"
-    place.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3M", "tmpfs", place], check=True)
-    yield place
-    subprocess.run(["umount", place], check=True)
-
-
+@pytest.mark.parametrize("small_disk", ["3M"], indirect=True)
 @pytest.mark.parametrize("mode", ["offline", "processes"])
 def test_a_full_disk_ends_the_recording_with_a_readable_bag(small_disk, mode):
     bag = small_disk / "bag"

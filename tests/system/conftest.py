@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What tests of the system share."""
+
+import subprocess
+
+import pytest
+
+
+@pytest.fixture
+def small_disk(request, tmp_path):
+    """A file system of its own, of a size such as ``3M`` (by `pytest.mark.parametrize`, indirect)."""
+    place = tmp_path / "small"
+    place.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={request.param}", "tmpfs", place], check=True)
+    yield place
+    subprocess.run(["umount", place], check=True)
