@@ -10,7 +10,7 @@ shown, but are not among the best. It is a sweep; see docs/sweeps.md.
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -162,7 +162,7 @@ def _base() -> Scenario:
     return cells.load(
         "speed_deviation",
         spindle_encoder={**law, "revolutions": _REVOLUTIONS},
-        learning_controller={**law, "events": [], "acceleration_window": 64, "model_natural_frequency": 1038.0},
+        learning_controller={**law, "events": [], "acceleration_window": 64},
         # The linear drive is studied, not what it may be asked for.
         electrodynamic_actuator={"max_velocity": 1e3, "max_acceleration": 1e6, "stroke": 1.0},
         tool={"harmonic_order": [2], "harmonic_amplitude": [225e-6]},
@@ -207,7 +207,7 @@ def run(parameters: BestLawParameters, track: Track = untracked) -> BestLawResul
         frequency=of[_FREQUENCY],
         amplitude=of[_AMPLITUDE],
         noise=of[_NOISE] * 1e9,
-        model=of[_MODEL] / 1038.0,
+        model=of[_MODEL] / cast("float", base.value("electrodynamic_actuator.natural_frequency")),
         error={law: found[k * count : (k + 1) * count] * 1e6 for k, law in enumerate(laws)},
     )
 
