@@ -18,7 +18,7 @@ from lathe_rc.commands import sweep as command
 from lathe_rc.control.decoupler import PAPER
 from lathe_rc.control.pid import PidGains
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.sweep import formulas, history, row, tune
+from lathe_rc.sweep import formulas, history, row, sweep, tune
 from lathe_rc.sweep.aims import aims
 from lathe_rc.sweep.free import Free, frees
 from lathe_rc.sweep.space import Space
@@ -424,7 +424,7 @@ def test_the_robust_setting_of_the_page_is_twice_as_good_on_the_worst_plant_as_t
 
 
 def test_the_command_shows_and_writes_what_it_found(tmp_path, monkeypatch, client):
-    monkeypatch.setattr(tune, "client_of", lambda *_: tune.nullcontext(client))
+    monkeypatch.setattr(sweep, "client_of", lambda *_: sweep.nullcontext(client))
     folder = tmp_path / "x"
     asked = ["tune", "piston", "--revolutions", "3", "--set", f"{LEAD}=0.9e-3", "--free", f"{LEAD}=0.8e-3:2e-3"]
     asked += ["--goal", "tool.max_error", "--over", "electrodynamic_actuator.damping=uniform:95%:105%"]
@@ -442,7 +442,7 @@ def test_the_command_shows_and_writes_what_it_found(tmp_path, monkeypatch, clien
 
 
 def test_where_nothing_runs_the_command_says_why(tmp_path, monkeypatch, client):
-    monkeypatch.setattr(tune, "client_of", lambda *_: tune.nullcontext(client))
+    monkeypatch.setattr(sweep, "client_of", lambda *_: sweep.nullcontext(client))
     monkeypatch.setattr(history, "write", lambda found: found.folder.path / "history.png")
     asked = ["tune", "piston", "--set", "spindle_encoder.revolutions=0.0", "--free", f"{LEAD}=1e-3:2e-3"]
     shown = CliRunner().invoke(
@@ -453,7 +453,7 @@ def test_where_nothing_runs_the_command_says_why(tmp_path, monkeypatch, client):
 
 
 def test_ctrl_c_says_what_is_kept(tmp_path, monkeypatch, client):
-    monkeypatch.setattr(tune, "client_of", lambda *_: tune.nullcontext(client))
+    monkeypatch.setattr(sweep, "client_of", lambda *_: sweep.nullcontext(client))
     monkeypatch.setattr(command.Watch, "describe", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     asked = ["tune", "piston", "--revolutions", "3", "--free", f"{LEAD}=0.8e-3:2e-3", "--goal", "tool.max_error"]
     stopped = CliRunner().invoke(cli.main, [*asked, "--trials", "20", "--batch", "2", "--out", str(tmp_path / "x")])

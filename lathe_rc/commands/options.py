@@ -20,3 +20,11 @@ start = click.option(
     type=click.Choice(["fork", "spawn"]),
     help="processes are forked from one that has imported everything, or interpreters of their own; default: fork",
 )
+
+length = click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of each run")
+
+scheduler = click.option("--scheduler", metavar="ADDRESS", help="of Dask; default: workers on this machine")
+
+workers = click.option(
+    "--workers", type=click.IntRange(1), help="processes on this machine; default: one for each core"
+)

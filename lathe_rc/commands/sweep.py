@@ -29,6 +29,21 @@ _BEST = 5  # cells that are shown
 INTERRUPTED = 130
 
 
+measured = click.option(
+    "--measure",
+    "measures",
+    multiple=True,
+    metavar="TOPIC.FIELD:STATISTIC",
+    help=f"more columns: {', '.join(row.STATISTICS)}",
+)
+
+
+def check_crew(scheduler: str | None, workers: int | None) -> None:
+    """Refuse workers of this machine beside those of a scheduler."""
+    if scheduler and workers:
+        raise InputError("--workers with --scheduler; allowed: one of them: a scheduler has its own workers")
+
+
 class _Sweep(click.Group):
     """``lathe sweep SCENARIO`` is short for ``lathe sweep run SCENARIO``."""
 
@@ -94,13 +109,7 @@ def space_of(
 )
 @click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="each cell with so many seeds")
 @click.option("--cells", type=click.Path(path_type=Path), help="CSV or YAML file with a cell a row")
-@click.option(
-    "--measure",
-    "measures",
-    multiple=True,
-    metavar="TOPIC.FIELD:STATISTIC",
-    help=f"more columns: {', '.join(row.STATISTICS)}",
-)
+@measured
 @click.option(
     "--models",
     type=click.Choice(["follow", "nominal"]),
@@ -109,10 +118,10 @@ def space_of(
     help="what controllers take for a drive that is varied: as it is, or as the scenario has it",
 )
 @options.overrides
-@click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of each run")
+@options.length
 @click.option("--out", type=click.Path(path_type=Path), help="folder of the results; default: sweep-SCENARIO")
-@click.option("--scheduler", metavar="ADDRESS", help="of Dask; default: workers on this machine")
-@click.option("--workers", type=click.IntRange(1), help="processes on this machine; default: one for each core")
+@options.scheduler
+@options.workers
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def run(
     scenario: str,
@@ -133,12 +142,8 @@ def run(
     as_json: bool,
 ) -> None:
     """Compute variations of a SCENARIO into a table; what is there already is not computed again."""
-    if scheduler and workers:
-        raise InputError("--workers with --scheduler; allowed: one of them: a scheduler has its own workers")
-    loaded = scenarios.load(scenario, overrides)
-    if revolutions is not None:
-        more = [f"{node}.revolutions={revolutions!r}" for node in loaded.masters]
-        loaded = scenarios.load(scenario, [*overrides, *more])
+    check_crew(scheduler, workers)
+    loaded = scenarios.load(scenario, overrides, revolutions=revolutions)
     space = space_of(vary, draw, tie, sample, seeds, cells)
     place = out or Path(f"sweep-{loaded.name}")
     progress = Watch(Console(stderr=True), quiet=as_json)

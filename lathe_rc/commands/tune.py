@@ -4,7 +4,7 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from rich.table import Table
 from lathe_rc import harness
 from lathe_rc.commands import options
 from lathe_rc.commands import scenario as scenarios
-from lathe_rc.commands.sweep import INTERRUPTED, Watch, pairs, space_of
+from lathe_rc.commands.sweep import INTERRUPTED, Watch, check_crew, measured, pairs, space_of
 from lathe_rc.errors import InputError
 from lathe_rc.sweep import history, row
 from lathe_rc.sweep.study import BATCH
@@ -61,18 +61,12 @@ _STEPS = 5  # of the history that are shown
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="of the search")
 @click.option("--batch", type=click.IntRange(1), default=BATCH, show_default=True, help="trials asked for at once")
 @click.option("--no-formulas", is_flag=True, help="do not let what formulas give be trial 1")
-@click.option(
-    "--measure",
-    "measures",
-    multiple=True,
-    metavar="TOPIC.FIELD:STATISTIC",
-    help=f"more columns: {', '.join(row.STATISTICS)}",
-)
+@measured
 @options.overrides
-@click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of each run")
+@options.length
 @click.option("--out", type=click.Path(path_type=Path), help="folder of the results; default: tune-SCENARIO")
-@click.option("--scheduler", metavar="ADDRESS", help="of Dask; default: workers on this machine")
-@click.option("--workers", type=click.IntRange(1), help="processes on this machine; default: one for each core")
+@options.scheduler
+@options.workers
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def tune(
     scenario: str,
@@ -100,17 +94,12 @@ def tune(
     as_json: bool,
 ) -> None:
     """Search the parameters of a SCENARIO that meet goals best; the same command goes on where it was stopped."""
-    if scheduler and workers:
-        raise InputError("--workers with --scheduler; allowed: one of them: a scheduler has its own workers")
+    check_crew(scheduler, workers)
     if worst and percentile is not None:
         raise InputError(f"--worst with --percentile {percentile:g}; allowed: one of them")
     if (worst or percentile is not None) and not over and seeds == 1:
         raise InputError(f"{'--worst' if worst else '--percentile'} of one cell; allowed: with --over or --seeds")
-    more: Sequence[str] = ()
-    if revolutions is not None:
-        masters = scenarios.load(scenario, overrides).masters
-        more = [f"{node}.revolutions={revolutions!r}" for node in masters]
-    loaded = scenarios.load(scenario, [*overrides, *more])
+    loaded = scenarios.load(scenario, overrides, revolutions=revolutions)
     drawn = [text for text in over if text.partition("=")[2].strip().startswith(_LAWS)]
     varied = [text for text in over if text not in drawn]
     place = out or Path(f"tune-{loaded.name}")

@@ -5,7 +5,7 @@ import hashlib
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -127,13 +127,22 @@ def run(
         left = total - sum(1 for job in _jobs(kept, space) if job.key in there) if there else total
         watch({"event": "began", "cells": total, "computed": total - left})
         if left:
-            for stages in compile_ahead(Cell(scenario.nodes).stages.values()):
-                watch({"event": "compiling", "nodes": stages})
-            with nullcontext(client) if client else client_of(scheduler, workers) as crew:
-                watch({"event": "ready", "dashboard": crew.dashboard_link})
+            with crew_for(scenario, client, scheduler, workers, watch) as crew:
                 jobs = (job for job in _jobs(kept, space) if job.key not in there)
                 keep(kept, rows(crew, order_of(kept), jobs, left), watch)
     return Sweep(kept)
+
+
+@contextmanager
+def crew_for(
+    scenario: Scenario, client: distributed.Client | None, scheduler: str | None, workers: int | None, watch: Watch
+) -> Iterator[distributed.Client]:
+    """Who computes cells of a scenario, once its kernels are compiled; arguments and events as in `run`."""
+    for stages in compile_ahead(Cell(scenario.nodes).stages.values()):
+        watch({"event": "compiling", "nodes": stages})
+    with nullcontext(client) if client else client_of(scheduler, workers) as crew:
+        watch({"event": "ready", "dashboard": crew.dashboard_link})
+        yield crew
 
 
 def order_of(folder: Folder) -> Order:

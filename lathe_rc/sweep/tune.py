@@ -10,15 +10,12 @@ DIR, the rest        see `lathe_rc.sweep.folder`: cell n of trial m is the row m
 
 import json
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from pathlib import Path
 
 import distributed
 
-from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.names import instead
 from lathe_rc.sweep.aims import Aims, aims
@@ -26,9 +23,8 @@ from lathe_rc.sweep.folder import Folder, writing
 from lathe_rc.sweep.free import Free, frees
 from lathe_rc.sweep.space import Space
 from lathe_rc.sweep.study import BATCH, Study
-from lathe_rc.sweep.sweep import Watch, ignore
+from lathe_rc.sweep.sweep import Watch, crew_for, ignore
 from lathe_rc.sweep.tuned import Tuning
-from lathe_rc.sweep.workers import client_of
 
 SAMPLERS = ("tpe", "cmaes", "nsga2")
 
@@ -119,10 +115,7 @@ def run(
         there = state.finished()
         watch({"event": "began", "cells": trials * state.count, "computed": there * state.count, "trials": there})
         if asked:
-            for stages in compile_ahead(Cell(scenario.nodes).stages.values()):
-                watch({"event": "compiling", "nodes": stages})
-            with nullcontext(client) if client else client_of(scheduler, workers) as crew:
-                watch({"event": "ready", "dashboard": crew.dashboard_link})
+            with crew_for(scenario, client, scheduler, workers, watch) as crew:
                 while asked:
                     state.compute(crew, asked, watch)
                     asked = state.ask(me, trials)
