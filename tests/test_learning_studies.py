@@ -51,9 +51,8 @@ ORDER = [
     "settings",
     [
         {},
-        {"wd": "40,150,300", "harmonic": 4, "amplitude_um": 60},
+        {"wd": "40,300", "harmonic": 4, "amplitude_um": 60},
         {"wd": "25", "harmonic": 1},
-        {"wd": "75", "harmonic": 3, "amplitude_um": 100},
     ],
 )
 def test_ordering_of_the_laws_holds_at_every_frequency(settings):
