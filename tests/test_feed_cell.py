@@ -162,9 +162,10 @@ class TestFullCell:
         assert grouped.digest == offline.digest
 
     def test_recorder_and_loops_in_processes_of_their_own_give_its_digests(self, longer):
-        outside = [["recorder"], ["cutting_process", "longitudinal", "force_controller"]]
-        inside = [name for name in longer.scenario.nodes if name not in sum(outside, [])]
-        assert harness.run(longer.scenario, mode="processes", groups=[inside, *outside]).digest == longer.digest
+        loops = ["cutting_process", "longitudinal", "force_controller"]
+        inside = [name for name in longer.scenario.nodes if name not in ("recorder", *loops)]
+        groups = [inside, loops, ["recorder"]]
+        assert harness.run(longer.scenario, mode="processes", groups=groups).digest == longer.digest
 
     def test_blocks_change_no_bit(self, offline):
         assert harness.run(load("full_cell", *self.SHORT, "block_size=17")).digest == offline.digest
