@@ -113,7 +113,6 @@ BOTH = ["learning_controller", "electrodynamic_actuator"]
 @pytest.mark.parametrize(
     ("foreign", "together"),
     [
-        (["learning_controller"], ["spindle_encoder", "electrodynamic_actuator", "tool"]),
         (["electrodynamic_actuator"], ["tool", "recorder"]),
         ([*BOTH, "listener"], ["spindle_encoder", "tool"]),
     ],
