@@ -149,9 +149,9 @@ def test_one_version_stands_everywhere() -> None:
     said = {
         re.search(pattern, (ROOT / path).read_text(encoding="utf-8"))[1]
         for path, pattern in (
-            ("setup.py", r'version="(.+?)"'),
             ("package.xml", "<version>(.+?)<"),
             ("msg_defs/package.xml", "<version>(.+?)<"),
+            ("CITATION.cff", r"(?m)^version: (.+)$"),
         )
     }
     assert said == {__version__}

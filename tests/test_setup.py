@@ -20,6 +20,7 @@ import installer
 import preconditions
 import recipe
 import ros
+import ros_wheels
 import steps
 import system
 import workplace
@@ -338,7 +339,13 @@ def test_every_package_of_every_list_is_in_a_lock():
         for name in ("ros.lock", "python.lock")
         for line in (workplace.REQUIREMENTS / name).read_text().splitlines()
     }
-    lists = ["ros.in", "runtime.in", "build.in", *(group.list for group in recipe.GROUPS.values())]
+    lists = [
+        "ros.in",
+        recipe.MESSAGES_LIST,
+        "runtime.in",
+        "build.in",
+        *(group.list for group in recipe.GROUPS.values()),
+    ]
     for name in lists:
         wanted = (workplace.REQUIREMENTS / name).read_text().splitlines()
         assert {recipe.normal(line) for line in wanted if line and not line.startswith("#")} <= locked, name
@@ -503,13 +510,12 @@ print(lathe_rc.__file__)
 
 
 def test_wheels_paths_are_mended(monkeypatch, tmp_path):
-    monkeypatch.setattr(ros, "VENV", tmp_path)
-    monkeypatch.setattr(ros.sysconfig, "get_path", lambda _name: "/here/include")
+    monkeypatch.setattr(ros_wheels.sysconfig, "get_path", lambda _name: "/here/include")
     export = tmp_path / "share" / "x" / "cmake" / "export.cmake"
     export.parent.mkdir(parents=True)
     old = "/opt/python/cp311-cp311"
     export.write_text(f'"{old}/include/python3.11;{old}/lib/python3.11/site-packages/numpy/_core/include"')
-    ros.mend_cmake_paths()
+    ros_wheels.mend_cmake_paths(tmp_path, ros.site_packages())
     assert export.read_text() == f'"/here/include;{ros.site_packages()}/numpy/_core/include"'
 
 
@@ -520,7 +526,7 @@ def test_command_gets_the_users_arguments_and_directory(copy, tmp_path):
     Path(fake_python(venv, 'pwd; printf "%s\\n" "$@" "$MADE"')).rename(venv / "python")
     key = subprocess.run(
         [workplace.BASE_PYTHON, "-c", "import recipe; print(recipe.Recipe(None)._package_key)"],
-        env={"PYTHONPATH": str(copy / "tools")},
+        env={"PYTHONPATH": os.pathsep.join([str(copy / "tools"), str(copy / "msg_defs")])},
         capture_output=True,
         text=True,
         check=True,
