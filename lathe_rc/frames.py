@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from lathe_rc.bag.columns import Column, columns, dense_rows, sparse_rows
-from lathe_rc.bag.formats import arrow_schema
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, full
+from lathe_rc import messages
+from lathe_rc.bag.exporting.formats import arrow_schema
+from lathe_rc.cell.columns import Column, columns, dense_rows, sparse_rows
 from lathe_rc.cell.recording import Recording
 from lathe_rc.errors import InputError
+from lathe_rc.messages import Samples, full
 
 _SPINDLE = (Column("revolution", np.dtype(np.int64)), Column("spindle_angle", np.dtype(np.float64), "rad"))
 
@@ -21,9 +21,9 @@ _SPINDLE = (Column("revolution", np.dtype(np.int64)), Column("spindle_angle", np
 def frame(recording: Recording, topic: str) -> Any:
     """A topic as a table: a row a sample, or a message; of a message with lists, a row an element.
 
-    The columns are those of `lathe_rc.bag.export`: ``sample``, ``time`` [s] (sample 0 is at 1 s) and the fields of the
-    message. With an encoder in the recording two come before the fields: ``revolution``, counted from 1, and
-    ``spindle_angle``, the true angle in it [rad].
+    The columns are those of `lathe_rc.bag.exporting.export`: ``sample``, ``time`` [s] (sample 0 is at 1 s) and the
+    fields of the message. With an encoder in the recording two come before the fields: ``revolution``, counted from 1,
+    and ``spindle_angle``, the true angle in it [rad].
 
     Args:
         recording: of a run.

@@ -27,31 +27,31 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Literal
 
-from lathe_rc import part, starting
+from lathe_rc import messages, part, starting
 from lathe_rc.analysis.budget import Budget
 from lathe_rc.analysis.metrology import FormErrors, Lay, Measurement
 from lathe_rc.analysis.tolerance import Verdict
-from lathe_rc.bag import reader, recover
+from lathe_rc.bag import reader
 from lathe_rc.bag.check import write_digests
-from lathe_rc.bag.record import OfflineRecorder, begin, begin_snapshots, recorder_of
-from lathe_rc.bag.writer import refuse_existing
+from lathe_rc.bag.repairing import recover
+from lathe_rc.bag.writing.record import OfflineRecorder, begin, begin_snapshots, recorder_of
+from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.cell import budget as budgets
-from lathe_rc.cell import messages
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.collect import Collector, Finite, check_room
 from lathe_rc.cell.durations import Lateness
 from lathe_rc.cell.engine import Engine, Sink
-from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.event_log import LogEntry, entries
 from lathe_rc.extensions import search_path
-from lathe_rc.happened import Happening, listed
+from lathe_rc.messages import Signals
 from lathe_rc.namespace import absolute, checked
-from lathe_rc.nodes import leftovers
+from lathe_rc.nodes import stale_shared_memory
 from lathe_rc.nodes.report import THROUGHPUT
 from lathe_rc.starting import Child, Start
 
@@ -70,7 +70,13 @@ _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag c
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
 _MOST_RESTARTS = 8  # of a process
 _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
-_NO_SIGN_OF_LIFE = {"stall", "stranger", "stopped", "continued", "waits"}  # events that come while nothing goes on
+_NO_SIGN_OF_LIFE = {
+    "stall",
+    "foreign_message",
+    "stopped",
+    "continued",
+    "waits",
+}  # events that come while nothing goes on
 _LOOK = 0.05  # [s] between looks at what a process has written
 
 
@@ -84,9 +90,9 @@ class Result:
         samples: length of the run.
         wall_s: from block 0 to the last block computed and recorded by every member [s].
         bag: where it is recorded; None if it was not to be kept, or in snapshots alone.
-        snapshots: bags of parts of the run, see `lathe_rc.bag.snapshots`.
+        snapshots: bags of parts of the run, see `lathe_rc.bag.writing.snapshots`.
         recording: all signals.
-        refused: messages of strangers that the nodes refused, by sender.
+        refused: messages from outside the cell that the nodes refused, by sender.
         not_reached: events that the run was too short for, by node.
         unchecked: what the check before the start could not see, since laws or drives of others do not tell it.
         lateness: of the blocks; None if there was no pace to keep, as offline or with a ``speed_factor`` of 0.
@@ -195,9 +201,9 @@ class Result:
         return self.recording.digests()
 
     @cached_property
-    def happened(self) -> list[Happening]:
+    def event_log(self) -> list[LogEntry]:
         """Events, alarms and reactions, in order."""
-        return listed(self.recording)
+        return entries(self.recording)
 
     def summary(self) -> dict[str, object]:
         """What ``lathe run --json`` prints."""
@@ -219,7 +225,7 @@ class Result:
             "refused": dict(self.refused),
             "events": [
                 {"sample": found.sample, "time": found.sample * step, "topic": found.topic, "text": found.text}
-                for found in self.happened
+                for found in self.event_log
             ],
             "not_reached": {node: list(events) for node, events in self.not_reached.items()},
             "unchecked": list(self.unchecked),
@@ -515,7 +521,7 @@ class Processes:
     Attributes:
         pids: process of each node.
         domain: the ROS domain in use.
-        refused: messages of strangers that the nodes refused, by sender; known when they have ended.
+        refused: messages from outside the cell that the nodes refused, by sender; known when they have ended.
         not_reached: events that the run was too short for, by node; the same.
     """
 
@@ -552,7 +558,7 @@ class Processes:
             self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-log-")))
             self._file = self._folder / "scenario.yaml"
             self._file.write_text(self._scenario.to_yaml(), encoding="utf-8")
-            leftovers.sweep()
+            stale_shared_memory.sweep()
             for group in self._groups:
                 self._start(group)
         except BaseException:

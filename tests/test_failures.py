@@ -16,11 +16,10 @@ from cells import told_until_all_have_ended
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from lathe_rc import harness, starting
+from lathe_rc import harness, messages, starting
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
-from lathe_rc.bag.resim import resimulate
-from lathe_rc.cell import messages
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.scenario import load
 from lathe_rc.commands.progress import TROUBLE
 from lathe_rc.errors import InputError, LatheError
@@ -81,7 +80,7 @@ class Finder:
     def find_spec(self, name, path=None, target=None):
         if name == "lathe_rc.nodes.recorder_node":
             sys.meta_path.remove(self)
-            from lathe_rc.bag.writer import BagWriter
+            from lathe_rc.bag.writing.writer import BagWriter
             BagWriter.close = close
 
 sys.meta_path.insert(0, Finder())

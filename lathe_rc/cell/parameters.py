@@ -15,9 +15,9 @@ from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from lathe_rc.cell.messages import MAX_BLOCK
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import Named
+from lathe_rc.messages import MAX_BLOCK
 from lathe_rc.names import instead
 
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import NOT_SIGNALS, START_NS, Samples, Signals
+from lathe_rc import messages
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.messages import NOT_SIGNALS, START_NS, Samples, Signals
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

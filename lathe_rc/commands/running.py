@@ -8,7 +8,7 @@ import click
 from rich.console import Console
 
 from lathe_rc import harness, part
-from lathe_rc.bag.record import recorder_of
+from lathe_rc.bag.writing.record import recorder_of
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.commands import budgeting, outcome, picture
 from lathe_rc.commands import scenario as scenarios

@@ -214,8 +214,8 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
     finally:
         for node in nodes:
             node.finish()
-            if node.strangers.senders:
-                reporter("refused", node.get_name(), senders=node.strangers.senders)
+            if node.refused_messages.senders:
+                reporter("refused", node.get_name(), senders=node.refused_messages.senders)
         # The nodes are not destroyed: Fast DDS may wait for itself for ever while others are leaving, too.
         rclpy.try_shutdown()
 

@@ -21,8 +21,8 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from std_msgs.msg import Empty
 
-from lathe_rc.bag.record import signal_depth
-from lathe_rc.cell import messages
+from lathe_rc import messages
+from lathe_rc.bag.writing.record import signal_depth
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import MASTERS
@@ -30,10 +30,10 @@ from lathe_rc.cell.wiring import Unknown
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.nodes import declare
 from lathe_rc.nodes.exchange import Exchange
+from lathe_rc.nodes.liveliness import SILENCE, Watch, liveliness, this_host
 from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
+from lathe_rc.nodes.refused_messages import ForeignMessage, RefusedMessages
 from lathe_rc.nodes.report import Reporter
-from lathe_rc.nodes.strangers import Stranger, Strangers
-from lathe_rc.nodes.watch import SILENCE, Watch, liveliness, this_host
 
 _TICK = 0.02  # [s] between looks at the graph while members join
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
@@ -63,7 +63,7 @@ class CellNode(LifecycleNode):
         due: messages have come since it last worked.
         handled: messages received so far.
         watch: whether those are alive that it cannot do without; there once it is active.
-        strangers: what it has refused.
+        refused_messages: those that do not belong to the cell.
         outlets, inlets: publisher and subscription of each signal topic, by fully qualified name.
         patience: for messages to be acknowledged [s].
         next_tick: monotonic time [s] at which it wants `tick` to be called.
@@ -85,7 +85,7 @@ class CellNode(LifecycleNode):
         self.next_tick, self.patience = time.monotonic(), _PATIENCE
         self.handled, self.due = 0, False
         self.full_name = self.get_fully_qualified_name()
-        self.strangers = Strangers(self._tell_stranger)
+        self.refused_messages = RefusedMessages(self._report_refused)
         self._diagnostics_due = time.monotonic() + _DIAGNOSTICS_PERIOD
         self._without_endpoints = self._endpoints()
         self._service_change_state.callback = self._refusing(self._service_change_state.callback)
@@ -308,8 +308,8 @@ class CellNode(LifecycleNode):
                 return
             try:
                 callback(message)
-            except Stranger as stranger:
-                self.strangers.refuse(stranger)
+            except ForeignMessage as refused:
+                self.refused_messages.refuse(refused)
             except LatheError as error:
                 self.fail(error)
 
@@ -332,10 +332,10 @@ class CellNode(LifecycleNode):
 
         return call
 
-    def _tell_stranger(self, stranger: Stranger) -> None:
-        publishers = self._who_publishes(stranger.topic)
-        self.get_logger().warning(f"refused: {stranger}; publishers of {stranger.topic}: {', '.join(publishers)}")
-        self.reporter("stranger", self.get_name(), message=str(stranger), publishers=publishers)
+    def _report_refused(self, message: ForeignMessage) -> None:
+        publishers = self._who_publishes(message.topic)
+        self.get_logger().warning(f"refused: {message}; publishers of {message.topic}: {', '.join(publishers)}")
+        self.reporter("foreign_message", self.get_name(), message=str(message), publishers=publishers)
         self._diagnostics_due = time.monotonic()
 
     def _who_publishes(self, topic: str) -> list[str]:
@@ -348,7 +348,7 @@ class CellNode(LifecycleNode):
         def call(data: bytes) -> None:
             try:
                 callback(data)
-            except Stranger:
+            except ForeignMessage:
                 raise
             except LatheError as error:
                 if len(publishers := self._who_publishes(topic)) > 1:
@@ -398,7 +398,7 @@ class CellNode(LifecycleNode):
         """Publishers that do not fit become named errors.
 
         To hear of lost messages as well may stop a node for ever: rmw_fastrtps 8.4 takes its own lock and then
-        that of DDS where DDS takes them the other way round (its pull request 890); a stranger's flood is enough.
+        that of DDS where DDS takes them the other way round (its pull request 890); a flood from outside is enough.
         Nothing is missed by that: every block and every message at a chosen sample is counted by who reads it.
         """
 
@@ -568,12 +568,12 @@ class CellNode(LifecycleNode):
             except (ValueError, RecursionError):
                 why = "its parameters are no JSON"
         if why:
-            raise Stranger(self._host["members"].topic_name, member.name, member.run_id, why)
+            raise ForeignMessage(self._host["members"].topic_name, member.name, member.run_id, why)
 
     def _on_cell_state(self, state: CellState) -> None:
         if state.run_id != self.table.run_id:
             if self.table.run_id:
-                raise Stranger(self.topic("cell_state"), "", state.run_id, f"expected run {self.table.run_id!r}")
+                raise ForeignMessage(self.topic("cell_state"), "", state.run_id, f"expected run {self.table.run_id!r}")
             return
         self._cell = state.state
         if self.failure:
@@ -760,7 +760,7 @@ class CellNode(LifecycleNode):
             self._publish_diagnostics()
 
     def _repeat(self, now: float) -> None:
-        """Announce itself again as long as others may wait for that: a flood of strangers may have pushed it out."""
+        """Announce itself again while others may wait for that: a flood of messages may have pushed it out."""
         of_a_cell = self.master is not None or self.member_names()
         if of_a_cell and (self._cell != CellState.RUNNING or self.failure) and now >= self._repeat_due:
             self._repeat_due = now + _REPEAT_PERIOD
@@ -769,11 +769,13 @@ class CellNode(LifecycleNode):
     def _level(self) -> bytes:
         if self.failure:
             return bytes(DiagnosticStatus.ERROR)
-        return bytes(DiagnosticStatus.WARN if self.strangers.senders else DiagnosticStatus.OK)
+        return bytes(DiagnosticStatus.WARN if self.refused_messages.senders else DiagnosticStatus.OK)
 
     def _publish_diagnostics(self) -> None:
-        told = self.statistics() | {"refused": self.strangers}
-        told |= {f"publishers of {topic}": ", ".join(self._who_publishes(topic)) for topic in self.strangers.topics}
+        told = self.statistics() | {"refused": self.refused_messages}
+        told |= {
+            f"publishers of {topic}": ", ".join(self._who_publishes(topic)) for topic in self.refused_messages.topics
+        }
         status = DiagnosticStatus(
             level=self._level(),
             name=self.full_name,

@@ -11,15 +11,16 @@ from typing import Any
 import numpy as np
 from lathe_rc_msgs.srv import Schedule
 
-from lathe_rc.bag.record import signal_depth
-from lathe_rc.cell import messages, state_file
+from lathe_rc import messages
+from lathe_rc.bag.writing.record import signal_depth
+from lathe_rc.cell import state_file
 from lathe_rc.cell.framing import Framer
-from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.stage import Input, Sparse, Stage, compile_kernels
 from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wire import Block, Encoder, Pool
 from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.nodes.chain import Chain, form
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import BlockQueue, message_class, signal_qos

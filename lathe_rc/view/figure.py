@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 from matplotlib.ticker import MaxNLocator
 
+from lathe_rc import messages
 from lathe_rc.analysis.metrology import FormErrors, turns_before
-from lathe_rc.cell import messages
 from lathe_rc.cell.recording import Recording
 from lathe_rc.errors import InputError
 

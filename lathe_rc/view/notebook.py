@@ -7,9 +7,9 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lathe_rc import messages
 from lathe_rc.analysis.metrology import turns_before
-from lathe_rc.bag.columns import columns
-from lathe_rc.cell import messages
+from lathe_rc.cell.columns import columns
 from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario

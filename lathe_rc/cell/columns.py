@@ -11,9 +11,9 @@ from typing import Any, cast
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import NOT_SIGNALS, START_NS, Samples, Signals
+from lathe_rc import messages
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.messages import NOT_SIGNALS, START_NS, Samples, Signals
 
 TEXT = np.dtype(object)  #: element type of texts
 _FIELD = re.compile(r"\S+\s+(\w+)\s*#(.*)")

@@ -20,9 +20,9 @@ from mcap.writer import MCAP0_MAGIC
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
-from lathe_rc.bag import trust
-from lathe_rc.bag.source import files_of, read_chunk, unpack, unpack_file, unpacked_size
-from lathe_rc.bag.trust import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record
+from lathe_rc.bag.reading import precheck
+from lathe_rc.bag.reading.precheck import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record
+from lathe_rc.bag.reading.source import files_of, read_chunk, unpack, unpack_file, unpacked_size
 from lathe_rc.errors import InputError, LatheError, shown
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -70,7 +70,7 @@ class Salvage:
     about: dict[str, str] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     lost_bytes: int = 0
-    _qos: trust.Qos = field(default_factory=trust.Qos, repr=False)
+    _qos: precheck.Qos = field(default_factory=precheck.Qos, repr=False)
     _described: int = 0  # characters of texts and definitions
 
     def __post_init__(self) -> None:
@@ -197,8 +197,8 @@ class Salvage:
 
     def _channel(self, channel: Channel, schemas: dict[int, Schema], channels: dict[int, str]) -> None:
         schema = schemas[channel.schema_id]
-        trust.check_name(channel.topic)
-        trust.check_name(schema.name)
+        precheck.check_name(channel.topic)
+        precheck.check_name(schema.name)
         self._qos.add(channel)
         qos = _profiles(channel.metadata.get("offered_qos_profiles", "") or "[]")
         digest = channel.metadata.get("topic_type_hash", "")
@@ -210,7 +210,7 @@ class Salvage:
     def _sqlite(self, file: Path) -> Iterator[tuple[str, int, bytes]]:
         try:
             with closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as base:
-                trust.check_tables(base)
+                precheck.check_tables(base)
                 names = self._sqlite_topics(base)
                 rows = base.execute(
                     "SELECT topic_id, timestamp, data FROM messages WHERE length(data) <= ? ORDER BY id", (MOST_BYTES,)
@@ -235,10 +235,10 @@ class Salvage:
         except sqlite3.Error:  # those of the oldest do not have that either
             listed = base.execute("SELECT id, name, type, serialization_format, '' FROM topics")
         for number, name, kind, encoding, qos in listed.fetchmany(MOST_TOPICS):
-            trust.check_name(name)
-            trust.check_name(kind)
+            precheck.check_name(name)
+            precheck.check_name(kind)
             text = qos if isinstance(qos, str) else ""
-            trust.check_yaml(text, "offered_qos_profiles")
+            precheck.check_yaml(text, "offered_qos_profiles")
             definition = defined.get(kind, "")
             self._describe(len(definition) + len(text))
             names[number] = name

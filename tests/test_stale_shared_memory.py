@@ -14,7 +14,7 @@ import pytest
 from cells import scenario
 
 from lathe_rc import harness
-from lathe_rc.nodes import leftovers
+from lathe_rc.nodes import stale_shared_memory
 
 SEGMENT = "fastrtps_0123456789abcdef"
 
@@ -45,35 +45,35 @@ def test_what_nobody_uses_is_removed_and_nothing_else(port, tmp_path):
     others = {"sem.fastrtps_port7661_mutex", "fastrtps_0123456789abcdef0", "fastrtps_without_a_lock", "port7661"}
     for name in others | {"fastrtps_port7661_el", SEGMENT, f"{SEGMENT}_el"}:
         (tmp_path / name).touch()
-    assert leftovers.sweep(tmp_path) == [port.name, SEGMENT]
+    assert stale_shared_memory.sweep(tmp_path) == [port.name, SEGMENT]
     # A lock that stays would make DDS take what comes next for a port of a dead process.
     assert {file.name for file in tmp_path.iterdir()} == others
-    assert leftovers.sweep(tmp_path) == []
+    assert stale_shared_memory.sweep(tmp_path) == []
 
 
 def test_the_segment_of_a_living_process_is_left_alone(tmp_path):
     segment, lock = tmp_path / SEGMENT, tmp_path / f"{SEGMENT}_el"
     segment.touch()
-    assert leftovers.sweep(tmp_path) == [], "whose lock is not there yet, or has just been removed"
+    assert stale_shared_memory.sweep(tmp_path) == [], "whose lock is not there yet, or has just been removed"
     with lock.open("ab") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        assert leftovers.sweep(tmp_path) == []
-    assert leftovers.sweep(tmp_path) == [SEGMENT]
+        assert stale_shared_memory.sweep(tmp_path) == []
+    assert stale_shared_memory.sweep(tmp_path) == [SEGMENT]
 
 
 @pytest.mark.parametrize("end", ["_el", "_sl"])
 def test_who_listens_is_left_alone(port, end):
     with port.with_name(port.name + end).open("ab") as lock:
         fcntl.flock(lock, fcntl.LOCK_SH)
-        assert leftovers.sweep(port.parent) == []
-    assert leftovers.sweep(port.parent) == [port.name]
+        assert stale_shared_memory.sweep(port.parent) == []
+    assert stale_shared_memory.sweep(port.parent) == [port.name]
 
 
 def test_who_has_it_in_memory_is_left_alone(port):
     with port.open("r+b") as stream, mmap.mmap(stream.fileno(), 0):
-        assert leftovers.sweep(port.parent) == []
+        assert stale_shared_memory.sweep(port.parent) == []
         assert [file.name for file in port.parent.iterdir()] == [port.name]
-    assert leftovers.sweep(port.parent) == [port.name]
+    assert stale_shared_memory.sweep(port.parent) == [port.name]
 
 
 def test_sweeps_wait_for_one_another(port, monkeypatch):
@@ -86,12 +86,12 @@ def test_sweeps_wait_for_one_another(port, monkeypatch):
         os.close(other)
         return False
 
-    monkeypatch.setattr(leftovers, "_is_mapped", is_mapped)
-    assert leftovers.sweep(port.parent) == [port.name]
+    monkeypatch.setattr(stale_shared_memory, "_is_mapped", is_mapped)
+    assert stale_shared_memory.sweep(port.parent) == [port.name]
 
 
 def test_a_machine_without_shared_memory(tmp_path):
-    assert leftovers.sweep(tmp_path / "nowhere") == []
+    assert stale_shared_memory.sweep(tmp_path / "nowhere") == []
 
 
 def locked_by(pid):
@@ -104,7 +104,7 @@ def locked_by(pid):
 
 
 def there(names):
-    return {name for name in names if (leftovers.FOLDER / name).exists()}
+    return {name for name in names if (stale_shared_memory.FOLDER / name).exists()}
 
 
 def test_what_a_killed_node_has_left_is_removed_and_what_a_living_one_has_is_not(domain):
@@ -119,10 +119,10 @@ def test_what_a_killed_node_has_left_is_removed_and_what_a_living_one_has_is_not
         signal.pidfd_send_signal(dead, signal.SIGKILL)
         select.select([dead], [], [])  # until it has ended
         os.close(dead)
-        leftovers.sweep()
+        stale_shared_memory.sweep()
         # The living one still has those in memory to which it has sent.
         assert there(used) == used
-    leftovers.sweep()
+    stale_shared_memory.sweep()
     # Ports below are shared by all domains: other tests may use them meanwhile.
     own = {name for name in left | used if "port" not in name or int(name.removeprefix("fastrtps_port")) >= 7400}
     assert len({name for name in own if "port" not in name}) == len(nodes)
@@ -134,6 +134,6 @@ def test_a_cell_runs_where_killed_ones_have_left_broken_ports(domain):
     """Without the sweep it stands still before the first block, as it does with those of processes that were killed."""
     for participant in range(8):
         port = 7400 + 250 * domain + 11 + 2 * participant  # of its messages (DDSI-RTPS 2.5, 9.6.2)
-        (leftovers.FOLDER / f"fastrtps_port{port}").write_bytes(bytes(52400))
+        (stale_shared_memory.FOLDER / f"fastrtps_port{port}").write_bytes(bytes(52400))
     cell = scenario(spindle_encoder={"revolutions": 5.0})
     assert harness.run(cell, mode="processes", domain=domain).digest == harness.run(cell).digest

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 from rosbags.interfaces import Qos
 
-from lathe_rc.bag.mcap_file import RowPlan
-from lathe_rc.bag.writer import Output
+from lathe_rc.bag.writing.mcap_file import RowPlan
+from lathe_rc.bag.writing.writer import Output
 
 
 class Both:

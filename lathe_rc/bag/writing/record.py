@@ -6,19 +6,19 @@ from pathlib import Path
 
 import numpy as np
 
-from lathe_rc.bag import story
-from lathe_rc.bag.both import Both
-from lathe_rc.bag.order import Merger
-from lathe_rc.bag.snapshots import Snapshots
-from lathe_rc.bag.writer import BagWriter, Output, offered_qos
-from lathe_rc.cell import messages
+from lathe_rc import messages
+from lathe_rc.bag import provenance
+from lathe_rc.bag.writing.order import Merger
+from lathe_rc.bag.writing.snapshots import Snapshots
+from lathe_rc.bag.writing.tee import Both
+from lathe_rc.bag.writing.writer import BagWriter, Output, offered_qos
 from lathe_rc.cell.framing import Framer
-from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recorder import KIND, RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.messages import Signals
 
 _SPARE, _FREE_RUNNING = 32, 1024  # messages
 
@@ -55,7 +55,7 @@ def begin(path: Path, scenario: Scenario, snapshots: Snapshots | None = None) ->
         InputError: the folder exists or cannot be made.
     """
     output = bag_of(path, recorder_of(scenario)[1], snapshots)
-    output.tell(story.tell(scenario, []))
+    output.tell(provenance.tell(scenario, []))
     return output
 
 

@@ -16,27 +16,28 @@ from pathlib import Path
 
 import numpy as np
 
-from lathe_rc import resources
-from lathe_rc.bag import check, identify, story
-from lathe_rc.bag.identify import Identified
-from lathe_rc.bag.played import asked_for, wire
-from lathe_rc.bag.record import OfflineRecorder, begin
-from lathe_rc.bag.recorded import Recorded
+from lathe_rc import messages, resources
+from lathe_rc.bag import check, provenance
+from lathe_rc.bag.reading.recorded import Recorded
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.stream import feed
+from lathe_rc.bag.resimulation import identify
+from lathe_rc.bag.resimulation.bag_spindle import asked_for, wire
+from lathe_rc.bag.resimulation.identify import Identified
 from lathe_rc.bag.snapshot import first_sample
-from lathe_rc.bag.source import Source
-from lathe_rc.bag.stream import feed
-from lathe_rc.bag.writer import refuse_existing
-from lathe_rc.cell import messages, models, ros_yaml
+from lathe_rc.bag.writing.record import OfflineRecorder, begin
+from lathe_rc.bag.writing.writer import refuse_existing
+from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.collect import Finite
 from lathe_rc.cell.engine import Engine, Sink
-from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.names import instead
 from lathe_rc.part import ErrorsByRevolution
 
@@ -133,7 +134,7 @@ def with_controller(scenario: Scenario, file: Path) -> Scenario:
 
 
 def _refuse_part(source: Source) -> None:
-    held = story.held(source.about)
+    held = provenance.held(source.about)
     if held:
         topic, sample = next(iter(held.items()))
         raise InputError(
@@ -188,10 +189,10 @@ def resimulate(
         else:
             assert original is not None, "it is the other source of a scenario"
             _refuse_overrides(original, overrides)
-            chosen = story.scenario_of(source.about, Path(folder), overrides) if overrides else original
+            chosen = provenance.scenario_of(source.about, Path(folder), overrides) if overrides else original
         if controller is not None:
             chosen = with_controller(chosen, controller)
-        warnings = story.changes(source.about) if original is not None else []
+        warnings = provenance.changes(source.about) if original is not None else []
         _refuse_events(chosen, original)
         drives = identify.drives(recorded, chosen) if identified else []
         chosen = identify.with_identified(chosen, drives)
@@ -247,12 +248,12 @@ def _of_bag(recorded: Recorded, source: Source, folder: Path) -> Scenario:
     Raises:
         InputError: it has none; says what it has and what is asked for.
     """
-    if story.SCENARIO not in source.about:
+    if provenance.SCENARIO not in source.about:
         raise InputError(f"{source.path}: {asked_for(recorded)}")
-    return story.scenario_of(source.about, folder)
+    return provenance.scenario_of(source.about, folder)
 
 
-_HAPPENED = (
+_PAST = (
     "events and faults come from the bag, as they took effect; leave them as they are, or run the scenario with others"
 )
 
@@ -262,7 +263,7 @@ def _refuse_overrides(original: Scenario, overrides: Sequence[str]) -> None:
     for text in overrides:
         name = text.partition("=")[0].strip()
         if name.endswith((".events", ".faults")):
-            raise InputError(f"--set {text!r}: {_HAPPENED}")
+            raise InputError(f"--set {text!r}: {_PAST}")
         if name.partition(".")[0] == spindle or "." not in name:
             raise InputError(f"--set {text!r}: the spindle and what all nodes share come from the bag; set others")
 
@@ -275,7 +276,7 @@ def _refuse_events(chosen: Scenario, original: Scenario | None) -> None:
         for what in ("events", "faults"):
             asked = getattr(table, what)
             if asked and asked != getattr(original.nodes[name], what):
-                raise InputError(f"{name}.{what} = {asked}: {_HAPPENED}")
+                raise InputError(f"{name}.{what} = {asked}: {_PAST}")
 
 
 def recorded_digests(path: Path) -> dict[str, str]:

@@ -5,11 +5,11 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
-from lathe_rc.bag.rows import Dense, Plan, Sheet
-from lathe_rc.bag.writer import Output
-from lathe_rc.cell.messages import START_NS, Samples, Signals
+from lathe_rc.bag.writing.rows import Dense, Plan, Sheet
+from lathe_rc.bag.writing.writer import Output
 from lathe_rc.cell.wire import Block
 from lathe_rc.errors import LatheError
+from lathe_rc.messages import START_NS, Samples, Signals
 
 _ROWS = 16  # of a sheet
 _MOST = 2**63  # messages

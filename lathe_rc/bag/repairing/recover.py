@@ -5,9 +5,9 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from lathe_rc.bag import story
-from lathe_rc.bag.salvage import Salvage
-from lathe_rc.bag.writer import BagWriter, refuse_existing
+from lathe_rc.bag import provenance
+from lathe_rc.bag.repairing.salvage import Salvage
+from lathe_rc.bag.writing.writer import BagWriter, refuse_existing
 from lathe_rc.errors import shown
 
 _CHUNK = 2**20  # [B]
@@ -75,7 +75,7 @@ def recover(path: Path, target: Path) -> Recovery:
         for topic in salvage.topics:
             if topic not in known and topic not in refused:  # announced, without a message
                 announce(topic)
-        writer.tell(salvage.about | {story.RECOVERED: f"{saved} messages; {salvage.lost_bytes} B lost"})
+        writer.tell(salvage.about | {provenance.RECOVERED: f"{saved} messages; {salvage.lost_bytes} B lost"})
     finally:
         writer.close()
     damage = [*salvage.damage, *(f"{topic}: {what} is not known" for topic, what in refused.items())]

@@ -9,7 +9,7 @@ _MOST = 32  # senders that are told apart
 _LONGEST = 256  # characters of a name that is kept
 
 
-class Stranger(LatheError):  # noqa: N818 - who it is, not what went wrong
+class ForeignMessage(LatheError):  # noqa: N818 - the message, not what went wrong
     """A message that does not belong; what was refused, and why.
 
     Args:
@@ -25,7 +25,7 @@ class Stranger(LatheError):  # noqa: N818 - who it is, not what went wrong
         self.topic = topic
 
 
-class Strangers:
+class RefusedMessages:
     """Counts what a node has refused.
 
     Args:
@@ -36,19 +36,19 @@ class Strangers:
         topics: on which any have come.
     """
 
-    def __init__(self, told: Callable[[Stranger], None]) -> None:
+    def __init__(self, told: Callable[[ForeignMessage], None]) -> None:
         self._told = told
         self.senders: dict[str, int] = {}
         self.topics: set[str] = set()
 
-    def refuse(self, stranger: Stranger) -> None:
+    def refuse(self, message: ForeignMessage) -> None:
         """Count a message."""
-        self.topics.add(stranger.topic)
-        new = stranger.sender not in self.senders
-        sender = "others" if new and len(self.senders) >= _MOST else stranger.sender
+        self.topics.add(message.topic)
+        new = message.sender not in self.senders
+        sender = "others" if new and len(self.senders) >= _MOST else message.sender
         self.senders[sender] = self.senders.get(sender, 0) + 1
         if new and sender != "others":
-            self._told(stranger)
+            self._told(message)
 
     def __str__(self) -> str:
         """How many of whom."""

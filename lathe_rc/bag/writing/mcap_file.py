@@ -51,7 +51,7 @@ class _Record(Protocol):
 
 
 class RowPlan(NamedTuple):
-    """Messages that come again and again in the same order, with the same lengths: rows, see `lathe_rc.bag.rows`.
+    """Messages that come again and again in the same order and with the same lengths, see `lathe_rc.bag.writing.rows`.
 
     Attributes:
         places: where the bytes of each channel's message begin in a row.

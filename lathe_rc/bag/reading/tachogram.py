@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lathe_rc.bag.recorded import Recorded
-from lathe_rc.bag.source import Source
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc import messages
+from lathe_rc.bag.reading.recorded import Recorded
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.errors import InputError
+from lathe_rc.messages import Samples
 from lathe_rc.signals import tachogram
 
 _RPM = 30.0 / np.pi  # for 1 rad/s

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from lathe_rc.bag.recorded import Recorded
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc import messages
+from lathe_rc.bag.reading.recorded import Recorded
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.part import ErrorsByRevolution
 
 _TYPES = {"/encoder": messages.ENCODER, "/tool": messages.TOOL}

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lathe_rc.bag.mcap_file import TIMES, RowPlan, message_head
-from lathe_rc.cell.messages import START_NS, Samples, Signals
+from lathe_rc.bag.writing.mcap_file import TIMES, RowPlan, message_head
 from lathe_rc.cell.wire import NUMBERS, Block, Layout
+from lathe_rc.messages import START_NS, Samples, Signals
 
 _BILLION = 1_000_000_000
 

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from lathe_rc import messages
+from lathe_rc.bag.reading.chunk_messages import Places
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.snapshot import first_sample
-from lathe_rc.bag.source import Source
-from lathe_rc.bag.walk import Places
-from lathe_rc.cell import messages
 from lathe_rc.cell.engine import Sink
-from lathe_rc.cell.messages import START_NS, Signals
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import LatheError, shown
+from lathe_rc.messages import START_NS, Signals
 
 _TOGETHER, _TOGETHER_BYTES = 64, 2**18  # messages of a topic that are read at once, and their size
 _AHEAD = 64  # pieces that one topic may be ahead of another

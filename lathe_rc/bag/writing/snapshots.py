@@ -14,14 +14,14 @@ from typing import NamedTuple
 
 from rosbags.interfaces import Qos
 
-from lathe_rc.bag.mcap_file import RowPlan
-from lathe_rc.bag.rows import Dense, Plan
+from lathe_rc import messages
 from lathe_rc.bag.snapshot import Snapshot
-from lathe_rc.bag.writer import BagWriter, refuse_existing
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import START_NS
+from lathe_rc.bag.writing.mcap_file import RowPlan
+from lathe_rc.bag.writing.rows import Dense, Plan
+from lathe_rc.bag.writing.writer import BagWriter, refuse_existing
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import START_NS
 from lathe_rc.names import instead
 
 _CATCH_UP = 4  # messages or rows that go to the disk for each that comes, until a snapshot has caught up

@@ -7,12 +7,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.bag.compare import Comparison, positions
-from lathe_rc.bag.recorded import Recorded, Spindle
-from lathe_rc.bag.source import Source
-from lathe_rc.bag.stream import Tape
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc import messages
+from lathe_rc.bag.reading.recorded import Recorded, Spindle
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.stream import Tape
+from lathe_rc.bag.resimulation.compare import Comparison, positions
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import DONE, Fields, Reached
@@ -21,6 +20,7 @@ from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 
 
 class Memory(NamedTuple):

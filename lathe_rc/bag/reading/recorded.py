@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lathe_rc.bag import story
-from lathe_rc.bag.source import Source
-from lathe_rc.bag.stream import Tape
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc import messages
+from lathe_rc.bag import provenance
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.stream import Tape
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import Samples, Signals
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Recorded:
     """
 
     def __init__(self, source: Source, names: Mapping[str, str]) -> None:
-        self.path, self.namespace = source.path, story.namespace(source.about)
+        self.path, self.namespace = source.path, provenance.namespace(source.about)
         self._source, self._names = source, dict(names)
         for name, topic in names.items():
             if topic not in source.topics:

@@ -13,9 +13,9 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv, parquet
 
-from lathe_rc.bag.columns import TEXT, Column
-from lathe_rc.cell.messages import Samples
+from lathe_rc.cell.columns import TEXT, Column
 from lathe_rc.errors import LatheError
+from lathe_rc.messages import Samples
 
 _MOST_TEXT = 4096  # characters of a text in an NPZ file, where every element is as wide as the widest
 

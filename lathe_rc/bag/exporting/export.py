@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from lathe_rc.bag.columns import Column, columns, dense_rows, sparse_rows
-from lathe_rc.bag.formats import FORMATS, Format, Rows
-from lathe_rc.bag.source import Source
-from lathe_rc.bag.stream import feed
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals, full
+from lathe_rc import messages
+from lathe_rc.bag.exporting.formats import FORMATS, Format, Rows
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.stream import feed
+from lathe_rc.cell.columns import Column, columns, dense_rows, sparse_rows
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.names import instead
 
 _TOPIC = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)

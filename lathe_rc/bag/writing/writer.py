@@ -2,8 +2,8 @@
 """Writing rosbag2 directories.
 
 rosbags writes the directory, its metadata and the schemas. Its own MCAP storage has neither a chunk size nor a
-flush, which are what a crash promise needs; `lathe_rc.bag.mcap_file` has. Its YAML takes 0.2 s for a bag, during which
-a cell that is being recorded would wait; libyaml takes some ms.
+flush, which are what a crash promise needs; `lathe_rc.bag.writing.mcap_file` has. Its YAML takes 0.2 s for a bag,
+during which a cell that is being recorded would wait; libyaml takes some ms.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,8 +27,8 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from lathe_rc.bag.mcap_file import McapFile, RowPlan
-from lathe_rc.cell import messages
+from lathe_rc import messages
+from lathe_rc.bag.writing.mcap_file import McapFile, RowPlan
 from lathe_rc.errors import InputError, LatheError
 
 Compression = Literal["zstd", "none"]
@@ -272,7 +272,7 @@ class BagWriter:
         return self._channels[topic]
 
     def write_rows(self, plan: RowPlan, first_ns: int, data: bytes) -> None:
-        """Append rows of blocks, the first with log time ``first_ns``; see `lathe_rc.bag.rows`.
+        """Append rows of blocks, the first with log time ``first_ns``; see `lathe_rc.bag.writing.rows`.
 
         Raises:
             LatheError: the disk does not take it.

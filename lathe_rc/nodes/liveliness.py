@@ -20,7 +20,7 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import LivelinessPolicy, QoSProfile
 from std_msgs.msg import Empty
 
-from lathe_rc.cell.messages import ALIVE
+from lathe_rc.messages import ALIVE
 
 SILENCE = 0.08  #: [s] after which a node is silent that DDS does not hear, and that completes nothing
 
@@ -33,7 +33,7 @@ def this_host() -> str:
 
 
 def liveliness() -> QoSProfile:
-    """Of the topic `lathe_rc.cell.messages.ALIVE`."""
+    """Of the topic `lathe_rc.messages.ALIVE`."""
     return QoSProfile(
         depth=1, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=SILENCE)
     )

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from lathe_rc import messages
 from lathe_rc.analysis import drive_fit, profile_csv
 from lathe_rc.analysis.drive_fit import DriveFit
 from lathe_rc.analysis.metrology import evenly
-from lathe_rc.bag.recorded import Recorded
-from lathe_rc.cell import messages, models
+from lathe_rc.bag.reading.recorded import Recorded
+from lathe_rc.cell import models
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters

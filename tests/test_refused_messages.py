@@ -17,8 +17,7 @@ from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
-from lathe_rc import harness
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.stage_node import StageNode
@@ -88,7 +87,7 @@ def diagnostics(bag):
     return {status.name: status for array in arrays for status in array.status}
 
 
-def test_a_cell_goes_on_among_strangers(ghost, domain, tmp_path):
+def test_a_cell_goes_on_among_foreign_messages(ghost, domain, tmp_path):
     """What does not belong is refused, counted and named, and the cell gives the bits that it has alone."""
     cell = scenario(spindle_encoder={"revolutions": 30.0, "speed_factor": 1.0})  # while all is said several times
     on = {"/encoder": (EncoderBlock, "/spindle_encoder"), "/tool": (ToolBlock, "/tool")}

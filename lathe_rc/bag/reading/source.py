@@ -27,9 +27,9 @@ from mcap.writer import MCAP0_MAGIC
 from rosbags.interfaces import Connection, Qos
 from rosbags.rosbag2 import Reader
 
-from lathe_rc.bag import trust
-from lathe_rc.bag.trust import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record
-from lathe_rc.bag.walk import Places, walk
+from lathe_rc.bag.reading import precheck
+from lathe_rc.bag.reading.chunk_messages import Places, walk
+from lathe_rc.bag.reading.precheck import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import InputError, LatheError, shown
 
@@ -170,11 +170,11 @@ def read_chunk(content: bytes, place: int) -> bytes:
 def _damage(path: Path) -> str:
     """What is longer than it says or than is allowed in an MCAP file, and where; empty if nothing is."""
     limit = path.stat().st_size - len(MCAP0_MAGIC)
-    qos = trust.Qos()
+    qos = precheck.Qos()
     with path.open("rb") as stream:
         head = stream.read(len(MCAP0_MAGIC))
         if head != MCAP0_MAGIC:
-            return "" if trust.is_packed(head) else f"{path.name}: not an MCAP file"
+            return "" if precheck.is_packed(head) else f"{path.name}: not an MCAP file"
         place = stream.tell()
         try:
             while (record := read_record(stream, limit)) and record[0] != Opcode.FOOTER:
@@ -192,7 +192,7 @@ def _damage(path: Path) -> str:
     return ""
 
 
-def _add_qos(qos: trust.Qos, opcode: int, content: bytes) -> None:
+def _add_qos(qos: precheck.Qos, opcode: int, content: bytes) -> None:
     if opcode == Opcode.CHANNEL:
         qos.add(Channel.read(ReadDataStream(BytesIO(content))))
 
@@ -205,18 +205,18 @@ def _check_storage(path: Path) -> None:
     """
     with path.open("rb") as stream:
         head = stream.read(len(_SQLITE))
-    if trust.is_packed(head):
+    if precheck.is_packed(head):
         with tempfile.TemporaryDirectory(prefix="lathe-unpacked-") as folder:
             plain = Path(folder) / path.stem
             with plain.open("wb") as out:
                 out.writelines(unpack_file(path))
             with plain.open("rb") as stream:
-                if trust.is_packed(stream.read(len(_SQLITE))):
+                if precheck.is_packed(stream.read(len(_SQLITE))):
                     raise ValueError(f"{path.name} is compressed twice")
             _check_storage(plain)
     elif head == _SQLITE:
-        trust.check_database(path)
-    elif head.startswith(MCAP0_MAGIC) and not trust.summary_of(path) and (why := _damage(path)):
+        precheck.check_database(path)
+    elif head.startswith(MCAP0_MAGIC) and not precheck.summary_of(path) and (why := _damage(path)):
         raise ValueError(why)
 
 
@@ -289,7 +289,7 @@ class Source:
                 raise ValueError(f"no {_METADATA} in that folder{lack}")
             if metadata.stat().st_size > MOST_TEXT * 16:
                 raise InputError(f"{metadata}: {metadata.stat().st_size} B; allowed: up to {MOST_TEXT * 16}")
-            trust.check_yaml(metadata.read_text(encoding="utf-8"), _METADATA)
+            precheck.check_yaml(metadata.read_text(encoding="utf-8"), _METADATA)
         for file in sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]:
             if file.is_file():
                 _check_storage(file)
@@ -305,15 +305,15 @@ class Source:
         texts = {key: text for key, text in custom.items() if isinstance(key, str) and isinstance(text, str)}
         self.about: Mapping[str, str] = {key[:256]: text[:MOST_TEXT] for key, text in texts.items()}
         spans = [each.metadata for each in self._storages if each.metadata.message_count]
-        self.first_ns = min((trust.number(span.start_time) for span in spans), default=0)
-        self.last_ns = max((trust.number(span.end_time) for span in spans), default=1) - 1
+        self.first_ns = min((precheck.number(span.start_time) for span in spans), default=0)
+        self.last_ns = max((precheck.number(span.end_time) for span in spans), default=1) - 1
         self.contradictions = self._believe_the_files()
 
     def _believe_the_files(self) -> list[str]:
         """Take the numbers of messages from the files; tells where metadata.yaml says something else."""
         wrong: list[tuple[str, int]] = []
         if self._reader.message_count and self.last_ns:
-            told = trust.number(self._reader.start_time), trust.number(self._reader.end_time) - 1
+            told = precheck.number(self._reader.start_time), precheck.number(self._reader.end_time) - 1
             held = zip(("first", "last"), told, (self.first_ns, self.last_ns), strict=True)
             wrong += [(f"{which} message at {said} ns", found) for which, said, found in held if said != found]
         connections = [each for storage in self._storages for each in storage.connections]
@@ -331,11 +331,11 @@ class Source:
         """What a file, or the metadata, says of topics."""
         found: dict[str, Topic] = {}
         for connection in connections:
-            trust.check_name(connection.topic)
-            trust.check_name(connection.msgtype)
+            precheck.check_name(connection.topic)
+            precheck.check_name(connection.msgtype)
             ext: Any = connection.ext
             known = found.get(connection.topic)
-            count = trust.number(connection.msgcount) + (known.count if known else 0)
+            count = precheck.number(connection.msgcount) + (known.count if known else 0)
             found[connection.topic] = Topic(connection.msgtype, tuple(ext.offered_qos_profiles), count)
         if len(found) > MOST_TOPICS:
             raise InputError(f"{self.path}: {len(found)} topics; allowed: up to {MOST_TOPICS}")

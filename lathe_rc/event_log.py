@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happened at a sample, in words: events, and what the supervisor says."""
+"""The event log of a run in words: events of nodes, and what the supervisor says."""
 
 from dataclasses import dataclass
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.safety.state_machine import Reaction, State
 
 _STATES, _REACTIONS = {int(s): s.name.lower() for s in State}, {int(r): r.name.lower() for r in Reaction}
 
-HAPPENED = (messages.EVENT, messages.SAFETY_STATUS)  #: types of messages that say so
+LOGGED = (messages.EVENT, messages.SAFETY_STATUS)  #: types of messages that say so
 
 
 @dataclass(frozen=True)
-class Happening:
-    """Something that happened.
+class LogEntry:
+    """An event at a sample.
 
     Attributes:
         sample: from which on.
@@ -28,12 +28,12 @@ class Happening:
     text: str
 
 
-def listed(recording: Recording) -> list[Happening]:
-    """All that happened in a run, in order."""
-    topics = [topic for topic in recording.sparse if recording.types[topic] in HAPPENED]
+def entries(recording: Recording) -> list[LogEntry]:
+    """The entries of a run, in order."""
+    topics = [topic for topic in recording.sparse if recording.types[topic] in LOGGED]
     said = [message for topic in topics for message in recording.messages(topic)]
-    found = [Happening(message.index, message.topic, text(message)) for message in said]
-    return sorted(found, key=lambda happening: happening.sample)
+    found = [LogEntry(message.index, message.topic, text(message)) for message in said]
+    return sorted(found, key=lambda entry: entry.sample)
 
 
 def text(message: Sparse) -> str:
