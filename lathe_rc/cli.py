@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import click
 
-from lathe_rc import __version__
+from lathe_rc import __version__, extras
 from lathe_rc.errors import LatheError, shown
 
 COMMANDS = {
@@ -63,6 +63,11 @@ class _Group(click.Group):
         except LatheError as error:
             click.echo(f"lathe: {error}", err=True)
             ctx.exit(error.exit_code)
+        except ModuleNotFoundError as error:
+            if not (missing := extras.refusal(error.name)):
+                raise
+            click.echo(f"lathe: {missing}", err=True)
+            ctx.exit(missing.exit_code)
         except MemoryError as error:
             click.echo(f"lathe: not enough memory ({shown(error)})", err=True)
             ctx.exit(LatheError.exit_code)

@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
+from lathe_rc import extras
 from lathe_rc.errors import LatheError
 
 Start = Literal["fork", "spawn"]  #: of a process: as a copy of one that has imported everything, or from nothing
@@ -82,11 +83,15 @@ class Child:
 class ForkServer:
     """A fork server of this process; it ends when this process does.
 
+    Raises:
+        LatheError: there is no ROS 2 here.
+
     Attributes:
         lost: it has ended before.
     """
 
     def __init__(self) -> None:
+        extras.require("rclpy")
         self._line, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(
