@@ -231,8 +231,8 @@ def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tm
 
 
 def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_is_lost(monkeypatch, tmp_path):
-    monkeypatch.setattr(harness, "_FAREWELL", 1.0)
-    monkeypatch.setattr(harness, "_GRACE", 0.2)  # it writes no log that tells where it is
+    monkeypatch.setattr("lathe_rc.harness.processes._FAREWELL", 1.0)
+    monkeypatch.setattr("lathe_rc.harness.processes._GRACE", 0.2)  # it writes no log that tells where it is
     bag, told = tmp_path / "bag", []
     cell = harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=6.0"]), bag, keep=True)
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:

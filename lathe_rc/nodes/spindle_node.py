@@ -15,7 +15,6 @@ from lathe_rc.cell.durations import LATENCY, LATENESS, PERCENT, Durations, Perce
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes.chain import form
 from lathe_rc.nodes.liveliness import SILENCE
 from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.refused_messages import ForeignMessage
@@ -144,7 +143,7 @@ class SpindleNode(StageNode):
         self.reporter("block0", self.get_name())
         self._schedule = self._heard = self._looked = time.monotonic()
         self._members_moved = dict.fromkeys(self._member_names, self._heard)
-        form(self, cell)
+        self.exchange.form(self, cell)
         if self.chain is None and self._inputs:
             self._join(0)
         self.release()

@@ -5,7 +5,7 @@ import json
 import shutil
 import zipfile
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
@@ -14,6 +14,7 @@ import pyarrow as pa
 from pyarrow import csv, parquet
 
 from lathe_rc.cell.columns import TEXT, Column
+from lathe_rc.cell.frames import arrow_schema
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Samples
 
@@ -49,20 +50,6 @@ class Format(ABC):
     @abstractmethod
     def finish(self) -> None:
         """All tables are closed: complete what they share."""
-
-
-def arrow_schema(columns: Sequence[Column], name: Callable[[Column], str]) -> Any:
-    """Arrow's view of a table; the units are metadata of the fields."""
-    return pa.schema(
-        [
-            pa.field(
-                name(column),
-                pa.string() if column.dtype == TEXT else pa.from_numpy_dtype(column.dtype),
-                metadata={"unit": column.unit} if column.unit else None,
-            )
-            for column in columns
-        ]
-    )
 
 
 class _ArrowRows:

@@ -1,31 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command ``lathe bench``: the benchmarks of the checkout, measured on the machine at hand."""
 
-import importlib
 import json
-import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import click
 from rich.console import Console
 from rich.table import Table
 
-import lathe_rc
+from benchmarks import growth, page, suite
+from lathe_rc import cli
 from lathe_rc.errors import InputError
 
 
-def _suite() -> ModuleType:
-    """The benchmarks, which lie beside the package in a checkout and nowhere else."""
-    checkout = Path(lathe_rc.__file__).resolve().parents[1]
-    if not (checkout / "benchmarks" / "suite.py").is_file():
-        raise InputError(f"no benchmarks beside {checkout}; run ./lathe bench in a checkout of the repository")
-    sys.path.insert(0, str(checkout))
-    return importlib.import_module("benchmarks.suite")
-
-
-def _stored(suite: ModuleType, option: str, name: str) -> dict[str, Any]:
+def _stored(option: str, name: str) -> dict[str, Any]:
     path = next((path for path in (Path(name), suite.STORE / f"{name}.json") if path.is_file()), None)
     if path is None:
         known = ", ".join(sorted(path.stem for path in suite.STORE.glob("*.json"))) or "none yet"
@@ -36,10 +25,9 @@ def _stored(suite: ModuleType, option: str, name: str) -> dict[str, Any]:
         raise InputError(f"{option} {path}: not a result of lathe bench ({error})") from None
 
 
-def _write_page(suite: ModuleType, result: dict[str, Any]) -> Path:
+def _write_page(result: dict[str, Any]) -> Path:
     """The page of a result, with its plot."""
     docs = Path(suite.ROOT) / "docs"
-    page, growth = (importlib.import_module(f"benchmarks.{name}") for name in ("page", "growth"))
     if "growth" in result:
         growth.plot(result["growth"], docs / page.GROWTH_IMAGE)
     path = docs / "performance.md"
@@ -47,7 +35,7 @@ def _write_page(suite: ModuleType, result: dict[str, Any]) -> Path:
     return path
 
 
-def _table(suite: ModuleType, result: dict[str, Any], other: dict[str, Any] | None) -> Table:
+def _table(result: dict[str, Any], other: dict[str, Any] | None) -> Table:
     table = Table(title=f"commit {result['commit']}", title_justify="left", show_edge=False, header_style="bold")
     table.add_column("figure")
     table.add_column("median", justify="right")
@@ -67,21 +55,22 @@ def _table(suite: ModuleType, result: dict[str, Any], other: dict[str, Any] | No
 @click.argument("parts", nargs=-1)
 @click.option("--quick", is_flag=True, help="under a minute; rough figures")
 @click.option("--against", metavar="COMMIT|FILE", help="show the figures of a stored result beside these")
-@click.option("--page", metavar="COMMIT|FILE", help="measure nothing: make docs/performance.md of a stored result")
+@click.option(
+    "--page", "stored", metavar="COMMIT|FILE", help="measure nothing: make docs/performance.md of a stored result"
+)
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
-def bench(parts: tuple[str, ...], against: str | None, page: str | None, *, quick: bool, as_json: bool) -> None:
+def bench(parts: tuple[str, ...], against: str | None, stored: str | None, *, quick: bool, as_json: bool) -> None:
     """Measure how fast lathe_rc is here, as ratios side by side; PARTS chooses some, default all.
 
     The result is kept under .lathe/bench by commit. docs/performance.md says what each figure means.
     """
-    suite = _suite()
     for part in parts:
         if part not in suite.PARTS:
             raise InputError(f"lathe bench {part}; allowed: {', '.join(suite.PARTS)}")
-    if page:
-        click.echo(_write_page(suite, _stored(suite, "--page", page)))
+    if stored:
+        click.echo(_write_page(_stored("--page", stored)))
         return
-    other = _stored(suite, "--against", against) if against else None
+    other = _stored("--against", against) if against else None
     said = Console(stderr=True)
     chosen = parts or (suite.QUICK if quick else suite.PARTS)
     result = suite.run(chosen, quick=quick, say=lambda line: said.print(line, highlight=False))
@@ -90,5 +79,11 @@ def bench(parts: tuple[str, ...], against: str | None, page: str | None, *, quic
         click.echo(json.dumps(result))
         return
     console = Console()
-    console.print(_table(suite, result, other))
+    console.print(_table(result, other))
     console.print(f"kept in {path}", highlight=False, soft_wrap=True)
+
+
+main = cli.Group("lathe", commands=[bench], context_settings={"help_option_names": ["-h", "--help"]})
+
+if __name__ == "__main__":
+    main(prog_name="lathe")

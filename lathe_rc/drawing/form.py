@@ -2,6 +2,7 @@
 """The figure of a run: profile, form error over angle, form error against revolution."""
 
 import io
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,13 +10,35 @@ from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 from matplotlib.ticker import MaxNLocator
 
-from lathe_rc import messages
-from lathe_rc.analysis.metrology import FormErrors, turns_before
-from lathe_rc.cell.recording import Recording
-from lathe_rc.errors import InputError
+from lathe_rc.analysis.metrology import FormErrors
 
 _FIRST, _LAST, _PEER = "#c0392b", "#1f6f8b", "#e08e0b"
 _IN_NOTEBOOK = 72.0  # [dots per inch]
+
+
+@dataclass(frozen=True)
+class TurnedForm:
+    """The form that a run has turned.
+
+    Attributes:
+        angle: of the spindle [rad], shape (samples,).
+        reference: desired radius deviation [m], shape (samples,).
+        error: form error [m], shape (samples,).
+        errors: form error by revolution; at least one.
+        before: revolutions before the first of them.
+    """
+
+    angle: np.ndarray
+    reference: np.ndarray
+    error: np.ndarray
+    errors: FormErrors
+    before: int
+
+    def revolution(self, number: int) -> tuple[np.ndarray, slice]:
+        """Angle in a revolution [°], and its samples."""
+        starts = self.errors.starts[number : number + 2] if number >= 0 else self.errors.starts[-2:]
+        span = slice(int(starts[0]), int(starts[1]))
+        return np.rad2deg(np.mod(self.angle[span], 2 * np.pi)), span
 
 
 class RunFigure(Figure):
@@ -32,48 +55,35 @@ def png(figure: Figure) -> bytes:
     return image.getvalue()
 
 
-def draw(recording: Recording, title: str = "", beside: tuple[str, Recording] | None = None) -> Figure:
+def draw(run: TurnedForm, title: str = "", beside: tuple[str, TurnedForm] | None = None) -> Figure:
     """Desired form, form error over angle in the first and the last revolution, and form error by revolution.
 
     Args:
-        recording: of a run, with a tool.
+        run: what it has turned.
         title: of the figure.
-        beside: name and recording of another run of the same part, whose errors are drawn as well.
+        beside: name and form of another run of the same part, whose errors are drawn as well.
 
     Returns:
         A figure that pyplot does not know: its ``savefig`` writes it, notebooks show it.
-
-    Raises:
-        InputError: there is no tool, or not one complete revolution.
     """
-    errors = recording.errors
-    if not errors.rms.size:
-        kinds = set(recording.types.values())
-        missing = [name for name, kind in (("encoder", messages.ENCODER), ("tool", messages.TOOL)) if kind not in kinds]
-        why = f"no {' and no '.join(missing)}; record both" if missing else "no complete revolution; let it run longer"
-        raise InputError(f"nothing to draw: the recording has {why}")
-    encoder, tool = recording.of_type(messages.ENCODER), recording.of_type(messages.TOOL)
+    errors = run.errors
     figure = RunFigure(figsize=(13, 4.4), layout="constrained")
     grid = figure.add_gridspec(1, 3, width_ratios=[1, 1.35, 1.35])
     figure.suptitle(title, fontsize=11)
 
-    def revolution(number: int) -> tuple[np.ndarray, slice]:
-        span = slice(int(errors.starts[number]), int(errors.starts[number + 1]))
-        return np.rad2deg(np.mod(encoder["angle_true"][span], 2 * np.pi)), span
-
-    before, last = turns_before(encoder["angle_true"]), errors.rms.size - 1
+    last = errors.rms.size - 1
     form = figure.add_subplot(grid[0], projection="polar")
     assert isinstance(form, PolarAxes)
     for number, colour, label in ((0, _FIRST, "first"), (last, _LAST, "last")):
-        degrees, span = revolution(number)
+        degrees, span = run.revolution(number)
         form.plot(
             np.deg2rad(degrees),
-            tool["reference"][span] * 1e6,
+            run.reference[span] * 1e6,
             color=colour,
             lw=1.2,
             label=f"{label} revolution",
         )
-    low, high = tool["reference"].min() * 1e6, tool["reference"].max() * 1e6
+    low, high = run.reference.min() * 1e6, run.reference.max() * 1e6
     size = high - low or 1.0  # a round part
     form.set_rlim(low - 1.2 * size, high + 0.1 * size)
     form.set_rlabel_position(75)
@@ -84,9 +94,9 @@ def draw(recording: Recording, title: str = "", beside: tuple[str, Recording] | 
 
     over_angle = figure.add_subplot(grid[1])
     for number, colour in ((0, _FIRST), (last, _LAST)):
-        degrees, span = revolution(number)
-        label = f"revolution {before + number + 1}: {errors.rms[number] * 1e6:.3g} µm RMS"
-        over_angle.plot(degrees, np.abs(tool["error"][span]) * 1e6, color=colour, lw=1.1, label=label)
+        degrees, span = run.revolution(number)
+        label = f"revolution {run.before + number + 1}: {errors.rms[number] * 1e6:.3g} µm RMS"
+        over_angle.plot(degrees, np.abs(run.error[span]) * 1e6, color=colour, lw=1.1, label=label)
     over_angle.set(
         xlabel="spindle angle [°]",
         ylabel="|form error| [µm]",
@@ -100,19 +110,18 @@ def draw(recording: Recording, title: str = "", beside: tuple[str, Recording] | 
     over_angle.legend(fontsize=8, loc="center", bbox_to_anchor=(0.5, 0.6))
 
     curve = figure.add_subplot(grid[2])
-    _by_revolution(curve, errors, before)
+    _by_revolution(curve, errors, run.before)
     curve.set_title("learning, revolution by revolution", fontsize=10)
     if beside is not None:
         _beside(over_angle, curve, *beside)
     return figure
 
 
-def _beside(over_angle: Axes, curve: Axes, name: str, peer: Recording) -> None:
+def _beside(over_angle: Axes, curve: Axes, name: str, peer: TurnedForm) -> None:
     """Add the errors of another run: over the angle in its last revolution, and by revolution."""
     errors = peer.errors
-    span = slice(*(int(start) for start in errors.starts[-2:]))
-    degrees = np.rad2deg(np.mod(peer.of_type(messages.ENCODER)["angle_true"][span], 2 * np.pi))
-    error = np.abs(peer.of_type(messages.TOOL)["error"][span]) * 1e6
+    degrees, span = peer.revolution(-1)
+    error = np.abs(peer.error[span]) * 1e6
     over_angle.plot(degrees, error, color=_PEER, lw=1.1, label=f"{name}: {errors.rms[-1] * 1e6:.3g} µm RMS")
     over_angle.set_ylim(top=over_angle.get_ylim()[1] * 30.0)  # room for the legend
     over_angle.legend(fontsize=8, loc="upper center")
