@@ -38,7 +38,9 @@ def mend_cmake_paths(prefix: Path, site_packages: Path) -> None:
         text = cmake.read_text(encoding="utf-8")
         mended = BUILD_MACHINE.sub(lambda path: include if path[1] else str(site_packages), text)
         if mended != text:
-            cmake.write_text(mended, encoding="utf-8")
+            draft = cmake.with_name(cmake.name + ".draft")  # uv links files from its cache, which others use
+            draft.write_text(mended, encoding="utf-8")
+            draft.replace(cmake)
 
 
 def environment(prefix: Path, site_packages: Path) -> dict[str, str]:

@@ -510,12 +510,17 @@ print(lathe_rc.__file__)
 
 
 def test_wheels_paths_are_mended(monkeypatch, tmp_path):
+    """In this environment, not in uv's cache, whose files uv links."""
     monkeypatch.setattr(ros_wheels.sysconfig, "get_path", lambda _name: "/here/include")
     export = tmp_path / "share" / "x" / "cmake" / "export.cmake"
     export.parent.mkdir(parents=True)
     old = "/opt/python/cp311-cp311"
     export.write_text(f'"{old}/include/python3.11;{old}/lib/python3.11/site-packages/numpy/_core/include"')
+    cached = tmp_path / "cached"
+    cached.hardlink_to(export)
+    before = export.read_text()
     ros_wheels.mend_cmake_paths(tmp_path, ros.site_packages())
+    assert cached.read_text() == before
     assert export.read_text() == f'"/here/include;{ros.site_packages()}/numpy/_core/include"'
 
 
