@@ -154,7 +154,7 @@ class ForkServer:
                 socket.send_fds(self._line, [json.dumps(request).encode()], [report.fileno(), log])
             child = self._started.get()
         if child is None:
-            self._started.put(None)  # for who asks next
+            self._started.put(None)  # for the next caller
             raise LatheError("the process that starts the nodes has ended: see what it has written")
         return child
 

@@ -136,7 +136,7 @@ def test_a_bag_of_others_can_be_paused_and_comes_whole(strange, listener):
 
 
 def test_every_message_comes_in_order_with_the_clock(strange, listener):
-    """Every message comes in order with the clock; to who comes late in a round, in the next one.
+    """Every message comes in order with the clock; to a late reader in the next round.
 
     Volatile topics reach those who are there; so the first round may lack its beginning, the second may not.
     """

@@ -223,7 +223,7 @@ def observer(domain):
 
 
 def wait(observer, what):
-    """Spin until ``what`` holds, or far too long: who waits looks himself at what is there then."""
+    """Spin until ``what`` holds, or far too long; the caller checks the result."""
     deadline = time.monotonic() + PATIENCE
     while not what() and time.monotonic() < deadline:
         observer[1].spin_once(timeout_sec=0.05)

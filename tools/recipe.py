@@ -145,7 +145,7 @@ class Recipe:
             self._install(step, GROUPS[name].list)
 
     def _install(self, step: Step, *lists: str) -> None:
-        """Install what files in requirements/ list: beside a sourced ROS 2 with pip, which knows what is there."""
+        """Install what files in requirements/ list: beside a sourced ROS 2 with pip, which knows its packages."""
         environ = build_environment(self._ros)
         if self._ros:
             files = [word for name in lists for word in ("-r", REQUIREMENTS / name)]

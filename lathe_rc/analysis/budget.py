@@ -58,7 +58,7 @@ class Budget:
         revolutions: the last ones of the run that it speaks of.
         rms, largest: form error in them [m].
         causes: what each cause does alone.
-        rest: what is there without any of them.
+        rest: the error without any of them.
         interactions: what causes do only together; with causes and rest it is the whole.
         pairs: parts of the interactions, by two causes each; empty if those come to less than `TOLD` together.
         left_out: causes that could not be switched off, and why.

@@ -3,7 +3,7 @@
 
 The tolerance ±t is that of a line profile (ISO 1101) whose zone is 2t wide, t to each side of the desired form. A
 revolution is in tolerance if its form error is nowhere larger than t; a run, from the revolution on from which all are,
-to its end. What is to spare is told of its last revolutions: the first that is in tolerance hardly is.
+to its end. The margin is that of its last revolutions: the first that is in tolerance hardly is.
 """
 
 from collections import deque

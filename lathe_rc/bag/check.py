@@ -18,7 +18,7 @@ from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import InputError, shown
 
 DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, as the harness found them
-_MOST_FINDINGS = 20  # that are told of one topic
+_MOST_FINDINGS = 20  # listed for one topic
 _MOST_DIGESTS = 2**20  # size of that file [B]
 
 

@@ -120,7 +120,7 @@ class _Keep:
         angle = self._kept["angle"]
         if angle.size < 2:
             return _Tail(0, np.empty((0, 0)), angle)
-        # One more than is told of, for the spline; the last may be short of two samples.
+        # One more than is reported, for the spline; the last may be short of two samples.
         before = max(int((angle[-1] + 2.0 * (angle[-1] - angle[-2])) / _TURN) - LAST - 1, 0)
         begin = int(np.searchsorted(angle, before * _TURN))
         error = evenly(angle[begin:] - before * _TURN, self._kept["error"][begin:])
@@ -179,7 +179,7 @@ def _speed(scenario: Scenario) -> dict[str, Cause]:
 
 
 def _feed(scenario: Scenario, height: Samples) -> dict[str, Cause]:
-    """A form that changes along the part: off, the tool stays at the middle of the heights that are told of."""
+    """A form that changes along the part: off, the tool stays at the middle of the heights that are reported."""
     forms = {node: table for node, table in scenario.nodes.items() if isinstance(table, FormParameters)}
     off: dict[str, Value] = {}
     for node, table in forms.items():
@@ -242,7 +242,7 @@ def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[
 
     Args:
         scenario: that can work.
-        height: of the tool along the part in the revolutions that are told of [m].
+        height: of the tool along the part in the revolutions that are reported [m].
 
     Returns:
         The causes, each after the one that it needs; and those that cannot be switched off, with the reason.

@@ -163,7 +163,7 @@ class Table(BaseModel):
 def about(node: str, *names: str) -> Iterator[None]:
     """Let a refusal of what is made of some parameters name them: ``node.a, b: ...``; one that does stays as it is.
 
-    Physics and control know nothing of parameters; who makes them of a table does.
+    Physics and control know nothing of parameters; the stage that makes them of a table does.
     """
     try:
         yield
@@ -236,7 +236,7 @@ class NodeParameters(SharedParameters):
     """
 
     listing: ClassVar[str] = "lathe node {} --help"
-    asks: ClassVar[tuple[frozenset[str], ...]] = ()  #: parameters that come from who knows them, unless one is given
+    asks: ClassVar[tuple[frozenset[str], ...]] = ()  #: parameters that come from the node that knows them, unless one is given
     judging: ClassVar[frozenset[str]] = frozenset()
 
     stage: str = parameter("", "what the node is; empty: its name says it")

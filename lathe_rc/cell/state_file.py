@@ -103,7 +103,7 @@ def dump(state: Mapping[str, object]) -> bytes:
 
 
 def save(path: Path, state: Mapping[str, object]) -> None:
-    """Write a state; who reads meanwhile, or after this process was killed, finds the one before or this one.
+    """Write a state; a reader finds the one before or this one, also after this process was killed.
 
     Raises:
         LatheError: it cannot be written.

@@ -83,7 +83,7 @@ class Track:
         return self._at(start, samples)
 
     def restart(self, first: int) -> None:
-        """Begin at sample ``first``, with zeros before it; drops what is there."""
+        """Begin at sample ``first``, with zeros before it; drops all samples."""
         for array in self._arrays.values():
             array[:] = 0
         self._base, self.end = first - self._kept, first

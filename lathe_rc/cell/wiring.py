@@ -27,7 +27,7 @@ from lathe_rc.signals.tip_path import steepest_fall
 
 @dataclass(frozen=True)
 class Source:
-    """Who publishes a topic."""
+    """The node that publishes a topic."""
 
     node: str
     type: str
@@ -109,7 +109,7 @@ class Cell:
         topics[topic] = source
 
     def source(self, stage: Stage, port: Input) -> Source:
-        """Who publishes what a stage reads.
+        """The publishers of a stage's inputs.
 
         Raises:
             InputError: nobody, or as another type.
@@ -286,8 +286,8 @@ class Cell:
         if asks and nodes and not listening & set(nodes):
             asked = f"monitor {asks.name} asks for {asks.reaction.name.lower()}"
             raise InputError(
-                f"{stage.name}: {asked}, but nobody who moves {drive} listens; allowed: {nodes[0]}.reaction_delay of a "
-                "block or more, or a weaker reaction"
+                f"{stage.name}: {asked}, but no node that moves {drive} reads safety; "
+                f"allowed: {nodes[0]}.reaction_delay of a block or more, or a weaker reaction"
             )
 
     def _check_retraction(self, stage: Supervisor) -> None:

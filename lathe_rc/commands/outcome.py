@@ -14,7 +14,7 @@ from lathe_rc.analysis.budget import Budget, Part
 from lathe_rc.analysis.metrology import Lay
 from lathe_rc.cell.durations import Lateness
 
-_MOST_EVENTS = 12  # that are told of a run
+_MOST_EVENTS = 12  # printed of a run
 _ALIKE = 4  # of them that follow one another: those in between are left out
 
 

@@ -87,7 +87,7 @@ def prepare() -> None:
 
 
 class Mode(IntEnum):
-    """Who commands."""
+    """The side that commands."""
 
     FOLLOW = 0  #: the controller
     HOLD = 1  #: nobody: the command comes to rest
@@ -170,7 +170,7 @@ class Takeover:
 
     @property
     def mode(self) -> Mode:
-        """Who commands; see `change`."""
+        """The side that commands; see `change`."""
         return Mode(self.table.whole[_MODE])
 
     @property

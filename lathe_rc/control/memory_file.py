@@ -21,7 +21,7 @@ _ROOM = 1 << 16  # [B] beside the memory itself: headers, the other numbers, the
 
 
 def save(path: Path, points: Array, grid: int) -> None:
-    """Write a memory: to the side, to the disk, then renamed over what was there.
+    """Write a memory: to the side, to the disk, then renamed over the old file.
 
     Args:
         path: NumPy archive (.npz) to write.

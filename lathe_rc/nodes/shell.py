@@ -194,7 +194,7 @@ class CellNode(Listening):
         self.fail(LatheError(f"{member.name} {why_failed(member)}"), cause="abandoned")
 
     def clean_up_part(self) -> None:
-        """Let go of what it has made; publishers, subscriptions and services are destroyed by who calls."""
+        """Let go of what it has made; publishers, subscriptions and services are destroyed by the caller."""
 
     def begin(self, *, joins: bool) -> None:
         """Every input and output is matched; ``joins``: the cell is running already."""

@@ -259,7 +259,7 @@ class SpindleNode(StageNode):
         self.attempt(self.release)
 
     def advance(self) -> None:
-        """Take what members in this process have told: not at once, the block that they tell of may be under way."""
+        """Take what members in this process have told: not at once, the block that they report may be under way."""
         while self._told:
             self._on_progress(self._told.popleft())
         if self._inputs and self.chain is None:

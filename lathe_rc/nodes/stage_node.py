@@ -201,7 +201,7 @@ class StageNode(CellNode):
         return sum(queue.lost for queue in self._queues.values())
 
     def matched(self) -> bool:
-        """See `CellNode`; who may join in mid-run must know whether the cell is running."""
+        """See `CellNode`; a node that may join in mid-run must know whether the cell is running."""
         return (self._cell is not None or not self._restart_file) and super().matched()
 
     def begin(self, *, joins: bool) -> None:
@@ -280,7 +280,7 @@ class StageNode(CellNode):
         self.due = True
 
     def _follow_the_master(self, first: int) -> None:
-        """Who reads from lost members alone would run ahead to the end: go no further than the spindle has come."""
+        """Go no further than the spindle: a node that reads from lost members alone would run ahead to the end."""
         assert self.master is not None, "it has declared the safe state"
         self._reach = first
         topic = next(

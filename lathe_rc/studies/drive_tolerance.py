@@ -134,7 +134,7 @@ def run(parameters: DriveToleranceParameters, track: Track = untracked) -> Drive
     for tolerance in parameters.tolerance:
         laws = dict.fromkeys(_drawn(base), f"normal:{100.0 * tolerance!r}%")
         spaces.append(Space(sampled=laws, sample=f"sobol:{parameters.drives}"))
-    # A folder of its own each: the rows of one are told apart by nothing else.
+    # A folder of its own each: nothing else distinguishes the rows of one from another's.
     asked = [(f"tolerance-{number}", base, space) for number, space in enumerate(spaces)]
     own, *found = sweeps.table(asked, parameters.folder, ["tool.max_error"], track, models="nominal")
     errors = [

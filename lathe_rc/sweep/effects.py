@@ -172,7 +172,7 @@ class Yield:
 
     Attributes:
         goal: of the cells that have one, ascending.
-        cells: all of them: who came to nothing keeps to no limit.
+        cells: all of them; a failed one keeps to no limit.
         above: the goal is to be large, not small.
     """
 

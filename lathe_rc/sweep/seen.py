@@ -19,7 +19,7 @@ from lathe_rc.sweep.folder import Folder
 GOAL = "tool.max_error"
 _LARGE = ("margin",)  # goals that are better the larger they are
 _UNITS = {"tool.in_tolerance_from": "revolutions"}
-_MOST_TEXTS = 24  # that are told apart
+_MOST_TEXTS = 24  # that have a colour each
 
 
 class Seen:

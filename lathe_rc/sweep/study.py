@@ -39,7 +39,7 @@ BATCH = 8  #: trials that are asked for at once
 _STUDY = "tuning"
 _POPULATION = 3 * BATCH  # of NSGA-II
 _UNKNOWN = 1e9  # what the samplers are told in place of a cost that there is not: beyond all that there are
-_BY, _SCORE = "by", "score"  # attributes of a trial: who computes it, what came of it
+_BY, _SCORE = "by", "score"  # attributes of a trial: its worker, its result
 
 
 class _Lock(JournalFileOpenLock):

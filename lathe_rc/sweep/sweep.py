@@ -137,7 +137,7 @@ def run(
 def crew_for(
     scenario: Scenario, client: distributed.Client | None, scheduler: str | None, workers: int | None, watch: Watch
 ) -> Iterator[distributed.Client]:
-    """Who computes cells of a scenario, once its kernels are compiled; arguments and events as in `run`."""
+    """The workers for cells of a scenario, once its kernels are compiled; arguments and events as in `run`."""
     for stages in compile_ahead(Cell(scenario.nodes).stages.values()):
         watch({"event": "compiling", "nodes": stages})
     with nullcontext(client) if client else client_of(scheduler, workers) as crew:

@@ -69,7 +69,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class FormSection:
-    """What is told of one tool."""
+    """The figures of one tool."""
 
     tool: str
     refused: str
@@ -182,7 +182,7 @@ def _timing(told: Gathered) -> Picture | None:
         f"Pace: simulated time by wall time, in {host.pace.size} intervals between reports of the time master on "
         "/diagnostics. Lateness: from the moment at which a block was due to that at which the time master let it go; "
         "only where the speed is given. Latency: from there until the time master had heard that every member had "
-        "completed the block; members tell of several blocks at a time."
+        "completed the block; members report several blocks at a time."
     )
     return Picture("Pace, lateness and latency", figures.timing(host, told.step_ns * 1e-9), caption, "docs/cell.md")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is heard of running cells: kept until it can be shown, and told apart by run."""
+"""What is heard of running cells: kept until it can be shown, separated by run."""
 
 import threading
 from collections import deque
@@ -37,7 +37,7 @@ class Backlog:
             self._news.notify()
 
     def close(self) -> None:
-        """Let the reader end when it has taken what is there."""
+        """Let the reader end when it has taken all pieces."""
         with self._news:
             self._closed = True
             self._news.notify()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs as they are heard, shown while they go on; knows nothing of ROS.
 
-Who only watches holds nobody up. What comes faster than it can be shown is left out, counted and said; a run that
+The view delays no member. Messages that come faster than it can show are left out, counted and reported; a run that
 begins anew, under whatever name, is a recording of its own.
 """
 
@@ -164,7 +164,7 @@ class Live:
         say: tells people.
 
     Attributes:
-        present: message type by topic, of what is there to be heard; a run begins with these.
+        present: message type by topic, of all topics that can be heard; a run begins with these.
         shown: the runs that are over.
     """
 

@@ -49,7 +49,7 @@ _SLIDE = {"position": Curve(SLIDE, "actual", 1e3)}  # of a state that a servo co
 
 @dataclass(frozen=True)
 class Cycle:
-    """How controllers tell of a cycle: field of its error [m], field of its number, and a word for the error."""
+    """How controllers report a cycle: field of its error [m], field of its number, and a word for the error."""
 
     error: str
     counter: str

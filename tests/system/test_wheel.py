@@ -121,7 +121,12 @@ def test_it_runs_without_ros(alone):
     assert (alone.folder / "report.html").stat().st_size > 100_000
     assert "Usage: " in alone.run("lathe", "study", "--help")
     alone.run("lathe", "new", "law", "mine")
-    notebook = "from lathe_rc import frames, harness; from lathe_rc.bag import reader; print(reader.read('B').plot())"
+    notebook = """
+from pathlib import Path
+from lathe_rc import harness
+from lathe_rc.bag import reader
+print(reader.read(Path("B")).plot())
+"""
     assert "Figure" in alone.run("python", "-c", notebook)
 
 

@@ -129,7 +129,7 @@ def summary_of(path: Path) -> bool:
     """Look at the summary of an MCAP file; whether it has all that rosbags asks for, which reads the whole file if not.
 
     Raises:
-        ValueError: there is none that could be believed; mcap raises others.
+        ValueError: it has no index that could be right; mcap raises others.
     """
     size, chunks = path.stat().st_size, []
     with path.open("rb") as stream:

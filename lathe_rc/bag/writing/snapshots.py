@@ -300,7 +300,7 @@ class Snapshots:
         self._told(snapshot)
 
     def flush(self) -> None:
-        """See `Output`; when nothing has come since the last time, nobody is held up by writing all that waits.
+        """See `Output`; when nothing has come since the last time, so that writing all that waits delays no node.
 
         Raises:
             LatheError: the disk does not take it.

@@ -142,7 +142,7 @@ class _McapStorage:
 
 
 class _Writer(RosbagWriter):
-    """rosbags' writer with the storage above, which is told of messages directly and counts them itself."""
+    """rosbags' writer with the storage above, which gets the messages directly and counts them itself."""
 
     def __init__(self, path: Path, chunk_size: int, *, compress: bool) -> None:
         super().__init__(path, version=9, storage_plugin=StoragePlugin.MCAP)
@@ -155,7 +155,7 @@ class _Writer(RosbagWriter):
         return cast("_McapStorage", self.storage)
 
     def close(self) -> None:
-        """See rosbags; the metadata tell of the messages that the storage has been given."""
+        """See rosbags; the metadata count the messages that the storage has been given."""
         file = self.mcap.file
         self.counts = {number: file.counts[channel] for number, channel in self.mcap.channels.items()}
         if file.first_ns is not None and file.last_ns is not None:

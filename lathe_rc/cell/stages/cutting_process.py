@@ -44,7 +44,7 @@ _HEIGHTS = 201  # places along a shaft between which its compliance is linear
 
 
 class CuttingProcessParameters(NodeParameters):
-    """What moves the edge, the material, the blank, the part, and what gives way."""
+    """Parameters of the edge, the material, the blank and the part, and of everything that gives way."""
 
     moved_by: list[Literal["tool", "cross", "longitudinal"]] = parameter(
         ["cross", "longitudinal"], "what moves the edge: the tool drives, the cross feed, the longitudinal feed"

@@ -123,7 +123,7 @@ def apply(obedience: ObedienceTable, command: Samples) -> None:
 
 NOBODY = ObedienceTable(
     np.zeros(2, np.int64), np.zeros(1), TakeoverTable(np.zeros(0), np.zeros(2, np.int64), np.zeros(2), np.zeros(2))
-)  #: for who listens to nobody
+)  #: of a node without a supervisor
 
 
 class Obedience:

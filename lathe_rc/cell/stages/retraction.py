@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a drive of the tool does by itself when members of the cell are lost: nobody need command it."""
+"""How a drive of the tool retracts by itself, without a command, when members of the cell are lost."""
 
 from typing import Annotated
 

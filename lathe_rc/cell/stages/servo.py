@@ -83,7 +83,7 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
 
 
 class Listener(NamedTuple):
-    """Who may have to obey, for kernels.
+    """The obedience of a node, if it has any, for kernels.
 
     Attributes:
         obedience: to the supervisor, if it ``listens``.

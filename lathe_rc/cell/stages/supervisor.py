@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watches the cell and says what is to be done; who listens reads it as feedback with a declared delay."""
+"""Watches the cell and asks for reactions; nodes read them as feedback with a declared delay."""
 
 from collections.abc import Sequence
 from dataclasses import replace

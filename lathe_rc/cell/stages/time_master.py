@@ -91,7 +91,7 @@ class TimeMaster(Stage):
         return round(self.parameters.revolutions * 2.0 * np.pi / self.shared.nominal_speed / self.shared.step)
 
     def place_triggers(self) -> None:
-        """Who makes the angle knows when events by revolutions come."""
+        """The stage that makes the angle knows when events by revolutions come."""
         self._triggers = [self._by_sample(trigger) for trigger in self._triggers]
 
     def _by_sample(self, trigger: Trigger) -> Trigger:
