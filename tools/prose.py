@@ -17,7 +17,7 @@ from workplace import ROOT
 FOLDERS = ("docs", "lathe_rc", "msg_defs", "tests", "tools")
 RULES = ROOT / "tools" / "prose.yaml"
 # These say nothing of their content.
-MODULES = frozenset("both happened leftovers offered played story strangers trust walk watch".split())
+MODULES = {"both", "happened", "leftovers", "offered", "played", "story", "strangers", "trust", "walk", "watch"}
 _CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
 
 

@@ -236,9 +236,7 @@ class NodeParameters(SharedParameters):
     """
 
     listing: ClassVar[str] = "lathe node {} --help"
-    asks: ClassVar[
-        tuple[frozenset[str], ...]
-    ] = ()  #: parameters that come from the node that knows them, unless one is given
+    asks: ClassVar[tuple[frozenset[str], ...]] = ()  #: parameters of the node that knows them, unless given
     judging: ClassVar[frozenset[str]] = frozenset()
 
     stage: str = parameter("", "what the node is; empty: its name says it")
