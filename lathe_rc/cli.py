@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import click
 
-from lathe_rc import __version__, extras
+from lathe_rc import __version__
 from lathe_rc.errors import LatheError, shown
 
 COMMANDS = {
@@ -64,6 +64,8 @@ class Group(click.Group):
             click.echo(f"lathe: {error}", err=True)
             ctx.exit(error.exit_code)
         except ModuleNotFoundError as error:
+            from lathe_rc import extras
+
             if not (missing := extras.refusal(error.name)):
                 raise
             click.echo(f"lathe: {missing}", err=True)
