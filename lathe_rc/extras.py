@@ -22,7 +22,7 @@ _CHECKOUT = {
 
 
 def refusal(module: str | None) -> LatheError | None:
-    """What to say of a module that cannot be imported; None: it belongs to no extra."""
+    """The error for a module that cannot be imported; None: it belongs to no extra."""
     extra = _EXTRAS.get((module or "").partition(".")[0])
     if extra is None:
         return None

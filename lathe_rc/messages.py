@@ -122,7 +122,7 @@ def encode(msgtype: str, message: Any) -> bytes:
 
 
 def values_of(msgtype: str, data: bytes) -> dict[str, Any]:
-    """What a message says, by field, but for its header and who sent it in which run.
+    """The fields of a message, without its header, sender and run.
 
     Raises:
         ValueError: the bytes are no such message.

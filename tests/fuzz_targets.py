@@ -182,7 +182,7 @@ def _csv() -> list[bytes]:
 
 
 def _fits(data: bytes) -> None:
-    """What `lathe fit` makes of a file that can be read."""
+    """`lathe fit` with a file that can be read."""
     with _folder() as folder, np.errstate(all="ignore"):
         (folder / "fuzz.csv").write_bytes(data)
         for command, *options in (("hysteresis",), ("channel", "--figure", str(folder / "fuzz.png"))):

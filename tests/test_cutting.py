@@ -29,7 +29,7 @@ def make(**options):
 
 
 def cut(process, samples, lengths=None, **inputs):
-    """What a process makes of its inputs, at constant speed and feed by default."""
+    """The outputs of a process, at constant speed and feed by default."""
     rate = np.broadcast_to(inputs.get("speed", SPEED), samples)
     given_to = {name: np.zeros(samples) for name in INPUTS}
     given_to["angle"] = SPEED * STEP * np.arange(samples)

@@ -215,7 +215,7 @@ def test_each_part_of_it_earns_its_place(without, condition, times):
 
 
 def test_the_drive_is_identified_while_it_cuts():
-    """What the force hides it tells by how it answers a speed that varies: to 3 % after 20 revolutions."""
+    """With a varying speed the drive is identified under the force to 3 % after 20 revolutions."""
     made = load("robust_cutting", "controller.allow_unstable=true").varied(drive(0.8, 1.2, 1.0, 1.0))
     cell = Cell(made.nodes)
     keeper = batch.Errors(cell, cell.samples)

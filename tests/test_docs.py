@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What users read is true: the reference page, links, the examples of the README, scenarios, the launch file."""
+"""The pages are true: the reference page, links, the examples of the README, scenarios, the launch file."""
 
 import ast
 import functools
@@ -244,7 +244,7 @@ def launch_file(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 class TestLaunch:
     @pytest.fixture
     def start(self, launch_file: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-        """What `ros2 launch` does with the description: the actions that it makes, for given arguments.
+        """The actions that `ros2 launch` makes of the description, for given arguments.
 
         ``including``: a file that it was given instead, which includes ours and sets the arguments.
         """
@@ -335,7 +335,7 @@ class TestLaunch:
 
 
 class TestEndsUnderLaunch:
-    """What launch makes of it: an error means that it ends the others and returns 1."""
+    """The answer of launch: an error means that it ends the others and returns 1."""
 
     @pytest.fixture
     def ended(self, launch_file: ModuleType) -> Callable[..., Any]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What breaks is named, the rest is ended, and the bag is readable."""
+"""A failed node is named, the others are ended, and the bag is readable."""
 
 import os
 import re

@@ -38,7 +38,7 @@ def run(machine, command, lengths=None):
 @pytest.mark.parametrize("lags", [(LAG,), (5e-3, LAG)])
 @pytest.mark.parametrize("command", [0.35, 0.6, -1.0])
 def test_steady_force_is_the_stribeck_curve(law, lags, command):
-    """What the motor does not need for the speed of its own equation, F1·(u - v/k), is Fc + (Fs - Fc)·e^… + Fv·v."""
+    """The motor's force beyond that of its own equation, F1·(u - v/k), is Fc + (Fs - Fc)·e^… + Fv·v."""
     friction = rubbing(law)
     speed = run(drive(friction, lags), np.full(64_000, command))[1][-1]
     force = FORCE * (command - speed / GAIN)

@@ -281,7 +281,7 @@ def listens(bridge):
 
 
 def told(bridge):
-    """What it says of the one run that it has shown."""
+    """The output about the one run that it has shown."""
     out, errors = bridge.communicate()
     assert bridge.returncode == 0, errors
     assert "Traceback" not in errors

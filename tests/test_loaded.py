@@ -59,7 +59,7 @@ def cutting(stiffness=300e3, depth=0.3e-3, lag=2e-3, step=STEP, **options):
 
 
 def turning(samples, step=STEP, speed=SPEED, **given):
-    """What a block takes, at constant speed and a feed of 1 mm."""
+    """The inputs of a block, at constant speed and a feed of 1 mm."""
     rate = np.full(samples, speed)
     found = {"command": np.zeros(samples), "angle": rate * step * np.arange(samples), "speed": rate}
     return found | {"feed_velocity": 1e-3 * rate / (2 * np.pi)} | given

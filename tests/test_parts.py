@@ -521,7 +521,7 @@ def test_a_bag_is_read_where_its_parts_are_not_installed(recorded, tmp_path):
 
 
 def told_by(path, origin):
-    """What a bag says of itself, with another origin of its parts."""
+    """The metadata of a bag, with another origin of its parts."""
     with Source(path) as source:
         about = dict(source.about)
     said = json.loads(about[provenance.ORIGINS])

@@ -293,7 +293,7 @@ HINT = "; lathe bag recover saves the rest"
 
 
 def unreadable(path, make):
-    """What is no readable bag, in a way."""
+    """Folders and files that are no readable bag."""
     if make in ("nothing there", "empty folder"):
         if make == "empty folder":
             path.mkdir()

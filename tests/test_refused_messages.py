@@ -51,7 +51,7 @@ def joint_state(sample):
 
 
 def senders(topic, own):
-    """What the refused of `foreign` are called."""
+    """The names of the refused messages of `foreign`."""
     sources = ["/other", "/step", "/long", "/uneven", "/nan", "/jump"]
     return {f"{source} of run 'test' on {topic}" for source in sources} | {
         f"{own} of run 'elsewhere' on {topic}",

@@ -181,7 +181,7 @@ def test_what_was_missed_is_told(node, tmp_path):
 
 
 def test_what_was_before_it_is_told_and_no_loss(node, tmp_path):
-    """What was said before a recorder came is told, and is no loss."""
+    """Messages from before the start of a recorder are reported, and are no loss."""
     talker = node.create_publisher(String, "/talk", 10)
     for _ in range(3):
         talker.publish(String(data="nobody hears"))

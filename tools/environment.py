@@ -15,7 +15,7 @@ SHELL_OWN = frozenset({"_", "OLDPWD", "PWD", "SHLVL"})
 
 
 class Changes(TypedDict):
-    """What to do to a user's environment before lathe_rc runs in it."""
+    """The changes to a user's environment before lathe_rc runs in it."""
 
     prepend: dict[str, list[str]]
     assign: dict[str, str]

@@ -54,7 +54,7 @@ def inverse_response(drives: Array, lead: float, lag: float, frequency: Array) -
 
 @dataclass(frozen=True)
 class Positivity:
-    """What eq. 14 asks of χ*.
+    """The condition of eq. 14 on χ*.
 
     Attributes:
         least_gain: χ* from which on Re(1/G) + χ* > 0 for all drives and frequencies [1].

@@ -35,7 +35,7 @@ def ideal_input(drives: Array, time: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """What distinguishes a run.
+    """The parameters that distinguish a run.
 
     Attributes:
         periods: to run.

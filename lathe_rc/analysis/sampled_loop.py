@@ -89,7 +89,7 @@ def series(top: Array, bottom: Array, terms: int) -> Array:
 
 @dataclass(frozen=True)
 class Measures:
-    """What a step response is judged by.
+    """Measures of a step response.
 
     Attributes:
         overshoot: relative to the step, 0 for none.
@@ -174,7 +174,7 @@ class StepResponse:
 
     @property
     def offset(self) -> float:
-        """What the load lacks at the end, relative to the step."""
+        """The load's remaining error at the end, relative to the step."""
         return float(1.0 - self.load[-1])
 
 

@@ -19,7 +19,7 @@ LAST = 10  #: revolutions at the end of a run that its spare and its budget spea
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is said of a run.
+    """The verdict on a run.
 
     Attributes:
         tolerance: form error that is allowed to each side [m].
@@ -41,7 +41,7 @@ class Verdict:
 
     @property
     def spare(self) -> float:
-        """What is left of the tolerance; negative: by so much it is exceeded; NaN without a revolution [m]."""
+        """The margin to the tolerance; negative: it is exceeded by so much; NaN without a revolution [m]."""
         return self.tolerance - self.largest
 
     def told(self) -> str:

@@ -24,7 +24,7 @@ _MOST_DIGESTS = 2**20  # size of that file [B]
 
 @dataclass
 class Findings:
-    """What a check found.
+    """The findings of a check.
 
     Attributes:
         wrong: what should not be there: numbers that are none, other digests than recorded.

@@ -144,7 +144,7 @@ def _check_installed(about: Mapping[str, str]) -> None:
 
 
 def changes(about: Mapping[str, str]) -> list[str]:
-    """What has changed of the classes of others, all of which are here, since a bag was made; a line for each class."""
+    """Changes since a bag was made in the classes of others, all of which are installed; a line for each class."""
     found = []
     for origin in origins(about):
         extensions.find(origin.name, origin.name)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the form error of a scenario is made of: its runs with causes switched off, offline and as a batch."""
+"""The parts of a scenario's form error: its runs with causes switched off, offline and as a batch."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -64,7 +64,7 @@ _SPEED = [name for name in SpeedLawParameters.model_fields if name not in NodePa
 
 @dataclass(frozen=True)
 class Cause:
-    """What may be switched off.
+    """A cause that may be switched off.
 
     Attributes:
         off: the values that do it, by NODE.PARAM.
@@ -224,7 +224,7 @@ def _flat(stage: LearningController, speeds: Collection[float], cell: Cell) -> d
 
 
 def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
-    """What Q forgets: off, each Q is 1 as far as its channel converges with it."""
+    """The part that Q forgets: off, each Q is 1 as far as its channel converges with it."""
     off: dict[str, Value] = {}
     low, high = cell.master.speed_range()
     for stage in cell.stages.values():
@@ -238,7 +238,7 @@ def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
 
 
 def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[str, str]]:
-    """What may be switched off in a scenario.
+    """The causes that may be switched off in a scenario.
 
     Args:
         scenario: that can work.

@@ -98,7 +98,7 @@ class Row:
         return found
 
     def allowed(self) -> str:
-        """What the parameter accepts, in words."""
+        """The values that the parameter accepts, in words."""
         what = f"one of {', '.join(self.choices)}" if self.choices else _NAMES[self.type]
         what = self.named.allowed() if self.named else what
         text = " ".join(filter(None, (what, self.limits)))
@@ -185,7 +185,7 @@ def _rows(table: type[Table]) -> Mapping[str, Row]:
 
 
 class SharedParameters(Table):
-    """What all nodes of a cell must agree on; may stand under ``/**`` in a parameter file."""
+    """Parameters that all nodes of a cell must agree on; may stand under ``/**`` in a parameter file."""
 
     sample_rate: Annotated[int, Ge(1000), Le(1_000_000)] = parameter(
         64_000, "sampling rate of the cell; the step must be a whole number of nanoseconds", "Hz"
@@ -229,7 +229,7 @@ class SharedParameters(Table):
 
 
 class NodeParameters(SharedParameters):
-    """What every node has.
+    """Parameters that every node has.
 
     Attributes:
         judging: parameters that change no sample and no message of a run, but what is said of it.
@@ -271,7 +271,7 @@ class NodeParameters(SharedParameters):
         return {}
 
     def known(self) -> Mapping[str, Value]:
-        """What others may know of the node, by their parameter."""
+        """The node's values that other nodes may use, by their parameter."""
         return {}
 
 

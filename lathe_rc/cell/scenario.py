@@ -61,7 +61,7 @@ _HOST_PARAMETERS = {
 
 
 def kind_of(node: str, stage: object) -> str:
-    """What a node is: its ``stage`` parameter, or its name.
+    """The kind of a node: its ``stage`` parameter, or its name.
 
     Raises:
         InputError: there is no such stage.
@@ -123,11 +123,11 @@ class Scenario:
 
     @property
     def shared(self) -> SharedParameters:
-        """What all nodes agree on."""
+        """The parameters that all nodes agree on."""
         return next(iter(self.nodes.values()))
 
     def kind(self, node: str) -> str:
-        """What a node is."""
+        """The kind of a node."""
         return kind_of(node, self.nodes[node].stage)
 
     def of_kind(self, kind: str) -> list[str]:
@@ -190,7 +190,7 @@ class Scenario:
         return rows[name].element()
 
     def value(self, target: str) -> Value:
-        """What a parameter is; see `parameter`."""
+        """The value of a parameter; see `parameter`."""
         whole, element = _element(target)
         node, _, name = whole.rpartition(".")
         found = getattr(self.nodes[node] if node else self.shared, name)

@@ -478,14 +478,14 @@ class Stage(ABC):
         raise NotImplementedError(action)
 
     def finish(self, index: int) -> list[Sparse]:
-        """What is still to be said when the run ends with sample ``index``."""
+        """The remaining events when the run ends with sample ``index``."""
         return []
 
     # ---- the compiled step ----------------------------------------------------------------------------
 
     @property
     def memory(self) -> tuple[Any, ...]:
-        """What the step works on, a NamedTuple of arrays and constants; another one may be given after each stop."""
+        """The memory of the step, a NamedTuple of arrays and constants; another one may be given after each stop."""
         return ()
 
     @property
@@ -524,7 +524,7 @@ class Stage(ABC):
         return self._room
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is worth keeping: addresses and room are not."""
+        """The state without addresses and scratch arrays."""
         return {**self.__dict__, "_native": None, "_room": None}
 
     def prepare(self, first: int, samples: int) -> None:  # noqa: B027 - most stages need nothing

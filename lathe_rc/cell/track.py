@@ -50,7 +50,7 @@ class Track:
         self.end = 0  #: index after the newest sample
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is worth keeping: views of arrays would be kept as copies."""
+        """The state without views of arrays, which would be kept as copies."""
         return {**self.__dict__, "_views": {}, "_size": 0, "_newest": {}}
 
     def _at(self, start: int, samples: int) -> Signals:

@@ -324,7 +324,7 @@ class Cell:
                 )
 
     def _check_reach(self, stage: Learner, name: str) -> None:
-        """What it takes over, it takes over wherever the drive can be."""
+        """Refuse bounds with which it could not take over from every position of the drive."""
         drive, parameters = self.stages[name], stage.parameters
         assert isinstance(drive, Drive), "it learns"
         reach = parameters.bounds().reach(parameters.retract_time)

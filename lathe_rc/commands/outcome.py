@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run gave, as tables and lines for the terminal."""
+"""The result of a run, as tables and lines for the terminal."""
 
 from collections.abc import Mapping
 from itertools import groupby

@@ -23,7 +23,7 @@ _WITHIN = 1.0 + 1e-9
 
 @dataclass(frozen=True)
 class Bounds:
-    """What a motion keeps within; what it begins with may be beyond.
+    """Bounds of a motion, which may begin beyond them.
 
     Attributes:
         velocity: [m/s].
@@ -175,7 +175,7 @@ class Takeover:
 
     @property
     def newest(self) -> float:
-        """What was given last [m]."""
+        """The last output [m]."""
         return float(self.table.given[1])
 
     @property

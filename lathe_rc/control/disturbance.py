@@ -85,7 +85,7 @@ class LowPass(NamedTuple):
 
 
 class DisturbanceTable(NamedTuple):
-    """What is known of drive and disturbance.
+    """The law's knowledge of drive and disturbance.
 
     Attributes:
         step: sampling step [s].
@@ -278,7 +278,7 @@ def _derivatives(stages: Array, bandwidth: float) -> tuple[float, float]:
 
 @kernel
 def expected(m: DisturbanceTable, angle: float, speed: float) -> float:
-    """What the memory expects at an angle [rad] and a speed [rad/s], in metres of the command."""
+    """The memory's prediction at an angle [rad] and a speed [rad/s], in metres of the command."""
     if not m.learns:
         return 0.0
     place = angle * (m.value.size / _TURN)

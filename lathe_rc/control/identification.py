@@ -146,7 +146,7 @@ class DriveIdentifier:
         command_sent(self.table, first, 0, command.size, command)
 
     def fit(self) -> Identified | None:
-        """What the measurements so far say; None while they say nothing. Older ones weigh less from now on."""
+        """The estimate from the measurements so far, None while there are too few; older ones weigh less each time."""
         s11, s12, s22, s1, s2, rest, command = self.table.sums
         found = None
         # Relative to independent regressors: the units of the two differ by orders of magnitude.

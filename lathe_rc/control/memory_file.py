@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a controller has learned, in a file that survives a crash."""
+"""The memory of a controller, in a file that survives a crash."""
 
 import errno
 import io

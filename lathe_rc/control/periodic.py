@@ -138,7 +138,7 @@ class PeriodicLaw(NamedTuple):
 
 
 class PeriodicState(NamedTuple):
-    """What the law remembers, for kernels.
+    """The state of the law, for kernels.
 
     Attributes:
         values: scalars, shape (9,).

@@ -175,7 +175,7 @@ class Processes:
         self._threads.append(listener)
 
     def _command(self, first: str, arguments: Sequence[str]) -> list[str]:
-        """What starts a process as an interpreter of its own; nothing where it is to be forked."""
+        """The command that starts a process as an interpreter of its own; empty where it is to be forked."""
         prefix = self._prefix.get(first, ())
         words = [*prefix, sys.executable, "-m", "lathe_rc.nodes.container", *arguments]
         return words if prefix or self._fresh else []

@@ -26,7 +26,7 @@ class _EncoderLostError(LatheError):
 
 @contextmanager
 def _losing_it() -> Iterator[None]:
-    """What goes wrong is the encoder's."""
+    """Turn errors inside into the loss of the encoder."""
     try:
         yield
     except LatheError as error:

@@ -45,7 +45,7 @@ def _alone(node: Any, cell: Cell | None) -> None:
 
 
 class Exchange:
-    """What a process hands over inside.
+    """Blocks that nodes hand over inside of a process.
 
     Attributes:
         master: takes the Progress of a node, if the time master is in this process.

@@ -59,7 +59,7 @@ def _become(request: dict[str, Any], report: int, log: int) -> int:
 
 
 def _changed(living: set[int]) -> Iterator[dict[str, Any]]:
-    """What has become of processes since the last call; those that have ended are not ``living`` any more."""
+    """Changes of processes since the last call; those that have ended are not ``living`` any more."""
     with contextlib.suppress(ChildProcessError):  # there is none
         while found := os.waitid(os.P_ALL, 0, _CHANGES):
             ended = found.si_code in (os.CLD_EXITED, os.CLD_KILLED, os.CLD_DUMPED)

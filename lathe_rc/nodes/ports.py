@@ -174,7 +174,7 @@ class BlockQueue:
             yield block
 
     def state(self) -> tuple[int, int, list[Block], Block | None]:
-        """What another process needs to go on: next sample, blocks received, those that wait, and the newest."""
+        """The state that another process needs to go on: next sample, blocks received, waiting and newest."""
         return self.end, self.received, list(self.blocks), self._newest
 
     def resume(self, source: str, state: tuple[int, int, list[Block], Block | None]) -> None:

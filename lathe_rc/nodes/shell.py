@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all nodes share: how they begin, look after one another, make progress, fail and end."""
+"""The common part of all nodes: how they begin, watch one another, make progress, fail and end."""
 
 import math
 import os
@@ -412,11 +412,11 @@ class CellNode(Listening):
 
 
 def why_failed(member: Member) -> str:
-    """What a member says of its failure; its name, with which that may begin, is said before."""
+    """The member's message about its failure, without its name at the beginning."""
     own_name = member.name.rpartition("/")[2]
     return f"failed: {member.message.removeprefix(f'{own_name}: ')}"
 
 
 def given_up(master: str) -> str:
-    """What members say that do without a silent time master from now on."""
+    """The announcement of members that go on without a silent time master."""
     return f"{master}, the time master, has been silent for {_GIVEN_UP:g} s: no sample follows"

@@ -31,7 +31,7 @@ _OUTSIDE_PERIOD = 0.1  # [s] between looks at who reads what in other processes
 
 
 class Chain(Protocol):
-    """What a node computes together with, see `lathe_rc.nodes.chain.Chain`."""
+    """The stages that a node computes together with, see `lathe_rc.nodes.chain.Chain`."""
 
     def advance(self) -> None:
         """Compute what the inputs from outside allow; the first of the nodes says how far."""

@@ -185,7 +185,7 @@ def _check_window(what: str, start: float, width: float) -> None:
 
 @dataclass(frozen=True)
 class Part:
-    """What the part does to the cut.
+    """The part's effect on the cut.
 
     Attributes:
         radius: at which the cutting path is reckoned [m].
@@ -294,7 +294,7 @@ def _missing(gaps: Array, angle: float) -> bool:
 
 @inlined
 def _pressed(process: Process, speed: float, wear: float) -> float:
-    """What the flank's force takes for each metre that the edge moves out of the part in a sample [N/m], times σ."""
+    """The loss of the flank's force for each metre that the edge moves out of the part in a sample [N/m], times σ."""
     if process.pressure == 0.0:
         return 0.0
     land = process.land + wear
@@ -359,7 +359,7 @@ class CutTable(NamedTuple):
 def meet(
     cut: CutTable, place: float, speed: float, height: float, angle: float, feed_velocity: float
 ) -> tuple[int, float, float, float]:
-    """What the edge meets at ``place`` [grid point]: why it cannot go on, feed, K, and σ·c; nothing changes."""
+    """The cut at ``place`` [grid point]: the reason to stop, feed, K, and σ·c; nothing changes."""
     process, state = cut.process, cut.state
     if not speed > 0.0:
         return _STANDS, 0.0, 0.0, 0.0
@@ -488,7 +488,7 @@ def cut_along(
 
 
 def _instant(system: System) -> float:
-    """What a unit of the input changes in the output of the same sample."""
+    """The change of the output for a unit of the input of the same sample."""
     return float(system.through + system.output @ system.now)
 
 

@@ -324,7 +324,7 @@ def _realise(model: TransferFunction) -> tuple[Array, Array]:
 
 
 def _rubbed(model: TransferFunction, friction: Friction, step: float) -> Array:
-    """What 1 N of friction, held over a step, takes from position, speed, …, shape (m,).
+    """The loss of position, speed, … by 1 N of friction, held over a step, shape (m,).
 
     Raises:
         InputError: the friction acts on a lag that the drive does not have.
@@ -340,7 +340,7 @@ def _rubbed(model: TransferFunction, friction: Friction, step: float) -> Array:
 
 
 def _settles(model: TransferFunction) -> tuple[float, bool]:
-    """What a command of 1 asks for, 0 if neither a position nor a speed, and whether it is a speed."""
+    """The motion that a command of 1 asks for, 0 if neither a position nor a speed, and whether it is a speed."""
     integrates = model.denominator[-1] == 0.0
     divisor = model.denominator[-2 if integrates else -1]
     return (abs(model.numerator[-1] / divisor) if divisor else 0.0), integrates

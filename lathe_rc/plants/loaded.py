@@ -165,7 +165,7 @@ class LoadedTable(NamedTuple):
 
 @kernel
 def _voltage(drive: LoadedTable, n: int, wanted: float) -> float:
-    """What the current loop applies until sample ``n`` [V], from the state of the sample before."""
+    """The voltage of the current loop until sample ``n`` [V], from the state of the sample before."""
     coil, state = drive.coil, drive.state
     current = state[state.size - 1]
     asked = (drive.spring * (wanted - state[0]) - drive.damper * state[1]) * drive.force_per_current
@@ -362,7 +362,7 @@ def failure(reason: int, angle: float, speed: float, feed: float) -> LatheError:
 
 @dataclass(frozen=True)
 class Piezo:
-    """What rides on the carriage.
+    """The piezo drive on the carriage.
 
     Attributes:
         stack: amplifier and ceramics; the drive takes over its state.

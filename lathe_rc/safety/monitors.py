@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is watched: signals against thresholds, each by a rule of `lathe_rc.safety.rules`, or in plain Python."""
+"""Monitors: signals against thresholds, each by a rule of `lathe_rc.safety.rules`, or in plain Python."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -73,7 +73,7 @@ class Monitor:
         self.memory = np.array(memory, np.float64)
 
     def told(self, value: float) -> float:
-        """What an alarm says of what the rule has found, in the unit of the limit."""
+        """The alarm's text for the rule's finding, in the unit of the limit."""
         return value
 
     def reset(self) -> None:

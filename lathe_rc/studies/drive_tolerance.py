@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a tolerance of drives costs: one controller, many drives of a batch.
+"""The cost of a tolerance of drives: one controller, many drives of a batch.
 
 The controllers keep the models and settings of the scenario. Natural frequency, damping and delay of every drive are
 drawn independently, normal about the scenario's value, with the tolerance as the standard deviation. A drive with
@@ -115,7 +115,7 @@ class DriveToleranceResult:
 
 
 def _drawn(scenario: Scenario) -> list[str]:
-    """What differs from drive to drive."""
+    """The parameters that differ from drive to drive."""
     drives = [name for name, stage in Cell(scenario.nodes).stages.items() if isinstance(stage, Drive)]
     return [
         f"{node}.{name}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is looked at of a sweep: its parameters as axes, its goals, and what the cells came to."""
+"""The data of a sweep's page: its parameters as axes, its goals, and the results of the cells."""
 
 from functools import cached_property
 from typing import cast

@@ -230,7 +230,7 @@ class Study:
         self._study.tell(number, known)
 
     def tuning(self) -> Tuning:
-        """What is there."""
+        """The tuning so far."""
         found = []
         for trial in self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             costs, violations, margin = cast("tuple[list[float], list[float], float]", trial.user_attrs[_SCORE])

@@ -33,7 +33,7 @@ _WRITE = 10.0  # [s] between writes of what has come
 
 @dataclass(frozen=True, repr=False)
 class Sweep:
-    """What a sweep gave.
+    """The result of a sweep.
 
     Attributes:
         folder: where it is.
@@ -42,7 +42,7 @@ class Sweep:
     folder: Folder
 
     def __repr__(self) -> str:
-        """What it is of, and how many cells came to what."""
+        """The scenario, and the numbers of cells by outcome."""
         told = ", ".join(f"{count} {status}" for status, count in self.statuses().items())
         return f"<Sweep of {self.folder.scenario.name} in {self.folder.path}: {told or 'nothing computed'}>"
 
@@ -146,7 +146,7 @@ def crew_for(
 
 
 def order_of(folder: Folder) -> Order:
-    """What all jobs of a folder have in common."""
+    """The order that all jobs of a folder share."""
     scenario = folder.scenario
     text = scenario.to_yaml(given=True)
     return Order(scenario.name, text, scenario.identity, folder.targets, folder.measures, folder.schema)

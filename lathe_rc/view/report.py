@@ -298,7 +298,7 @@ def _about(told: Gathered) -> Grid | None:
         [printable(key), f"{len(text)} characters of base64" if key.startswith(FILE) else printable(text)]
         for key, text in sorted(given.items())
     )
-    caption = "What else the bag says of itself."
+    caption = "Further metadata of the bag."
     return Grid(("key", "text"), _cut(rows, len(given)), caption, "docs/bags.md", ("key", "text"))
 
 
@@ -365,7 +365,7 @@ def render(told: Gathered, name: str, command: str, made_of: Budget | None = Non
         forms = [_form(form, cycles) for form in told.forms]
         signals, timing = _signals(told), _timing(told)
         if cycles and not any(form.figures for form in forms):
-            caption = "What each controller measured in its own cycles."
+            caption = "The controllers' own measurements, by cycle."
             signals.append(Picture("Convergence", figures.convergence(None, cycles), caption, "docs/learning.md"))
     text: str = page_template(Path(__file__).with_name("report.html.j2")).render(
         title=f"Report of {printable(name, 80)}",

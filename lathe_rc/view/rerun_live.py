@@ -31,7 +31,7 @@ _FLUSH = 30.0  # [s] for a viewer to take the rest of a recording
 
 @dataclass(frozen=True)
 class Shown:
-    """What a view has of a run.
+    """The view of a run.
 
     Attributes:
         run_id: of the run.

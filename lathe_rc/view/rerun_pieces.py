@@ -17,7 +17,7 @@ _AHEAD = 4  # pieces that wait for the topics that are late
 
 
 class _Part:
-    """What has come of one topic for one piece."""
+    """The part of a piece that has come of one topic."""
 
     def __init__(self, msgtype: str, size: int) -> None:
         fields = wanted(msgtype)

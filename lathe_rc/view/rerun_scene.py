@@ -183,7 +183,7 @@ class Scene:
         self._send(path, self._when(first + at, number), rr.Scalars.columns(scalars=values[at]))
 
     def _tell(self, topic: str, found: list[Sparse]) -> None:
-        """What controllers say of their cycles, and events."""
+        """The controllers' reports of their cycles, and events."""
         index, kind = np.array([message.index for message in found]), found[0].type
         if kind in CYCLES:
             cycle = CYCLES[kind]

@@ -68,7 +68,7 @@ _PART = {
 
 
 def curves(types: Mapping[str, str]) -> dict[str, dict[str, Curve]]:
-    """What is drawn of a recording, by fully qualified topic and field.
+    """The drawn curves of a recording, by fully qualified topic and field.
 
     Args:
         types: message type by topic.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What pip installs: sdist and wheel hold what they should, and work in an environment that has nothing else."""
+"""sdist and wheel hold the package and its data, and work in an environment that has nothing else."""
 
 import os
 import shutil

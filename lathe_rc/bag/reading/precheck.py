@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is looked at before a library opens a bag: whatever would cost it memory or time without end is refused.
+"""Checks before a library opens a bag, which refuse a file that would cost it unlimited memory or time.
 
 rosbags believes what a file says of sizes, expands what YAML repeats, and asks SQLite for what the schema defines.
 """

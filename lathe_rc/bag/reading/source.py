@@ -80,7 +80,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class Topic:
-    """What a bag says of a topic.
+    """The bag's metadata of a topic.
 
     Attributes:
         type: message type.
@@ -168,7 +168,7 @@ def read_chunk(content: bytes, place: int) -> bytes:
 
 
 def _damage(path: Path) -> str:
-    """What is longer than it says or than is allowed in an MCAP file, and where; empty if nothing is."""
+    """The first record of an MCAP file that is longer than it says or than allowed, and its place; empty: none."""
     limit = path.stat().st_size - len(MCAP0_MAGIC)
     qos = precheck.Qos()
     with path.open("rb") as stream:
@@ -328,7 +328,7 @@ class Source:
         return [f"{_METADATA} says {said}; the files: {found}" for said, found in wrong]
 
     def _topics_of(self, connections: Sequence[Connection]) -> dict[str, Topic]:
-        """What a file, or the metadata, says of topics."""
+        """The topics by a file, or by the metadata."""
         found: dict[str, Topic] = {}
         for connection in connections:
             precheck.check_name(connection.topic)

@@ -26,7 +26,7 @@ _MOST_WAITING = 2**18  # messages of a sparse topic ahead of the blocks
 
 @dataclass(frozen=True)
 class BagHeader:
-    """What a bag of the cell is, once it has been read.
+    """The header of a bag of the cell, once it has been read.
 
     Attributes:
         types: message type by fully qualified signal topic.

@@ -33,7 +33,7 @@ _MOST_DAMAGE = 1000  # places that are told
 
 @dataclass(frozen=True)
 class Announced:
-    """What a broken bag still says of a topic; texts may be empty."""
+    """A topic as a broken bag announces it; texts may be empty."""
 
     type: str
     definition: str
@@ -50,7 +50,7 @@ def _profiles(text: str) -> tuple[Qos, ...]:
 
 @dataclass
 class Salvage:
-    """What is left of a bag; iterate over it to get topic, log time [ns] and bytes of each whole message.
+    """The readable rest of a bag; iterate over it to get topic, log time [ns] and bytes of each whole message.
 
     Args:
         path: a rosbag2 folder or a file of one.
@@ -135,7 +135,7 @@ class Salvage:
         channels: dict[int, str],
         inside: int | None = None,
     ) -> Iterator[tuple[str, int, bytes]]:
-        """What the records of a file hold, or those of a chunk that stands at byte ``inside`` of it."""
+        """The records of a file, or those of a chunk at byte ``inside`` of it."""
         while True:
             place = stream.tell()
             try:

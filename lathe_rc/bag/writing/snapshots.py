@@ -32,7 +32,7 @@ _HEARD = (messages.EVENT, messages.SAFETY_STATUS)  # what may be a trigger
 
 
 class _Item(NamedTuple):
-    """What came: a message of a topic, or a row."""
+    """A message of a topic, or a row."""
 
     log_ns: int
     key: str | RowPlan

@@ -50,7 +50,7 @@ _Dumper.add_representer(str, lambda dumper, text: dumper.represent_scalar("tag:y
 
 
 class _Yaml:
-    """What rosbags' writer uses of ruamel.yaml."""
+    """The part of ruamel.yaml that rosbags' writer uses."""
 
     def __init__(self, typ: str) -> None:
         self.default_flow_style = False
@@ -64,7 +64,7 @@ rosbags.rosbag2.writer.YAML = _Yaml  # type: ignore[attr-defined,assignment]  # 
 
 
 class Output(Protocol):
-    """What takes the messages of a run: a bag, or what makes bags of them."""
+    """A sink for the messages of a run: a bag, or a writer of several bags."""
 
     def tell(self, about: Mapping[str, str]) -> None:
         """Store texts; see `BagWriter`."""

@@ -31,7 +31,7 @@ class CompoundControllerParameters(FormLawParameters):
 
 
 class Memory(NamedTuple):
-    """What the law works on.
+    """Memory of the law.
 
     Attributes:
         spindle: filter of the angle.

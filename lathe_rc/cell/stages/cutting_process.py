@@ -198,7 +198,7 @@ class CuttingProcessParameters(NodeParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         cut: the machine.

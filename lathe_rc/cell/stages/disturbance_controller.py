@@ -58,7 +58,7 @@ class DisturbanceControllerParameters(FormLawParameters):
     )
 
     def make(self, node: str) -> DisturbanceTable:
-        """What a node knows before its first sample.
+        """The state before the first sample.
 
         Raises:
             InputError: a memory that cannot be made.
@@ -85,7 +85,7 @@ class DisturbanceControllerParameters(FormLawParameters):
 
 
 class Memory(NamedTuple):
-    """What the law works on.
+    """Memory of the law.
 
     Attributes:
         spindle: filter of the angle.

@@ -181,7 +181,7 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         drive: the machine.

@@ -52,7 +52,7 @@ _INSIDE, _BEGIN, _END, _LOST, _LOST_AT = range(5)
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         control: the memory of the channel.
@@ -440,7 +440,7 @@ class _Margins:
         self._suprema: dict[tuple[object, ...], float] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """What cannot be had again: a response is computed when it is asked for."""
+        """The state without responses, which are computed when they are asked for."""
         return {**self.__dict__, "_responses": {}}
 
     def _response(self, model: Identified) -> Response:

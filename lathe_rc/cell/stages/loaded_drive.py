@@ -85,7 +85,7 @@ class LoadedFineParameters(PiezoActuatorParameters):
 
 
 class LoadedParameters(ComposedParameters):
-    """What drives under the cutting force have beyond the parameters of drives and cut."""
+    """Parameters of drives under the cutting force beyond those of drives and cut."""
 
     radial_ratio: Annotated[float, Ge(0), Le(2)] = parameter(
         0.4, "radial part of the cutting force, which pushes the tool out of the part, over the main one"
@@ -163,7 +163,7 @@ LoadedSeriesDriveParameters = create_model(
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         retraction, limits, limits_fine: of the commands.

@@ -83,7 +83,7 @@ _TOLD = 1  # why a step stops: the log is full
 
 
 class Wanted(NamedTuple):
-    """What is controlled, for the steps of all laws.
+    """The controlled quantity, for the steps of all laws.
 
     Attributes:
         course: of the set point.
@@ -100,7 +100,7 @@ class Wanted(NamedTuple):
 
 
 class PidMemory(NamedTuple):
-    """What the step of the PID works on."""
+    """Memory of the step of the PID."""
 
     wanted: Wanted
     pid: PidTable
@@ -108,14 +108,14 @@ class PidMemory(NamedTuple):
 
 
 class LinkMemory(NamedTuple):
-    """What the step of the sampled link works on."""
+    """Memory of the step of the sampled link."""
 
     wanted: Wanted
     link: HeldLink
 
 
 class PeriodicMemory(NamedTuple):
-    """What the step of the periodic law works on.
+    """Memory of the step of the periodic law.
 
     Attributes:
         wanted: see above.

@@ -34,7 +34,7 @@ class ResonantControllerParameters(FormLawParameters):
 
 
 class Memory(NamedTuple):
-    """What the law works on.
+    """Memory of the law.
 
     Attributes:
         spindle: filter of the angle.

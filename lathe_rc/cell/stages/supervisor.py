@@ -135,7 +135,7 @@ _ANSWER = 1  # why it stops: the state changes within the block, or there is som
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         watch: the monitors.
@@ -224,14 +224,14 @@ class Supervisor(Stage):
         return max(1, round(seconds * self.shared.sample_rate))
 
     def _each(self, name: str, of: Sequence[str]) -> list[tuple[str, float]]:
-        """What is watched with its limit, for a list of limits that are on."""
+        """The watched signals with their limits, for a list of limits that are on."""
         limits: list[float] = getattr(self.parameters, name)
         if limits and len(limits) != len(of):
             raise InputError(f"{self.name}.{name} = {limits}; allowed: one for each of {', '.join(of) or 'none'}")
         return [(subject, limit) for subject, limit in zip(of, limits or [0.0] * len(of), strict=True) if limit]
 
     def _reaction(self, name: str, text: str = "") -> Reaction:
-        """What a parameter asks for, or one of its texts."""
+        """The reaction that a parameter asks for, or one of its texts."""
         asked = Reaction[(text or getattr(self.parameters, name)).upper()]
         if asked >= Reaction.RETRACT and not self.parameters.drives:
             raise InputError(

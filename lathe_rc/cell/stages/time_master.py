@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What gives the cell its time and angle: a spindle that is emulated, a real encoder, or one that was recorded."""
+"""The source of the cell's time and angle: an emulated spindle, a real encoder, or a recorded one."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
