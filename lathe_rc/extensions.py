@@ -15,7 +15,7 @@ import sys
 import sysconfig
 import traceback
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -126,7 +126,7 @@ class Registry(Offers[type[T]], Generic[T]):
 
     def allowed(self) -> str:
         """The names, in words."""
-        return f"{', '.join(self)}, or PACKAGE.MODULE:CLASS"
+        return in_words(self)
 
     def origin(self, name: str) -> Mapping[str, str] | None:
         """Where a class of others comes from: distribution, version, hash of its source; None: it is ours."""
@@ -199,6 +199,12 @@ def _offered(group: str) -> Mapping[str, importlib.metadata.EntryPoint]:
             both = f"{_distribution(other.dist)} and {_distribution(point.dist)}"
             raise InputError(f"{both} offer {point.name!r} ({group}); allowed: one of them; uninstall the other")
     return found
+
+
+def in_words(names: Iterable[str]) -> str:
+    """What may be given where ``names`` are known, and classes of others."""
+    listed = ", ".join(names)
+    return f"{listed}, or PACKAGE.MODULE:CLASS" if listed else "PACKAGE.MODULE:CLASS"
 
 
 def _distribution(dist: importlib.metadata.Distribution | None) -> str:
@@ -306,7 +312,7 @@ class Named(Generic[T]):
     def allowed(self) -> str:
         """The values that the parameter accepts, in words."""
         names = [*(name or "''" for name in self.special), *self.registry]
-        return f"one of {', '.join(names)}, or PACKAGE.MODULE:CLASS" if names else "PACKAGE.MODULE:CLASS"
+        return f"one of {in_words(names)}" if names else in_words(names)
 
     def others(self, value: object) -> list[str]:
         """The names of classes of other packages in a parameter's value, a name or a list of some."""

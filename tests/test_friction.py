@@ -9,7 +9,8 @@ from hypothesis import given
 from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_rc.errors import InputError
-from lathe_rc.plants.feed import FeedDrive, dc_screw, fourth_order
+from lathe_rc.plants.feed import FeedDrive
+from lathe_rc.plants.feed_models import dc_screw, fourth_order
 from lathe_rc.plants.friction import Friction, mobility
 
 STEP = 1 / 64000

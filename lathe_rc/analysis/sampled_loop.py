@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from lathe_rc.control.sampled_link import Link, LinkTable, SampledDrive, closed_loop, correct, largest_pole, rest, table
 from lathe_rc.jit import kernel
-from lathe_rc.plants.feed import DriveTable, Feedback, FeedDrive, hold, load_of, motor_of, move, sampled
+from lathe_rc.plants.feed import DriveTable, Feedback, FeedDrive, hold, load_of, motor_of, move
+from lathe_rc.plants.feed_models import sampled
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]

@@ -13,8 +13,9 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.snapshot import first_sample, span_of
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.recording import Digester, SparseTopic
-from lathe_rc.cell.wire import Block, Decoder
+from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, shown
 
 DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, as the harness found them

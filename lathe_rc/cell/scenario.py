@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenarios: ROS 2 parameter files that describe a whole cell."""
+"""Scenarios: ROS 2 parameter files that describe a whole cell.
+
+Longer than 400 lines: a scenario's way from its text to its tables, and back.
+"""
 
 import hashlib
 import json
@@ -19,6 +22,7 @@ from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.drawing import html
 from lathe_rc.errors import InputError, shown
+from lathe_rc.extensions import in_words
 from lathe_rc.names import instead
 
 
@@ -32,7 +36,7 @@ class _Tables(Mapping[str, type[NodeParameters]]):
 
     def allowed(self) -> str:
         """The kinds, in words."""
-        return f"{', '.join(self)}, or PACKAGE.MODULE:CLASS"
+        return in_words(self)
 
     def instead(self, kind: str) -> str:
         """The kinds that look like one that there is not, or all of them, in words."""

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The wired cell: stages in the order in which they compute, topics by name, and the checks before a start."""
+"""The wired cell: stages in the order in which they compute, topics by name, and the checks before a start.
+
+Longer than 400 lines: each check looks at the same wired cell, and a cell is refused by all of them or by none.
+"""
 
 import math
 from collections.abc import Collection, Mapping

@@ -16,8 +16,8 @@ from rich.console import Console
 from lathe_rc import messages
 from lathe_rc.bag.reading import stream
 from lathe_rc.bag.reading.source import Source
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.rerun_bridge import PORT, RATE, Kind
-from lathe_rc.cell.wire import Block
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.messages import START_NS
 from lathe_rc.view.rerun_output import Viewer, end, require, viewer

@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from lathe_rc.cell.wire import Block
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.wiring import Cell
 
 

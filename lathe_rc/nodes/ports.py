@@ -12,8 +12,9 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from lathe_rc import messages
 from lathe_rc.bag.writing.record import signal_depth
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.parameters import NodeParameters
-from lathe_rc.cell.wire import Block, Decoder, NoBlockError
+from lathe_rc.cell.wire import Decoder, NoBlockError
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.refused_messages import ForeignMessage

@@ -17,10 +17,12 @@ from rich.console import Group
 
 from lathe_rc.analysis.loaded import compliance
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.plants.cutting import RIGID, CuttingProcess, Part
+from lathe_rc.plants.cutting import CuttingProcess
 from lathe_rc.plants.cutting_force import SpecificForce
+from lathe_rc.plants.deflection import RIGID
 from lathe_rc.plants.loaded import LoadedDrive
 from lathe_rc.plants.spindle import LoadedSpindle, SpeedLoop
+from lathe_rc.plants.workpiece import Part
 from lathe_rc.studies.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

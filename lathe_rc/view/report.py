@@ -3,6 +3,8 @@
 
 Whatever comes from the bag is somebody else's text: it is escaped by the template, cut to a length, and shown without
 characters that do not print.
+
+Longer than 400 lines: each table and picture of the page has its function here, in the order of the page.
 """
 
 import json

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lathe_rc import messages
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wire import Block, Decoder
+from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.messages import Signals
 from lathe_rc.view.rerun_blueprint import blueprint

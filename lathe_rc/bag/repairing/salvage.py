@@ -22,7 +22,8 @@ from rosbags.rosbag2.metadata import parse_qos
 
 from lathe_rc.bag.reading import precheck
 from lathe_rc.bag.reading.precheck import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record
-from lathe_rc.bag.reading.source import files_of, read_chunk, unpack, unpack_file, unpacked_size
+from lathe_rc.bag.reading.source import files_of
+from lathe_rc.bag.reading.unpacking import read_chunk, unpack, unpack_file, unpacked_size
 from lathe_rc.errors import InputError, LatheError, shown
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time

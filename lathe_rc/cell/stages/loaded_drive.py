@@ -25,8 +25,10 @@ from lathe_rc.control.limits import CommandLimits, LimiterTable, limiter
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
-from lathe_rc.plants.cutting import CutTable
-from lathe_rc.plants.loaded import Coil, LoadedDrive, LoadedTable, Piezo, advance_loaded, failure
+from lathe_rc.plants.chip import CutTable
+from lathe_rc.plants.coil import Coil
+from lathe_rc.plants.loaded import LoadedDrive, Piezo
+from lathe_rc.plants.loaded_motion import LoadedTable, advance_loaded, failure
 from lathe_rc.signals.allowance import AllowanceTable, allow
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
 

@@ -19,6 +19,7 @@ from lathe_rc.cell.stages.servo import Listener, ServoParameters, listener, pid_
 from lathe_rc.cell.stages.trajectory import Course, Trajectory, follow
 from lathe_rc.control import periodic
 from lathe_rc.control.periodic import PeriodicController, PeriodicLaw, PeriodicState
+from lathe_rc.control.periodic_gains import PRESETS
 from lathe_rc.control.pid import POSITION, Pid, PidTable
 from lathe_rc.control.predistortion import PathTable, Predistortion, offset_along
 from lathe_rc.control.sampled_link import HeldLink, SampledLink, correct_along
@@ -288,7 +289,7 @@ class PositionController(Stage):
                 )
         with about(self.name, "period", "memory_filter", "divisor"):
             return PeriodicController(
-                periodic.PRESETS[parameters.periodic_gains],
+                PRESETS[parameters.periodic_gains],
                 period=parameters.period,
                 limit=parameters.command_limit,
                 step_s=parameters.step * parameters.divisor,
