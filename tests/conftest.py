@@ -31,7 +31,7 @@ os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(dds.__file__).w
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
-    """What is collected stays to the end: the collector of garbage need not walk through it, now or later."""
+    """The tests stay until the end: the collector of garbage need not walk through them, now or later."""
     gc.disable()
     try:
         return (yield)
