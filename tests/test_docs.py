@@ -130,7 +130,7 @@ class TestHostTopics:
 
 
 @functools.cache
-def tests() -> set[str]:
+def names_of_tests() -> set[str]:
     """All tests as pytest calls them, below tests/."""
     found, root = set(), Path(__file__).parent
     for path in root.rglob("test_*.py"):
@@ -146,7 +146,7 @@ def tests() -> set[str]:
 def test_every_test_that_a_page_names_exists(page: Path) -> None:
     lines = enumerate(page.read_text(encoding="utf-8").splitlines(), 1)
     named = {(number, test) for number, line in lines for test in _TEST.findall(line)}
-    known = tests() | {test.rpartition("::")[2] for test in tests()}
+    known = names_of_tests() | {test.rpartition("::")[2] for test in names_of_tests()}
     assert [f"{name(page)}:{number}: no test {test}" for number, test in sorted(named) if test not in known] == []
 
 
