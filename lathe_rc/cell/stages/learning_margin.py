@@ -42,7 +42,7 @@ class Margins:
         self._suprema: dict[tuple[object, ...], float] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """What cannot be had again: a response is computed when it is asked for."""
+        """A response is computed when it is asked for, and cannot be had again."""
         return {**self.__dict__, "_responses": {}}
 
     def _response(self, model: Identified) -> Response:
