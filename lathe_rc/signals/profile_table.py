@@ -195,7 +195,7 @@ class ProfileTable:
             row[:] = spline.c.T
 
     def demand(self, speed: float, acceleration: float, feed: float) -> Demand:
-        """The demand of the profile at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], ``feed`` in m/rev."""
+        """The profile's demand at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], ``feed`` in m/rev."""
         return _demand(self, speed, acceleration, feed)
 
 

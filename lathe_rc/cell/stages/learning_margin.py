@@ -42,7 +42,7 @@ class Margins:
         self._suprema: dict[tuple[object, ...], float] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """A response is computed when it is asked for, and cannot be had again."""
+        """The state without responses, which are computed when they are asked for."""
         return {**self.__dict__, "_responses": {}}
 
     def _response(self, model: Identified) -> Response:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The step of the learning controller, sample by sample."""
+"""The step of the learning controller."""
 
 from typing import NamedTuple
 
