@@ -203,7 +203,7 @@ class TestVerdict:
         assert text.index("In tolerance (±2 µm)") < text.index("Nothing went wrong") < text.index("Result")
 
     def test_says_that_learning_is_not_over_and_when_it_would_be(self, tmp_path):
-        """Of a round part with a slow filter nothing is left to guess: each revolution is better than the one before."""
+        """With a small gain, each revolution is better than the one before."""
         slow = scenario(
             spindle_encoder={"revolutions": 12.2},
             learning_controller={"learning_gain": 0.2},

@@ -41,7 +41,7 @@ class Shown(HTMLParser):
         self.tables, self.text, self._heading, self._inside = {}, "", "", []
         self.feed(self.source)
         self.text = " ".join(self.text.split())
-        told = re.search(r'<script type="application/json" id="figures">(.*)</script>', self.source)
+        told = re.search(r'<script type="application/json" id="figures">(.*?)</script>', self.source)
         found = json.loads(told[1]) if told else {}
         self.specs, self.data, self.chosen = (found.get(name, {}) for name in ("specs", "data", "chosen"))
 

@@ -2,7 +2,7 @@
 // Draws the figures of a page in its own colours, light or dark, and as wide as the page is.
 // A figure with a parameter "box" is enlarged by dragging across it; a double click or the button shows it whole.
 const { specs: SPECS, data: DATA, chosen: CHOSEN } = JSON.parse(document.getElementById("figures").textContent);
-const DARK = matchMedia("(prefers-color-scheme: dark)"), ENLARGED = {}, LEAST = 8;
+const DARK = matchMedia("(prefers-color-scheme: dark)"), ENLARGED = {}, LEAST = 8, MARGIN = 5; // [px]
 function config(width) {
   const style = getComputedStyle(document.documentElement), told = name => style.getPropertyValue(name).trim();
   const [ink, soft, line, paper] = ["--ink", "--soft", "--line", "--paper"].map(told);
@@ -22,7 +22,10 @@ async function draw(name) {
   if (spec.padding) spec.width = place.clientWidth - spec.padding.left - spec.padding.right;
   else { spec.width = place.clientWidth; spec.datasets = DATA; }
   const own = spec.usermeta || {};
-  if (own.square) spec.width = spec.height = Math.min(place.clientWidth, own.square);
+  if (own.square) {
+    spec.width = spec.height = Math.min(place.clientWidth, own.square) - 2 * MARGIN;
+    spec.autosize = "pad"; // else width would be what the margins leave of it, and height would not
+  }
   for (const [channel, ends] of Object.entries(ENLARGED[name] || {})) {
     const encoding = spec.encoding[channel];
     encoding.scale = { ...encoding.scale, domain: ends, nice: false, ...(encoding.scale?.type == "log" ? {} : { zero: false }) };

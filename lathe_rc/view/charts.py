@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of an HTML page, drawn where it is read: Vega-Lite, its library, and the script that draws.
 
-The page carries all of it. Its scripts are these two alone, by their hashes: what a bag or a sweep says in it cannot run.
+The page carries all of it. It runs these two scripts alone, known by their hashes, and nothing that a bag or a sweep
+says in it.
 """
 
 import base64

@@ -73,6 +73,7 @@ def _spec(height: int, **parts: Any) -> Spec:
 
 _LEGEND: Spec = {"orient": "top", "title": None, "labelLimit": 260, "symbolType": "stroke", "symbolOpacity": 1}
 _LEGEND |= {"symbolStrokeWidth": 3}
+_GRADIENT: Spec = {"orient": "top", "direction": "horizontal", "gradientLength": 260, "columns": 0, "titleLimit": 300}
 
 
 def _map(rows: Samples, across: Spec, up: Spec, colour: Spec, meta: Spec) -> Spec:
@@ -126,9 +127,9 @@ def form_map(form: Form, maps: int) -> Spec:
     ticks = [largest, linear] if largest > 3 * linear else [largest]
     values = [*(-tick for tick in ticks), 0.0, *reversed(ticks)]
     colour = _quantity("data", "radius deviation [µm]")
-    colour["scale"] = {"type": "symlog", "constant": linear / _LINEAR, "domain": [-largest, largest], "range": "diverging"}
-    colour["legend"] = {"orient": "top", "direction": "horizontal", "columns": 0, "gradientLength": 260, "values": values}
-    colour["legend"] |= {"type": "gradient", "format": ".3~g", "titleLimit": 300}
+    colour["scale"] = {"type": "symlog", "constant": linear / _LINEAR, "domain": [-largest, largest]}
+    colour["scale"]["range"] = "diverging"
+    colour["legend"] = {**_GRADIENT, "values": values, "format": ".3~g"}
     return _map(rows, across, up, colour, {"renderer": "canvas"})
 
 
@@ -147,7 +148,7 @@ def along(surface: Lay) -> list[Spec]:
     up = {"title": "height [mm]", "start": low - step / 2, "step": step * group, "end": high + step / 2}
     up["scale"] = _axis(ends=ends)
     colour = _quantity("data", "radius deviation [µm]", scale={"scheme": "viridis"})
-    colour["legend"] = {"orient": "top", "direction": "horizontal", "columns": 0, "gradientLength": 260, "titleLimit": 300}
+    colour["legend"] = _GRADIENT
     trace = [{"u": _number(x), "v": _number(y)} for x, y in zip(place.tolist(), deviation[0].tolist(), strict=True)]
     line = _spec(
         240,

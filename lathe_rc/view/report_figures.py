@@ -191,7 +191,8 @@ def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> str:
         place, low, high = series.curve()
         axes.plot(place + 1, (um(low) + um(high)) / 2, ".", color=colour, ms=4, label=plain(name))
     if form and form.tolerance:
-        axes.axhline(form.tolerance * 1e6, color=_GREY, lw=1.0, ls="--", label=f"tolerance {form.tolerance * 1e6:.3g} µm")
+        limit = form.tolerance * 1e6
+        axes.axhline(limit, color=_GREY, lw=1.0, ls="--", label=f"tolerance {limit:.3g} µm")
     axes.set(xlabel="revolution or cycle", ylabel="error [µm]", yscale="log")
     _grid(axes)
     axes.legend(loc="upper right")

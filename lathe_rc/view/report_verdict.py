@@ -162,7 +162,7 @@ def _speed(told: Gathered) -> str:
     """By how much the spindle speed varies."""
     for (_, name), series in told.curves.signals.items():
         low, high = series.extremes
-        if name == "speed_true" and 0.0 < low and math.isfinite(high):
+        if name == "speed_true" and low > 0.0 and math.isfinite(high):
             deviation = (high - low) / (high + low)
             return f" (which varies by ±{deviation:.1%})" if deviation >= _VARIES else ""
     return ""
