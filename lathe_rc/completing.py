@@ -7,7 +7,6 @@ until a module of lathe_rc has changed; `stand_in` makes commands of it that onl
 
 import contextlib
 import hashlib
-import importlib
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping

@@ -99,7 +99,9 @@ def test_bash_completes_lathe_and_the_launcher_of_a_checkout(program):
     script = printed + "compopt() { echo compopt $@; }\n"
     for line in lines:
         words = line.split()
-        script += f"COMP_WORDS=({line}) COMP_CWORD={len(words) - 1}; _lathe_complete {program} {words[-1]} {words[-2]}; "
+        script += (
+            f"COMP_WORDS=({line}) COMP_CWORD={len(words) - 1}; _lathe_complete {program} {words[-1]} {words[-2]}; "
+        )
         script += "printf '%s\\n' \"${COMPREPLY[@]}\"\n"
     script += "complete -p lathe\n"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
@@ -129,7 +131,9 @@ class TestInstall:
         monkeypatch.setenv("HOME", str(tmp_path))
         return tmp_path
 
-    @pytest.mark.parametrize(("shell", "rc"), [("bash", ".bashrc"), ("zsh", ".zshrc"), ("fish", ".config/fish/config.fish")])
+    @pytest.mark.parametrize(
+        ("shell", "rc"), [("bash", ".bashrc"), ("zsh", ".zshrc"), ("fish", ".config/fish/config.fish")]
+    )
     def test_writes_one_line_once_and_takes_it_out_again(self, home, shell, rc):
         rc = home / rc
         rc.parent.mkdir(parents=True, exist_ok=True)

@@ -79,7 +79,7 @@ def test_neither_a_pipe_nor_json_has_it():
 def test_the_curves_are_where_the_errors_are():
     """Between the decades that hold them; of a long run no more points than can be seen, and no peak is lost."""
     result = run(spindle_encoder={"revolutions": 40.0}, tool={"tolerance": 2e-6})
-    console = Console(width=60, force_terminal=True, color_system=None, file=open(os.devnull, "w"))  # noqa: SIM115
+    console = Console(width=60, force_terminal=True, color_system=None)
     with console.capture() as caught:
         console.print(plot.drawn(result, 60))
     ticks = [float(tick) for tick in re.findall(r"(?m)^ *([\d.]+)┤", caught.get())]

@@ -10,7 +10,7 @@ import click
 import platformdirs
 
 from lathe_rc import completing
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, shown
 
 _MARK = "# completion of lathe_rc"
 
@@ -30,7 +30,8 @@ class _Shell(NamedTuple):
 _BASH = """\
 _lathe_complete() {
     local IFS=$'\\n' told kind value
-    told=$(COMP_WORDS="${COMP_WORDS[*]}" COMP_CWORD=$COMP_CWORD _LATHE_COMPLETE=bash_complete "${1/#\\~/$HOME}" 2>/dev/null)
+    told=$(COMP_WORDS="${COMP_WORDS[*]}" COMP_CWORD=$COMP_CWORD _LATHE_COMPLETE=bash_complete \\
+        "${1/#\\~/$HOME}" 2>/dev/null)
     COMPREPLY=()
     for each in $told; do
         IFS=',' read -r kind value <<< "$each"
@@ -51,7 +52,9 @@ if ! (( $+functions[compdef] )); then autoload -Uz compinit && compinit; fi
 _lathe_complete() {
     local -a described plain open told
     local kind value about
-    told=("${(@f)$(COMP_WORDS="${words[*]}" COMP_CWORD=$((CURRENT-1)) _LATHE_COMPLETE=zsh_complete ${~words[1]} 2>/dev/null)}")
+    export COMP_WORDS="${words[*]}" COMP_CWORD=$((CURRENT-1))
+    told=("${(@f)$(_LATHE_COMPLETE=zsh_complete ${~words[1]} 2>/dev/null)}")
+    unset COMP_WORDS COMP_CWORD
     for kind value about in $told; do
         case $kind in
             dir) _path_files -/ ;;
@@ -130,7 +133,7 @@ def completion(shell: str | None, *, install: bool, remove: bool) -> None:
         else:
             _remove(script, rc)
     except (OSError, UnicodeError) as error:
-        raise InputError(f"{getattr(error, 'filename', None) or rc}: {getattr(error, 'strerror', None) or error}") from None
+        raise InputError(f"{rc} or {script}: {shown(error)}") from None
 
 
 def _lines(rc: Path) -> list[str]:

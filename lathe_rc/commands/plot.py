@@ -20,9 +20,9 @@ _STYLES = {"gray+": "white", "cyan+": "bright_cyan", "orange+": "bright_yellow"}
 
 def show(result: harness.Result, console: Console) -> None:
     """Draw it if somebody looks: in no pipe and no file, and in no terminal that cannot show it."""
-    if console.file.isatty() and not console.is_dumb_terminal and console.width >= _NARROWEST:
-        if text := drawn(result, console.width):
-            console.print(text)
+    seen = console.file.isatty() and not console.is_dumb_terminal and console.width >= _NARROWEST
+    if seen and (text := drawn(result, console.width)):
+        console.print(text)
 
 
 def drawn(result: harness.Result, width: int) -> Text | None:
