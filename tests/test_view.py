@@ -14,10 +14,9 @@ rr = pytest.importorskip("rerun")
 rrb = pytest.importorskip("rerun.blueprint")
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
 
-from lathe_rc import harness, resources  # noqa: E402
+from lathe_rc import harness, messages, resources  # noqa: E402
 from lathe_rc.analysis import metrology  # noqa: E402
 from lathe_rc.bag import reader  # noqa: E402
-from lathe_rc.cell import messages  # noqa: E402
 from lathe_rc.cell.scenario import load  # noqa: E402
 from lathe_rc.cell.stage import Sparse  # noqa: E402
 from lathe_rc.cli import main  # noqa: E402
@@ -180,7 +179,7 @@ def test_the_tool_touches_what_it_has_turned(turned, shown):
 
 
 def test_every_curve_and_picture_has_a_view(turned, shown):
-    """What nobody would see was logged in vain."""
+    """Everything that is logged has a place in the view."""
 
     def contents(part):
         if isinstance(part, rrb.View):
@@ -212,19 +211,19 @@ def test_states_of_the_supervisor_and_faults_are_bands(tmp_path):
     overrides = ["spindle_encoder.revolutions=8"]
     overrides += ["electrodynamic_actuator.faults=['revolution 4 to 5: coarse/state.measured_position stuck']"]
     cell = load(resources.find(Path("supervised.yaml")), overrides)
-    happened = harness.run(cell, bag=tmp_path / "bag").happened
+    logged = harness.run(cell, bag=tmp_path / "bag").event_log
     done = lathe("view", tmp_path / "bag", "-o", tmp_path / "out.rrd")
     assert done.exit_code == 0, done.output
     view = View(tmp_path / "out.rrd")
     assert view.entities("StateChange:state") == {"/states/cell/safety", "/states/electrodynamic_actuator/fault"}
-    status = [each for each in happened if each.topic == "/safety/status"]
+    status = [each for each in logged if each.topic == "/safety/status"]
     states = [state for (state,) in view.column("/states/cell/safety", "StateChange:state")]
     assert list(dict.fromkeys(states)) == ["nominal", "retracting", "safe"]
     samples = [0, *(each.sample for each in status)]
     assert view.column("/states/cell/safety", "time") == [sample * STEP_NS for sample in samples]
     fault = view.column("/states/electrodynamic_actuator/fault", "StateChange:state")
     assert fault == [["coarse/state.measured_position stuck"], [""]]
-    begun, over = (each.sample for each in happened if each.topic == "/electrodynamic_actuator/events")
+    begun, over = (each.sample for each in logged if each.topic == "/electrodynamic_actuator/events")
     assert view.column("/states/electrodynamic_actuator/fault", "time") == [begun * STEP_NS, over * STEP_NS]
 
 

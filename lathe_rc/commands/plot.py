@@ -8,9 +8,8 @@ import plotext
 from rich.console import Console
 from rich.text import Text
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import turns_before
-from lathe_rc.cell import messages
 
 _HEIGHT = 14  # lines
 _NARROWEST = 40  # characters

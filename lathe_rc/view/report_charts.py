@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.analysis.metrology import Lay
-from lathe_rc.cell.messages import Samples
+from lathe_rc.messages import Samples
 from lathe_rc.view.charts import FIT, SCHEMA, Rows, Spec
 from lathe_rc.view.report_figures import (
     FLOOR,

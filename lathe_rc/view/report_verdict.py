@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lathe_rc import messages
 from lathe_rc.analysis.budget import Budget
-from lathe_rc.cell import messages
 from lathe_rc.cell.stages.command_limits import LIMITED
 from lathe_rc.view.report_figures import um
 from lathe_rc.view.report_form import Form

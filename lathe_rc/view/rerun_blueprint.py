@@ -5,8 +5,8 @@ from collections.abc import Collection, Mapping
 
 import rerun.blueprint as rrb
 
-from lathe_rc.cell import messages
-from lathe_rc.happened import HAPPENED
+from lathe_rc import messages
+from lathe_rc.event_log import LOGGED
 from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.rerun_signals import CYCLES, DRIVE, ERROR, PLOTS, POSITION, curve_path, curves
 from lathe_rc.view.rerun_states import ROOT
@@ -26,7 +26,7 @@ def _so_far() -> list[rrb.VisibleTimeRange]:
 
 
 def _latest() -> list[rrb.VisibleTimeRange]:
-    """What lies shortly before the time cursor: the plot takes its scale from that."""
+    """The range shortly before the time cursor: the plot takes its scale from that."""
     starts = {
         "time": rrb.TimeRangeBoundary.cursor_relative(seconds=-_LATEST_S),
         "revolution": rrb.TimeRangeBoundary.cursor_relative(seq=-_LATEST_REVOLUTIONS),
@@ -125,11 +125,11 @@ def blueprint(types: Mapping[str, str], *, live: bool = False, silent: Collectio
     rows: list[rrb.View | rrb.Container] = [rrb.Horizontal(*top, column_shares=[3, 2][: len(top)])] if top else []
     rows += first
     tabs: list[rrb.View] = list(plots.values())
-    if live or said & {*HAPPENED}:  # live, what had to be left out stands there
+    if live or said & {*LOGGED}:  # live, what had to be left out stands there
         tabs.append(rrb.TextLogView(origin="/events", name="events"))
     if tabs:
         rows.append(rrb.Tabs(*tabs, active_tab=0))
-    if messages.SAFETY_STATUS in kinds or said & {*HAPPENED}:
+    if messages.SAFETY_STATUS in kinds or said & {*LOGGED}:
         rows.append(rrb.StateTimelineView(origin=f"/{ROOT}", name="states of the supervisor, faults, limits met"))
     right = rrb.Vertical(*rows)
     return rrb.Blueprint(

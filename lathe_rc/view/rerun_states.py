@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the cell and its nodes are in over time, as bands: the supervisor's states, faults, limits of commands."""
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import full
+from lathe_rc import messages
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED
+from lathe_rc.messages import full
 from lathe_rc.safety.state_machine import State
 
 ROOT = "states"  #: where the bands are in the view
