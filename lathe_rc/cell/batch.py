@@ -95,10 +95,10 @@ def run(scenarios: Iterable[Scenario], keep: Make[K_co], *, threads: int | None 
     """
     count = threads or os.cpu_count() or 1
     waiting: deque[Future[Outcome[K_co]]] = deque()
-    pool = ThreadPoolExecutor(count)
+    pool, idle = ThreadPoolExecutor(count), deque(Bench() for _ in range(count))
     try:
         for number, scenario in enumerate(scenarios):
-            waiting.append(pool.submit(_outcome, scenario, keep))
+            waiting.append(pool.submit(_outcome, scenario, keep, idle))
             # The first compiles what the others use.
             if number == 0 or len(waiting) > _AHEAD * count:
                 yield waiting.popleft().result()
@@ -108,15 +108,34 @@ def run(scenarios: Iterable[Scenario], keep: Make[K_co], *, threads: int | None 
         pool.shutdown(cancel_futures=True)
 
 
-def _outcome(scenario: Scenario, keep: Make[K_co]) -> Outcome[K_co]:
+class Bench:
+    """Runs cells one after the other; those that are wired alike go through the same engine."""
+
+    def __init__(self) -> None:
+        self._engine: Engine | None = None
+
+    def run(self, cell: Cell, keeper: Keeper[K_co]) -> K_co:
+        """Run a cell that has passed its check to its end.
+
+        Raises:
+            LatheError: it cannot go on.
+        """
+        if self._engine is None or not self._engine.begin(cell, keeper.heard):
+            self._engine = Engine(cell, keeper.heard)
+        self._engine.run([Finite(cell), keeper])
+        return keeper.kept()
+
+
+def _outcome(scenario: Scenario, keep: Make[K_co], idle: deque[Bench]) -> Outcome[K_co]:
+    bench = idle.pop()
     try:
         cell = Cell(scenario.nodes)
         cell.check()
-        keeper = keep(cell, cell.samples)
-        Engine(cell, keeper.heard).run([Finite(cell), keeper])
+        return Outcome(scenario, bench.run(cell, keep(cell, cell.samples)))
     except LatheError as error:
         return Outcome(scenario, None, error)
-    return Outcome(scenario, keeper.kept())
+    finally:
+        idle.append(bench)
 
 
 class Errors:

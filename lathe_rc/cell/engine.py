@@ -37,19 +37,33 @@ class Engine:
     """
 
     def __init__(self, cell: Cell, heard: Collection[str] | None = None) -> None:
-        self.samples = cell.samples
-        self._stages = list(cell.stages.values())
-        if heard is not None:
-            for stage in self._stages:
-                stage.unheard = {topic for topic in stage.sparse_topics if remapped(stage.shared, topic) not in heard}
         chunk = chunk_of(cell.master.shared.block_size, [cell.shortest_feedback or 0])
         self._piece = MAX_BLOCK // chunk * chunk
         topics = {topic: (source.type, longest_delays(cell.inputs(topic))) for topic, source in cell.dense.items()}
         self._tapes = Tapes(topics, self._piece)
+        self._take(cell, heard)
+        wires = [wired(stage) for stage in self._stages]
+        self._topics = [each.outputs for each in wires]
+        self._program = Program(wires, self._tapes, chunk)
+
+    def _take(self, cell: Cell, heard: Collection[str] | None) -> None:
+        """Have the stages of a cell ready."""
+        self.samples = cell.samples
+        self._wiring, self._block = cell.wiring, cell.master.shared.block_size
+        self._stages = list(cell.stages.values())
         for stage in self._stages:
+            if heard is not None:
+                stage.unheard = {topic for topic in stage.sparse_topics if remapped(stage.shared, topic) not in heard}
             compile_kernels(stage)
-        self._wired = [wired(stage) for stage in self._stages]
-        self._program = Program(self._wired, self._tapes, chunk)
+
+    def begin(self, cell: Cell, heard: Collection[str] | None = None) -> bool:
+        """Begin anew with another cell; whether that can be: it must be wired as the one before, and checked too."""
+        if cell.wiring is not self._wiring or cell.master.shared.block_size != self._block:
+            return False
+        self._take(cell, heard)
+        self._tapes.rewind()
+        self._program.begin(self._stages)
+        return True
 
     def run(self, sinks: Iterable[Sink]) -> None:
         """Run to the end."""
@@ -79,7 +93,7 @@ class Engine:
             return
         dense: dict[str, Signals] = {}
         sparse: dict[str, list[Sparse]] = {}
-        for number, (stage, _, topics) in enumerate(self._wired):
+        for number, (stage, topics) in enumerate(zip(self._stages, self._topics, strict=True)):
             outputs = [self._tapes.view(topic, first, end - first) for topic in topics]
             dense.update(zip(topics, outputs, strict=True))
             # Where a stage has failed, those before it have gone on.

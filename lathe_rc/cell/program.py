@@ -16,7 +16,7 @@ from lathe_rc.cell.native import BROKEN, Integers, broken
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
 from lathe_rc.jit import kernel
-from lathe_rc.placed import call, floats
+from lathe_rc.placed import address, call, floats
 
 _CHUNK = 1024  # samples that a stage computes in one go, at most: what stages hand on stays in the cache
 
@@ -59,6 +59,12 @@ class Tapes:
                 array, kept = self.arrays[key], slice(self.history - delay, self.history)
                 array[kept] = array[kept.start + shift : kept.stop + shift].copy()
         self.begin = first
+
+    def rewind(self) -> None:
+        """Begin again before sample 0."""
+        for array in self.arrays.values():
+            array.fill(0)
+        self.begin = 0
 
 
 # Columns of the plan of the stages: address of the step or 0, address of its memory, its first field, the field with
@@ -165,10 +171,10 @@ class Program:
     """
 
     def __init__(self, stages: Sequence[Wired], tapes: Tapes, chunk: int) -> None:
-        self._wired, self._stages, self._tapes, self._chunk = stages, [each.stage for each in stages], tapes, chunk
-        self.number, self.ends = 0, [0] * len(stages)
-        self._turn = np.empty(len(self._stages))
-        self._plan = np.zeros((len(self._stages) + 1, 5), np.int64)
+        self._tapes, self._chunk = tapes, chunk
+        self._inputs, self._outputs = [each.inputs for each in stages], [each.outputs for each in stages]
+        self._turn = np.empty(len(stages))
+        self._plan = np.zeros((len(stages) + 1, 5), np.int64)
         fields: list[tuple[int, int, int]] = []
         for row, (stage, inputs, outputs) in zip(self._plan, stages, strict=False):
             row[_FIELD], row[_ANGLE], angle = len(fields), -1, stage.angle_input
@@ -184,21 +190,29 @@ class Program:
         self._plan[-1, _FIELD] = len(fields)
         self._fields = np.ascontiguousarray(np.array(fields, np.int64).T)
         self._where = np.zeros(3, np.int64)
-        self._told = [0] * len(self._stages)
-        self._sparse: list[list[Sparse]] = [[] for _ in self._stages]
-        for number in range(len(self._stages)):
+        self.begin([each.stage for each in stages])
+
+    def begin(self, stages: Sequence[Stage]) -> None:
+        """Begin at sample 0 with stages whose ports are those of the stages that it was made of."""
+        self._stages = stages
+        self.number, self.ends = 0, [0] * len(stages)
+        self._where[:] = 0
+        self._told = [0] * len(stages)
+        self._sparse: list[list[Sparse]] = [[] for _ in stages]
+        for number in range(len(stages)):
             self._load(number)
 
     def _field(self, tape: str, delay: int, name: str) -> tuple[int, int, int]:
         array = self._tapes.arrays[tape, name]
-        return array.ctypes.data - delay * array.itemsize, array.itemsize, 0
+        return address(array) - delay * array.itemsize, array.itemsize, 0
 
     def _load(self, number: int) -> None:
         """Take what a stage has in its memory now, and when it wants Python next."""
         stage, row = self._stages[number], self._plan[number]
+        row[_STEP] = row[_WORDS] = 0
         if stage.is_compiled:
             native = stage.native()
-            row[_STEP], row[_WORDS] = native.address, native.words.ctypes.data
+            row[_STEP], row[_WORDS] = native.address, address(native.words)
         row[_DUE], self._turn[number] = stage.due
 
     def run(self, end: int) -> None:
@@ -237,8 +251,8 @@ class Program:
     def _serve(self, reason: int, first: int, number: int, reached: int, samples: int) -> None:
         """Do in Python what a stage needs."""
         stage, tapes = self._stages[number], self._tapes
-        inputs = [tapes.view(tape, first, samples, delay) for tape, delay in self._wired[number].inputs]
-        outputs = [tapes.view(tape, first, samples) for tape in self._wired[number].outputs]
+        inputs = [tapes.view(tape, first, samples, delay) for tape, delay in self._inputs[number]]
+        outputs = [tapes.view(tape, first, samples) for tape in self._outputs[number]]
         with stage.named():
             if reason == BROKEN:
                 raise broken()

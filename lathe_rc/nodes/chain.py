@@ -134,7 +134,7 @@ def _groups(cell: Cell, here: Mapping[str, object]) -> list[list[str]]:
     groups: list[list[str]] = [[]]
     beyond: set[str] = set()  # stages elsewhere that compute after some of the group at hand
     for name, stage in cell.stages.items():
-        reads = {cell.source(stage, port).node for port in stage.inputs if not port.delay}
+        reads = {cell.dense[remapped(stage.shared, port.topic)].node for port in stage.inputs if not port.delay}
         if name in here:
             if reads & (beyond | cell.unknown.keys()):
                 groups.append([])
