@@ -38,7 +38,7 @@ from lathe_rc.bag.writer import refuse_existing
 from lathe_rc.cell import budget as budgets
 from lathe_rc.cell import messages
 from lathe_rc.cell.ahead import compile_ahead
-from lathe_rc.cell.collect import Collector, Finite, check_room
+from lathe_rc.cell.collect import Collector, check_room
 from lathe_rc.cell.durations import Lateness
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.messages import Signals
@@ -446,7 +446,7 @@ class _Watcher:
 def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[Event], None]) -> Result:
     engine = Engine(cell)
     collector = Collector(cell, engine.samples)
-    sinks: list[Sink] = [Finite(cell), collector, _Watcher(watch)]
+    sinks: list[Sink] = [collector, _Watcher(watch)]
     recorder = snapshots = None
     if bag is not None:
         snapshots = begin_snapshots(bag, scenario, cell)

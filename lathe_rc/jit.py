@@ -26,7 +26,6 @@ _KERNELS = (
     "bag/played.py",
     "bag/walk.py",
     "safety/*.py",
-    "cell/collect.py",
     "cell/native.py",
     "cell/program.py",
     "cell/stages/*.py",

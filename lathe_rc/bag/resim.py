@@ -28,7 +28,6 @@ from lathe_rc.bag.stream import feed
 from lathe_rc.bag.writer import refuse_existing
 from lathe_rc.cell import messages, models, ros_yaml
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.collect import Finite
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import SharedParameters
@@ -207,7 +206,7 @@ def resimulate(
         samples = cell.master.samples
         assert samples is not None, "a bag has an end"
         writer = begin(output, chosen) if output is not None else None
-        all_sinks: list[Sink] = [Finite(cell), digests, errors, *([compared] if compared else [])]
+        all_sinks: list[Sink] = [digests, errors, *([compared] if compared else [])]
         if writer is not None:
             all_sinks.append(OfflineRecorder(cell, samples, writer))
         engine = Engine(cell)

@@ -21,10 +21,11 @@ import numpy as np
 
 from lathe_rc.analysis.metrology import FormErrors, form_errors
 from lathe_rc.cell import messages
-from lathe_rc.cell.collect import Collector, Finite
+from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.recording import Recording
+from lathe_rc.cell.rewind import Stock
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
@@ -109,10 +110,19 @@ def run(scenarios: Iterable[Scenario], keep: Make[K_co], *, threads: int | None 
 
 
 class Bench:
-    """Runs cells one after the other; those that are wired alike go through the same engine."""
+    """Runs cells one after the other. Those that are alike share what does not differ: engine, and stages."""
 
     def __init__(self) -> None:
+        self._stock = Stock()
         self._engine: Engine | None = None
+
+    def cell(self, scenario: Scenario) -> Cell:
+        """The cell of a scenario; it is good until the next one is asked for.
+
+        Raises:
+            InputError: see `Cell`.
+        """
+        return Cell(scenario.nodes, stage=self._stock.take)
 
     def run(self, cell: Cell, keeper: Keeper[K_co]) -> K_co:
         """Run a cell that has passed its check to its end.
@@ -122,14 +132,14 @@ class Bench:
         """
         if self._engine is None or not self._engine.begin(cell, keeper.heard):
             self._engine = Engine(cell, keeper.heard)
-        self._engine.run([Finite(cell), keeper])
+        self._engine.run([keeper])
         return keeper.kept()
 
 
 def _outcome(scenario: Scenario, keep: Make[K_co], idle: deque[Bench]) -> Outcome[K_co]:
     bench = idle.pop()
     try:
-        cell = Cell(scenario.nodes)
+        cell = bench.cell(scenario)
         cell.check()
         return Outcome(scenario, bench.run(cell, keep(cell, cell.samples)))
     except LatheError as error:

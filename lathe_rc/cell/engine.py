@@ -3,7 +3,7 @@
 
 import gc
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Protocol
+from typing import NoReturn, Protocol
 
 import numpy as np
 
@@ -12,7 +12,9 @@ from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.program import Program, Tapes, chunk_of, wired
 from lathe_rc.cell.stage import Sparse, compile_kernels
 from lathe_rc.cell.track import longest_delays
+from lathe_rc.cell.wire import NotFiniteError, check_finite
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import DivergedError
 
 
 class Sink(Protocol):
@@ -52,8 +54,8 @@ class Engine:
         self._wiring, self._block = cell.wiring, cell.master.shared.block_size
         self._stages = list(cell.stages.values())
         for stage in self._stages:
-            if heard is not None:
-                stage.unheard = {topic for topic in stage.sparse_topics if remapped(stage.shared, topic) not in heard}
+            unheard = () if heard is None else stage.sparse_topics
+            stage.unheard = {topic for topic in unheard if remapped(stage.shared, topic) not in (heard or ())}
             compile_kernels(stage)
 
     def begin(self, cell: Cell, heard: Collection[str] | None = None) -> bool:
@@ -66,11 +68,16 @@ class Engine:
         return True
 
     def run(self, sinks: Iterable[Sink]) -> None:
-        """Run to the end."""
+        """Run to the end.
+
+        Raises:
+            DivergedError: a sample that sinks would take is NaN or infinite; names the first.
+            LatheError: a stage cannot go on.
+        """
         # Freeze existing objects so that the garbage collector skips them.
         gc.freeze()
         try:
-            # What is not finite is named by a sink, see `lathe_rc.cell.collect.Finite`; NumPy need not warn of it too.
+            # What is not finite is named here; NumPy need not warn of it too.
             with np.errstate(over="ignore", invalid="ignore"):
                 for _ in self.steps(list(sinks)):
                     pass
@@ -78,14 +85,29 @@ class Engine:
             gc.unfreeze()
 
     def steps(self, sinks: Sequence[Sink]) -> Iterator[int]:
-        """Run piece by piece; the sample index after each."""
+        """Run piece by piece; the sample index after each. Raises as `run`."""
         for first in range(0, self.samples, self._piece):
             self._tapes.advance(first)
+            broken = False
             try:
-                self._program.run(min(first + self._piece, self.samples))
+                broken = self._program.run(min(first + self._piece, self.samples), finite=bool(sinks))
             finally:
-                self._hand_over(first, self._program.reached, sinks)
+                if not broken:
+                    self._hand_over(first, self._program.reached, sinks)
+            if broken:
+                self._break_off(first)
             yield self._program.reached
+
+    def _break_off(self, first: int) -> NoReturn:
+        """Name the first sample of the piece that is not finite, as nodes do."""
+        found: list[tuple[int, int, str]] = []
+        for topic, source in self._wiring.dense.items():
+            for name, array in self._tapes.view(topic, first, self._program.reached - first).items():
+                try:
+                    check_finite(f"/{source.node}", name, array, first)
+                except NotFiniteError as error:
+                    found.append((error.index, len(found), f"/{topic}: {error}"))
+        raise DivergedError(min(found)[2])
 
     def _hand_over(self, first: int, end: int, sinks: Sequence[Sink]) -> None:
         """Give a piece to the sinks."""

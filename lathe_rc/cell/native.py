@@ -145,7 +145,7 @@ def _call(
 # ---- the module ----------------------------------------------------------------------------------------------------
 
 
-class _Entry:
+class Entry:
     """The function of addresses for a kind of step, memory and ports; see `Native`."""
 
     def __init__(
@@ -163,7 +163,7 @@ class _Entry:
             raise InputError(_cause(str(error))) from error
 
 
-_entry = cache(_Entry)  # made once for all that are alike
+_entry = cache(Entry)  # made once for all that are alike
 
 
 def _text(step: Step, memory: Placed, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]) -> str:

@@ -67,13 +67,18 @@ class Tapes:
         self.begin = 0
 
 
+NOT_FINITE = -3  #: why a program has stopped: a number is not finite
+_NOBODY = np.empty(0, np.int64)
+
 # Columns of the plan of the stages: address of the step or 0, address of its memory, its first field, the field with
 # the spindle angle or -1, the sample from which on it needs Python.
 _STEP, _WORDS, _FIELD, _ANGLE, _DUE = range(5)
 
 
 @kernel
-def _run(plan: Integers, turn: Samples, fields: Integers, where: Integers, base: int, end: int, chunk: int) -> int:
+def _run(
+    plan: Integers, turn: Samples, fields: Integers, where: Integers, base: int, end: int, chunk: int, told: Integers
+) -> int:
     """Compute from `where` (block, stage, sample in the block) up to sample ``end``; see `Program`.
 
     Args:
@@ -85,9 +90,10 @@ def _run(plan: Integers, turn: Samples, fields: Integers, where: Integers, base:
         base: place of sample 0 on the tape.
         end: see above.
         chunk: samples that a stage computes in one go.
+        told: numbers of the fields that have to be finite.
 
     Returns:
-        Why it stopped: `DONE` at the end.
+        Why it stopped: `DONE` at the end, `NOT_FINITE` after the chunk in which a number is not.
     """
     first, stage, start = where[0], where[1], where[2]
     origin, size, at = fields[0], fields[1], fields[2]
@@ -114,8 +120,20 @@ def _run(plan: Integers, turn: Samples, fields: Integers, where: Integers, base:
             start = 0
         stage = 0
         first += n
-    where[0], where[1], where[2] = first, 0, 0
+        where[0], where[1], where[2] = first, 0, 0
+        for field in told:
+            if not _finite(floats(at.ctypes.data, field, n)):
+                return NOT_FINITE
     return DONE
+
+
+@kernel
+def _finite(samples: Samples) -> bool:
+    """Whether no sample is NaN or infinite."""
+    count = 0
+    for k in range(samples.size):
+        count += not abs(samples[k]) < np.inf
+    return count == 0
 
 
 @kernel
@@ -176,6 +194,7 @@ class Program:
         self._turn = np.empty(len(stages))
         self._plan = np.zeros((len(stages) + 1, 5), np.int64)
         fields: list[tuple[int, int, int]] = []
+        told: list[int] = []
         for row, (stage, inputs, outputs) in zip(self._plan, stages, strict=False):
             row[_FIELD], row[_ANGLE], angle = len(fields), -1, stage.angle_input
             for place, port in enumerate(stage.inputs[: stage.own_inputs]):
@@ -183,12 +202,15 @@ class Program:
                     row[_ANGLE] = len(fields) + port.fields.index("angle")
                 fields += [self._field(*inputs[place], name) for name in port.fields]
             for tape, output in zip(outputs, stage.outputs, strict=True):
-                fields += [self._field(tape, 0, name) for name in messages.sample_fields(output.type)]
+                for name, dtype in messages.sample_fields(output.type).items():
+                    told += [len(fields)] if dtype == np.float64 else []
+                    fields.append(self._field(tape, 0, name))
             if angle is not None and angle >= stage.own_inputs:
                 row[_ANGLE] = len(fields)
                 fields.append(self._field(*inputs[angle], "angle"))
         self._plan[-1, _FIELD] = len(fields)
         self._fields = np.ascontiguousarray(np.array(fields, np.int64).T)
+        self._told_of = np.array(told, np.int64)
         self._where = np.zeros(3, np.int64)
         self.begin([each.stage for each in stages])
 
@@ -215,15 +237,22 @@ class Program:
             row[_STEP], row[_WORDS] = native.address, address(native.words)
         row[_DUE], self._turn[number] = stage.due
 
-    def run(self, end: int) -> None:
+    def run(self, end: int, *, finite: bool = False) -> bool:
         """Compute up to sample ``end``, which must lie within the piece of the tapes.
+
+        Args:
+            end: see above.
+            finite: stop after the chunk in which something is computed that is not.
+
+        Returns:
+            Whether it has stopped there.
 
         Raises:
             LatheError: a stage cannot go on; names it. What was computed before is on the tapes, see `reached`.
         """
         self.number = 0
         try:
-            self._compute(end)
+            return self._compute(end, self._told_of if finite else _NOBODY)
         finally:
             first = self.reached
             ahead = min(first + self._chunk, end)
@@ -231,17 +260,21 @@ class Program:
             for number, reached in enumerate(self.ends):
                 self._tell(number, reached)
 
-    def _compute(self, end: int) -> None:
+    def _compute(self, end: int, told: Integers) -> bool:
         for number, stage in enumerate(self._stages):
             self.number = number
             with stage.named():
                 stage.prepare(self.reached, end - self.reached)
             self._plan[number, _DUE], self._turn[number] = stage.due
         base = self._tapes.history - self._tapes.begin
-        while (reason := _run(self._plan, self._turn, self._fields, self._where, base, end, self._chunk)) != DONE:
+        plan, turn, fields, where = self._plan, self._turn, self._fields, self._where
+        while (reason := _run(plan, turn, fields, where, base, end, self._chunk, told)) != DONE:
+            if reason == NOT_FINITE:
+                return True
             first, self.number, reached = self._where.tolist()
             self._serve(reason, first, self.number, reached, min(self._chunk, end - first))
             self._load(self.number)
+        return False
 
     @property
     def reached(self) -> int:

@@ -2,7 +2,7 @@
 """The wired cell: stages in the order in which they compute, topics by name, and the checks before a start."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from graphlib import CycleError, TopologicalSorter
@@ -143,12 +143,18 @@ def _source(dense: Mapping[str, Source], node: str, topic: str, port: Input) -> 
     return source
 
 
+def new_stage(name: str, table: NodeParameters) -> Stage:
+    """The stage of a node."""
+    return STAGES[kind_of(name, table.stage)](name, table)
+
+
 class Cell:
     """All stages of a scenario, wired.
 
     Args:
         nodes: table of each node by name; nodes that are no stages are left out.
         unknown: members that nobody here knows more of than their topics, by name.
+        stage: gives the stage of a name and table.
 
     Attributes:
         unknown: see above.
@@ -165,14 +171,16 @@ class Cell:
         InputError: a topic without or with two publishers, types that do not match, a loop without a delay.
     """
 
-    def __init__(self, nodes: Mapping[str, NodeParameters], unknown: Mapping[str, Unknown] | None = None) -> None:
+    def __init__(
+        self,
+        nodes: Mapping[str, NodeParameters],
+        unknown: Mapping[str, Unknown] | None = None,
+        *,
+        stage: Callable[[str, NodeParameters], Stage] = new_stage,
+    ) -> None:
         self.unknown, self.unchecked = unknown or {}, list[str]()
         self.factors: dict[str, float] = {}
-        made: dict[str, Stage] = {}
-        for name, table in nodes.items():
-            kind = kind_of(name, table.stage)
-            if kind in STAGES:
-                made[name] = STAGES[kind](name, table)
+        made = {name: stage(name, table) for name, table in nodes.items() if kind_of(name, table.stage) in STAGES}
         ports = tuple(map(_ports, made.values()))
         self.wiring = _wire(ports, self.unknown) if self.unknown else _wire_alike(ports)
         self.dense, self.sparse = self.wiring.dense, self.wiring.sparse

@@ -199,17 +199,18 @@ def compute(
     start = time.perf_counter()
     row: dict[str, Any] = {"status": DONE, "version": revision()}
     row |= {target: values[target] for target in targets if target in values}
+    bench = bench or Bench()
     cell: Cell | None = None
     started = False
     try:
         scenario = base.varied(values)
         row["seed"] = scenario.shared.seed
-        cell = Cell(scenario.nodes)
+        cell = bench.cell(scenario)
         cell.check()
         keeper = _Keeper(cell, cell.samples, measures)
         started = True
-        (bench or Bench()).run(cell, keeper)
-        row |= _found(cell, keeper)
+        errors = bench.run(cell, keeper)
+        row |= _found(cell, keeper, errors)
     except LatheError as error:
         refused = isinstance(error, InputError) and not started
         row["status"] = REFUSED if refused else DIVERGED if isinstance(error, DivergedError) else FAILED
@@ -220,8 +221,7 @@ def compute(
     return row
 
 
-def _found(cell: Cell, keeper: _Keeper) -> dict[str, Any]:
-    errors = keeper.kept()
+def _found(cell: Cell, keeper: _Keeper, errors: FormErrors) -> dict[str, Any]:
     found: dict[str, Any] = {
         "limits": ", ".join(sorted(keeper.limited)),
         "samples": cell.samples,

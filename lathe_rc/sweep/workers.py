@@ -86,7 +86,7 @@ def _scenario(name: str, text: str, identity: str) -> Scenario:
         raise InputError(
             f"{name} is another cell at a worker: another lathe_rc, or files that it names differ; allowed: the same"
         )
-    return found
+    return found.named()
 
 
 def compute(order: Order, jobs: Sequence[Job]) -> pa.Table:
