@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many cells at once: each with its own memory, all through the same compiled program, on all cores.
+"""Many cells at once, all through the same compiled program, on all cores.
 
     piston = scenario.load(Path("config/piston.yaml"))
     cells = (piston.varied({"learning_controller.learning_gain": gain}) for gain in (0.25, 0.5, 1.0))
     for outcome in run(cells, Errors):
         print(outcome.kept.rms[-1])
 
-A cell gets the bits that it gets alone. Nothing is kept of its signals but what is asked for, and cells are made when
-their turn comes, so that the memory that a batch takes does not depend on how many they are.
+A cell gets the bits that it gets alone, though it shares with the one before what does not differ: see `Bench`. Nothing
+is kept of its signals but what is asked for, and cells are made when their turn comes, so that the memory that a batch
+takes does not depend on how many they are.
 """
 
 import os
@@ -37,7 +38,7 @@ _AHEAD = 2  # cells that are made for each thread before the first of them has b
 
 
 class Keeper(Sink, Protocol[K_co]):
-    """A sink that keeps of a run what is asked for."""
+    """A sink that keeps of a run what is asked for; the cell's stages run again in the next one."""
 
     @property
     def heard(self) -> Collection[str]:

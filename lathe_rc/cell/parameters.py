@@ -145,7 +145,6 @@ class Table(BaseModel):
             given = f"{values.get(name, cls.model_fields[name].default)!r:.200}"
             raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
 
-
     def changed(self: T, node: str, values: Mapping[str, object]) -> T:
         """The same table with other values; raises as `read`."""
         kind = type(self)

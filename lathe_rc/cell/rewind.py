@@ -31,7 +31,7 @@ class _Plain:
     """An object with nothing but its attributes; those of other make may hide something."""
 
 
-class UnknownPart(Exception):
+class UnknownPartError(Exception):
     """An object of which nobody here knows what a run may change of it."""
 
 
@@ -42,7 +42,7 @@ class Start:
         stage: which has not run.
 
     Raises:
-        UnknownPart: part of it is of a kind that cannot be set back, such as an open file.
+        UnknownPartError: part of it is of a kind that cannot be set back, such as an open file.
     """
 
     def __init__(self, stage: Stage) -> None:
@@ -84,13 +84,13 @@ class Start:
             parts = [*attributes.values()]
             self._back.append(lambda: _reset(part, attributes))
         else:
-            raise UnknownPart(f"a {type(part).__name__}")
+            raise UnknownPartError(f"a {type(part).__name__}")
         for each in parts:
             self._look(each)
 
     def _look_at_array(self, array: "np.ndarray[Any, Any]") -> None:
         if array.dtype.hasobject:
-            raise UnknownPart("an array of objects")
+            raise UnknownPartError("an array of objects")
         if array.flags.writeable:
             self._arrays.append((array, array.copy()))
 
@@ -151,13 +151,15 @@ def _start(stage: Stage) -> Start | None:
         if stage.is_compiled:
             stage.native()
         return Start(stage)
-    except UnknownPart:
+    except UnknownPartError:
         return None
 
 
 def _same(stage: Stage, table: NodeParameters) -> bool:
     """Whether a stage has such a table; the name of the run counts for those of others, who may write it somewhere."""
     before = stage.shared
+    if before is table:
+        return True
     if type(before) is not type(table):
         return False
     ours = is_ours(type(stage).__module__)

@@ -358,9 +358,7 @@ def _hash(fingerprints: Mapping[str, str]) -> str:
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
-def _agreed(
-    name: str, tables: Mapping[str, NodeParameters], fingerprints: Mapping[str, str], run_id: str
-) -> Scenario:
+def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mapping[str, str], run_id: str) -> Scenario:
     """The scenario of some tables, with a run id.
 
     Raises:

@@ -95,6 +95,21 @@ class Wiring:
 
 def _wire(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> Wiring:
     """Wire some stages and members; raises as `Cell` does."""
+    dense, sparse = _sources(stages, unknown)
+    order: TopologicalSorter[str] = TopologicalSorter({stage.node: () for stage in stages})
+    for stage in stages:
+        for topic, port in stage.inputs:
+            source = _source(dense, stage.node, topic, port)
+            if port.delay == 0 and source.node not in unknown:
+                order.add(stage.node, source.node)
+    try:
+        return Wiring(dense, sparse, tuple(order.static_order()))
+    except CycleError as error:
+        raise InputError(f"{' -> '.join(error.args[1])}: a loop without a feedback delay cannot start") from None
+
+
+def _sources(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> tuple[dict[str, Source], dict[str, Source]]:
+    """Who publishes the dense and the sparse topics."""
     dense: dict[str, Source] = {}
     sparse: dict[str, Source] = {}
 
@@ -112,17 +127,7 @@ def _wire(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> Wiring:
         for topics, published in ((dense, member.dense), (sparse, member.sparse)):
             for topic, msgtype in published.items():
                 add(topics, topic, Source(name, msgtype))
-    made = {stage.node for stage in stages}
-    order: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys((stage.node for stage in stages), ()))
-    for stage in stages:
-        for topic, port in stage.inputs:
-            source = _source(dense, stage.node, topic, port)
-            if port.delay == 0 and source.node in made:
-                order.add(stage.node, source.node)
-    try:
-        return Wiring(dense, sparse, tuple(order.static_order()))
-    except CycleError as error:
-        raise InputError(f"{' -> '.join(error.args[1])}: a loop without a feedback delay cannot start") from None
+    return dense, sparse
 
 
 @lru_cache

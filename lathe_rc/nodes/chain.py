@@ -10,6 +10,7 @@ and tracks hold what it would find there. So when anything goes wrong the chain 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.program import Program, Tapes, Wired, chunk_of
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
