@@ -195,7 +195,7 @@ class Words:
 def address(array: npt.NDArray[Any]) -> int:
     """Where a contiguous array begins; NumPy takes ten times as long to say so."""
     try:
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]  # it is a buffer
     except (TypeError, ValueError):  # nobody may write to it, or it is empty
         return array.ctypes.data
 

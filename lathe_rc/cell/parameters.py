@@ -164,7 +164,8 @@ class Table(BaseModel):
 def _check(table: type[Table], name: str) -> Callable[[object], Any]:
     """What a table makes of a value of a parameter; raises ValidationError."""
     field = table.model_fields[name]
-    kind: Any = Annotated[(field.annotation, *field.metadata)] if field.metadata else field.annotation
+    parts = (field.annotation, *field.metadata)
+    kind = cast("Any", Annotated)[parts] if field.metadata else field.annotation
     config = ConfigDict(strict=True, allow_inf_nan=False)
     found: TypeAdapter[Any] = TypeAdapter(kind, config=config)
     return found.validate_python
