@@ -7,10 +7,10 @@ from functools import cached_property
 import numpy as np
 import pytest
 
-from lathe_rc.cell.messages import COMMAND
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.rewind import Start, UnknownPartError
 from lathe_rc.cell.stage import Output, Stage
+from lathe_rc.messages import COMMAND
 
 
 class Part:

@@ -8,18 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.framing import Framer
-from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 
 
 def _free_memory() -> int:
-    """What programs can still have without swapping [B]; all that there is where nobody says."""
+    """Memory that programs can still have without swapping [B]; all memory where the system does not say."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             name, _, size = line.partition(":")
@@ -86,7 +86,7 @@ class Collector:
             kept.extend(sparse.get(topic, ()))
 
     def recording(self) -> Recording:
-        """What was collected, by fully qualified topic."""
+        """The collected signals, by fully qualified topic."""
         sparse = {}
         for topic, found in self._sparse.items():
             part = sparse[f"/{topic}"] = SparseTopic()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a sweep keeps of a cell: one row of its table.
+"""The row of a cell in the table of a sweep.
 
 | column | what |
 |---|---|
@@ -28,11 +28,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from lathe_rc import messages
 from lathe_rc.analysis.metrology import FormErrors, form_errors
 from lathe_rc.analysis.tolerance import judge
-from lathe_rc.cell import messages
 from lathe_rc.cell.batch import Bench, Errors
-from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
@@ -42,6 +41,7 @@ from lathe_rc.cell.stages.obedience import OUT_OF_REACH
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError, LatheError
+from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 from lathe_rc.sweep.revision import revision
 
@@ -95,7 +95,7 @@ class Measure(NamedTuple):
 
 
 def measure(text: str, scenario: Scenario) -> Measure:
-    """What ``TOPIC.FIELD:STATISTIC`` asks for.
+    """The measure that ``TOPIC.FIELD:STATISTIC`` asks for.
 
     Raises:
         InputError: the scenario has no such topic, the topic no such field, or there is no such statistic.
@@ -163,7 +163,7 @@ class _Keeper(Errors):
 
 
 def digest(recording: Recording, measures: Sequence[Measure]) -> str | None:
-    """What stands in the row of a cell that was run again.
+    """The digest in the row of a cell that was run again.
 
     SHA-256 of all samples, little-endian, of the form error; of a cell without a tool, of what is measured. None where
     there is neither.
