@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prints the table of learning.md: the steady-error formula against a run of 100 revolutions."""
 
-from pathlib import Path
-
 import numpy as np
+from place import CONFIG
 from scipy.integrate import trapezoid
 
 from lathe_rc import harness
@@ -14,7 +13,7 @@ WAVES = [2, 5, 10, 15, 20]
 AMPLITUDE = 10e-6  # [m]
 
 loaded = scenario.load(
-    Path(__file__).parents[1] / "config" / "piston.yaml",
+    CONFIG / "piston.yaml",
     [
         "spindle_encoder.deviation_amplitude=[0.0]",
         "spindle_encoder.revolutions=100",

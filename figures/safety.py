@@ -2,16 +2,15 @@
 """Prints the tables of safety.md: kinds of faults, states, reactions, and what is done about every fault."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
+from place import CONFIG
 
 from lathe_rc import harness
 from lathe_rc.cell import messages, scenario
 from lathe_rc.safety.faults import KINDS
 from lathe_rc.safety.state_machine import MEANING, Reaction, State, table
 
-CONFIG = Path(__file__).parents[1] / "config"
 SPINDLE = [
     "encoder.angle off",
     "encoder.angle stuck",

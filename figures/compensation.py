@@ -2,11 +2,11 @@
 """Draws img/compensation.png and prints the tables of compensation.md: what direct piezo compensation can do."""
 
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
+from place import PICTURES
 
 from lathe_rc.analysis.responses import Response, in_series
 from lathe_rc.analysis.structures import limit_frequency, uncompensated
@@ -111,4 +111,4 @@ by_band.set_title("reduction of a vibration from 0 Hz up", fontsize=10)
 for axes in (by_frequency, by_band):
     axes.grid(visible=True, which="both", alpha=0.25)
     axes.legend(fontsize=8)
-figure.savefig(Path(__file__).parent / "img" / "compensation.png", dpi=130)
+figure.savefig(PICTURES / "compensation.png", dpi=130)
