@@ -298,7 +298,8 @@ def test_the_viewer_stays_away_from_a_sourced_ros():
 @pytest.mark.parametrize(
     ("arguments", "groups"),
     [
-        (["test", "-k", "view"], ["sweep", "test", "view"]),
+        (["test", "-k", "view"], ["docs", "sweep", "test", "view"]),
+        (["docs", "--build"], ["docs"]),
         (["sweep", "piston"], ["sweep"]),
         (["tune", "piston"], ["sweep"]),
         (["view", "bag"], ["view"]),
@@ -313,7 +314,7 @@ def test_a_command_says_what_it_needs(arguments, groups):
 
 def test_setup_of_an_unknown_group_is_refused(copy):
     assert_refused(
-        lathe(copy, "setup", "viewer"), copy, "setup viewer; allowed: notebook, sweep, test, view, or nothing more"
+        lathe(copy, "setup", "viewer"), copy, "setup viewer; allowed: docs, notebook, sweep, test, view, or nothing more"
     )
 
 
