@@ -313,9 +313,8 @@ def test_a_command_says_what_it_needs(arguments, groups):
 
 
 def test_setup_of_an_unknown_group_is_refused(copy):
-    assert_refused(
-        lathe(copy, "setup", "viewer"), copy, "setup viewer; allowed: docs, notebook, sweep, test, view, or nothing more"
-    )
+    allowed = "docs, notebook, sweep, test, view, or nothing more"
+    assert_refused(lathe(copy, "setup", "viewer"), copy, f"setup viewer; allowed: {allowed}")
 
 
 def test_what_is_set_for_pip_holds_for_uv_and_the_environment_comes_first():

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -42,7 +43,9 @@ def main(arguments: Sequence[str]) -> int:
             print(f"site: {chosen.build}/index.html")
         return code
     serve = [*MKDOCS, "serve", *CONFIG, "--dev-addr", f"127.0.0.1:{chosen.port}"]
-    return subprocess.run(serve, env=os.environ | QUIET, check=False).returncode
+    with suppress(KeyboardInterrupt):  # that is how it ends
+        return subprocess.run(serve, env=os.environ | QUIET, check=False).returncode
+    return 0
 
 
 if __name__ == "__main__":
