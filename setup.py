@@ -32,6 +32,7 @@ NODES = [
     "supervisor",
     "recorder",
 ]
+ALONE = ["container", "replayer", "rerun_bridge", "topic_recorder"]
 
 
 def shared_files() -> list[tuple[str, list[str]]]:
@@ -77,10 +78,8 @@ setup(
     entry_points={
         "console_scripts": [
             "lathe = lathe_rc.cli:main",
-            *(
-                f"{node} = lathe_rc.nodes.{node}:main"
-                for node in [*NODES, "container", "replayer", "rerun_bridge", "topic_recorder"]
-            ),
+            *(f"{node} = lathe_rc.nodes.executables:{node}" for node in NODES),
+            *(f"{node} = lathe_rc.nodes.{node}:main" for node in ALONE),
         ],
     },
     zip_safe=False,

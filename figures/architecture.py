@@ -24,17 +24,22 @@ LAYERS = (
     Layer("to look at", {"view": "report, figures, Rerun, notebooks"}),
     Layer("recordings", {"bag": "MCAP: record, read, check, recover, simulate again"}),
     Layer("the cell", {"cell": "stages, blocks, scenario, checks, offline run"}),
-    Layer("around it", {"analysis": "formulas, metrology, identification", "safety": "faults, monitors, safe state"}),
+    Layer(
+        "around it",
+        {
+            "drawing": "pictures of arrays",
+            "analysis": "formulas, metrology, fits",
+            "safety": "faults, monitors, safe state",
+        },
+    ),
     Layer("physics, laws", {"plants": "drives, cut, slides, spindle", "control": "learning, PID, decoupling"}),
     Layer("signals", {"signals": "speed, encoder, form"}),
 )
 #: Arrows within a layer.
-BESIDE = (("studies", "harness"), ("plants", "control"))
-#: Arrows upwards, from the last box of a layer to the last one, dashed, with what they are for.
-UPWARDS = {("cell", "view"): "to show itself", ("safety", "cell"): "types of blocks"}
+BESIDE = (("studies", "harness"), ("drawing", "analysis"), ("plants", "control"))
 
-LEFT, WIDTH, RIGHT = 132, 600, 128
-HEIGHT, GAP, SPACE = 50, 22, 44  # of a box, between layers, between boxes
+LEFT, WIDTH, RIGHT = 112, 640, 4
+HEIGHT, GAP, SPACE = 50, 22, 36  # of a box, between layers, between boxes
 TOP = 12
 STYLE = """
   text { font-family: system-ui, "Segoe UI", Roboto, "Helvetica Neue", "DejaVu Sans", sans-serif; }
@@ -42,9 +47,8 @@ STYLE = """
   .ros { fill: #fbecd9; stroke: #b5651d; }
   .name { font-weight: 600; font-size: 15px; fill: #0f3542; }
   .what { font-size: 12px; fill: #33505a; }
-  .caption, .why { font-size: 12.5px; fill: #7f8c92; }
+  .caption { font-size: 12.5px; fill: #7f8c92; }
   .arrow { stroke: #7f8c92; stroke-width: 1.6; fill: none; }
-  .up { stroke-dasharray: 5 4; }
 """
 
 
@@ -58,9 +62,9 @@ def places() -> dict[str, tuple[float, float, float]]:
     return found
 
 
-def arrow(path: str, extra: str = "") -> str:
+def arrow(path: str) -> str:
     """Return an arrow along a path."""
-    return f'<path class="arrow{extra}" d="{path}" marker-end="url(#tip)"/>'
+    return f'<path class="arrow" d="{path}" marker-end="url(#tip)"/>'
 
 
 def picture() -> str:
@@ -82,11 +86,6 @@ def picture() -> str:
     for start, end in BESIDE:
         (x, y, width), (other, _, _) = found[start], found[end]
         drawn.append(arrow(f"M {x + width:g} {y + HEIGHT / 2:g} H {other - 3:g}"))
-    edge = LEFT + WIDTH
-    for (start, end), why in UPWARDS.items():
-        low, high = found[start][1] + HEIGHT / 3, found[end][1] + 2 * HEIGHT / 3
-        drawn.append(arrow(f"M {edge} {low:.0f} h 24 V {high:.0f} H {edge + 3}", " up"))
-        drawn.append(f'<text class="why" x="{edge + 31}" y="{(low + high) / 2 + 4:.0f}">{why}</text>')
     height = TOP + len(LAYERS) * (HEIGHT + GAP)
     tip = '<marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
     return "\n".join(

@@ -5,10 +5,10 @@ import numpy as np
 import numpy.typing as npt
 from place import CONFIG
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import POINTS, measure, undulations
 from lathe_rc.analysis.structures import Channel, steady_error
-from lathe_rc.cell import messages, scenario
+from lathe_rc.cell import scenario
 
 loaded = scenario.load(
     CONFIG / "piston.yaml",

@@ -6,9 +6,9 @@ from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 from place import CONFIG, PICTURES
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import measure
-from lathe_rc.cell import messages, scenario
+from lathe_rc.cell import scenario
 
 CUTOFF = 50.0  # [UPR]
 SHOWN = {4: "#c0392b", 60: "#1f6f8b"}  # revolutions

@@ -8,9 +8,9 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 from place import CONFIG, PICTURES
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.analysis.hysteresis_fit import Loop, identify
-from lathe_rc.cell import messages, scenario
+from lathe_rc.cell import scenario
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuator, PiezoActuatorParameters
 from lathe_rc.cell.stages.series_drive import SeriesDriveParameters, SeriesDriveStage

@@ -15,7 +15,6 @@ from lathe_rc.errors import LatheError, shown
 
 COMMANDS = {
     "bag": "Ask bags what is in them; check and recover them; take a tachogram out.",
-    "bench": "Measure how fast lathe_rc is here.",
     "budget": "Tell what the form error of a scenario is made of.",
     "container": "Run several nodes in one process.",
     "demo": "Turn a piston with ROS 2 processes and draw it.",
@@ -52,7 +51,7 @@ class _Command(click.Command):
         return command.make_context(info_name, args, parent, **extra)
 
 
-class _Group(click.Group):
+class Group(click.Group):
     """Turns the project's errors into one line and an exit code."""
 
     def invoke(self, ctx: click.Context) -> Any:
@@ -69,11 +68,11 @@ class _Group(click.Group):
 
 
 @click.group(
-    cls=_Group,
+    cls=Group,
     commands=[_Command(name, short_help=summary) for name, summary in COMMANDS.items()],
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="./lathe of a checkout also has: setup; test (linters and tests; --system: those that need privileges); "
-    "docs (the documentation as a site); python SCRIPT ... (in its environment).",
+    "docs (the documentation as a site); bench (how fast it is here); python SCRIPT ... (in its environment).",
 )
 @click.version_option(__version__)
 def main() -> None:

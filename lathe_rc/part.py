@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
+from lathe_rc import messages
 from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.metrology import FormErrors, Lay, Measurement, evenly, form_errors, lay, measure, turns_before
 from lathe_rc.analysis.tolerance import Verdict, judge
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals, full
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError
+from lathe_rc.messages import Signals, full
 
 _CUTOFF = 50.0  # of the filters for roundness and roughness [undulations per revolution]
 _TOGETHER = 16  # revolutions that are looked at at once
@@ -122,7 +122,7 @@ def _encoder_and_tool(types: Mapping[str, str]) -> list[str | None]:
 
 
 class ErrorsByRevolution:
-    """Form error by revolution of a run that comes in pieces; a sink of the engine and of `lathe_rc.bag.stream`.
+    """Form error by revolution of a run that comes in pieces; a sink of the engine and `lathe_rc.bag.reading.stream`.
 
     Args:
         types: message type by fully qualified topic.

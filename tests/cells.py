@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from lathe_rc import harness
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.wire import Encoder

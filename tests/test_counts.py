@@ -273,7 +273,7 @@ def test_events_tell_of_speeds_that_the_checks_did_not_count_on(tmp_path):
     path = tmp_path / "counts.csv"
     write_counts(path, 0.2)
     result = harness.run(follower(path, revolutions=2.0, max_deviation=0.02))
-    said = [found.text.partition(":")[0] for found in result.happened if found.topic == "/encoder_device/events"]
+    said = [found.text.partition(":")[0] for found in result.event_log if found.topic == "/encoder_device/events"]
     assert sorted(said) == ["too fast", "too slow"]
     with pytest.raises(InputError, match="at 199 rad/s the cycle leaves"):
         harness.run(follower(path, revolutions=2.0, max_deviation=0.9))

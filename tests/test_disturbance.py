@@ -11,8 +11,8 @@ from cells import scenario
 from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lathe_rc import harness
-from lathe_rc.cell import batch, messages
+from lathe_rc import harness, messages
+from lathe_rc.cell import batch
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.stages.law import Law

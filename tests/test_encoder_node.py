@@ -13,7 +13,7 @@ from test_counts import COUNTS, TURN, follower, write_counts
 from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
-from lathe_rc.bag.resim import resimulate
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.errors import LatheError
 

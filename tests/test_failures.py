@@ -16,11 +16,10 @@ from cells import told_until_all_have_ended
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from lathe_rc import harness, starting
+from lathe_rc import harness, messages, starting
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
-from lathe_rc.bag.resim import resimulate
-from lathe_rc.cell import messages
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.scenario import load
 from lathe_rc.commands.progress import TROUBLE
 from lathe_rc.errors import InputError, LatheError
@@ -81,7 +80,7 @@ class Finder:
     def find_spec(self, name, path=None, target=None):
         if name == "lathe_rc.nodes.recorder_node":
             sys.meta_path.remove(self)
-            from lathe_rc.bag.writer import BagWriter
+            from lathe_rc.bag.writing.writer import BagWriter
             BagWriter.close = close
 
 sys.meta_path.insert(0, Finder())
@@ -232,8 +231,8 @@ def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tm
 
 
 def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_is_lost(monkeypatch, tmp_path):
-    monkeypatch.setattr(harness, "_FAREWELL", 1.0)
-    monkeypatch.setattr(harness, "_GRACE", 0.2)  # it writes no log that tells where it is
+    monkeypatch.setattr("lathe_rc.harness.processes._FAREWELL", 1.0)
+    monkeypatch.setattr("lathe_rc.harness.processes._GRACE", 0.2)  # it writes no log that tells where it is
     bag, told = tmp_path / "bag", []
     cell = harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=6.0"]), bag, keep=True)
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:

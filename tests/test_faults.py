@@ -10,9 +10,8 @@ from click.testing import CliRunner
 from hypothesis import given
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lathe_rc import harness
-from lathe_rc.bag.resim import resimulate
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError, LatheError

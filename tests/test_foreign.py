@@ -19,10 +19,9 @@ pytest.importorskip("rclpy")
 
 from lathe_rc_msgs.msg import Member
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import form_errors
 from lathe_rc.bag import reader
-from lathe_rc.cell import messages
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.cell.wiring import Unknown

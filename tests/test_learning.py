@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc import harness
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 

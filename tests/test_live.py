@@ -19,10 +19,9 @@ pytest.importorskip("rerun")
 
 from test_view import TWO, Taken, View, blocks, refused
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.bag import reader
-from lathe_rc.bag.source import Source
-from lathe_rc.cell import messages
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import LatheError
 from lathe_rc.view.rerun_heard import Backlog, Order

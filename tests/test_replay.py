@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 
 from lathe_rc import harness
 from lathe_rc.bag.check import check
-from lathe_rc.bag.source import Source
+from lathe_rc.bag.reading.source import Source
 
 COUNT = 1500
 

@@ -20,8 +20,8 @@ from std_msgs.msg import String
 
 from lathe_rc import harness
 from lathe_rc.bag.check import check
-from lathe_rc.bag.source import Source
-from lathe_rc.bag.writer import offered_qos
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.writing.writer import offered_qos
 from lathe_rc.errors import InputError
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -238,9 +238,9 @@ def test_what_cannot_be_recorded_is_refused(domain, tmp_path, arguments, said):
 
 
 def test_a_type_that_is_not_installed_is_refused():
-    from lathe_rc.nodes import offered
+    from lathe_rc.nodes import publisher_info
 
     with pytest.raises(InputError, match="message type nowhere_msgs/msg/Thing is not installed"):
-        offered.installed("nowhere_msgs/msg/Thing")
-    store = offered.installed("sensor_msgs/msg/JointState")
+        publisher_info.installed("nowhere_msgs/msg/Thing")
+    store = publisher_info.installed("sensor_msgs/msg/JointState")
     assert store.hash_rihs01("sensor_msgs/msg/JointState") == STORE.hash_rihs01("sensor_msgs/msg/JointState")

@@ -15,11 +15,11 @@ from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check as check_bag
 from lathe_rc.cell import state_file
-from lathe_rc.cell.messages import sample_fields
 from lathe_rc.cell.scenario import load
 from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
+from lathe_rc.messages import sample_fields
 
 CONFIG = Path(__file__).parents[1] / "config"
 BLOCK = 64
@@ -166,7 +166,7 @@ def named(module, name, *arguments):
         pickle.dumps(Path()),
         pickle.dumps(np.zeros(3)),
         named("lathe_rc.analysis.angle_domain", "np.f2py.subprocess.Popen", "true"),
-        named("lathe_rc.bag.writer", "BagWriter", "bag"),
+        named("lathe_rc.bag.writing.writer", "BagWriter", "bag"),
     ],
 )
 def test_what_is_no_state_is_refused(data, tmp_path):

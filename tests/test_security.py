@@ -395,7 +395,7 @@ def test_a_node_alone_hears_the_network_only_if_asked_to(wanted, observer, domai
     as_started_by_a_user(monkeypatch)
     if wanted:
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", wanted)
-    with subprocess.Popen([sys.executable, "-m", "lathe_rc.nodes.tool", "--ros-args"]) as process:
+    with subprocess.Popen([sys.executable, "-m", "lathe_rc.nodes.executables", "tool", "--ros-args"]) as process:
         try:
             wait(observer, lambda: "tool" in observer[0].get_node_names())
             assert (multicast(domain) in udp_ports(process.pid)) == (wanted is not None)

@@ -11,9 +11,8 @@ from click.testing import CliRunner
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from lathe_rc import harness
-from lathe_rc.bag.resim import resimulate
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cli import main
 
 LEFT = scenario({"run_id": "left"}, spindle_encoder={"revolutions": 20.0, "speed_factor": 1.0})  # there for 1.2 s

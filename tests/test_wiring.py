@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 from cells import NODES, announced, run, scenario
 
-from lathe_rc import harness
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.stage import Input, Output, Stage

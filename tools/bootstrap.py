@@ -71,6 +71,8 @@ def command(arguments: Sequence[str]) -> list[str]:
     for name, script in {"docs": "docs.py", "test": "check.py"}.items():
         if arguments[:1] == [name]:
             return [str(ROOT / "tools" / script), *arguments[1:]]
+    if arguments[:1] == ["bench"]:
+        return ["-m", "benchmarks", *arguments]
     if arguments[:1] == ["python"]:
         return list(arguments[1:])
     return ["-m", "lathe_rc", *arguments]

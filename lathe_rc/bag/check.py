@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from lathe_rc.bag import story
+from lathe_rc import messages
+from lathe_rc.bag import provenance
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.snapshot import first_sample, span_of
-from lathe_rc.bag.source import Source
-from lathe_rc.cell import messages
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import InputError, shown
@@ -106,7 +106,7 @@ def check(path: Path) -> Findings:
     """Look at every message of a bag.
 
     Raises:
-        InputError: not a bag, or one that is cut off or broken: then only `lathe_rc.bag.recover` reads it.
+        InputError: not a bag, or one that is cut off or broken: then only `lathe_rc.bag.repairing.recover` reads it.
     """
     findings, digester = Findings(), Digester()
     sparse: dict[str, SparseTopic] = {}
@@ -133,7 +133,7 @@ def check(path: Path) -> Findings:
         findings.lost.append(f"the snapshot has {findings.samples} samples, and {why}")
     findings.lost += [
         f"{topic}: from sample {first} on its newest value, held: the node was lost"
-        for topic, first in story.held(source.about).items()
+        for topic, first in provenance.held(source.about).items()
     ]
     if dense and not findings.lost and not findings.wrong:
         findings.digests = digester.result(sparse)

@@ -19,16 +19,16 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
+from lathe_rc import messages
 from lathe_rc.analysis.metrology import FormErrors, form_errors
-from lathe_rc.cell import messages
 from lathe_rc.cell.collect import Collector, Finite
 from lathe_rc.cell.engine import Engine, Sink
-from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
+from lathe_rc.messages import Signals
 
 K_co = TypeVar("K_co", covariant=True)
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from lathe_rc import messages
 from lathe_rc.analysis.budget import TOLD, Budget, Causes, Decomposition
 from lathe_rc.analysis.metrology import evenly
 from lathe_rc.analysis.tolerance import LAST
-from lathe_rc.cell import batch, messages, models
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell import batch, models
 from lathe_rc.cell.parameters import NodeParameters, Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
@@ -24,6 +24,7 @@ from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.cell.stages.vibration import VibrationParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import Samples, Signals
 
 _TURN = 2.0 * np.pi
 _PREFIXES = ("", "coarse_", "fine_", "cut_")  # of the parameters of a part; those of stages with several have one

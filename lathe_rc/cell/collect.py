@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.framing import Framer
-from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import NotFiniteError, check_finite
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.names import instead
 
 

@@ -7,12 +7,12 @@ from typing import Protocol
 
 import numpy as np
 
-from lathe_rc.cell.messages import MAX_BLOCK, Signals
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.program import Program, Tapes, chunk_of, wired
 from lathe_rc.cell.stage import Sparse, compile_kernels
 from lathe_rc.cell.track import longest_delays
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.messages import MAX_BLOCK, Signals
 
 
 class Sink(Protocol):

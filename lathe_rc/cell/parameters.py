@@ -6,24 +6,26 @@ ROS descriptors, validation, help and the documentation are made from these tabl
 
 import copy
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from lathe_rc.cell.messages import MAX_BLOCK
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import Named
+from lathe_rc.messages import MAX_BLOCK
 from lathe_rc.names import instead
 
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
 
 T = TypeVar("T", bound="Table")
 
+_LONGEST = 60  # characters of a value in a summary
 _NAMES = {bool: "true or false", int: "an integer", float: "a finite number", str: "a text"}
 
 
@@ -120,6 +122,17 @@ class Table(BaseModel):
     def rows(cls) -> Mapping[str, Row]:
         """The parameters by name."""
         return _rows(cls)
+
+    def other_than_default(self, names: Collection[str]) -> str:
+        """Those of some parameters that are not at their defaults, in words."""
+        told = []
+        for row in self.rows().values():
+            value = getattr(self, row.name)
+            if value != row.default and row.name != "stage" and row.name in names:
+                text = Path(value).name if row.is_path else str(value)
+                short = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+                told.append(f"{row.name} = {short}" if row.unit == "1" else f"{row.name} = {short} {row.unit}")
+        return ", ".join(told)
 
     @classmethod
     def read(cls: type[T], node: str, values: Mapping[str, object]) -> T:

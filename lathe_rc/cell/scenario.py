@@ -17,6 +17,7 @@ from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Valu
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stages import MASTERS, STAGES
+from lathe_rc.drawing import html
 from lathe_rc.errors import InputError, shown
 from lathe_rc.names import instead
 
@@ -113,9 +114,12 @@ class Scenario:
 
     def _repr_html_(self) -> str:
         """Its nodes and what is set in them, as a table, for notebooks."""
-        from lathe_rc.view import notebook
-
-        return notebook.scenario(self)
+        shared = SharedParameters.model_fields
+        rows = [("all nodes", "", self.shared.other_than_default(shared))] if self.nodes else []
+        for node, table in self.nodes.items():
+            own = table.other_than_default(table.rows().keys() - shared.keys())
+            rows.append((node, self.kind(node) if table.stage else "", own))
+        return html.table((self.name, "kind", "other than default"), rows)
 
     @property
     def shared(self) -> SharedParameters:

@@ -23,12 +23,12 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc import messages
 from lathe_rc.cell.native import Native, Step, is_compiled
 from lathe_rc.cell.parameters import NodeParameters, about, remapped
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.extensions import is_ours
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.names import instead
 from lathe_rc.placed import unfit
 from lathe_rc.safety import faults

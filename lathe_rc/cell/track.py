@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc import messages
 from lathe_rc.cell.stage import Input
+from lathe_rc.messages import Signals
 
 _MOVED = 0.25  # of the samples, at most, are copied once more to keep them contiguous
 _VIEWS = 256  # that are made once

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import MAX_BLOCK, START_NS, Samples, Signals
+from lathe_rc import messages
+from lathe_rc.messages import MAX_BLOCK, START_NS, Samples, Signals
 
 _BILLION = 1_000_000_000
 _MOST_FIELDS = 16
@@ -231,7 +231,7 @@ def check_finite(source: str, name: str, array: Samples, first: int) -> None:
     Args:
         source: who publishes them.
         name: of the field.
-        array: shape (n,), any type; n up to `lathe_rc.cell.messages.MAX_BLOCK`.
+        array: shape (n,), any type; n up to `lathe_rc.messages.MAX_BLOCK`.
         first: index of the first sample.
 
     Raises:

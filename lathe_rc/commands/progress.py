@@ -92,7 +92,7 @@ class Watch:
 
 TROUBLE: dict[str, Callable[[harness.Event], str]] = {
     "stuck": lambda event: f"{event['node']} did not end{event['place']}; the bag is closed: no longer waited for",
-    "stranger": lambda event: (
+    "foreign_message": lambda event: (
         f"{event['node']} refuses: {event['message']}; publishers: {', '.join(event['publishers'])}"
     ),
     "dead": lambda event: (

@@ -13,13 +13,13 @@ import click
 import numpy as np
 from rich.console import Console
 
-from lathe_rc.bag import stream
-from lathe_rc.bag.source import Source
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import START_NS
+from lathe_rc import messages
+from lathe_rc.bag.reading import stream
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.rerun_bridge import PORT, RATE, Kind
 from lathe_rc.cell.wire import Block
 from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.messages import START_NS
 from lathe_rc.view.rerun_output import Viewer, end, require, viewer
 
 if TYPE_CHECKING:

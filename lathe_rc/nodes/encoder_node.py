@@ -13,7 +13,7 @@ from sensor_msgs.msg import JointState
 from lathe_rc.cell.stages.encoder_device import EncoderDevice, EncoderDeviceParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
-from lathe_rc.nodes.offered import asked
+from lathe_rc.nodes.publisher_info import asked
 from lathe_rc.nodes.spindle_node import SpindleNode
 from lathe_rc.signals.counts import LineReader, Reading
 

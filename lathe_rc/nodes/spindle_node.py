@@ -10,17 +10,16 @@ from lathe_rc_msgs.msg import CellState, Member, Progress
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.durations import LATENCY, LATENESS, PERCENT, Durations, Percentiles
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes.chain import form
+from lathe_rc.nodes.liveliness import SILENCE
 from lathe_rc.nodes.ports import latched_qos
+from lathe_rc.nodes.refused_messages import ForeignMessage
 from lathe_rc.nodes.shell import given_up, why_failed
 from lathe_rc.nodes.stage_node import StageNode
-from lathe_rc.nodes.strangers import Stranger
-from lathe_rc.nodes.watch import SILENCE
 
 _GONE = 0.2  # [s] for messages to be acknowledged, if who has died never will
 _LOOK = 0.02  # [s] between looks at the members
@@ -144,7 +143,7 @@ class SpindleNode(StageNode):
         self.reporter("block0", self.get_name())
         self._schedule = self._heard = self._looked = time.monotonic()
         self._members_moved = dict.fromkeys(self._member_names, self._heard)
-        form(self, cell)
+        self.exchange.form(self, cell)
         if self.chain is None and self._inputs:
             self._join(0)
         self.release()
@@ -154,7 +153,7 @@ class SpindleNode(StageNode):
     def _on_progress(self, progress: Progress) -> None:
         if progress.run_id != self.table.run_id:
             why = f"expected run {self.table.run_id!r}"
-            raise Stranger(self._host["progress"].topic_name, progress.name, progress.run_id, why)
+            raise ForeignMessage(self._host["progress"].topic_name, progress.name, progress.run_id, why)
         if progress.blocks <= self._completed.get(progress.name, progress.blocks):
             return
         if progress.blocks > self.blocks:

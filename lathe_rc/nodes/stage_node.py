@@ -6,21 +6,21 @@ from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from lathe_rc_msgs.srv import Schedule
 
-from lathe_rc.bag.record import signal_depth
-from lathe_rc.cell import messages, state_file
+from lathe_rc import messages
+from lathe_rc.bag.writing.record import signal_depth
+from lathe_rc.cell import state_file
 from lathe_rc.cell.framing import Framer
-from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.stage import Input, Sparse, Stage, compile_kernels
 from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wire import Block, Encoder, Pool
 from lathe_rc.errors import InputError, LatheError, LossyRunError
-from lathe_rc.nodes.chain import Chain, form
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import BlockQueue, message_class, signal_qos
 from lathe_rc.nodes.shell import CellNode
@@ -28,6 +28,22 @@ from lathe_rc.nodes.shell import CellNode
 _EARLY = 4  # times the blocks in flight are kept until it is known where to go on
 _TOGETHER = 2  # parts of the window: so much is computed in one go, and members still work side by side
 _OUTSIDE_PERIOD = 0.1  # [s] between looks at who reads what in other processes
+
+
+class Chain(Protocol):
+    """What a node computes together with, see `lathe_rc.nodes.chain.Chain`."""
+
+    def advance(self) -> None:
+        """Compute what the inputs from outside allow; the first of the nodes says how far."""
+
+    def ready(self) -> tuple[int, bool] | None:
+        """Samples that all can compute, and whether the run ends with them; None while an input is missing."""
+
+    def compute(self, samples: int, *, last: bool) -> None:
+        """Let all compute so many samples, with which the run may end, and publish them."""
+
+    def leave(self) -> None:
+        """Let each node go on alone, from where it stands."""
 
 
 class StageNode(CellNode):
@@ -444,7 +460,7 @@ class StageNode(CellNode):
     def advance(self) -> None:
         """Compute every block whose inputs are there."""
         if not self._started and any(queue.blocks for queue in self._forward):
-            form(self)
+            self.exchange.form(self, None)
         if self.chain is not None:
             self.chain.advance()
             return

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lathe_rc.cell.messages import Signals
 from lathe_rc.errors import InputError, shown
+from lathe_rc.messages import Signals
 
 Array = npt.NDArray[np.float64]
 

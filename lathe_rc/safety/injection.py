@@ -5,9 +5,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc import messages
 from lathe_rc.errors import InputError
+from lathe_rc.messages import Signals
 from lathe_rc.safety.faults import DISTURBANCES, KINDS, Disturbance, Fault, Kind
 
 _TRUE = "_true"  # fields with this ending are what really happens

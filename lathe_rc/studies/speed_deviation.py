@@ -15,7 +15,7 @@ import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.studies import cells
 from lathe_rc.studies.study import Study, StudyParameters, Track, comparison, untracked

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.wiring import Cell

@@ -28,13 +28,12 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from lathe_rc import messages
 from lathe_rc.analysis.metrology import FormErrors, form_errors
 from lathe_rc.analysis.tolerance import judge
-from lathe_rc.cell import messages
 from lathe_rc.cell.batch import Errors
 from lathe_rc.cell.collect import Finite
 from lathe_rc.cell.engine import Engine
-from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
@@ -44,6 +43,7 @@ from lathe_rc.cell.stages.obedience import OUT_OF_REACH
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError, LatheError
+from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 from lathe_rc.sweep.revision import revision
 

@@ -16,12 +16,11 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from lathe_rc import __version__
+from lathe_rc import __version__, messages
 from lathe_rc.analysis.budget import TOLD, Budget
 from lathe_rc.analysis.metrology import Lay
 from lathe_rc.analysis.tolerance import Verdict
-from lathe_rc.bag.story import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS, origins, scenario_of
-from lathe_rc.cell import messages
+from lathe_rc.bag.provenance import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS, origins, scenario_of
 from lathe_rc.cell.budget import budget
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place, replacing

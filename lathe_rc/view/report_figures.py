@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 
 from lathe_rc.analysis.metrology import Lay
-from lathe_rc.cell.messages import Samples
+from lathe_rc.messages import Samples
 from lathe_rc.view.report_form import Form, Revolution
 from lathe_rc.view.report_gather import Gathered
 from lathe_rc.view.report_host import Host

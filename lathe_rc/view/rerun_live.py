@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc import messages
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Block, Decoder
 from lathe_rc.errors import LatheError, shown
+from lathe_rc.messages import Signals
 from lathe_rc.view.rerun_blueprint import blueprint
 from lathe_rc.view.rerun_heard import Order
 from lathe_rc.view.rerun_pieces import Pieces

@@ -7,10 +7,10 @@ what several publishers send, and goes on where something is missing: who only w
 
 from collections.abc import Mapping
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.engine import Sink
-from lathe_rc.cell.messages import Samples, Signals, full
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view.rerun_signals import wanted
 
 _AHEAD = 4  # pieces that wait for the topics that are late

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, full
-from lathe_rc.happened import HAPPENED
+from lathe_rc import messages
+from lathe_rc.event_log import LOGGED
+from lathe_rc.messages import Samples, full
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def wanted(msgtype: str) -> set[str]:
 
 def drawn(msgtype: str) -> bool:
     """Whether a scene has any use for messages of a type."""
-    return bool(wanted(msgtype)) or msgtype in CYCLES or msgtype in HAPPENED
+    return bool(wanted(msgtype)) or msgtype in CYCLES or msgtype in LOGGED
 
 
 def curve_path(topic: str, field: str) -> str:

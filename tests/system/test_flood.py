@@ -8,9 +8,8 @@ import pytest
 from cells import block, scenario
 from lathe_rc_msgs.msg import EncoderBlock, Member
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.bag import reader
-from lathe_rc.cell import messages
 from lathe_rc.nodes.ports import latched_qos
 
 pytestmark = pytest.mark.system
@@ -36,7 +35,7 @@ def test_a_flood_takes_no_memory(ghost, domain, tmp_path):
                 publisher.publish(make(count))
             publisher.publish(end(f"end of part {part}"))
             told = f"{publisher.topic_name}: message of run 'end of part {part}' from /end; expected run 'test'"
-            processes.wait_for("stranger", "tool", message=told)
+            processes.wait_for("foreign_message", "tool", message=told)
 
     with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
         processes.wait_for("cycle")

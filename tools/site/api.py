@@ -11,15 +11,16 @@ ALONE = "lathe_rc"  # its page has modules that are in no package of it
 # In the order in which a user meets them, with the modules of those of which only some are for users. Commands and
 # nodes are called by their names, not imported.
 PACKAGES: dict[str, tuple[str, ...]] = {
-    ALONE: ("harness", "resources", "errors", "jit"),
+    "harness": (),
     "bag": (),
     "sweep": (),
-    "cell": ("scenario", "recording", "batch", "messages", "parameters", "stage", "stages.law", "stages.plant"),
+    "cell": ("scenario", "recording", "batch", "parameters", "stage", "stages.law", "stages.plant"),
     "signals": (),
     "plants": (),
     "control": (),
     "analysis": (),
     "safety": (),
+    ALONE: ("messages", "resources", "errors", "jit"),
 }
 
 

@@ -6,12 +6,12 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.control.limits import CommandLimits, LimiterTable, limit, limiter
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 
 LIMITED, FREE = "limited", "free"  #: events: a sample is clipped; none has been for a while
 _TELL = 0.1  # [s] after which a command that goes on being clipped says how often

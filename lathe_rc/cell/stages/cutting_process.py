@@ -7,13 +7,13 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
+from lathe_rc import messages
 from lathe_rc.analysis.shaft import STEEL_MODULUS, Shaft, Support
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.plants.cutting import (
     PAPER,
     REALISTIC,

@@ -8,13 +8,12 @@ from typing import Annotated, Literal
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from lathe_rc import resources
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc import messages, resources
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Joint, Output, Sparse
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.signals.counts import CountedAngle, CsvReader
 
 TOO_FAST, TOO_SLOW, LATE = "too fast", "too slow", "late"  #: events that come about by themselves

@@ -8,14 +8,13 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from lathe_rc import resources
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc import messages, resources
 from lathe_rc.cell.parameters import NodeParameters, Value, about, parameter
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 from lathe_rc.plants.tool import equal
 from lathe_rc.signals.part_profile import PartProfile, checked
 from lathe_rc.signals.profile import (

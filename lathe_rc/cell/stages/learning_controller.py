@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc import messages
 from lathe_rc.analysis.learning import LearningLoop, Response
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import MAX_BLOCK, Samples, Signals
 from lathe_rc.cell.parameters import about
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
 from lathe_rc.cell.stages.learner import Learner
@@ -37,6 +36,7 @@ from lathe_rc.control.lead import PreviewTable, look_ahead
 from lathe_rc.control.repetitive import Cycle, RepetitiveController, largest_feedback_delay
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
+from lathe_rc.messages import MAX_BLOCK, Samples, Signals
 from lathe_rc.plants.linear import discretise, second_order
 from lathe_rc.safety.state_machine import Reaction
 

@@ -8,9 +8,8 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 from pydantic import create_model
 
+from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedCommand, limited, remembered
@@ -25,6 +24,7 @@ from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import CommandLimits, LimiterTable, limiter
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 from lathe_rc.plants.cutting import CutTable
 from lathe_rc.plants.loaded import Coil, LoadedDrive, LoadedTable, Piezo, advance_loaded, failure
 from lathe_rc.signals.allowance import AllowanceTable, allow

@@ -8,14 +8,14 @@ import numpy as np
 import numpy.typing as npt
 from annotated_types import Gt
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc import messages
 from lathe_rc.cell.parameters import ObedientParameters, parameter
 from lathe_rc.cell.stage import Input, Sparse
 from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, take_over
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 from lathe_rc.safety.state_machine import Reaction
 
 OUT_OF_REACH = "out of reach"  #: event of a takeover that could not begin where the command was

@@ -8,9 +8,8 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
+from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
@@ -19,6 +18,7 @@ from lathe_rc.cell.stages.set_point import SetPoint, SetPointParameters, sum_up
 from lathe_rc.control.limits import LimiterTable
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 from lathe_rc.plants.hysteresis import (
     THRESHOLDS,
     WEIGHTS,

@@ -9,9 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 
-from lathe_rc import resources
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc import messages, resources
 from lathe_rc.cell.native import Step
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
@@ -25,6 +23,7 @@ from lathe_rc.control.pid import POSITION, Pid, PidTable
 from lathe_rc.control.predistortion import PathTable, Predistortion, offset_along
 from lathe_rc.control.sampled_link import HeldLink, SampledLink, correct_along
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.example_002 import PERIOD
 

@@ -5,10 +5,10 @@ from typing import Annotated
 
 from annotated_types import Gt
 
-from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, follows, take_over
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 
 
 class BoundedParameters(NodeParameters):

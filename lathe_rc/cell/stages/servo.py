@@ -5,7 +5,6 @@ from typing import Annotated, Literal, NamedTuple
 
 from annotated_types import Ge, Gt, Le
 
-from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE
 from lathe_rc.cell.stages.obedience import (
@@ -22,6 +21,7 @@ from lathe_rc.cell.stages.obedience import (
 from lathe_rc.cell.stages.trajectory import TrajectoryParameters
 from lathe_rc.control.pid import Pid, PidGains, PidTable, control_along, lets_learn
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 from lathe_rc.safety.state_machine import Reaction
 
 

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 
 
 class SetPointParameters(NodeParameters):

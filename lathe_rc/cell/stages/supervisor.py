@@ -10,13 +10,13 @@ import numpy as np
 import numpy.typing as npt
 from annotated_types import Ge, Le
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage, cut
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.safety import state_machine
 from lathe_rc.safety.monitors import (
     Alarm,
