@@ -33,6 +33,7 @@ SECTIONS = "## All pages"  # of docs/index.md; a heading below is a section, a l
 _SECTION = re.compile(r"^### (.+)$|^- \[(.+?)\]\((.+?)\)", re.MULTILINE)
 _ALL = re.MULTILINE | re.DOTALL
 _LINK = re.compile(r"(^ *(`{3,}).*?^ *\2$|(`+)(?!`).+?(?<!`)\3(?!`))|(\]\()([^)\s#:]+)(#[^)\s]*)?\)", _ALL)
+_DIAGRAM = re.compile(r'<pre class="mermaid">.*?</pre>', re.DOTALL)
 _equations: list[Equations] = []
 
 
@@ -125,7 +126,7 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
     """Put the equations in, and the script that draws diagrams where there are some."""
     if '<pre class="mermaid">' in html:
         script = posixpath.relpath(MERMAID, posixpath.dirname(page.file.dest_uri) or ".")
-        html = f'<script src="{script}"></script>\n{html}'
+        html = _DIAGRAM.sub(r'<div class="diagram">\g<0></div>', f'<script src="{script}"></script>\n{html}')
     return _equations[-1].put_in(html)
 
 
