@@ -3,12 +3,12 @@
 
 import numpy as np
 import numpy.typing as npt
-from place import CONFIG
 
 from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import POINTS, measure, undulations
 from lathe_rc.analysis.structures import Channel, steady_error
 from lathe_rc.cell import scenario
+from place import CONFIG
 
 loaded = scenario.load(
     CONFIG / "piston.yaml",

@@ -6,13 +6,13 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
-from place import PICTURES
 
 from lathe_rc.analysis.responses import Response, in_series
 from lathe_rc.analysis.structures import limit_frequency, uncompensated
 from lathe_rc.analysis.tuning import FREQUENCIES, START
 from lathe_rc.analysis.vibration import describing_function, reduction, widest_band
 from lathe_rc.plants.hysteresis import PrandtlIshlinskii
+from place import PICTURES
 
 HERTZ = 2 * np.pi
 HIGHEST = 4e4  # [rad/s]

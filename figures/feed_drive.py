@@ -4,11 +4,11 @@
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
-from place import PICTURES
 
 from lathe_rc.plants.feed import FeedDrive, dc_screw
 from lathe_rc.plants.friction import Friction, mobility
 from lathe_rc.plants.screw import Screw
+from place import PICTURES
 
 Array = npt.NDArray[np.float64]
 

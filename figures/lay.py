@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from place import PICTURES
 
 from lathe_rc import harness, resources
 from lathe_rc.analysis.metrology import Lay, lay
 from lathe_rc.cell import scenario
+from place import PICTURES
 
 BLUE, GREY = "#1f6f8b", "#777777"
 NOSE, FEED = 0.8e-3, 0.1e-3

@@ -4,11 +4,11 @@
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
-from place import CONFIG, PICTURES
 
 from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import measure
 from lathe_rc.cell import scenario
+from place import CONFIG, PICTURES
 
 CUTOFF = 50.0  # [UPR]
 SHOWN = {4: "#c0392b", 60: "#1f6f8b"}  # revolutions

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
-from place import CONFIG, PICTURES
 
 from lathe_rc import harness, messages
 from lathe_rc.analysis.hysteresis_fit import Loop, identify
@@ -14,6 +13,7 @@ from lathe_rc.cell import scenario
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuator, PiezoActuatorParameters
 from lathe_rc.cell.stages.series_drive import SeriesDriveParameters, SeriesDriveStage
+from place import CONFIG, PICTURES
 
 STROKE, RATE = 15e-6, 64_000  # [m], [Hz]
 TABLE = np.array([500.0, 1000.0, 1500.0, 2000.0])  # [rad/s], the columns of paper 001

@@ -3,10 +3,10 @@
 
 import numpy as np
 from matplotlib.figure import Figure
-from place import PICTURES
 
 from lathe_rc.analysis.shaft import Shaft
 from lathe_rc.control.predistortion import Predistortion, cancelling, contraction, proportional, turned
+from place import PICTURES
 
 STIFFNESS = 233.3e3  # W4 of paper 004 [N/m]
 DEPTH = 150.0 / STIFFNESS  # [m]

@@ -6,11 +6,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-from place import PICTURES
-
 from lathe_rc import harness, resources
 from lathe_rc.cell import scenario
 from lathe_rc.view import report
+from place import PICTURES
 
 PICTURE = PICTURES / "report.png"
 BROWSER = sys.argv[1] if len(sys.argv) > 1 else "chromium"

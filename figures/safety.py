@@ -4,12 +4,12 @@
 import sys
 
 import numpy as np
-from place import CONFIG
 
 from lathe_rc import harness, messages
 from lathe_rc.cell import scenario
 from lathe_rc.safety.faults import KINDS
 from lathe_rc.safety.state_machine import MEANING, Reaction, State, table
+from place import CONFIG
 
 SPINDLE = [
     "encoder.angle off",

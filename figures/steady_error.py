@@ -2,12 +2,12 @@
 """Prints the table of learning.md: the steady-error formula against a run of 100 revolutions."""
 
 import numpy as np
-from place import CONFIG
 from scipy.integrate import trapezoid
 
 from lathe_rc import harness, messages
 from lathe_rc.cell import scenario
 from lathe_rc.cell.wiring import Cell
+from place import CONFIG
 
 WAVES = [2, 5, 10, 15, 20]
 AMPLITUDE = 10e-6  # [m]

@@ -3,10 +3,10 @@
 
 import numpy as np
 from matplotlib.figure import Figure
-from place import PICTURES
 
 from lathe_rc.signals.profile import Harmonics, ProfileTable
 from lathe_rc.signals.tip_path import TipPath, steepest_fall
+from place import PICTURES
 
 RADIUS, TIP = 2e-3, 0.4e-3
 BLUE, RED, GREY = "#1f6f8b", "#c0392b", "#777777"

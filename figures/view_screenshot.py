@@ -10,9 +10,9 @@ import tempfile
 from pathlib import Path
 
 from PIL import Image
-from place import PICTURES
 
 from lathe_rc.commands import view
+from place import PICTURES
 
 SIZE = (1500, 900)
 

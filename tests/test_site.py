@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The site says what the pages say, and its picture of the packages is true; that it can be built, ./lathe test sees."""
+"""The site says what the pages say, and its picture of the packages is true; linters build it."""
 
 import ast
 import re
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -11,13 +10,11 @@ import pytest
 from markdown import Markdown
 from markdown_it import MarkdownIt
 
-ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT / "tools" / "site"), str(ROOT / "figures")]
-
 import architecture
 import equations
 from gfm import for_python_markdown
 
+ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 EXTENSIONS = ["attr_list", "md_in_html", "pymdownx.betterem", "pymdownx.superfences", "sane_lists", "tables"]
 

@@ -22,7 +22,6 @@ sys.path[:0] = [str(HERE), str(HERE.parent)]
 import api
 from equations import KATEX, EquationError, Equations
 from gfm import for_python_markdown
-
 from workplace import NODE, ROOT
 
 DOCS = ROOT / "docs"
