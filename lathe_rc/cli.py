@@ -55,6 +55,7 @@ class Group(click.Group):
     """Turns the project's errors into one line and an exit code."""
 
     def invoke(self, ctx: click.Context) -> Any:
+        """See `click.Command`."""
         # SIGTERM ends a command as Ctrl-C does: children are ended and bags closed on the way out.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from steps import write_atomically
 from workplace import HOME, VENV, RefusalError
 
 # What the wheels' CMake files say instead of the paths of the interpreter at hand.
@@ -81,7 +82,7 @@ def mend_cmake_paths() -> None:
         text = cmake.read_text(encoding="utf-8")
         mended = BUILD_MACHINE.sub(lambda path: include if path[1] else str(site_packages()), text)
         if mended != text:
-            cmake.write_text(mended, encoding="utf-8")
+            write_atomically(cmake, mended)  # a new file: uv links those of its cache, which others use
 
 
 def wheel_environment() -> dict[str, str]:
