@@ -12,6 +12,7 @@ from markdown_it import MarkdownIt
 
 import architecture
 import equations
+import pictures
 from gfm import for_python_markdown
 
 ROOT = Path(__file__).parents[1]
@@ -70,3 +71,22 @@ def test_the_picture_of_the_architecture_is_true():
     assert {one for one, other, _ in known if other == "nodes"} <= {"commands", "harness"}, "who knows of ROS"
     drawn = (ROOT / "docs" / "img" / "architecture.svg").read_text(encoding="utf-8")
     assert drawn == architecture.picture(), "run: ./lathe python figures/architecture.py"
+
+
+class TestPictures:
+    def test_each_is_drawn_by_a_command_and_shown_by_its_page(self):
+        assert {path.name for path in pictures.PICTURES.iterdir()} == set(pictures.TABLE)
+        for name, picture in pictures.TABLE.items():
+            assert f"](img/{name})" in (ROOT / "docs" / picture.page).read_text(encoding="utf-8"), picture.page
+
+    def test_no_script_draws_what_nobody_shows(self):
+        scripts = {path.name for path in (ROOT / "figures").glob("*.py")} - {"place.py"}
+        drawing = {Path(word).name for picture in pictures.TABLE.values() for word in picture.command.split()}
+        shown = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+        assert [name for name in scripts - drawing if f"figures/{name}" not in shown] == []
+
+    @pytest.mark.parametrize("name", [name for name, found in pictures.TABLE.items() if found.seconds <= pictures.QUICK])
+    def test_is_what_the_code_draws_and_its_page_has_what_it_prints(self, name, tmp_path):
+        """Of the quick ones; ./lathe docs --figures does it with all."""
+        found, _ = pictures.check(name, tmp_path)
+        assert found == [], f"run: ./lathe docs --figures {name}"

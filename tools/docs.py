@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import pictures
 from workplace import HOME, ROOT
 
 MKDOCS = [sys.executable, "-m", "mkdocs"]
@@ -33,7 +34,10 @@ def main(arguments: Sequence[str]) -> int:
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument("--build", nargs="?", type=Path, const=SITE, metavar="DIR", help="write it, to .lathe/site")
     instead.add_argument("--check", action="store_true", help="see whether it can be built, docstrings left out")
+    instead.add_argument("--figures", nargs="*", metavar="NAME", help="draw pictures anew, and tell which are others now")
     chosen = parser.parse_args(arguments)
+    if chosen.figures is not None:
+        return pictures.main(chosen.figures)
     if chosen.check:
         with TemporaryDirectory() as folder:
             return subprocess.run(build(Path(folder)), env=os.environ | QUIET | BARE, check=False).returncode

@@ -86,6 +86,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, place, content=text))
     assets = {
         "assets/site.css": HERE / "site.css",
+        "assets/favicon.svg": HERE / "favicon.svg",
         "assets/katex/katex.min.css": KATEX / "dist" / "katex.min.css",
         MERMAID: NODE / "node_modules" / "@mermaid-js" / "tiny" / "dist" / "mermaid.tiny.js",
     }
