@@ -89,12 +89,13 @@ for frequency, noise in ((1.0, 0.0), (1.0, 50e-9), (10.0, 0.0), (100.0, 0.0)):
         f"{weights.min():.4f} … {weights.max():.4f} | {percent(rest)} |"
     )
 
-print("\n| ω [rad/s] | " + " | ".join(f"{w:.0f}" for w in TABLE) + " |")
+print("\n| $\\omega$ [rad/s] | " + " | ".join(f"{w:.0f}" for w in TABLE) + " |")
 print("| --- | ---: | ---: | ---: | ---: |")
 for damping in (0.299, 0.292):
     for ratio in (0.0, 0.1):
         cells = np.abs(1 - series(ratio, damping).drive.response(TABLE))
-        print(f"| \\|1 − Wpk\\|, m/M = {ratio:g}, ζ2 = {damping:g} | {' | '.join(f'{c:.4f}' for c in cells)} |")
+        name = rf"$\lvert 1 - W_{{pk}}\rvert$, $m/M = {ratio:g}$, $\zeta_2 = {damping:g}$"
+        print(f"| {name} | {' | '.join(f'{c:.4f}' for c in cells)} |")
 print(f"| bend of the piezo over x1, m/M = 0.1 | {' | '.join(f'{bend(w):.4f}' for w in TABLE)} |")
 
 parallel = scenario.load(CONFIG / "direct_compensation.yaml", ["spindle_encoder.revolutions=60"])

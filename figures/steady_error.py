@@ -33,7 +33,7 @@ last = slice(*result.errors.starts[-2:])
 angle = result.recording.of_type(messages.ENCODER)["angle_true"][last]
 error = result.recording.of_type(messages.TOOL)["error"][last]
 
-print("| waves | ω [rad/s] | \\|Q − γZ\\| | formula | run |")
+print(r"| waves | $\omega$ [rad/s] | $\lvert Q - \gamma Z\rvert$ | formula | run |")
 print("| ---: | ---: | ---: | ---: | ---: |")
 for waves in WAVES:
     at = np.array([waves])

@@ -77,7 +77,7 @@ class TestPictures:
     def test_each_is_drawn_by_a_command_and_shown_by_its_page(self):
         assert {path.name for path in pictures.PICTURES.iterdir()} == set(pictures.TABLE)
         for name, picture in pictures.TABLE.items():
-            assert f"](img/{name})" in (ROOT / "docs" / picture.page).read_text(encoding="utf-8"), picture.page
+            assert f"img/{name})" in (ROOT / "docs" / picture.page).read_text(encoding="utf-8"), picture.page
 
     def test_no_script_draws_what_nobody_shows(self):
         scripts = {path.name for path in (ROOT / "figures").glob("*.py")} - {"place.py"}
@@ -85,7 +85,7 @@ class TestPictures:
         shown = "".join(page.read_text(encoding="utf-8") for page in PAGES)
         assert [name for name in scripts - drawing if f"figures/{name}" not in shown] == []
 
-    @pytest.mark.parametrize("name", [name for name, found in pictures.TABLE.items() if found.seconds <= pictures.QUICK])
+    @pytest.mark.parametrize("name", [name for name, row in pictures.TABLE.items() if row.seconds <= pictures.QUICK])
     def test_is_what_the_code_draws_and_its_page_has_what_it_prints(self, name, tmp_path):
         """Of the quick ones; ./lathe docs --figures does it with all."""
         found, _ = pictures.check(name, tmp_path)

@@ -34,7 +34,7 @@ def main(arguments: Sequence[str]) -> int:
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument("--build", nargs="?", type=Path, const=SITE, metavar="DIR", help="write it, to .lathe/site")
     instead.add_argument("--check", action="store_true", help="see whether it can be built, docstrings left out")
-    instead.add_argument("--figures", nargs="*", metavar="NAME", help="draw pictures anew, and tell which are others now")
+    instead.add_argument("--figures", nargs="*", metavar="NAME", help="draw pictures anew; tell which are stale")
     chosen = parser.parse_args(arguments)
     if chosen.figures is not None:
         return pictures.main(chosen.figures)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""./lathe docs --figures: draws the pictures of the pages anew and tells which of them are no longer what the code draws.
+"""./lathe docs --figures: draws the pictures of the pages anew and tells which are no longer what the code draws.
 
 What the same command prints is looked for on the page as well.
 """
@@ -17,6 +17,7 @@ from typing import NamedTuple
 from workplace import ROOT
 
 PICTURES = ROOT / "docs" / "img"
+_TABLE = re.compile(r"(?:^.*[|┃│╇┼━].*\n?)+", re.MULTILINE)
 LARGEST_SHARE = 5e-4  # of pixels that may differ: other versions of fonts and plots round otherwise
 LARGEST_STEP = 0.2  # of a colour, from 0 to 1, that is no difference yet
 
@@ -28,7 +29,7 @@ class Picture(NamedTuple):
         command: words after ./lathe, in an empty folder.
         page: in docs/, which shows it and has what the command prints.
         made: what the command writes there; empty: the picture's own name.
-        seconds: about how long that takes; of those that take no more than QUICK the tests draw each anew.
+        seconds: about how long that takes; those that take no more than QUICK the tests draw anew.
         steady: whether it is the same each time; a photograph of a screen is not, and is made by who wants a new one.
     """
 
@@ -43,11 +44,15 @@ def _script(name: str, seconds: int, page: str = "") -> Picture:
     return Picture(f"python {{root}}/figures/{name}.py", f"{page or name}.md", seconds=seconds)
 
 
+def _photograph(name: str, page: str, argument: str = "") -> Picture:
+    return Picture(f"python {{root}}/figures/{name}.py{argument}", page, seconds=60, steady=False)
+
+
 def _study(name: str, seconds: int, page: str = "studies", options: str = "") -> Picture:
     return Picture(f"study {name}{options}", f"{page}.md", seconds=seconds)
 
 
-QUICK = 8
+QUICK = 3
 _TUNE = (
     "tune two_channel --no-formulas --trials 120 --out two_channel_tuned"
     " --set learning_controller.lead_time=0.9e-3 --set learning_controller.q_time=200e-6"
@@ -71,7 +76,9 @@ TABLE = {
     "metrology.png": _script("metrology", 5),
     "piezo.png": _script("piezo", 30),
     "predistortion.png": _script("predistortion", 5),
-    "report.png": Picture("python {root}/figures/report_screenshot.py", "report.md", seconds=30, steady=False),
+    "report.png": _photograph("report_screenshot", "report.md"),
+    "site.png": _photograph("site_screenshots", "../CONTRIBUTING.md"),
+    "site-narrow.png": _photograph("site_screenshots", "../CONTRIBUTING.md"),
     "study-angle-domain.png": _study("angle-domain", 30),
     "study-best-law.png": _study("best-law", 600),
     "study-coupling.png": _study("coupling", 60),
@@ -89,7 +96,7 @@ TABLE = {
     "sweep.png": Picture(_SWEEP, "sweeps.md", "sweep-piston/figures/heat-map.png", 60),
     "tip.png": _script("tip", 3, "signals"),
     "tuning.png": Picture(_TUNE, "tuning.md", "two_channel_tuned/history.png", 150),
-    "view.png": Picture("python {root}/figures/view_screenshot.py BAG", "view.md", seconds=60, steady=False),
+    "view.png": _photograph("view_screenshot", "view.md", " {root}/bags/demo-1"),
 }
 
 
@@ -98,7 +105,9 @@ def check(name: str, folder: Path) -> tuple[list[str], Path]:
     picture = TABLE[name]
     words = [word.format(root=ROOT) for word in picture.command.split()]
     environ = os.environ | {"LATHE_PICTURES": str(folder), "COLUMNS": "80"}
-    done = subprocess.run([ROOT / "lathe", *words], cwd=folder, env=environ, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [ROOT / "lathe", *words], cwd=folder, env=environ, capture_output=True, text=True, check=False
+    )
     drawn = folder / (picture.made or name)
     if done.returncode or not drawn.is_file():
         last = (done.stderr.strip() or "it wrote no picture").splitlines()[-1]
@@ -111,8 +120,7 @@ def check(name: str, folder: Path) -> tuple[list[str], Path]:
 
 def printed(text: str) -> list[str]:
     """Return the tables in what a command prints, which pages show; what lies between them is different each time."""
-    parts = re.split(r"\n\s*\n", text)
-    return [table.strip("\n") for part in parts for table in re.findall(r"(?:^[ |]?.*[|┃│╇┼━].*\n?)+", part, re.MULTILINE)]
+    return [table.strip("\n") for table in _TABLE.findall(text)]
 
 
 def differences(old: Path, new: Path) -> list[str]:

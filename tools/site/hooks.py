@@ -44,6 +44,7 @@ def slug(heading: str, separator: str) -> str:
 def navigation() -> list[Any]:
     """Return the navigation: the sections and pages that docs/index.md lists, and the Python interface."""
     _, _, listed = (DOCS / "index.md").read_text(encoding="utf-8").partition(f"\n{SECTIONS}\n")
+    listed = re.sub(r"<!--.*?-->", "", listed, flags=re.DOTALL)
     found: list[Any] = [{"In a minute": "index.md"}]
     for section, title, target in _SECTION.findall(listed):
         if section:
@@ -80,6 +81,8 @@ def on_pre_build(config: MkDocsConfig) -> None:
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add what is not in docs/."""
     pages = {place: (ROOT / name).read_text(encoding="utf-8") for name, place in ROOT_PAGES.items()}
+    # What README.md begins with, docs/index.md says.
+    pages["start.md"] = "# Start\n\n## " + pages["start.md"].partition("\n## ")[2]
     bare = os.environ.get("LATHE_DOCS") == "bare"
     pages |= {f"{api.FOLDER}/{package}.md": api.page(package, bare=bare) for package in api.PACKAGES}
     for place, text in pages.items():
