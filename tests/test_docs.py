@@ -34,7 +34,7 @@ _LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
 _BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _RUN = re.compile(r"^\$ \./lathe (run .*)$", re.MULTILINE)
 _TEST = re.compile(r"`(test_[a-z0-9_]+)`")
-_CODE = re.compile(r"```.*?```|`[^`]*`", re.DOTALL)
+_CODE = re.compile(r"```.*?```|`[^`]*`|<!--.*?-->", re.DOTALL)
 
 
 def name(path: Path) -> str:
