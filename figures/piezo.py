@@ -96,7 +96,7 @@ for damping in (0.299, 0.292):
         cells = np.abs(1 - series(ratio, damping).drive.response(TABLE))
         name = rf"$\lvert 1 - W_{{pk}}\rvert$, $m/M = {ratio:g}$, $\zeta_2 = {damping:g}$"
         print(f"| {name} | {' | '.join(f'{c:.4f}' for c in cells)} |")
-print(f"| bend of the piezo over x1, m/M = 0.1 | {' | '.join(f'{bend(w):.4f}' for w in TABLE)} |")
+print(f"| bend of the piezo over $x_1$, $m/M = 0.1$ | {' | '.join(f'{bend(w):.4f}' for w in TABLE)} |")
 
 parallel = scenario.load(CONFIG / "direct_compensation.yaml", ["spindle_encoder.revolutions=60"])
 shared = parallel.shared.model_dump(include=set(SharedParameters.model_fields))
