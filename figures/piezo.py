@@ -36,7 +36,7 @@ def position(set_point: Array, **values: Any) -> Array:
 
 
 def error(**values: Any) -> Array:
-    """What a drive leaves of the last second of a swing at 1 Hz [m]."""
+    """A drive's residual of the last second of a swing at 1 Hz [m]."""
     return np.asarray((position(SLOW, **values) - SLOW)[-RATE:])
 
 

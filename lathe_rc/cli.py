@@ -63,6 +63,13 @@ class Group(click.Group):
         except LatheError as error:
             click.echo(f"lathe: {error}", err=True)
             ctx.exit(error.exit_code)
+        except ModuleNotFoundError as error:
+            from lathe_rc import extras
+
+            if not (missing := extras.refusal(error.name)):
+                raise
+            click.echo(f"lathe: {missing}", err=True)
+            ctx.exit(missing.exit_code)
         except MemoryError as error:
             click.echo(f"lathe: not enough memory ({shown(error)})", err=True)
             ctx.exit(LatheError.exit_code)

@@ -43,11 +43,8 @@ Signals = dict[str, Samples]  #: the arrays of a block by field name
 def store() -> Typestore:
     """ROS 2's own types and those of lathe_rc."""
     types = get_typestore(Stores.ROS2_JAZZY)
-    # In a wheel the .msg files lie inside the package, in a checkout beside it.
-    package = Path(__file__).parents[1]
-    folder = next(path for path in (package / "msg_defs", package.parent / "msg_defs") if path.is_dir())
     own = {}
-    for path in sorted((folder / "msg").glob("*.msg")):
+    for path in sorted((Path(__file__).with_name("msg_defs") / "msg").glob("*.msg")):
         own.update(get_types_from_msg(path.read_text(encoding="utf-8"), f"{PACKAGE}/msg/{path.stem}"))
     types.register(own)
     return types
@@ -125,7 +122,7 @@ def encode(msgtype: str, message: Any) -> bytes:
 
 
 def values_of(msgtype: str, data: bytes) -> dict[str, Any]:
-    """What a message says, by field, but for its header and who sent it in which run.
+    """The fields of a message, without its header, sender and run.
 
     Raises:
         ValueError: the bytes are no such message.

@@ -73,7 +73,7 @@ def surface(recording: Recording, found: Measurement, nose_radius: float) -> Lay
 
 
 def along(found: Lay) -> dict[str, Any]:
-    """What is told of the surface along the part; lengths in µm, the feed in µm a revolution."""
+    """The figures of the surface along the part; lengths in µm, the feed in µm a revolution."""
     rt, ra = found.rt * 1e6, found.ra * 1e6
     return {
         "revolutions": found.revolutions,
@@ -95,7 +95,7 @@ def along_in_words(found: Lay) -> str:
 
 
 def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
-    """What is told of one revolution, counted from 0; lengths in µm."""
+    """The figures of one revolution, counted from 0; lengths in µm."""
     around, waves = found.roundness, found.undulations.amplitude[revolution]
     largest = int(np.argmax(waves[2:])) + 2  # 0 is the size of the part, 1 its place
 
@@ -196,7 +196,7 @@ class FirstAndLast:
             self._tail = self._tail[:, int(np.searchsorted(self._tail[0], past * 2.0 * np.pi)) :]
 
     def numbers(self) -> dict[str, Any] | None:
-        """Revolutions, and what is told of the first and the last; None if there is no complete one."""
+        """Revolutions, and the figures of the first and the last; None if there is no complete one."""
         head = measure(self._head[0] - self._start, self._head[1], roundness_cutoff=_CUTOFF)
         if not head.form.rms.size:
             return None

@@ -49,7 +49,7 @@ _COMMAND_LINE = "/_ros2cli_*/get_type_description"  # that the nodes of ros2 top
 
 @dataclass(frozen=True, kw_only=True)
 class Profile:
-    """What one node may do. Names are relative to its namespace, or absolute where the whole domain shares them.
+    """The permissions of one node. Names are relative to its namespace, or absolute where the whole domain shares them.
 
     Attributes:
         namespace: of the node; ``/`` or ``/a/b``.
@@ -169,7 +169,7 @@ def policy(
     namespace: str = "/",
     beside: Iterable[str] = (),
 ) -> Policy:
-    """What the processes of a scenario may do.
+    """The permissions of a scenario's processes.
 
     Args:
         scenario: the cell; it gets a recorder if it has none.

@@ -79,7 +79,7 @@ def held(cell: Scenario, domain: int) -> Iterator[tuple[harness.Processes, Calla
 
 @contextlib.contextmanager
 def files_up_to(size: int) -> Iterator[None]:
-    """No file may grow beyond ``size`` [B]: to who writes one, the disk is full."""
+    """No file may grow beyond ``size`` [B]: for a process that writes one, the disk is full."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:

@@ -40,7 +40,7 @@ from lathe_rc.commands.fit import fit as fit_command
 from lathe_rc.control import memory_file
 from lathe_rc.control.predistortion import Predistortion
 from lathe_rc.errors import LatheError
-from lathe_rc.signals import profile
+from lathe_rc.signals import measured_profile, profile_table
 from lathe_rc.view import report
 from lathe_rc.view.report_gather import gather
 from lathe_rc.view.report_host import DIAGNOSTICS
@@ -138,7 +138,7 @@ def _trajectory(path: Path) -> None:
 
 
 def _profile(path: Path) -> None:
-    profile.ProfileTable(profile.read_csv(path), 64).demand(100.0, 1.0, 1e-4)
+    profile_table.ProfileTable(measured_profile.read_csv(path), 64).demand(100.0, 1.0, 1e-4)
 
 
 _TABLES: Mapping[str, Callable[[Path], object]] = {
@@ -182,7 +182,7 @@ def _csv() -> list[bytes]:
 
 
 def _fits(data: bytes) -> None:
-    """What `lathe fit` makes of a file that can be read."""
+    """`lathe fit` with a file that can be read."""
     with _folder() as folder, np.errstate(all="ignore"):
         (folder / "fuzz.csv").write_bytes(data)
         for command, *options in (("hysteresis",), ("channel", "--figure", str(folder / "fuzz.png"))):

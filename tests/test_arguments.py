@@ -73,7 +73,7 @@ OWN, SHARED = "/tool: {ros__parameters: {feed: 1.0}}\n", "/**: {ros__parameters:
 
 
 def feed_of(folder, words, file):
-    """What the node ``tool`` gets, and whether what it does not get is refused."""
+    """The parameters of the node ``tool``, and whether those that it does not get are refused."""
     path = folder / "some.yaml"
     path.write_text(file)
     given = ["--ros-args", *(str(path) if word == "FILE" else word for word in words)]

@@ -217,7 +217,7 @@ def test_the_end_is_the_first_sample_that_has_reached_the_angle(wanted, seed):
 
 
 def write_counts(path, seconds=0.4, every=5e-4, law=LAW, first=7 * 10**17):
-    """What a real encoder of `COUNTS` counts would have given."""
+    """The readings of a real encoder of `COUNTS` counts."""
     times = np.arange(0.0, seconds, every)
     counts = np.floor(law.at(times)[0] * COUNTS / TURN)
     rows = [f"{first + round(time * 1e9)},{count:.0f}" for time, count in zip(times, counts, strict=True)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What breaks is named, the rest is ended, and the bag is readable."""
+"""A failed node is named, the others are ended, and the bag is readable."""
 
 import os
 import re
@@ -169,7 +169,7 @@ def told_after_the_death_of(node, bag):
 def test_without_the_harness_every_process_of_a_cell_that_lost_a_member_says_so_by_its_exit_code(tmp_path):
     told = told_after_the_death_of("tool", tmp_path / "bag")
     codes = {event["node"]: event["code"] for event in told if event["event"] == "exit"}
-    # Who is killed may take a lock of DDS with it: whoever that holds up is killed and named.
+    # Who is killed may take a lock of DDS with it: whichever that blocks is killed and named.
     held_up = {event["node"] for event in told if event["event"] == "stuck"}
     assert {name for name, code in codes.items() if code == -signal.SIGKILL} == {"tool"} | held_up
     assert {code for code in codes.values() if code != -signal.SIGKILL} == {LatheError.exit_code}
@@ -236,7 +236,7 @@ def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_i
     bag, told = tmp_path / "bag", []
     cell = harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=6.0"]), bag, keep=True)
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
-        # It stands for a process that DDS holds up.
+        # It stands for a process that DDS blocks.
         processes._children["held"] = subprocess.Popen(["/bin/sh", "-c", "trap '' USR1; exec sleep 1000"])
         thread = threading.Thread(target=processes._listen, args=("held", socket.socket(), processes._children["held"]))
         thread.start()

@@ -37,7 +37,7 @@ FAULTS = {
 
 
 def disturbed(text, *signals, start=0, lengths=None, seed=0):
-    """What a fault makes of signals that it meets from sample ``start`` on, in blocks."""
+    """Signals with a fault from sample ``start`` on, in blocks."""
     fault = parse(text, "test")
     made = DISTURBANCES[fault.kind](fault, seed=seed, step=STEP, whose="test")
     names = ["angle", "speed", "index_pulse"] if KINDS[fault.kind].what == "encoder" else [fault.target.split(".")[-1]]

@@ -21,8 +21,10 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.check import check
 from lathe_rc.bag.reading import precheck
-from lathe_rc.bag.reading.source import MOST_BYTES, Source, unpack
+from lathe_rc.bag.reading.precheck import MOST_BYTES
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import Feeder
+from lathe_rc.bag.reading.unpacking import unpack
 from lathe_rc.bag.repairing.salvage import Salvage
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.control import memory_file

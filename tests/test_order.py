@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bag holds does not depend on who arrives first, and is what rosbags would have encoded and sorted."""
+"""The content of a bag does not depend on the order of arrival, and is as rosbags would have encoded and sorted it."""
 
 from pathlib import Path
 

@@ -351,7 +351,7 @@ def test_what_a_monitor_cannot_watch_is_refused(values, says):
 
 def test_a_monitor_of_others_asks_for_a_retraction_only_where_somebody_listens():
     asked = {"drives": ["coarse"], "clear_position": 1e-4, "monitor_reactions": ["warn", "retract"]}
-    with pytest.raises(InputError, match="monitor parts:Drift asks for retract, but nobody who moves coarse listens"):
+    with pytest.raises(InputError, match="monitor parts:Drift asks for retract, but no node that moves coarse listens"):
         Cell(cell(learning_controller={"reaction_delay": 0}, supervisor=asked).nodes).check()
 
 
@@ -522,7 +522,7 @@ def test_a_bag_is_read_where_its_parts_are_not_installed(recorded, tmp_path):
 
 
 def told_by(path, origin):
-    """What a bag says of itself, with another origin of its parts."""
+    """The metadata of a bag, with another origin of its parts."""
     with Source(path) as source:
         about = dict(source.about)
     said = json.loads(about[provenance.ORIGINS])

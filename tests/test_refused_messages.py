@@ -51,7 +51,7 @@ def joint_state(sample):
 
 
 def senders(topic, own):
-    """What the refused of `foreign` are called."""
+    """The names of the refused messages of `foreign`."""
     sources = ["/other", "/step", "/long", "/uneven", "/nan", "/jump"]
     return {f"{source} of run 'test' on {topic}" for source in sources} | {
         f"{own} of run 'elsewhere' on {topic}",
@@ -88,7 +88,7 @@ def diagnostics(bag):
 
 
 def test_a_cell_goes_on_among_foreign_messages(ghost, domain, tmp_path):
-    """What does not belong is refused, counted and named, and the cell gives the bits that it has alone."""
+    """Foreign messages are refused, counted and named, and the cell gives the bits that it has alone."""
     cell = scenario(spindle_encoder={"revolutions": 30.0, "speed_factor": 1.0})  # while all is said several times
     on = {"/encoder": (EncoderBlock, "/spindle_encoder"), "/tool": (ToolBlock, "/tool")}
     sends = []
@@ -135,7 +135,7 @@ def test_a_cell_begins_in_a_flood_of_announcements(ghost, domain):
 
 
 def test_who_speaks_in_the_name_of_a_member_makes_the_cell_safe_and_all_publishers_are_named(ghost, domain, tmp_path):
-    """Who speaks in a member's name makes the cell safe, as a member that goes wrong: nobody can tell them apart."""
+    """A sender in a member's name makes the cell safe, as a member that goes wrong: no node can distinguish them."""
     cell, sent = scenario(spindle_encoder={"revolutions": 200.0, "speed_factor": 1.0}), []
     publisher = ghost.create_publisher(ToolBlock, "/tool", latched_qos(10))
 

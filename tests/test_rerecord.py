@@ -165,7 +165,7 @@ LOOKS = "from lathe_rc.nodes import topic_recorder; topic_recorder._LOOKS = {}"
 
 
 def test_what_was_missed_is_told(node, tmp_path):
-    """A recorder that was there first tells of what it missed of a publisher that did not wait for it."""
+    """A recorder that was there first reports the messages that it missed of a publisher that did not wait for it."""
     # Nobody is in this domain yet: to look for them for 3 s would find nobody.
     with started("record", tmp_path / "bag", "--once", first=LOOKS.format(4)) as recording:
         assert any("what begins from now on is heard from its first message on" in line for line in recording.stdout)
@@ -181,7 +181,7 @@ def test_what_was_missed_is_told(node, tmp_path):
 
 
 def test_what_was_before_it_is_told_and_no_loss(node, tmp_path):
-    """What was said before a recorder came is told, and is no loss."""
+    """Messages from before the start of a recorder are reported, and are no loss."""
     talker = node.create_publisher(String, "/talk", 10)
     for _ in range(3):
         talker.publish(String(data="nobody hears"))

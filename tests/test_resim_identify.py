@@ -20,7 +20,7 @@ from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
 from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
-from lathe_rc.signals.profile import read_csv
+from lathe_rc.signals.measured_profile import read_csv
 
 STEP = 1.0 / 64000.0
 PISTON = resources.find(Path("piston.yaml"))

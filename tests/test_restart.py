@@ -39,7 +39,7 @@ def samples(recording):
 
 
 def commands(cell, table, recording, keep_at, path):
-    """What the controller commands and says, block by block; it is kept and read again before some blocks."""
+    """The outputs of the controller, block by block; its state is kept and read again before some blocks."""
     stage, tracks = Cell(cell.nodes).stages[OWN], {}
     for port in stage.inputs:
         if port.topic not in tracks:
@@ -138,7 +138,7 @@ def loaded(path):
 
 
 class Call:
-    """What pickle makes a call of."""
+    """An object of which pickle makes a call."""
 
     def __init__(self, function, *arguments):
         self.function, self.arguments = function, arguments

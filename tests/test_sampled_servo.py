@@ -279,7 +279,7 @@ def test_other_drives(values):
 
 
 def test_the_command_prints_what_the_paper_has_and_refuses_what_cannot_be(monkeypatch):
-    """What all studies do, like the width of the table and the figure, is in test_studies.py."""
+    """Checks of all studies, such as the width of the table, are in test_studies.py."""
     monkeypatch.setattr("lathe_rc.commands.study._save", lambda *_: None)
     told = CliRunner(env={"COLUMNS": "80"}).invoke(main, ["study", "sampled-servo", "--set", "t=0.16"])
     assert told.exit_code == 0, told.stderr

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a prompt or a notebook shows of scenarios, results and recordings, and the figure of a run."""
+"""Scenarios, results and recordings at a prompt or in a notebook, and the figure of a run."""
 
 import warnings
 from pathlib import Path

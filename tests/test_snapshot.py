@@ -380,7 +380,7 @@ def test_memory_does_not_grow_with_the_run_nor_with_triggers(tmp_path):
 
 
 def test_snapshot_comes_to_the_disk_in_bounded_pieces(tmp_path):
-    """A trigger writes nothing by itself, and each block that comes a few: the cell is not held up."""
+    """A trigger writes nothing by itself, and each block that comes a few: the cell is not delayed."""
     feed = Feed(tmp_path, chunk_size=4096, compression="none")
     for _ in range(200):
         feed.row()

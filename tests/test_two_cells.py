@@ -29,7 +29,7 @@ def alone(cell, namespace):
 
 
 def mixed(bag, namespace):
-    """What is in a bag and of another cell: topics, and nodes in the diagnostics."""
+    """The foreign part of a bag: topics of another cell, and its nodes in the diagnostics."""
     with AnyReader([bag]) as found:
         topics = {c.topic for c in found.connections if c.topic != "/diagnostics"}
     with next(bag.glob("*.mcap")).open("rb") as stream:

@@ -177,7 +177,7 @@ def test_the_tool_touches_what_it_has_turned(turned, shown):
 
 
 def test_every_curve_and_picture_has_a_view(turned, shown):
-    """What nobody would see was logged in vain."""
+    """Everything that is logged has a place in the view."""
 
     def contents(part):
         if isinstance(part, rrb.View):

@@ -181,7 +181,7 @@ def test_endless_run_is_refused_offline():
         ),
         (
             "learning_controller.reaction_delay=0",
-            r"monitor \w+ asks for \w+, but nobody who moves coarse listens; allowed: learning_controller.re",
+            r"monitor \w+ asks for \w+, but no node that moves coarse reads safety; allowed: learning_controller.re",
         ),
         ("electrodynamic_actuator.command_stroke=0.275e-3", r"electrodynamic_actuator.command_stroke = 0.000275 m"),
     ],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ./lathe does: make the environment if it is not there or out of date, then run the command in it."""
+"""./lathe: make the environment if it is not there or out of date, then run the command in it."""
 
 import os
 import signal

@@ -24,6 +24,8 @@ LINTERS = {
     "ruff check": ["ruff", "check", "--quiet"],
     "ruff format": ["ruff", "format", "--check", "--quiet"],
     "mypy": ["mypy", "--no-error-summary"],
+    "spelling": ["codespell"],  # setup.cfg has its settings
+    "prose": [sys.executable, str(ROOT / "tools" / "prose.py")],
     "imports": ["lint-imports", "--no-logo", "--no-cache"],
 }
 SITE = [sys.executable, str(ROOT / "tools" / "docs.py"), "--check"]

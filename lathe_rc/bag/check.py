@@ -13,18 +13,19 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.snapshot import first_sample, span_of
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.recording import Digester, SparseTopic
-from lathe_rc.cell.wire import Block, Decoder
+from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, shown
 
 DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, as the harness found them
-_MOST_FINDINGS = 20  # that are told of one topic
+_MOST_FINDINGS = 20  # listed for one topic
 _MOST_DIGESTS = 2**20  # size of that file [B]
 
 
 @dataclass
 class Findings:
-    """What a check found.
+    """The findings of a check.
 
     Attributes:
         wrong: what should not be there: numbers that are none, other digests than recorded.

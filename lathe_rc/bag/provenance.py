@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bag tells of its run, so that it explains itself for months: scenario, files, versions."""
+"""Scenario, files and versions of a bag's run, kept in the bag, so that it can be read months later."""
 
 import base64
 import contextlib
@@ -144,7 +144,7 @@ def _check_installed(about: Mapping[str, str]) -> None:
 
 
 def changes(about: Mapping[str, str]) -> list[str]:
-    """What has changed of the classes of others, all of which are here, since a bag was made; a line for each class."""
+    """Changes since a bag was made in the classes of others, all of which are installed; a line for each class."""
     found = []
     for origin in origins(about):
         extensions.find(origin.name, origin.name)
@@ -207,7 +207,7 @@ def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str]
     """The scenario that a bag was made with.
 
     Its files are written to ``folder``, which must last as long as it. Files that it names and the bag does not hold
-    are copied there: a run of what somebody else recorded writes to none that it names.
+    are copied there: a run of what somebody else recorded writes to no file that it names.
 
     Raises:
         InputError: the bag has none, or one that this version does not accept.

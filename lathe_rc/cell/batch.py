@@ -43,7 +43,7 @@ class Keeper(Sink, Protocol[K_co]):
         """Relative topics whose sparse messages it takes; others are not made."""
 
     def kept(self) -> K_co:
-        """What is kept, at the end of the run."""
+        """The kept result, at the end of the run."""
 
 
 Make = Callable[[Cell, int], Keeper[K_co]]  #: makes a keeper for a cell and so many samples
@@ -51,7 +51,7 @@ Make = Callable[[Cell, int], Keeper[K_co]]  #: makes a keeper for a cell and so 
 
 @dataclass(frozen=True)
 class Outcome(Generic[K_co]):
-    """What a cell gave.
+    """The outcome of a cell.
 
     Attributes:
         scenario: of the cell.

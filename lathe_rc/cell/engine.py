@@ -16,7 +16,7 @@ from lathe_rc.messages import MAX_BLOCK, Signals
 
 
 class Sink(Protocol):
-    """What takes the results of a run, piece by piece, in order."""
+    """A sink for the results of a run, piece by piece, in order."""
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Take the samples ``first`` on of every topic and the sparse messages among them, by relative topic."""

@@ -98,7 +98,7 @@ class Row:
         return found
 
     def allowed(self) -> str:
-        """What the parameter accepts, in words."""
+        """The values that the parameter accepts, in words."""
         what = f"one of {', '.join(self.choices)}" if self.choices else _NAMES[self.type]
         what = self.named.allowed() if self.named else what
         text = " ".join(filter(None, (what, self.limits)))
@@ -163,7 +163,7 @@ class Table(BaseModel):
 def about(node: str, *names: str) -> Iterator[None]:
     """Let a refusal of what is made of some parameters name them: ``node.a, b: ...``; one that does stays as it is.
 
-    Physics and control know nothing of parameters; who makes them of a table does.
+    Physics and control know nothing of parameters; the stage that makes them of a table does.
     """
     try:
         yield
@@ -185,7 +185,7 @@ def _rows(table: type[Table]) -> Mapping[str, Row]:
 
 
 class SharedParameters(Table):
-    """What all nodes of a cell must agree on; may stand under ``/**`` in a parameter file."""
+    """Parameters that all nodes of a cell must agree on; may stand under ``/**`` in a parameter file."""
 
     sample_rate: Annotated[int, Ge(1000), Le(1_000_000)] = parameter(
         64_000, "sampling rate of the cell; the step must be a whole number of nanoseconds", "Hz"
@@ -229,14 +229,14 @@ class SharedParameters(Table):
 
 
 class NodeParameters(SharedParameters):
-    """What every node has.
+    """Parameters that every node has.
 
     Attributes:
         judging: parameters that change no sample and no message of a run, but what is said of it.
     """
 
     listing: ClassVar[str] = "lathe node {} --help"
-    asks: ClassVar[tuple[frozenset[str], ...]] = ()  #: parameters that come from who knows them, unless one is given
+    asks: ClassVar[tuple[frozenset[str], ...]] = ()  #: parameters of the node that knows them, unless given
     judging: ClassVar[frozenset[str]] = frozenset()
 
     stage: str = parameter("", "what the node is; empty: its name says it")
@@ -271,7 +271,7 @@ class NodeParameters(SharedParameters):
         return {}
 
     def known(self) -> Mapping[str, Value]:
-        """What others may know of the node, by their parameter."""
+        """The node's values that other nodes may use, by their parameter."""
         return {}
 
 

@@ -258,6 +258,6 @@ class Program:
             self._told[number] = end
 
     def said(self, number: int, end: int) -> list[Sparse]:
-        """What a stage has said since the last call of the samples before ``end``."""
+        """The stage's events since the last call, of the samples before ``end``."""
         said, self._sparse[number] = self._sparse[number], []
         return [message for message in said if message.index < end]

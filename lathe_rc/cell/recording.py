@@ -76,7 +76,7 @@ class Recording:
     first: int = 0
 
     def __repr__(self) -> str:
-        """What it holds, in a line."""
+        """Its content, in a line."""
         size = f"{self.samples} samples ({self.samples * self.step_ns * 1e-9:.3g} s)"
         return f"<Recording: {', '.join([f'{len(self.types)} topics', size, *self.errors.told()])}>"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run gave, as tables and lines for the terminal."""
+"""The result of a run, as tables and lines for the terminal."""
 
 from collections.abc import Mapping
 from itertools import groupby
@@ -14,7 +14,7 @@ from lathe_rc.analysis.budget import Budget, Part
 from lathe_rc.analysis.metrology import Lay
 from lathe_rc.cell.durations import Lateness
 
-_MOST_EVENTS = 12  # that are told of a run
+_MOST_EVENTS = 12  # printed of a run
 _ALIKE = 4  # of them that follow one another: those in between are left out
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``lathe run`` and ``lathe demo`` do once their arguments are known and all is imported."""
+"""``lathe run`` and ``lathe demo``, once their arguments are known and all is imported."""
 
 import json
 from pathlib import Path

@@ -12,7 +12,7 @@ Event = Mapping[str, Any]
 
 
 def how_it_ended(event: Event) -> str:
-    """What is said of a process that did not end by itself and in order, from its ``exit``."""
+    """The description of a process that did not end by itself and in order, from its ``exit``."""
     code = event["code"]
     return f"{event['node']} " + (
         f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"

@@ -175,7 +175,7 @@ class Processes:
         self._threads.append(listener)
 
     def _command(self, first: str, arguments: Sequence[str]) -> list[str]:
-        """What starts a process as an interpreter of its own; nothing where it is to be forked."""
+        """The command that starts a process as an interpreter of its own; empty where it is to be forked."""
         prefix = self._prefix.get(first, ())
         words = [*prefix, sys.executable, "-m", "lathe_rc.nodes.container", *arguments]
         return words if prefix or self._fresh else []
@@ -196,7 +196,7 @@ class Processes:
     def _changed(self, name: str, state: str, number: int) -> None:
         """Turn into an event that a process has been stopped by a signal, or continued.
 
-        A process that is stopped with a lock of DDS in its hands holds up all who send to it, the time master among
+        A process that is stopped with a lock of DDS in its hands blocks all that send to it, the time master among
         them: then nobody else can say so.
         """
         self._say(state, name, signal=number, waits=self._waits)
@@ -260,7 +260,7 @@ class Processes:
 
     @property
     def _waits(self) -> bool:
-        """Whether the cell waits for who stands still, however long."""
+        """Whether the cell waits for a member that stands still, however long."""
         masters = (self._scenario.nodes[name] for name in self._scenario.masters)
         return all(getattr(master, "stall_reaction", "") == "wait" for master in masters)
 
@@ -276,7 +276,7 @@ class Processes:
     def _end_the_silent(self) -> None:
         """End processes that the run does not need any more, and that do not end by themselves; names them.
 
-        DDS may hold one up: a neighbour that left took a lock of the shared memory with it.
+        DDS may block one: a neighbour that left took a lock of the shared memory with it.
         """
         for name in self._running:
             self._abandoned.add(name)

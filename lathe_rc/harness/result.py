@@ -27,7 +27,7 @@ Mode = Literal["offline", "composed", "processes"]
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """What a run gave.
+    """The result of a run.
 
     Attributes:
         scenario: what ran.
@@ -71,7 +71,7 @@ class Result:
     lateness: Lateness | None = None
 
     def __repr__(self) -> str:
-        """What ran and what came of it, in a line."""
+        """The scenario and the result, in a line."""
         bag = f"bag {self.bag}" if self.bag else "no bag"
         return f"<Result of {self.scenario.name}: {', '.join([self.mode, *self.errors.told(), bag])}>"
 
@@ -154,7 +154,7 @@ class Result:
         return entries(self.recording)
 
     def summary(self) -> dict[str, object]:
-        """What ``lathe run --json`` prints."""
+        """The output of ``lathe run --json``."""
         errors, step, verdict = self.errors, self.scenario.shared.step, self.verdict
 
         def of(revolution: int) -> dict[str, Any] | None:

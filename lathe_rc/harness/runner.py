@@ -146,7 +146,7 @@ def _run(
 
 
 def _lateness(events: Mapping[str, Event]) -> Lateness | None:
-    """What the time master has told of its pace."""
+    """The pace, as the time master reports it."""
     if "pace" not in events:
         return None
     told = events["pace"]

@@ -32,7 +32,7 @@ def tune(scenario: Scenario, free: Mapping[str, Any], goals: Sequence[str], fold
 def budget(
     scenario: Scenario, *, threads: int | None = None, watch: Callable[[int, int], None] | None = None
 ) -> Budget:
-    """What the form error of a scenario is made of, in its last ten revolutions; see `lathe_rc.analysis.budget`.
+    """The parts of a scenario's form error, in its last ten revolutions; see `lathe_rc.analysis.budget`.
 
     It runs offline, as a batch, with one cause after the other switched off: some ten runs, or some thirty if causes
     act together.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What comes before the first node of a process: DDS is to stay on this machine, unless the user says otherwise."""
+"""Settings before the first node of a process: DDS is to stay on this machine, unless the user says otherwise."""
 
 import os
 from pathlib import Path

@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from lathe_rc.cell.wire import Block
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.wiring import Cell
 
 
@@ -45,7 +45,7 @@ def _alone(node: Any, cell: Cell | None) -> None:
 
 
 class Exchange:
-    """What a process hands over inside.
+    """Blocks that nodes hand over inside of a process.
 
     Attributes:
         master: takes the Progress of a node, if the time master is in this process.

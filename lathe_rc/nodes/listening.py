@@ -134,7 +134,7 @@ class Listening(Membership):
 
         To hear of lost messages as well may stop a node for ever: rmw_fastrtps 8.4 takes its own lock and then
         that of DDS where DDS takes them the other way round (its pull request 890); a flood from outside is enough.
-        Nothing is missed by that: every block and every message at a chosen sample is counted by who reads it.
+        Nothing is missed by that: every block and every message at a chosen sample is counted by its readers.
         """
 
         def incompatible(status: Any) -> None:

@@ -27,7 +27,7 @@ SILENCE = 0.08  #: [s] after which a node is silent that DDS does not hear, and 
 
 @cache
 def this_host() -> str:
-    """What processes have in common that can see each other's numbers: the boot of a machine, and the name space."""
+    """An identity that processes share if they see each other's numbers: the boot of a machine, and the name space."""
     boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     return f"{boot} {Path('/proc/self/ns/pid').stat().st_ino}"
 

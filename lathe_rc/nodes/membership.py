@@ -110,7 +110,7 @@ class Membership(Lifecycle):
         return self.table.model_copy(update={"remap": changed})
 
     def announced(self, names: Iterable[str]) -> tuple[dict[str, NodeParameters], dict[str, Unknown]]:
-        """What members have announced, by their name in this node's namespace: for a `lathe_rc.cell.wiring.Cell`.
+        """The members' announcements, by their name in this node's namespace: for a `lathe_rc.cell.wiring.Cell`.
 
         Returns:
             The parameters of those that are known here, and the topics of those of whom nobody here knows more.
@@ -138,7 +138,7 @@ class Membership(Lifecycle):
         return name.removeprefix(self.get_namespace().rstrip("/") + "/")
 
     def _table(self, name: str) -> NodeParameters | None:
-        """What a member has announced of its parameters; None, and told once, if nobody here knows what it is."""
+        """The parameters that a member has announced; None, and reported once, if its stage is unknown here."""
         member = self.members[name]
         try:
             kind = TABLES.get(member.stage)
@@ -186,7 +186,7 @@ class Membership(Lifecycle):
             raise ForeignMessage(self._host["members"].topic_name, member.name, member.run_id, why)
 
     def _parameter(self, name: str, key: str) -> object:
-        """What a member has announced of its parameters; None if it has no such."""
+        """A parameter that a member has announced; None if it has no such."""
         return json.loads(self.members[name].parameters).get(key)
 
     def restarts(self, name: str) -> bool:

@@ -12,8 +12,9 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from lathe_rc import messages
 from lathe_rc.bag.writing.record import signal_depth
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.parameters import NodeParameters
-from lathe_rc.cell.wire import Block, Decoder, NoBlockError
+from lathe_rc.cell.wire import Decoder, NoBlockError
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.refused_messages import ForeignMessage
@@ -174,7 +175,7 @@ class BlockQueue:
             yield block
 
     def state(self) -> tuple[int, int, list[Block], Block | None]:
-        """What another process needs to go on: next sample, blocks received, those that wait, and the newest."""
+        """The state that another process needs to go on: next sample, blocks received, waiting and newest."""
         return self.end, self.received, list(self.blocks), self._newest
 
     def resume(self, source: str, state: tuple[int, int, list[Block], Block | None]) -> None:

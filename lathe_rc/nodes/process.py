@@ -67,7 +67,7 @@ def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellN
 
 
 def _words(error: RuntimeError) -> str:
-    """What rcl says, without the file and line of its source."""
+    """The message of rcl, without the file and line of its source."""
     return str(error).splitlines()[0].partition(", at /")[0]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What publishers of any topic offer: message types as they are installed here, and quality of service."""
+"""Offers of the publishers of any topic: message types as they are installed here, and quality of service."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -46,7 +46,7 @@ def _used(kind: Any) -> Iterable[str]:
 
 
 def offered(publisher: TopicEndpointInfo) -> Qos:
-    """What a publisher offers, as bags say it. History and depth are not told over DDS."""
+    """The offer of a publisher, in the form of bags. DDS does not carry history and depth."""
     qos = publisher.qos_profile
     deadline, lifespan, lease = (
         QosTime(*divmod(duration.nanoseconds, 10**9))

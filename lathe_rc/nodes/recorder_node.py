@@ -20,10 +20,11 @@ from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.record import bag_of, signal_depth
 from lathe_rc.bag.writing.snapshots import Snapshots
 from lathe_rc.bag.writing.writer import FLUSH_PERIOD, Output, offered_qos
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages import MASTERS
-from lathe_rc.cell.wire import Block, Decoder, Encoder
+from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import LatheError, LossyRunError
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import BlockQueue, latched_qos

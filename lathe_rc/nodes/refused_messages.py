@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from lathe_rc.errors import LatheError
 
-_MOST = 32  # senders that are told apart
+_MOST = 32  # senders that are counted by name
 _LONGEST = 256  # characters of a name that is kept
 
 
@@ -29,7 +29,7 @@ class RefusedMessages:
     """Counts what a node has refused.
 
     Args:
-        told: called with the first message of each sender; of so many as are told apart.
+        told: called with the first message of each sender, up to a number of senders.
 
     Attributes:
         senders: messages by sender; those of too many senders together.

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all nodes share: how they begin, look after one another, make progress, fail and end."""
+"""What all nodes share: how they begin, look after one another, make progress, fail and end.
+
+Longer than 400 lines: whoever changes a step of a node's life has to see what the others do to the same state.
+"""
 
 import math
 import os
@@ -194,7 +197,7 @@ class CellNode(Listening):
         self.fail(LatheError(f"{member.name} {why_failed(member)}"), cause="abandoned")
 
     def clean_up_part(self) -> None:
-        """Let go of what it has made; publishers, subscriptions and services are destroyed by who calls."""
+        """Let go of what it has made; publishers, subscriptions and services are destroyed by the caller."""
 
     def begin(self, *, joins: bool) -> None:
         """Every input and output is matched; ``joins``: the cell is running already."""
@@ -412,11 +415,11 @@ class CellNode(Listening):
 
 
 def why_failed(member: Member) -> str:
-    """What a member says of its failure; its name, with which that may begin, is said before."""
+    """The member's message about its failure, without its name at the beginning."""
     own_name = member.name.rpartition("/")[2]
     return f"failed: {member.message.removeprefix(f'{own_name}: ')}"
 
 
 def given_up(master: str) -> str:
-    """What members say that do without a silent time master from now on."""
+    """The announcement of members that go on without a silent time master."""
     return f"{master}, the time master, has been silent for {_GIVEN_UP:g} s: no sample follows"

@@ -18,7 +18,7 @@ from pathlib import Path
 FOLDER = Path("/dev/shm")  # noqa: S108 - where POSIX shared memory is on Linux
 _PORT = re.compile(r"fast(rtps|dds)_port\d{1,5}")
 _SEGMENT = re.compile(r"fast(rtps|dds)_[0-9a-f]{16}")
-_LOCKS = ("_el", "_sl")  # of who listens alone, and of those who listen together
+_LOCKS = ("_el", "_sl")  # of a process that listens alone, and of those that listen together
 
 
 def sweep(folder: Path = FOLDER) -> list[str]:
@@ -66,7 +66,7 @@ def _remove_port(port: Path) -> bool:
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except (BlockingIOError, FileNotFoundError):  # somebody listens, or has just removed it
             return False
-        # As long as the locks are held, nobody can begin to listen; who had begun before has it in memory.
+        # As long as the locks are held, no process can begin to listen; one that had begun before has it in memory.
         free = not _is_mapped(port)
         gone = [port, *locks] if free else []
         if made and not free:
@@ -77,7 +77,7 @@ def _remove_port(port: Path) -> bool:
 
 
 def _remove_segment(segment: Path) -> bool:
-    """Remove a segment if its process has ended; whether it has. Who still reads in it has it in memory."""
+    """Remove a segment if its process has ended; whether it has. A process that still reads in it has it in memory."""
     lock = segment.with_name(segment.name + _LOCKS[0])
     try:
         with lock.open("rb") as stream:

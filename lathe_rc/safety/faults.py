@@ -193,7 +193,7 @@ def _allowed(kind: Kind) -> str:
 
 
 class Disturbance:
-    """What a fault of a port makes of the samples while it lasts, and what it leaves.
+    """The effect of a port's fault on the samples while it lasts, and the state after it.
 
     Args:
         fault: see `Fault`.

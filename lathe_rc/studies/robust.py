@@ -119,7 +119,7 @@ class RobustParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class RobustResult:
-    """What each law achieves under each condition; arrays of shape (conditions, laws, drives), the told drive first.
+    """The error of each law under each condition; arrays of shape (conditions, laws, drives), the told drive first.
 
     Attributes:
         conditions, laws: their names.
@@ -212,7 +212,7 @@ def _figure(value: float) -> str:
 
 @dataclass(frozen=True)
 class _Judged:
-    """What is kept of a run: largest error by revolution [µm], RMS of the last ones [µm], RMS current [A]."""
+    """Kept results of a run: largest error by revolution [µm], RMS of the last ones [µm], RMS current [A]."""
 
     largest: Array
     rms: float

@@ -38,7 +38,7 @@ _BACKLASH_PERIODS = 60  # a loop over a gap has no pole to say how long it takes
 
 @dataclass(frozen=True)
 class SampledServoResult(SampledServoNumbers):
-    """What the study found; see `SampledServoNumbers`."""
+    """The result of the study; see `SampledServoNumbers`."""
 
     def table(self) -> "Group":
         """See `lathe_rc.studies.sampled_servo_table`."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What paper 003 prints of the sampled position servo, parameters and results of the study of it.
+"""The numbers of paper 003 on the sampled position servo, parameters and results of the study of it.
 
 The paper's table is the step response of the desired function with the pseudo-frequency read as a frequency. Beside
 it stands the drive with the link that makes that function, seen between the samples too; and beside the paper's link
@@ -136,7 +136,7 @@ class LinkRow:
 
 @dataclass(frozen=True)
 class SampledServoNumbers:
-    """What the study found, in numbers.
+    """The result of the study, in numbers.
 
     Attributes:
         parameters: of the study.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What encoder and position sensor leave of a law that does not know the speed, against the variable lead.
+"""A law that does not know the speed, with errors of encoder and position sensor, against the variable lead.
 
 The cell of `lathe_rc.studies.speed_deviation`, frozen, with the variable lead of paper 000 (eq. 20) and with
 ``disturbance_controller``, over counts, noise, frequencies of the deviation and harmonics of the profile.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a sweep keeps of a cell: one row of its table.
+"""The row of a cell in the table of a sweep.
 
 | column | what |
 |---|---|
@@ -97,7 +97,7 @@ class Measure(NamedTuple):
 
 
 def measure(text: str, scenario: Scenario) -> Measure:
-    """What ``TOPIC.FIELD:STATISTIC`` asks for.
+    """The measure that ``TOPIC.FIELD:STATISTIC`` asks for.
 
     Raises:
         InputError: the scenario has no such topic, the topic no such field, or there is no such statistic.
@@ -165,7 +165,7 @@ class _Keeper(Errors):
 
 
 def digest(recording: Recording, measures: Sequence[Measure]) -> str | None:
-    """What stands in the row of a cell that was run again.
+    """The digest in the row of a cell that was run again.
 
     SHA-256 of all samples, little-endian, of the form error; of a cell without a tool, of what is measured. None where
     there is neither.

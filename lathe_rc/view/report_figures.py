@@ -28,7 +28,7 @@ _TICKS = 8  # font size
 _LONGEST_LABEL = 60  # characters
 _MOST_LENGTH = 1e3  # [m]
 _MOST_VALUE = 1e12  # of other signals
-_ALMOST = 1e-9  # of their size, by which numbers that are told apart differ
+_ALMOST = 1e-9  # of their size, by which numbers differ that count as two
 STYLE: Any = {"svg.hashsalt": "lathe_rc", "axes.titlesize": 10, "axes.labelsize": 9, "legend.fontsize": 8}
 STYLE |= {"xtick.labelsize": _TICKS, "ytick.labelsize": _TICKS}
 

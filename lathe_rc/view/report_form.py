@@ -27,7 +27,7 @@ _TURN = 2.0 * np.pi
 
 @dataclass(frozen=True)
 class Revolution:
-    """A revolution that is told of.
+    """A revolution in the report.
 
     Attributes:
         numbers: see `lathe_rc.part.numbers`.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a report tells of a bag, gathered in one pass and in memory that does not grow with the bag."""
+"""The figures of a report, gathered in one pass over the bag and in memory that does not grow with it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -24,7 +24,7 @@ def _so_far() -> list[rrb.VisibleTimeRange]:
 
 
 def _latest() -> list[rrb.VisibleTimeRange]:
-    """What lies shortly before the time cursor: the plot takes its scale from that."""
+    """The range shortly before the time cursor: the plot takes its scale from that."""
     starts = {
         "time": rrb.TimeRangeBoundary.cursor_relative(seconds=-_LATEST_S),
         "revolution": rrb.TimeRangeBoundary.cursor_relative(seq=-_LATEST_REVOLUTIONS),

@@ -25,7 +25,7 @@ _POSES = 250.0  # of part and tool in a second
 _ROWS = 512  # of the map
 _BARS = np.arange(1, HIGHEST + 1) - 0.5  # left edges: Rerun draws bars to the right of their place
 _GROWTH = 8  # the map is sent again when it has this part more rows
-# Colours of Okabe and Ito, which most colour-blind people can tell apart.
+# Colours of Okabe and Ito, which most colour-blind people can distinguish.
 _PALETTE = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (240, 228, 66), (213, 94, 0))
 
 
@@ -183,7 +183,7 @@ class Scene:
         self._send(path, self._when(first + at, number), rr.Scalars.columns(scalars=values[at]))
 
     def _tell(self, topic: str, found: list[Sparse]) -> None:
-        """What controllers say of their cycles, and events."""
+        """The controllers' reports of their cycles, and events."""
         index, kind = np.array([message.index for message in found]), found[0].type
         if kind in CYCLES:
             cycle = CYCLES[kind]

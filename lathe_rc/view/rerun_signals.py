@@ -49,7 +49,7 @@ _SLIDE = {"position": Curve(SLIDE, "actual", 1e3)}  # of a state that a servo co
 
 @dataclass(frozen=True)
 class Cycle:
-    """How controllers tell of a cycle: field of its error [m], field of its number, and a word for the error."""
+    """How controllers report a cycle: field of its error [m], field of its number, and a word for the error."""
 
     error: str
     counter: str
@@ -68,7 +68,7 @@ _PART = {
 
 
 def curves(types: Mapping[str, str]) -> dict[str, dict[str, Curve]]:
-    """What is drawn of a recording, by fully qualified topic and field.
+    """The drawn curves of a recording, by fully qualified topic and field.
 
     Args:
         types: message type by topic.

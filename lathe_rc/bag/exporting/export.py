@@ -27,7 +27,7 @@ _ROWS = 65536  # of a table that are collected before they are written
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written: rows by topic."""
+    """The written rows by topic."""
 
     place: Path
     rows: Mapping[str, int]

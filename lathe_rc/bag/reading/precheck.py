@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is looked at before a library opens a bag: whatever would cost it memory or time without end is refused.
+"""Checks before a library opens a bag, which refuse a file that would cost it unlimited memory or time.
 
 rosbags believes what a file says of sizes, expands what YAML repeats, and asks SQLite for what the schema defines.
 """
@@ -129,7 +129,7 @@ def summary_of(path: Path) -> bool:
     """Look at the summary of an MCAP file; whether it has all that rosbags asks for, which reads the whole file if not.
 
     Raises:
-        ValueError: there is none that could be believed; mcap raises others.
+        ValueError: it has no index that could be right; mcap raises others.
     """
     size, chunks = path.stat().st_size, []
     with path.open("rb") as stream:

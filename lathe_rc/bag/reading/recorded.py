@@ -39,7 +39,7 @@ class Spindle:
 
 
 class Recorded:
-    """What a bag holds of a cell.
+    """The parts of a cell that a bag holds.
 
     Args:
         source: the bag.
@@ -91,7 +91,7 @@ class Recorded:
         return topic
 
     def lacks(self, name: str, msgtype: str) -> str:
-        """What to say of a topic that is not there; names those of its type that are."""
+        """The message about a missing topic; names those of its type in the bag."""
         others = [t for t, said in sorted(self._source.topics.items()) if said.type == msgtype and said.count]
         options = " or ".join(f"--topic {name}={topic}" for topic in others or ["/TOPIC"])
         return f"{msgtype.rpartition('/')[2]} on {messages.full(name)} (or {options})"

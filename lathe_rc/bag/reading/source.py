@@ -5,7 +5,6 @@ Nothing in a bag is trusted: what it says of sizes is checked before anything of
 """
 
 import heapq
-import struct
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,10 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import lz4.frame
 import numpy as np
-import zstandard
-from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel
@@ -29,19 +25,17 @@ from rosbags.rosbag2 import Reader
 
 from lathe_rc.bag.reading import precheck
 from lathe_rc.bag.reading.chunk_messages import Places, walk
-from lathe_rc.bag.reading.precheck import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record
-from lathe_rc.cell.wire import Block, Decoder
+from lathe_rc.bag.reading.precheck import MOST_TEXT, MOST_TOPICS, read_record
+from lathe_rc.bag.reading.unpacking import read_chunk, unpack, unpack_file, unpacked_size
+from lathe_rc.cell.block import Block
+from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
 
 Message = tuple[str, int, bytes]  #: topic, log time [ns] and bytes
 
-MOST_UNPACKED = 2**36  #: of a file that is compressed as a whole [B]
-
-_PIECE = 2**20  # of a file that is unpacked [B]
 _NEVER = 2**64  # log time after all others [ns]
 _CHANNELS = 2**16  # numbers that a channel may have
 _AT_ONCE = 2**14  # messages of a batch
-_CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
 _SQLITE = b"SQLite format 3\0"
 _METADATA = "metadata.yaml"
 _KINDS = (".mcap", ".db3", ".zstd")
@@ -80,7 +74,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class Topic:
-    """What a bag says of a topic.
+    """The bag's metadata of a topic.
 
     Attributes:
         type: message type.
@@ -99,76 +93,8 @@ def files_of(path: Path) -> list[Path]:
     return sorted(file for file in found if file.suffix in _KINDS and file.is_file())
 
 
-def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
-    """The records of a chunk; never more than it says.
-
-    Raises:
-        ValueError: it does not unpack to ``size`` bytes, or not at all.
-    """
-    if not 0 <= size <= MOST_BYTES:
-        raise ValueError(f"{size} B when unpacked; allowed: up to {MOST_BYTES}")
-    try:
-        if compression == "zstd":
-            unpacker = zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True)
-            whole = unpacker.read(size + 1)
-        elif compression == "lz4":
-            whole = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
-        elif compression == "":
-            whole = bytes(data)
-        else:
-            raise ValueError(f"compression {compression[:64]!r} is not known; allowed: zstd, lz4, none")
-    except (zstandard.ZstdError, RuntimeError) as error:
-        raise ValueError(shown(error)) from None
-    if len(whole) != size:
-        raise ValueError(f"it does not unpack to the {size} B that it says")
-    return whole
-
-
-def unpacked_size(data: bytes) -> int:
-    """Size that a zstd frame says it has [B], from its first 18 bytes; -1 if it says nothing or is none."""
-    try:
-        return int(zstandard.frame_content_size(data))
-    except zstandard.ZstdError:
-        return -1
-
-
-def unpack_file(path: Path) -> Iterator[bytes]:
-    """The content of a file that is compressed as a whole, piece by piece.
-
-    Raises:
-        ValueError: it is longer than allowed.
-        ZstdError: it is broken.
-    """
-    size = 0
-    with path.open("rb") as stream:
-        reader = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
-        while piece := reader.read(_PIECE):
-            size += len(piece)
-            if size > MOST_UNPACKED:
-                raise ValueError(f"{path.name} unpacks to more than {MOST_UNPACKED} B, which is not allowed")
-            yield piece
-
-
-def read_chunk(content: bytes, place: int) -> bytes:
-    """The records of a chunk that stands at byte ``place``.
-
-    Raises:
-        ValueError: it is broken.
-    """
-    try:
-        _, _, size, crc, name = _CHUNK.unpack_from(content)
-        start = _CHUNK.size + name
-        name_of = content[_CHUNK.size : start].decode("utf-8", "replace")
-        whole = unpack(name_of, memoryview(content)[start + 8 :], size)
-    except (ValueError, struct.error) as error:
-        raise ValueError(f"chunk at byte {place}: {shown(error)}") from None
-    if crc and crc32(whole) != crc:
-        raise ValueError(f"chunk at byte {place}: its checksum is wrong")
-    return whole
-
-
 def _damage(path: Path) -> str:
-    """What is longer than it says or than is allowed in an MCAP file, and where; empty if nothing is."""
+    """The first record of an MCAP file that is longer than it says or than allowed, and its place; empty: none."""
     limit = path.stat().st_size - len(MCAP0_MAGIC)
     qos = precheck.Qos()
     with path.open("rb") as stream:
@@ -328,7 +254,7 @@ class Source:
         return [f"{_METADATA} says {said}; the files: {found}" for said, found in wrong]
 
     def _topics_of(self, connections: Sequence[Connection]) -> dict[str, Topic]:
-        """What a file, or the metadata, says of topics."""
+        """The topics by a file, or by the metadata."""
         found: dict[str, Topic] = {}
         for connection in connections:
             precheck.check_name(connection.topic)

@@ -13,9 +13,10 @@ from lathe_rc import messages
 from lathe_rc.bag.reading.chunk_messages import Places
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.snapshot import first_sample
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.engine import Sink
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wire import Block, Decoder
+from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.messages import START_NS, Signals
 
@@ -26,7 +27,7 @@ _MOST_WAITING = 2**18  # messages of a sparse topic ahead of the blocks
 
 @dataclass(frozen=True)
 class BagHeader:
-    """What a bag of the cell is, once it has been read.
+    """The header of a bag of the cell, once it has been read.
 
     Attributes:
         types: message type by fully qualified signal topic.

@@ -19,7 +19,7 @@ _RPM = 30.0 / np.pi  # for 1 rad/s
 
 @dataclass(frozen=True)
 class Made:
-    """What has been written.
+    """The files that have been written.
 
     Attributes:
         points: rows of the file.

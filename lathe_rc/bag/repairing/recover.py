@@ -16,7 +16,7 @@ _ENCODING = "cdr"  # how messages are serialized in what this package writes
 
 @dataclass(frozen=True)
 class Recovery:
-    """What came of a broken bag.
+    """The result of a recovery.
 
     Attributes:
         saved: messages.

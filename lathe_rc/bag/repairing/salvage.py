@@ -22,7 +22,8 @@ from rosbags.rosbag2.metadata import parse_qos
 
 from lathe_rc.bag.reading import precheck
 from lathe_rc.bag.reading.precheck import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record
-from lathe_rc.bag.reading.source import files_of, read_chunk, unpack, unpack_file, unpacked_size
+from lathe_rc.bag.reading.source import files_of
+from lathe_rc.bag.reading.unpacking import read_chunk, unpack, unpack_file, unpacked_size
 from lathe_rc.errors import InputError, LatheError, shown
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -33,7 +34,7 @@ _MOST_DAMAGE = 1000  # places that are told
 
 @dataclass(frozen=True)
 class Announced:
-    """What a broken bag still says of a topic; texts may be empty."""
+    """A topic as a broken bag announces it; texts may be empty."""
 
     type: str
     definition: str
@@ -50,7 +51,7 @@ def _profiles(text: str) -> tuple[Qos, ...]:
 
 @dataclass
 class Salvage:
-    """What is left of a bag; iterate over it to get topic, log time [ns] and bytes of each whole message.
+    """The readable rest of a bag; iterate over it to get topic, log time [ns] and bytes of each whole message.
 
     Args:
         path: a rosbag2 folder or a file of one.
@@ -135,7 +136,7 @@ class Salvage:
         channels: dict[int, str],
         inside: int | None = None,
     ) -> Iterator[tuple[str, int, bytes]]:
-        """What the records of a file hold, or those of a chunk that stands at byte ``inside`` of it."""
+        """The records of a file, or those of a chunk at byte ``inside`` of it."""
         while True:
             place = stream.tell()
             try:

@@ -24,7 +24,7 @@ from lathe_rc.messages import Samples
 
 
 class Memory(NamedTuple):
-    """What the step works on: samples that have been read.
+    """Memory of the step: samples that have been read.
 
     Attributes:
         span: index of the first, and of the one after the last.
@@ -108,7 +108,7 @@ class _PlayedSpindle(TimeMaster):
         self._scheduled.append((index, action))
 
     def act(self, action: str, index: int) -> None:
-        """What was wrong with it is in the recording."""
+        """Faults of the encoder are in the recording already."""
 
 
 Events = dict[str, list[tuple[int, str]]]  #: sample and action of the events of each node
@@ -162,7 +162,7 @@ def wire(
 
 
 def asked_for(recorded: Recorded, *, identified: bool = False) -> str:
-    """What a bag without a scenario has, what it lacks, and what to give; one line.
+    """The signals of a bag without a scenario, the missing ones, and the options that supply them; one line.
 
     Args:
         recorded: what it has.

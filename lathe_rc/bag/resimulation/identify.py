@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bag tells of the cell that it does not say: models of drives, and the form of the part."""
+"""Models of drives and the form of the part, identified from the signals of a bag."""
 
 import shutil
 from collections.abc import Mapping, Sequence

@@ -44,7 +44,7 @@ from lathe_rc.part import ErrorsByRevolution
 
 @dataclass(frozen=True)
 class Resimulation:
-    """What a re-simulation gave.
+    """The result of a re-simulation.
 
     Attributes:
         scenario: what ran.

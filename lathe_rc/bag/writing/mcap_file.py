@@ -105,7 +105,7 @@ class _Run:
 
 
 def message_head(channel: int, log_ns: int, length: int) -> bytes:
-    """What stands in a file ahead of the ``length`` bytes of a message."""
+    """The bytes of a file ahead of the ``length`` bytes of a message."""
     return _MESSAGE.pack(Opcode.MESSAGE, length + _AFTER_LENGTH, channel, 0, log_ns, log_ns)
 
 

@@ -113,7 +113,7 @@ class PublicationOrder:
         heapq.heappush(self._heap, held)
 
     def release(self, seen_ns: int) -> Iterator[Recorded]:
-        """What is ready, in order.
+        """The messages that are ready, in order.
 
         Args:
             seen_ns: all messages that had arrived before one of this time of publication have been taken [ns].
@@ -125,7 +125,7 @@ class PublicationOrder:
             yield from self._give(heapq.heappop(self._heap))
 
     def rest(self) -> Iterator[Recorded]:
-        """What is left, in order, when nothing published before can still come.
+        """The remaining messages, in order, when none published before can still come.
 
         Raises:
             LatheError: see `release`.

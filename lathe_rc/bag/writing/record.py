@@ -32,7 +32,7 @@ def signal_depth(shared: SharedParameters) -> int:
 
 
 def bag_of(path: Path, table: RecorderParameters, snapshots: Snapshots | None) -> Output:
-    """What a recorder writes to: the bag of the whole run unless only snapshots are wanted, and these if there are any.
+    """The outputs of a recorder: the bag of the whole run unless only snapshots are wanted, and these if there are any.
 
     Raises:
         InputError: the folder exists or cannot be made.

@@ -32,7 +32,7 @@ _HEARD = (messages.EVENT, messages.SAFETY_STATUS)  # what may be a trigger
 
 
 class _Item(NamedTuple):
-    """What came: a message of a topic, or a row."""
+    """A message of a topic, or a row."""
 
     log_ns: int
     key: str | RowPlan
@@ -300,7 +300,7 @@ class Snapshots:
         self._told(snapshot)
 
     def flush(self) -> None:
-        """See `Output`; when nothing has come since the last time, nobody is held up by writing all that waits.
+        """See `Output`; when nothing has come since the last time, so that writing all that waits delays no node.
 
         Raises:
             LatheError: the disk does not take it.

@@ -50,7 +50,7 @@ _Dumper.add_representer(str, lambda dumper, text: dumper.represent_scalar("tag:y
 
 
 class _Yaml:
-    """What rosbags' writer uses of ruamel.yaml."""
+    """The part of ruamel.yaml that rosbags' writer uses."""
 
     def __init__(self, typ: str) -> None:
         self.default_flow_style = False
@@ -64,7 +64,7 @@ rosbags.rosbag2.writer.YAML = _Yaml  # type: ignore[attr-defined,assignment]  # 
 
 
 class Output(Protocol):
-    """What takes the messages of a run: a bag, or what makes bags of them."""
+    """A sink for the messages of a run: a bag, or a writer of several bags."""
 
     def tell(self, about: Mapping[str, str]) -> None:
         """Store texts; see `BagWriter`."""
@@ -142,7 +142,7 @@ class _McapStorage:
 
 
 class _Writer(RosbagWriter):
-    """rosbags' writer with the storage above, which is told of messages directly and counts them itself."""
+    """rosbags' writer with the storage above, which gets the messages directly and counts them itself."""
 
     def __init__(self, path: Path, chunk_size: int, *, compress: bool) -> None:
         super().__init__(path, version=9, storage_plugin=StoragePlugin.MCAP)
@@ -155,7 +155,7 @@ class _Writer(RosbagWriter):
         return cast("_McapStorage", self.storage)
 
     def close(self) -> None:
-        """See rosbags; the metadata tell of the messages that the storage has been given."""
+        """See rosbags; the metadata count the messages that the storage has been given."""
         file = self.mcap.file
         self.counts = {number: file.counts[channel] for number, channel in self.mcap.channels.items()}
         if file.first_ns is not None and file.last_ns is not None:

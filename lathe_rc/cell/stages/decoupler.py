@@ -62,7 +62,7 @@ class DecouplerParameters(NodeParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on: K1 and K2 with their states."""
+    """Memory of the step: K1 and K2 with their states."""
 
     k1: System
     state1: Samples

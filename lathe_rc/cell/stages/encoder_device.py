@@ -56,7 +56,7 @@ class EncoderDeviceParameters(TimeMasterParameters):
         0.5, "topic, line: how far the cell may fall behind the readings; farther is an error", "s"
     )
     max_deviation: Annotated[float, Gt(0), Lt(1)] = parameter(
-        0.2, "the checks before the start count on speeds this near to the nominal one; events tell of others", "1"
+        0.2, "the checks before the start count on speeds this near to the nominal one; events report others", "1"
     )
     max_acceleration: Annotated[float, Ge(0)] = parameter(
         200.0, "the checks before the start count on no greater acceleration of the spindle", "rad/s^2"
@@ -217,7 +217,7 @@ class EncoderDevice(TimeMaster):
         return self._say(first, out["speed"])
 
     def _say(self, first: int, speed: Samples) -> list[Sparse]:
-        """What is to be told of these samples; of the speed once."""
+        """Events of these samples; those of the speed once."""
         low, high = self.speed_range()
         said = []
         for what, outside in ((TOO_FAST, speed > high), (TOO_SLOW, speed < low)):

@@ -33,7 +33,7 @@ class ForceControllerParameters(ServoParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on."""
+    """Memory of the step."""
 
     course: Course
     pid: PidTable

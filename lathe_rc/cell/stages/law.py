@@ -55,7 +55,7 @@ _DIVERGED = 1  # why a step stops
 
 
 class LawParameters(LearnerParameters):
-    """What every law has."""
+    """Parameters that every law has."""
 
     stop_ratio: Annotated[float, Ge(0)] = parameter(
         2.0,
@@ -65,7 +65,7 @@ class LawParameters(LearnerParameters):
 
 
 class Now(NamedTuple):
-    """What a law knows at a sample.
+    """The inputs of a law at a sample.
 
     Attributes:
         sample: index of the sample.
@@ -130,7 +130,7 @@ def _grows(guard: GuardTable, angle: float, error: float, form: float) -> bool:
 
 
 class LawMemory(NamedTuple):
-    """What the step of a law works on.
+    """Memory of the step of a law.
 
     Attributes:
         law: its own.

@@ -62,7 +62,7 @@ class LoadedSpindleParameters(SpindleEncoderParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         encoder: with the law.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a controller or a feed drive does when the supervisor asks for a reaction."""
+"""Reactions of a controller or a feed drive to the supervisor."""
 
 import math
 from typing import Annotated, NamedTuple
@@ -41,7 +41,7 @@ class FeedObedientParameters(ObedientParameters):
     )
 
     def obedience(self, name: str, *, speed: bool, limit: float, settled: int) -> "Obedience":
-        """What obeys for a command of the feed.
+        """The obedience for a command of the feed.
 
         A command for a speed goes to 0, one for a position stays: so the slide stands. Nothing is taken out of the
         part along the slide.
@@ -123,7 +123,7 @@ def apply(obedience: ObedienceTable, command: Samples) -> None:
 
 NOBODY = ObedienceTable(
     np.zeros(2, np.int64), np.zeros(1), TakeoverTable(np.zeros(0), np.zeros(2, np.int64), np.zeros(2), np.zeros(2))
-)  #: for who listens to nobody
+)  #: of a node without a supervisor
 
 
 class Obedience:

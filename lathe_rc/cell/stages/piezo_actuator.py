@@ -88,7 +88,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
             return self._plays(self.play_thresholds, self.play_weights, self.play_proportional)
 
     def _identified(self, named: _Named) -> PrandtlIshlinskii | BoucWen | None:
-        """What the linearisation takes for the hysteresis."""
+        """The linearisation's model of the hysteresis."""
         if not self.identified_weights:
             with named("identified_weights"):
                 if self.identified_thresholds or self.identified_proportional:
@@ -144,7 +144,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on."""
+    """Memory of the step."""
 
     signs: Samples
     limits: LimiterTable

@@ -52,7 +52,7 @@ class PlantParameters(LimitedParameters, RetractionParameters):
 
 
 class PlantMemory(NamedTuple):
-    """What the step of a drive works on.
+    """Memory of the step of a drive.
 
     Attributes:
         retraction: what it does by itself when members are lost.

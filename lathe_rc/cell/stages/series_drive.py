@@ -31,7 +31,7 @@ _FINE = "fine_"  # begins the parameters of the fine drive
 
 
 class SeriesParameters(ComposedParameters):
-    """What the series drive has beyond the parameters of both drives."""
+    """Parameters of the series drive beyond those of both drives."""
 
     mass_ratio: Annotated[float, Ge(0), Le(1)] = parameter(0.1, "mass of the tool over coarse_moving_mass", "1")
 
@@ -64,7 +64,7 @@ SeriesDriveParameters = create_model(
 
 
 class Memory(NamedTuple):
-    """What the step works on; the noise is that of the carriage's sensor, which the machine itself rounds."""
+    """Memory of the step; the noise is that of the carriage's sensor, which the machine itself rounds."""
 
     retraction: TakeoverTable
     limits: LimiterTable

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What servo controllers have in common: a PID, converters, and a feedback edge."""
+"""The common part of servo controllers: a PID, converters, and a feedback edge."""
 
 from typing import Annotated, Literal, NamedTuple
 
@@ -52,7 +52,7 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
     )
 
     def obeys(self, name: str) -> Obedience | None:
-        """What obeys the supervisor for a node; None if nobody is listened to.
+        """The obedience of a node; None if it reads no supervisor.
 
         Raises:
             InputError: see `FeedObedientParameters.obedience`; so no command is ever out of reach.
@@ -83,7 +83,7 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
 
 
 class Listener(NamedTuple):
-    """Who may have to obey, for kernels.
+    """The obedience of a node, if it has any, for kernels.
 
     Attributes:
         obedience: to the supervisor, if it ``listens``.

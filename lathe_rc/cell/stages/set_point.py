@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fine drive is asked for: a learned command, the reference, displacements to compensate."""
+"""The set point of a fine drive: a learned command, the reference, displacements to compensate."""
 
 from collections.abc import Sequence
 

@@ -89,7 +89,7 @@ class SpindleEncoder(TimeMaster):
         self.declare(inputs=loads, outputs=outputs, tells=bool(loads))
 
     def _loads(self) -> Sequence[Input]:
-        """What it reads of what loads it."""
+        """The inputs from its loads."""
         return ()
 
     def _lag(self) -> float:

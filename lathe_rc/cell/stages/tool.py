@@ -52,7 +52,7 @@ class ToolParameters(FormParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         form: of the part; without a table if a profile node has it.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a servo controller is told to follow, over time."""
+"""The set point of a servo controller, over time."""
 
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple

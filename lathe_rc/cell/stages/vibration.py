@@ -32,7 +32,7 @@ class VibrationParameters(NodeParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on."""
+    """Memory of the step."""
 
     lines: Samples
     period: float
