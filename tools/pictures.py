@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """./lathe docs --figures: draws the pictures of the pages anew and tells which are no longer what the code draws.
 
-What the same command prints is looked for on the page as well.
+The tables that the same command prints have to be on the page.
 """
 
 import os
@@ -30,7 +30,7 @@ class Picture(NamedTuple):
         page: in docs/, which shows it and has what the command prints.
         made: what the command writes there; empty: the picture's own name.
         seconds: about how long that takes; those that take no more than QUICK the tests draw anew.
-        steady: whether it is the same each time; a photograph of a screen is not, and is made by who wants a new one.
+        steady: whether it is the same each time; a photograph of a screen is not, and is made by hand.
     """
 
     command: str

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What MkDocs does besides: pages from outside docs/, navigation from docs/index.md, links, lists, equations.
+"""Additions to MkDocs: pages from outside docs/, navigation from docs/index.md, links, lists, equations.
 
 MkDocs calls the functions by their names; mkdocs.yml names this file.
 """
