@@ -137,7 +137,7 @@ def derivatives_at(
 
 @dataclass(frozen=True)
 class Demand:
-    """What a profile asks of a drive at its worst place."""
+    """The demand of a profile on a drive at its worst place."""
 
     stroke: float  #: largest displacement from the middle [m]
     velocity: float  #: [m/s]
@@ -195,7 +195,7 @@ class ProfileTable:
             row[:] = spline.c.T
 
     def demand(self, speed: float, acceleration: float, feed: float) -> Demand:
-        """What the profile asks at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], ``feed`` in m/rev."""
+        """The profile's demand at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], ``feed`` in m/rev."""
         return _demand(self, speed, acceleration, feed)
 
 
