@@ -24,7 +24,7 @@ from lathe_rc.commands.run import run
 from lathe_rc.errors import InputError, LatheError
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
 SCENARIOS = sorted((ROOT / "config").glob("*.yaml"))
 FIVE = {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder"}
@@ -34,7 +34,7 @@ _LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
 _BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _RUN = re.compile(r"^\$ \./lathe (run .*)$", re.MULTILINE)
 _TEST = re.compile(r"`((?:(?:system/)?test_\w+\.py::(?:\w+::)?)?test_[a-z0-9_]+)`")
-_CODE = re.compile(r"```.*?```|`[^`]*`", re.DOTALL)
+_CODE = re.compile(r"```.*?```|`[^`]*`|<!--.*?-->", re.DOTALL)
 
 
 def name(path: Path) -> str:

@@ -299,7 +299,8 @@ def test_the_viewer_stays_away_from_a_sourced_ros():
 @pytest.mark.parametrize(
     ("arguments", "groups"),
     [
-        (["test", "-k", "view"], ["sweep", "test", "view"]),
+        (["test", "-k", "view"], ["docs", "sweep", "test", "view"]),
+        (["docs", "--build"], ["docs"]),
         (["sweep", "piston"], ["sweep"]),
         (["tune", "piston"], ["sweep"]),
         (["view", "bag"], ["view"]),
@@ -313,9 +314,8 @@ def test_a_command_says_what_it_needs(arguments, groups):
 
 
 def test_setup_of_an_unknown_group_is_refused(copy):
-    assert_refused(
-        lathe(copy, "setup", "viewer"), copy, "setup viewer; allowed: notebook, sweep, test, view, or nothing more"
-    )
+    allowed = "docs, notebook, sweep, test, view, or nothing more"
+    assert_refused(lathe(copy, "setup", "viewer"), copy, f"setup viewer; allowed: {allowed}")
 
 
 def test_what_is_set_for_pip_holds_for_uv_and_the_environment_comes_first():

@@ -15,6 +15,9 @@ from ros import SourcedRos, sourced_ros
 from steps import exclusive
 from workplace import PYTHON, ROOT, VENV, RefusalError, StepError, say
 
+COMPLETES = "_LATHE_COMPLETE"  #: in the environment: a shell asks what may follow
+OWN = ("setup", "test", "python")  #: commands of ./lathe alone
+
 
 def main(arguments: Sequence[str]) -> int:
     """Set up, then become the command; return an exit code on failure or if there is no command to run."""
@@ -24,6 +27,8 @@ def main(arguments: Sequence[str]) -> int:
         ros = sourced_ros(os.environ)
         if python := ros.python() if ros else settled(os.environ):
             change_to(python)
+        if COMPLETES in os.environ:
+            return complete(Recipe(ros).ready([]))
         wanted = set_up(ros, needed(arguments))
     except RefusalError as refusal:
         say(str(refusal))
@@ -39,6 +44,14 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
+def complete(ready: Changes | None) -> int:
+    """Become the command line that completes for a shell; where nothing is set up, say nothing."""
+    if ready:
+        environ = run_environment(ready, os.environ) | {"_LATHE_ALSO": " ".join(OWN)}
+        os.execve(PYTHON, [str(PYTHON), *command([])], environ)
+    return 0
+
+
 def needed(arguments: Sequence[str]) -> Sequence[str]:
     """Return the groups of packages that a command needs beside those of all.
 
@@ -51,7 +64,7 @@ def needed(arguments: Sequence[str]) -> Sequence[str]:
                 raise RefusalError(f"setup {name}; allowed: {', '.join(GROUPS)}, or nothing more")
         return arguments[1:]
     sweeps = {name: ["sweep"] for name in ("bench", "sweep", "tune")}
-    wanted = {**sweeps, "test": ["sweep", "test", "view"], "view": ["view"]}
+    wanted = {**sweeps, "docs": ["docs"], "test": ["docs", "sweep", "test", "view"], "view": ["view"]}
     return wanted.get(next(iter(arguments), ""), [])
 
 
@@ -68,8 +81,9 @@ def set_up(ros: SourcedRos | None, groups: Sequence[str]) -> Changes:
 
 def command(arguments: Sequence[str]) -> list[str]:
     """Return what the Python of the environment is to run."""
-    if arguments[:1] == ["test"]:
-        return [str(ROOT / "tools" / "check.py"), *arguments[1:]]
+    for name, script in {"docs": "docs.py", "test": "check.py"}.items():
+        if arguments[:1] == [name]:
+            return [str(ROOT / "tools" / script), *arguments[1:]]
     if arguments[:1] == ["bench"]:
         return ["-m", "benchmarks", *arguments]
     if arguments[:1] == ["python"]:

@@ -31,6 +31,7 @@ LINTERS = {
     "prose": [sys.executable, str(ROOT / "tools" / "prose.py")],
     "imports": ["lint-imports", "--no-logo", "--no-cache"],
 }
+SITE = [sys.executable, str(ROOT / "tools" / "docs.py"), "--check"]
 # What would be compiled in the middle of the tests, by several of them at once; the linters leave cores for it.
 KERNELS = [sys.executable, str(ROOT / "tools" / "kernels.py")]
 # Tests wait for processes now and then, so three files run at once on two cores; what a file's tests share is made
@@ -109,11 +110,12 @@ def main(arguments: list[str]) -> int:
     if (here := version("numpy")) != (locked := locked_numpy()):
         del linters["mypy"]
         verdicts.append(f"not run: mypy, because its verdict is for the types of NumPy {locked}, not {here}")
-    with ThreadPoolExecutor(1) as beside:
-        compiled = beside.submit(lint, "kernels", KERNELS) if not arguments else None
+    with ThreadPoolExecutor(2) as pool:
+        beside = {"docs": pool.submit(lint, "docs", SITE)}
+        if not arguments:
+            beside["kernels"] = pool.submit(lint, "kernels", KERNELS)
         failed = [name for name, command in linters.items() if not lint(name, command)]
-    if compiled is not None and not compiled.result():
-        failed.append("kernels")
+    failed += [name for name, passed in beside.items() if not passed.result()]
     if "--lint" in arguments:
         print(*verdicts, sep="\n", end="\n" if verdicts else "")
         return int(bool(failed))

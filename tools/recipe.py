@@ -37,16 +37,19 @@ class Group(NamedTuple):
         list: file in requirements/ that names them.
         usual: how long they take to install, and how much they take, for the terminal.
         sourced: whether they go with a ROS 2 that is sourced.
+        npm: whether they bring npm, which installs what requirements/package.json lists.
     """
 
     list: str
     usual: str
     sourced: bool
+    npm: bool = False
 
 
 GROUPS = {
+    "docs": Group("docs.in", "5 s, 250 MB", sourced=True, npm=True),
     "notebook": Group("notebook.in", "10 s, 300 MB", sourced=True),
-    "sweep": Group("sweep.in", "5 s, 150 MB", sourced=True),
+    "sweep": Group("sweep.in", "5 s, 70 MB", sourced=True),
     "test": Group("test.in", "5 s, 300 MB", sourced=True),
     "view": Group("view.in", "10 s, 400 MB", sourced=False),
 }
@@ -127,7 +130,7 @@ class Recipe:
             step.run(BASE_PYTHON, "-m", "venv", *options, VENV, environ=build_environment(self._ros))
 
     def _install_packages(self, lock: int) -> None:
-        with Step("packages", "20 s, 900 MB", CHECK_NETWORK, lock) as step:
+        with Step("packages", "20 s, 1000 MB", CHECK_NETWORK, lock) as step:
             if self._ros:
                 environ = build_environment(self._ros)
                 found = step.run(BASE_PYTHON, "-c", LIST_PACKAGES, environ=environ).splitlines()
@@ -143,6 +146,8 @@ class Recipe:
     def _install_group(self, name: str, lock: int) -> None:
         with Step(f"packages: {name}", GROUPS[name].usual, CHECK_NETWORK, lock) as step:
             self._install(step, GROUPS[name].list)
+            if GROUPS[name].npm:
+                step.run(*installer.npm(), environ=build_environment(self._ros))
 
     def _install(self, step: Step, *lists: str) -> None:
         """Install what files in requirements/ list: beside a sourced ROS 2 with pip, which knows its packages."""

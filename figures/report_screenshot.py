@@ -9,8 +9,9 @@ from pathlib import Path
 from lathe_rc import harness, resources
 from lathe_rc.cell import scenario
 from lathe_rc.view import report
+from place import PICTURES
 
-PICTURE = Path(__file__).parent / "img" / "report.png"
+PICTURE = PICTURES / "report.png"
 BROWSER = sys.argv[1] if len(sys.argv) > 1 else "chromium"
 
 piston = scenario.load(

@@ -12,11 +12,12 @@ from pathlib import Path
 from PIL import Image
 
 from lathe_rc.commands import view
+from place import PICTURES
 
 SIZE = (1500, 900)
 
 if len(sys.argv) != 2:
-    sys.exit("usage: python docs/view_screenshot.py BAG   (bags/demo-1, which ./lathe demo records)")
+    sys.exit("usage: python figures/view_screenshot.py BAG   (bags/demo-1, which ./lathe demo records)")
 view.require()
 with tempfile.TemporaryDirectory() as folder:
     recording, shot = Path(folder) / "demo.rrd", Path(folder) / "shot.png"
@@ -28,4 +29,4 @@ with tempfile.TemporaryDirectory() as folder:
     subprocess.run([*limit, *screen, *viewer, "--screenshot-to", str(shot), str(recording)], check=True)
     with Image.open(shot) as picture:
         small = picture.convert("RGB").resize(SIZE, Image.Resampling.LANCZOS)
-    small.save(Path(__file__).parent / "img" / "view.png", optimize=True)
+    small.save(PICTURES / "view.png", optimize=True)
