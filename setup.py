@@ -71,6 +71,8 @@ setup(
             "msg_defs/srv/*.srv",
             "sweep/*.j2",
             "view/*.j2",
+            "view/*.css",
+            "view/*.js",
             "templates/*/*.j2",
         ]
     },

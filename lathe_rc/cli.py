@@ -5,17 +5,20 @@ To list or complete the commands takes no more than their names and summaries, s
 """
 
 import importlib
+import os
 import signal
 from typing import Any, cast
 
 import click
+from click.shell_completion import CompletionItem
 
-from lathe_rc import __version__
+from lathe_rc import __version__, completing
 from lathe_rc.errors import LatheError, shown
 
 COMMANDS = {
     "bag": "Ask bags what is in them; check and recover them; take a tachogram out.",
     "budget": "Tell what the form error of a scenario is made of.",
+    "completion": "Make the shell complete the command line.",
     "container": "Run several nodes in one process.",
     "demo": "Turn a piston with ROS 2 processes and draw it.",
     "export": "Export a recording as CSV, Parquet or NPZ.",
@@ -38,6 +41,12 @@ COMMANDS = {
 _BESIDES = {"container": "node"}  # commands in the module of another one
 
 
+def imported(name: str) -> click.Command:
+    """A command with its module."""
+    module = importlib.import_module(f"lathe_rc.commands.{_BESIDES.get(name, name)}")
+    return cast("click.Command", getattr(module, name))
+
+
 class _Command(click.Command):
     """A command whose module is imported when it is called, not when it is listed."""
 
@@ -45,14 +54,18 @@ class _Command(click.Command):
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
     ) -> click.Context:
         """See `click.Command`."""
-        name = str(self.name)
-        module = importlib.import_module(f"lathe_rc.commands.{_BESIDES.get(name, name)}")
-        command = cast("click.Command", getattr(module, name))
+        command = completing.stand_in(str(self.name)) if extra.get("resilient_parsing") else imported(str(self.name))
         return command.make_context(info_name, args, parent, **extra)
 
 
 class Group(click.Group):
     """Turns the project's errors into one line and an exit code."""
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """See `click.Command`; ./lathe of a checkout names its own commands in the environment."""
+        also = os.environ.get("_LATHE_ALSO", "").split()
+        own = [CompletionItem(name) for name in also if name.startswith(incomplete) and not incomplete.startswith("-")]
+        return [*super().shell_complete(ctx, incomplete), *own]
 
     def invoke(self, ctx: click.Context) -> Any:
         """See `click.Command`."""

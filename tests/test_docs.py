@@ -33,7 +33,7 @@ LAUNCH = ROOT / "launch" / "cell.launch.py"
 _LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
 _BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _RUN = re.compile(r"^\$ \./lathe (run .*)$", re.MULTILINE)
-_TEST = re.compile(r"`(test_[a-z0-9_]+)`")
+_TEST = re.compile(r"`((?:(?:system/)?test_\w+\.py::(?:\w+::)?)?test_[a-z0-9_]+)`")
 _CODE = re.compile(r"```.*?```|`[^`]*`|<!--.*?-->", re.DOTALL)
 
 
@@ -130,12 +130,15 @@ class TestHostTopics:
 
 
 @functools.cache
-def names_of_tests() -> set[str]:
-    """Names of all tests."""
-    found = set()
-    for path in Path(__file__).parent.rglob("test_*.py"):
-        tree = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        found |= {node.name for node in tree if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")}
+def tests() -> set[str]:
+    """All tests as pytest calls them, below tests/."""
+    found, root = set(), Path(__file__).parent
+    for path in root.rglob("test_*.py"):
+        file = path.relative_to(root).as_posix()
+        for outer in ast.parse(path.read_text(encoding="utf-8")).body:
+            owner, body = (f"{outer.name}::", outer.body) if isinstance(outer, ast.ClassDef) else ("", [outer])
+            names = [node.name for node in body if isinstance(node, ast.FunctionDef)]
+            found |= {f"{file}::{owner}{name}" for name in names if name.startswith("test_")}
     return found
 
 
@@ -143,17 +146,21 @@ def names_of_tests() -> set[str]:
 def test_every_test_that_a_page_names_exists(page: Path) -> None:
     lines = enumerate(page.read_text(encoding="utf-8").splitlines(), 1)
     named = {(number, test) for number, line in lines for test in _TEST.findall(line)}
-    known = names_of_tests()
+    known = tests() | {test.rpartition("::")[2] for test in tests()}
     assert [f"{name(page)}:{number}: no test {test}" for number, test in sorted(named) if test not in known] == []
 
 
 @pytest.mark.parametrize("page", ["cell", "safety"])
 def test_every_promise_names_a_test(page: str) -> None:
+    """By its file and name, or it is one of another page whose promises are checked in the same way."""
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
     _, _, table = text.partition("## Which test holds what\n")
-    rows = [line for line in table.splitlines() if line.startswith("| ")][2:]
+    rows = [line.strip("| ").rpartition(" | ") for line in table.splitlines() if line.startswith("| ")][2:]
     assert len(rows) >= 20
-    assert [row for row in rows if not _TEST.search(row) and "cell.md#" not in row] == []
+    named = {promise: _TEST.findall(held) for promise, _, held in rows}
+    elsewhere = {promise for promise, _, held in rows if "(cell.md#which-test-holds-what)" in held}
+    assert [promise for promise, found in named.items() if not found and promise not in elsewhere] == []
+    assert [test for found in named.values() for test in found if "::" not in test] == []
 
 
 def test_one_version_stands_everywhere() -> None:

@@ -2,11 +2,15 @@
 """``lathe report``: what the page says is what was turned, and nothing from a bag can harm it."""
 
 import base64
+import json
 import re
+from hashlib import sha256
 from html.parser import HTMLParser
+from pathlib import Path
 from types import SimpleNamespace
 from xml.etree import ElementTree as ET
 
+import altair as alt
 import numpy as np
 import pytest
 from cells import scenario
@@ -15,18 +19,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc import __version__, harness, messages, part
+from lathe_rc import __version__, harness, messages, part, resources
 from lathe_rc.bag import reader
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
+from lathe_rc.cell.scenario import load
 from lathe_rc.commands.report import report
 from lathe_rc.errors import InputError
+from lathe_rc.view import charts
 from lathe_rc.view import report as reporting
 from lathe_rc.view.report_figures import timing
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_gather import gather
 from lathe_rc.view.report_host import CELL_STATE, DIAGNOSTICS, Host
 from lathe_rc.view.report_series import Envelope, MeanRows, Thinned
+from lathe_rc.view.report_verdict import judged
 
 HOSTILE = "<script>alert(1)</script>$x_{$\u202e\x07"
 
@@ -36,24 +43,43 @@ class Page(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.tags, self.links, self.cells, self._cell = [], [], [], False
-        self.text = ""
+        self.tags, self.links, self.cells, self._cell, self._script = [], [], [], False, False
+        self.text, self.scripts, self.ids = "", [], []
         self.feed(text)
 
     def handle_starttag(self, tag, attributes):
         self.tags.append(tag)
+        if ("http-equiv", "Content-Security-Policy") in attributes:
+            self.policy = dict(attributes)["content"]
+        self.ids += [value for name, value in attributes if name == "id"]
+        self._script = tag == "script"
+        if self._script:
+            self.scripts.append("")
         self.links += [value for name, value in attributes if name in ("src", "href", "srcset", "action")]
         self._cell = tag == "td"
         if self._cell:
             self.cells.append("")
 
     def handle_endtag(self, tag):
-        self._cell = False
+        self._cell = self._script = False
 
     def handle_data(self, data):
+        if self._script:
+            self.scripts[-1] += data
+            return
         self.text += data
         if self._cell:
             self.cells[-1] += data
+
+    @property
+    def figures(self):
+        """Specifications by place."""
+        return {name: specs[""] for name, specs in json.loads(self.scripts[0])["specs"].items()}
+
+    def may_run(self):
+        """The scripts that the page allows itself."""
+        hashes = set(re.findall(r"'sha256-([^']+)'", self.policy))
+        return [text for text in self.scripts if base64.b64encode(sha256(text.encode()).digest()).decode() in hashes]
 
 
 @pytest.fixture(scope="module")
@@ -92,10 +118,32 @@ class TestPage:
 
     def test_needs_nothing_else(self, turned):
         page = Page(turned[2])
-        assert "script" not in page.tags
-        assert all(link.startswith("data:") for link in page.links)
-        assert not re.search(r"https?:|@import|url\(", re.sub(r"base64,[^\"]+", "", turned[2]))
-        assert "default-src 'none'" in turned[2]
+        assert all(link.startswith("data:") or link.removeprefix("#") in page.ids for link in page.links)
+        body = turned[2][: turned[2].index("<script")]
+        assert not re.search(r"https?:|@import|url\(", re.sub(r"base64,[^\"]+", "", body))
+        assert page.policy.startswith("default-src 'none'; ")
+        assert len(turned[2].encode()) < 3_000_000
+
+    def test_runs_its_own_two_scripts_and_no_other(self, turned):
+        page = Page(turned[2])
+        assert "unsafe" not in page.policy.partition("script-src")[2]
+        assert page.may_run() == [charts.library(), *page.scripts[2:]]
+        assert len(page.scripts) == 3  # the first is data
+
+    def test_figures_to_enlarge_have_the_numbers_of_the_pictures(self, turned):
+        """Each follows the schema of its language; the curve of the form error is that of the recording."""
+        specs = Page(turned[2]).figures
+        assert len(specs) == 6  # the polar figure has two
+        for spec in specs.values():
+            alt.Chart.from_dict(spec)
+            assert spec["usermeta"]["box"]
+        found = part.measured(turned[1])
+        curve = next(spec for spec in specs.values() if spec["encoding"]["x"].get("title") == "revolution or cycle")
+        for label, values in (("form error, RMS", found.form.rms), ("form error, largest", found.form.largest)):
+            rows = [row for row in curve["data"]["values"] if row["l"] == label]
+            assert_allclose([row["a"] for row in rows], values * 1e6, rtol=1e-3)
+        field = specs["figure-0-0"]["data"]["values"]
+        assert_allclose(field[-256:], found.profile[-1].reshape(256, 16).mean(axis=-1) * 1e6, rtol=1e-3, atol=1e-9)
 
     def test_figures_are_whole_svg_without_links(self, turned):
         images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', turned[2])
@@ -133,6 +181,61 @@ class TestPage:
         bag, _, page = turned
         reporting.write(bag, bag.parent / "page.html")
         assert (bag.parent / "page.html").read_text(encoding="utf-8") == page
+
+
+class TestVerdict:
+    """What the page begins with."""
+
+    def told(self, cell, place):
+        harness.run(cell, bag=place / "bag")
+        found = gather(place / "bag")
+        return judged(found, reporting.losses(found), None)
+
+    def test_says_first_whether_the_part_is_in_tolerance(self, tmp_path):
+        cell = scenario(spindle_encoder={"revolutions": 6.2}, tool={"tolerance": 2e-6})
+        told = self.told(cell, tmp_path)
+        assert told.verdict.text == re.sub("^i", "I", harness.run(cell).verdict.told()) + "."
+        assert (told.verdict.mood, told.wrong) == ("good", [])
+        page = tmp_path / "page.html"
+        reporting.write(tmp_path / "bag", page)
+        text = Page(page.read_text(encoding="utf-8")).text
+        assert text.index("In tolerance (±2 µm)") < text.index("Nothing went wrong") < text.index("Result")
+
+    def test_says_that_learning_is_not_over_and_when_it_would_be(self, tmp_path):
+        """With a small gain, each revolution is better than the one before."""
+        slow = scenario(
+            spindle_encoder={"revolutions": 12.2},
+            learning_controller={"learning_gain": 0.2},
+            tool={"tolerance": 1e-9},
+        )
+        told = self.told(slow, tmp_path)
+        assert told.verdict.mood == "bad"
+        assert re.search(r"falls by [\d.]+% a revolution; in tolerance after some \d+ more", told.limits[0].text)
+        assert "repeats from revolution to revolution, most at 2 UPR" in told.limits[1].text
+
+    def test_noise_changes_from_revolution_to_revolution(self, tmp_path):
+        noisy = scenario(
+            spindle_encoder={"revolutions": 24.2}, electrodynamic_actuator={"noise_rms": 1e-6}, tool={"tolerance": 1e-6}
+        )
+        told = self.told(noisy, tmp_path)
+        assert re.search(r"^\d+% of .* changes from revolution to revolution: noise", told.limits[0].text)
+
+    def test_says_who_came_to_a_limit(self, tmp_path):
+        limited = scenario(electrodynamic_actuator={"command_velocity": 5e-3})
+        told = self.told(limited, tmp_path)
+        assert re.search(r"^electrodynamic_actuator came to the limits of its command, ", told.limits[0].text)
+
+    def test_a_fault_and_what_the_supervisor_did_come_first(self, tmp_path):
+        """And no word of what learning leaves: the error is the fault's."""
+        fault = "electrodynamic_actuator.faults=['revolution 6: coarse/state.measured_position stuck']"
+        supervised = load(resources.find(Path("supervised.yaml")), ["spindle_encoder.revolutions=12", fault])
+        told = self.told(supervised, tmp_path)
+        assert re.match(
+            r"electrodynamic_actuator/events: fault coarse/state.measured_position stuck, at 0.34", told.wrong[0].text
+        )
+        assert re.match(r"safety/status: .*, limit .*: retracting, retract, at ", told.wrong[1].text)
+        assert told.verdict.mood == "bad"
+        assert told.limits == []
 
 
 def test_surface_along_the_part_is_that_of_the_whole_run(tmp_path):
@@ -362,12 +465,14 @@ def test_a_hostile_bag_gives_a_harmless_page(hostile, tmp_path):
     assert "incomplete recording" in done.stderr
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     page = Page(text)
-    assert "script" not in page.tags
+    assert page.may_run() == page.scripts[1:]
+    assert len(page.scripts) == 3
     assert "b" in page.tags  # ours
     assert "<b>run" not in text
     assert "\u202e" not in text
     assert "\x07" not in text
-    assert len(text) < 2_000_000
+    assert len(text.encode()) < 3_000_000
+    assert page.text.index("What went wrong") < page.text.index("No tolerance to judge by") < page.text.index("Result")
     assert "(540000 characters)" in page.text or "characters)" in page.text
     assert "the recording was cut off" in page.text
     assert "1 messages of host topics cannot be decoded" in page.text

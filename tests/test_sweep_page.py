@@ -11,7 +11,6 @@ import altair as alt
 import numpy as np
 import pyarrow as pa
 import pytest
-import vl_convert
 from click.testing import CliRunner
 from matplotlib.image import imread
 from numpy.testing import assert_allclose
@@ -24,6 +23,7 @@ from lathe_rc.sweep.effects import Axis, Yield, bins, effect, is_grid
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.seen import Seen
 from lathe_rc.sweep.space import Space
+from lathe_rc.view import charts
 
 LEAD, Q = "learning_controller.lead_time", "learning_controller.q_time"
 DAMPING, LAW = "electrodynamic_actuator.damping", "learning_controller.lead_law"
@@ -41,8 +41,9 @@ class Shown(HTMLParser):
         self.tables, self.text, self._heading, self._inside = {}, "", "", []
         self.feed(self.source)
         self.text = " ".join(self.text.split())
-        told = re.search(r"^const SPECS = (.*), DATA = (.*), CHOSEN = (.*);$", self.source, re.MULTILINE)
-        self.specs, self.data, self.chosen = map(json.loads, told.groups()) if told else ({}, {}, {})
+        told = re.search(r'<script type="application/json" id="figures">(.*?)</script>', self.source)
+        found = json.loads(told[1]) if told else {}
+        self.specs, self.data, self.chosen = (found.get(name, {}) for name in ("specs", "data", "chosen"))
 
     def handle_starttag(self, tag, attributes):
         self._inside = [*self._inside, tag] if tag in ("style", "script", "h2", "td", "noscript") else self._inside
@@ -102,7 +103,7 @@ def grid(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def no_library(monkeypatch):
     """Pages of single tests do without the scripts, which take seconds; that of the grid has them."""
-    monkeypatch.setattr(vl_convert, "javascript_bundle", lambda _: "")
+    monkeypatch.setattr(charts, "library", lambda: "")
 
 
 class TestEffects:
@@ -303,7 +304,7 @@ class TestPage:
         folder = swept(tmp_path / "sweep", space, lambda values: ("failed", hostile) if values[Q] < 1.5e-5 else 1e-6)
         page.write(folder)
         shown = Shown(folder.path / "page.html")
-        assert shown.source.count("<script>") == shown.source.count("</script>") == 2
+        assert shown.source.count("<script") == shown.source.count("</script>") == 3
         assert "<b>$x" not in shown.source
         assert hostile in shown.text
         assert [row["t"] for row in shown.data["bins-0"]] == [hostile, "<b>$x"]

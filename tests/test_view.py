@@ -2,6 +2,7 @@
 """``lathe view`` and the scene behind it: what Rerun is given is what was recorded."""
 
 import importlib.util
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ rr = pytest.importorskip("rerun")
 rrb = pytest.importorskip("rerun.blueprint")
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
 
-from lathe_rc import harness, messages  # noqa: E402
+from lathe_rc import harness, messages, resources  # noqa: E402
 from lathe_rc.analysis import metrology  # noqa: E402
 from lathe_rc.bag import reader  # noqa: E402
+from lathe_rc.cell.scenario import load  # noqa: E402
 from lathe_rc.cell.stage import Sparse  # noqa: E402
 from lathe_rc.cli import main  # noqa: E402
 from lathe_rc.errors import LatheError  # noqa: E402
@@ -196,10 +198,51 @@ def test_every_curve_and_picture_has_a_view(turned, shown):
     }
 
 
+def test_desired_and_actual_position_of_the_tool_are_in_one_view(turned):
+    """And the title names the colours of its two curves, so that no legend lies on them."""
+    views = blueprint(turned[1].types).root_container.contents[-1].contents
+    (view,) = [view for view in views if isinstance(view, rrb.TimeSeriesView) and "tool position" in view.name]
+    assert view.name == "tool position [µm]: desired blue, actual orange, latest 0.3 s"
+    assert view.contents == ["/signals/tool/reference", "/signals/tool/displacement"]
+
+
+def test_states_of_the_supervisor_and_faults_are_bands(tmp_path):
+    """From nominal on; a fault is a band of its own from its first sample to its last."""
+    overrides = ["spindle_encoder.revolutions=8"]
+    overrides += ["electrodynamic_actuator.faults=['revolution 4 to 5: coarse/state.measured_position stuck']"]
+    cell = load(resources.find(Path("supervised.yaml")), overrides)
+    logged = harness.run(cell, bag=tmp_path / "bag").event_log
+    done = lathe("view", tmp_path / "bag", "-o", tmp_path / "out.rrd")
+    assert done.exit_code == 0, done.output
+    view = View(tmp_path / "out.rrd")
+    assert view.entities("StateChange:state") == {"/states/cell/safety", "/states/electrodynamic_actuator/fault"}
+    status = [each for each in logged if each.topic == "/safety/status"]
+    states = [state for (state,) in view.column("/states/cell/safety", "StateChange:state")]
+    assert list(dict.fromkeys(states)) == ["nominal", "retracting", "safe"]
+    samples = [0, *(each.sample for each in status)]
+    assert view.column("/states/cell/safety", "time") == [sample * STEP_NS for sample in samples]
+    fault = view.column("/states/electrodynamic_actuator/fault", "StateChange:state")
+    assert fault == [["coarse/state.measured_position stuck"], [""]]
+    begun, over = (each.sample for each in logged if each.topic == "/electrodynamic_actuator/events")
+    assert view.column("/states/electrodynamic_actuator/fault", "time") == [begun * STEP_NS, over * STEP_NS]
+
+
+def test_where_nothing_has_happened_there_are_neither_bands_nor_events(turned):
+    types = turned[1].types
+    silent = [topic for topic, kind in types.items() if kind == messages.EVENT]
+    rows = blueprint(types, silent=silent).root_container.contents[-1].contents
+    assert not any(isinstance(row, rrb.StateTimelineView) for row in rows)
+    assert any(isinstance(row, rrb.StateTimelineView) for row in blueprint(types).root_container.contents[-1].contents)
+
+
 def test_a_bag_without_a_tool_has_only_curves():
     types = {"/encoder": messages.ENCODER, "/x/state": messages.STATE, "/x/command": messages.SERVO}
     names = [view.name for view in blueprint(types).root_container.contents[-1].contents]
-    assert names == ["spindle speed [1/min]", "slides [mm]", "servo [own units]"]
+    assert names == [
+        "spindle speed [1/min]: measured blue, true orange",
+        "slides [mm]",
+        "servo [own units]: command blue, error orange",
+    ]
 
 
 # --- revolutions
@@ -250,12 +293,12 @@ def test_an_angle_that_no_spindle_has_is_refused(jump):
 
 
 def test_a_long_run_stays_small(tmp_path):
-    """Of 2000 revolutions the map has at most 512 rows, rings become rarer, nothing else piles up."""
+    """Of 1200 revolutions the map has at most 512 rows, rings become rarer, nothing else piles up."""
     types = {"encoder": messages.ENCODER, "tool": messages.TOOL}
     recording = rr.RecordingStream("test")
     recording.save(tmp_path / "long.rrd")
     scene = Scene(recording, types, STEP_NS, rate=50.0)
-    for first in range(0, 800_000, 80_000):
+    for first in range(0, 480_000, 80_000):
         angle = 2 * np.pi * np.arange(first, first + 80_000) / 400
         encoder = {"angle_true": angle, "speed": angle, "speed_true": angle}
         zeros = np.zeros(80_000)
@@ -266,9 +309,9 @@ def test_a_long_run_stays_small(tmp_path):
     view = View(tmp_path / "long.rrd")
     shapes = [row[0]["shape"] for row in view.column("/form_error/map", "Tensor:data")]
     assert max(shapes) <= [512, ANGLES]
-    assert shapes[-1] == [500, ANGLES]  # every fourth
+    assert shapes[-1] == [300, ANGLES]  # every fourth
     assert len(shapes) < 60
-    assert len(view.column("/machine/part/surface", "Mesh3D:vertex_positions")) == 512 + 256 + 244
+    assert len(view.column("/machine/part/surface", "Mesh3D:vertex_positions")) == 512 + 256 + 44
 
 
 # --- envelopes and pieces

@@ -15,6 +15,9 @@ from ros import SourcedRos, sourced_ros
 from steps import exclusive
 from workplace import PYTHON, ROOT, VENV, RefusalError, StepError, say
 
+COMPLETES = "_LATHE_COMPLETE"  #: in the environment: a shell asks what may follow
+OWN = ("setup", "test", "python")  #: commands of ./lathe alone
+
 
 def main(arguments: Sequence[str]) -> int:
     """Set up, then become the command; return an exit code on failure or if there is no command to run."""
@@ -24,6 +27,8 @@ def main(arguments: Sequence[str]) -> int:
         ros = sourced_ros(os.environ)
         if python := ros.python() if ros else settled(os.environ):
             change_to(python)
+        if COMPLETES in os.environ:
+            return complete(Recipe(ros).ready([]))
         wanted = set_up(ros, needed(arguments))
     except RefusalError as refusal:
         say(str(refusal))
@@ -36,6 +41,14 @@ def main(arguments: Sequence[str]) -> int:
         return 130
     if arguments[:1] != ["setup"]:
         os.execve(PYTHON, [str(PYTHON), *command(arguments)], run_environment(wanted, os.environ))
+    return 0
+
+
+def complete(ready: Changes | None) -> int:
+    """Become the command line that completes for a shell; where nothing is set up, say nothing."""
+    if ready:
+        environ = run_environment(ready, os.environ) | {"_LATHE_ALSO": " ".join(OWN)}
+        os.execve(PYTHON, [str(PYTHON), *command([])], environ)
     return 0
 
 

@@ -49,7 +49,7 @@ class Group(NamedTuple):
 GROUPS = {
     "docs": Group("docs.in", "5 s, 250 MB", sourced=True, npm=True),
     "notebook": Group("notebook.in", "10 s, 300 MB", sourced=True),
-    "sweep": Group("sweep.in", "5 s, 150 MB", sourced=True),
+    "sweep": Group("sweep.in", "5 s, 70 MB", sourced=True),
     "test": Group("test.in", "5 s, 300 MB", sourced=True),
     "view": Group("view.in", "10 s, 400 MB", sourced=False),
 }
@@ -130,7 +130,7 @@ class Recipe:
             step.run(BASE_PYTHON, "-m", "venv", *options, VENV, environ=build_environment(self._ros))
 
     def _install_packages(self, lock: int) -> None:
-        with Step("packages", "20 s, 900 MB", CHECK_NETWORK, lock) as step:
+        with Step("packages", "20 s, 1000 MB", CHECK_NETWORK, lock) as step:
             if self._ros:
                 environ = build_environment(self._ros)
                 found = step.run(BASE_PYTHON, "-c", LIST_PACKAGES, environ=environ).splitlines()

@@ -13,6 +13,7 @@ from lathe_rc import harness, part
 from lathe_rc.analysis.budget import Budget, Part
 from lathe_rc.analysis.metrology import Lay
 from lathe_rc.cell.durations import Lateness
+from lathe_rc.commands import plot
 
 _MOST_EVENTS = 12  # printed of a run
 _ALIKE = 4  # of them that follow one another: those in between are left out
@@ -93,6 +94,7 @@ def show(result: harness.Result, further: Mapping[str, Path], *, told: str = "",
     console = Console()
     if result.errors.rms.size:
         console.print(table(result))
+        plot.show(result, console)
     if result.event_log:
         console.print(_events(result))
     for fact in [*facts(result), *filter(None, [told])]:

@@ -10,7 +10,7 @@ from rich.console import Console
 from lathe_rc import harness, part
 from lathe_rc.bag.writing.record import recorder_of
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.commands import budgeting, outcome, picture
+from lathe_rc.commands import budgeting, outcome, picture, plot
 from lathe_rc.commands import scenario as scenarios
 from lathe_rc.commands.demos import Demo
 from lathe_rc.commands.progress import Watch
@@ -119,6 +119,7 @@ def demo(shown: Demo, revolutions: float, folder: Path) -> None:
     drawn = place.with_suffix(".png")
     picture.save(result.recording.plot(shown.title, beside), drawn)
     console.print(outcome.table(result))
+    plot.show(result, console)
     if beside:
         console.print(f"{shown.peer_name}: {', '.join(peer.errors.told()[1:])}", highlight=False)
     for fact in outcome.facts(result):

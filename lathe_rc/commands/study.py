@@ -79,7 +79,7 @@ class _StudyCommand(click.Command):
         if "quick" in subject.parameters.rows():
             options.append(click.Option(["--quick"], is_flag=True, help="as --set quick=true"))
         super().__init__(name, params=list(options), callback=self._run, help=subject.doc)
-        self._subject = subject
+        self.subject = subject
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Append the parameters."""
@@ -87,17 +87,17 @@ class _StudyCommand(click.Command):
             formatter.write_dl(
                 [
                     (name, f"{row.doc}; {row.allowed()}; default {json.dumps(row.default)}")
-                    for name, row in self._subject.parameters.rows().items()
+                    for name, row in self.subject.parameters.rows().items()
                 ]
             )
 
     def _run(self, overrides: tuple[str, ...], figure: Path, *, as_json: bool, quick: bool = False) -> None:
-        parameters = read(self._subject, (*overrides, "quick=true") if quick else overrides)
+        parameters = read(self.subject, (*overrides, "quick=true") if quick else overrides)
         picture.check_place(figure)
         console = Console(stderr=True)
         with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-            result = self._subject.run(parameters, lambda items: progress.track(items, description=self._subject.name))
-        _save(self._subject, result, figure)
+            result = self.subject.run(parameters, lambda items: progress.track(items, description=self.subject.name))
+        _save(self.subject, result, figure)
         if as_json:
             click.echo(json.dumps({**result.to_json(), "figure": str(figure)}, allow_nan=False))
             return

@@ -47,10 +47,12 @@ def check_crew(scheduler: str | None, workers: int | None) -> None:
 class _Sweep(click.Group):
     """``lathe sweep SCENARIO`` is short for ``lathe sweep run SCENARIO``."""
 
+    short_for = "run"
+
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """See `click.Command`."""
         if args and args[0] not in self.commands and args[0] not in ("-h", "--help"):
-            args = ["run", *args]
+            args = [self.short_for, *args]
         return super().parse_args(ctx, args)
 
 

@@ -49,8 +49,8 @@ def _last(source: Source, topic: str) -> Block | None:
     return newest[0] if newest else None
 
 
-def _foresee(path: Path) -> tuple[dict[str, str], int, float, "Outlook"]:
-    """Signal topics with their types, step [ns], length [s] and outlook of a bag."""
+def _foresee(path: Path) -> tuple[dict[str, str], list[str], int, float, "Outlook"]:
+    """Signal topics with their types, those without messages, step [ns], length [s] and outlook of a bag."""
     from lathe_rc.view.rerun_part import Outlook
 
     with Source(path) as source:
@@ -71,7 +71,8 @@ def _foresee(path: Path) -> tuple[dict[str, str], int, float, "Outlook"]:
             raise InputError(
                 f"{path}: step {step_ns} ns, {turned:g} turns, {travel:g} m along the part: not a cell's bag"
             )
-        return types, step_ns, (source.last_ns - START_NS) * 1e-9, Outlook(turned, travel)
+        silent = [topic for topic in types if not source.topics[topic].count]
+        return types, silent, step_ns, (source.last_ns - START_NS) * 1e-9, Outlook(turned, travel)
 
 
 def log(recording: "rr.RecordingStream", bag: Path, *, rate: float) -> int:
@@ -92,9 +93,9 @@ def log(recording: "rr.RecordingStream", bag: Path, *, rate: float) -> int:
     from lathe_rc.view.rerun_blueprint import blueprint
     from lathe_rc.view.rerun_scene import Scene
 
-    types, step_ns, length, outlook = _foresee(bag)
+    types, silent, step_ns, length, outlook = _foresee(bag)
     scene = Scene(recording, types, step_ns, outlook=outlook, rate=min(rate, _POINTS / max(length, 1e-9)))
-    recording.send_blueprint(blueprint(types))
+    recording.send_blueprint(blueprint(types, silent=silent))
     header = stream.feed(bag, [scene], piece=max(scene.window, _PIECE // scene.window * scene.window))
     scene.close()
     try:

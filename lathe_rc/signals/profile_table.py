@@ -181,7 +181,7 @@ class ProfileTable:
 
     Attributes:
         heights: [m], shape (m,).
-        table: polynomial coefficients of each interval, highest power first, shape (m, points, 4).
+        table: polynomial coefficients of each interval, highest power first, shape (m, points, 4); not to be written.
     """
 
     def __init__(self, profile: Profile, points: int = 4096) -> None:
@@ -193,6 +193,7 @@ class ProfileTable:
             values[-1] = values[0]
             spline = scipy.interpolate.CubicSpline(np.arange(points + 1.0), values, bc_type="periodic")
             row[:] = spline.c.T
+        self.table.flags.writeable = False
 
     def demand(self, speed: float, acceleration: float, feed: float) -> Demand:
         """The profile's demand at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], ``feed`` in m/rev."""

@@ -9,18 +9,13 @@ smallest and the largest goal, p and q its 5 and 95 % points.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lathe_rc.sweep.effects import Axis, Bins, Effect, Index, Samples, Yield, is_wide
+from lathe_rc.view.charts import FIT, SCHEMA, Rows, Spec
 
-Spec = dict[str, Any]
-Rows = list[dict[str, Any]]
-
-SCHEMA = "https://vega.github.io/schema/vega-lite/v6.json"
-FIT = {"type": "fit-x", "contains": "padding"}
 GOOD_TO_BAD = ("#2f7fd0", "#9460b4", "#cf5a3c", "#d99a1b")  #: seen on white and on black
 _MAP = "viridis"
 _LINE = "#2f8fae"

@@ -9,7 +9,7 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import combinations, permutations
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,11 @@ from lathe_rc import __version__, files
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.sweep import figures, row
 from lathe_rc.sweep.effects import LEAST, Axis, Bins, Effect, Yield, bins, effect, is_grid
-from lathe_rc.sweep.figures import Goal, Rows, Spec, said
+from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.parallel import parallel
 from lathe_rc.sweep.seen import GOAL, Seen, text_of
+from lathe_rc.view.charts import Charts
 from lathe_rc.view.page_template import page_template
 
 PAGE, FIGURES = "page.html", "figures"
@@ -66,27 +67,16 @@ class Written:
     figures: Sequence[Path]
 
 
-@dataclass(eq=False)
-class _Drawn:
-    """Figures of a page: specifications by figure and choice, the data sets of them all, and which is shown first."""
-
-    specs: dict[str, dict[str, Spec]] = field(default_factory=dict)
-    first: dict[str, str] = field(default_factory=dict)
-    data: dict[str, Rows] = field(default_factory=dict)
-
-    def add(self, name: str, specs: Mapping[str, Spec], first: str = "") -> None:
-        self.specs[name], self.first[name] = dict(specs), first
-
-    def pngs(self) -> dict[str, bytes]:
-        """The pictures by their names, each as it is shown first."""
-        found = {}
-        for name, specs in self.specs.items():
-            spec = {**specs[self.first[name]], "config": _LIGHT}
-            if name == "parallel-coordinates":
-                found[name] = vl_convert.vega_to_png(spec, scale=_SCALE)
-            else:
-                found[name] = vl_convert.vegalite_to_png({**spec, "datasets": self.data}, scale=_SCALE)
-        return found
+def _pngs(charts: Charts) -> dict[str, bytes]:
+    """The pictures by their names, each as it is shown first."""
+    found = {}
+    for name, specs in charts.specs.items():
+        spec = {**specs[charts.chosen[name]], "config": _LIGHT}
+        if name == "parallel-coordinates":
+            found[name] = vl_convert.vega_to_png(spec, scale=_SCALE)
+        else:
+            found[name] = vl_convert.vegalite_to_png({**spec, "datasets": charts.data}, scale=_SCALE)
+    return found
 
 
 def write(folder: Folder, goal: str = GOAL) -> Written:
@@ -101,10 +91,10 @@ def write(folder: Folder, goal: str = GOAL) -> Written:
         LatheError: the disk does not take it.
     """
     seen = Seen(folder, goal)
-    drawn = _Drawn()
+    drawn = Charts()
     text = _text(seen, drawn)
     place, page = folder.path / FIGURES, folder.path / PAGE
-    pngs = {place / f"{name}.png": png for name, png in drawn.pngs().items()}
+    pngs = {place / f"{name}.png": png for name, png in _pngs(drawn).items()}
     try:
         place.mkdir(exist_ok=True)
         for old in {place / f"{name}.png" for name in _NAMES} - pngs.keys():
@@ -119,7 +109,7 @@ def write(folder: Folder, goal: str = GOAL) -> Written:
     return Written(page, list(pngs))
 
 
-def _text(seen: Seen, drawn: _Drawn) -> str:
+def _text(seen: Seen, drawn: Charts) -> str:
     done = Yield(np.sort(seen.goal.values[seen.goal.order]), len(seen.cells), seen.goal.above)
     sections: dict[str, Any] = {"nothing": _nothing(seen)}
     if not sections["nothing"]:
@@ -136,10 +126,7 @@ def _text(seen: Seen, drawn: _Drawn) -> str:
         folder=shlex.quote(str(seen.folder.path)),
         version=__version__,
         least=LEAST,
-        specs=drawn.specs,
-        first=drawn.first,
-        data=drawn.data,
-        script=vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;") if drawn.specs else "",
+        charts=drawn,
         **sections,
     )
 
@@ -202,7 +189,7 @@ def _limits(seen: Seen) -> str:
     return ", ".join(f"{name} in {count} cells" for name, count in counts.most_common())
 
 
-def _sections(seen: Seen, done: Yield, drawn: _Drawn) -> dict[str, Any]:
+def _sections(seen: Seen, done: Yield, drawn: Charts) -> dict[str, Any]:
     """The sections of the template for cells that have a goal, and the figures."""
     grids = {goal.name: is_grid(seen.axes, goal.values) for goal in seen.goals}
     effects = {goal.name: [_effect(axis, goal, grid=grids[goal.name]) for axis in seen.axes] for goal in seen.goals}
@@ -255,7 +242,7 @@ def _told(found: Effect) -> str:
     return f"{share} ({rank})" if rank else share or "–"
 
 
-def _choices(seen: Seen, axes: Sequence[Axis], drawn: _Drawn) -> str:
+def _choices(seen: Seen, axes: Sequence[Axis], drawn: Charts) -> str:
     """Maps and lines of the parameters that matter most; says what of the cells is in them."""
     some = list(axes[:_MOST_AXES])
     free = [axis for axis in axes if not axis.tied]
@@ -281,7 +268,7 @@ def _choices(seen: Seen, axes: Sequence[Axis], drawn: _Drawn) -> str:
     return f"{told} Values{whose} are put into {most} bins of equal width." if binned else told
 
 
-def _parallel(seen: Seen, axes: Sequence[Axis], drawn: _Drawn) -> str:
+def _parallel(seen: Seen, axes: Sequence[Axis], drawn: Charts) -> str:
     """Parallel coordinates; says which cells are in them."""
     some = list(axes[:_MOST_LINES])
     margin = next((goal for goal in seen.goals if goal.name == "margin" and goal is not seen.goal), None)

@@ -21,17 +21,19 @@ import numpy as np
 from lathe_rc import __version__, messages
 from lathe_rc.analysis.budget import TOLD, Budget
 from lathe_rc.analysis.metrology import Lay
-from lathe_rc.analysis.tolerance import Verdict
 from lathe_rc.bag.provenance import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS, origins, scenario_of
 from lathe_rc.cell.budget import budget
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place, replacing
 from lathe_rc.part import along_in_words
+from lathe_rc.view import report_charts as charts
 from lathe_rc.view import report_figures as figures
+from lathe_rc.view.charts import Charts, Spec
 from lathe_rc.view.page_template import page_template
 from lathe_rc.view.report_form import CUTOFF, Form
 from lathe_rc.view.report_gather import Gathered, gather
 from lathe_rc.view.report_series import Envelope
+from lathe_rc.view.report_verdict import hint, judged
 
 _LONGEST_SCENARIO = 200_000  # characters
 _LONGEST_TEXT = 300
@@ -48,14 +50,23 @@ class Fact:
     mood: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Picture:
-    """A figure with what it shows and where its formula is."""
+    """A figure with what it shows and where its formula is.
+
+    Attributes:
+        name, caption, page: see above.
+        image: for paper, and where no script runs.
+        specs: what takes its place on a screen, see `Charts`; side by side if there are several.
+        places: their names on the page.
+    """
 
     name: str
     image: str
     caption: str
     page: str
+    specs: Sequence[Spec]
+    places: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -112,7 +123,7 @@ def _metrics(form: Form) -> Grid:
     return Grid(columns, rows, caption, "docs/metrology.md", ("",))
 
 
-def _form(form: Form, cycles: Mapping[str, Envelope]) -> FormSection:
+def _form(form: Form, cycles: Mapping[str, Envelope], maps: int) -> FormSection:
     refused = printable(form.refused)
     if form.first is None:
         return FormSection(printable(form.tool), refused or "the bag holds no complete revolution", None, ())
@@ -125,18 +136,21 @@ def _form(form: Form, cycles: Mapping[str, Envelope]) -> FormSection:
             "Radius of the part less desired radius over spindle angle and revolution; red: material left. The "
             f"colours are linear around zero and logarithmic beyond the largest of the last quarter.{grouped}",
             page,
+            [charts.form_map(form, maps)],
         ),
         Picture(
             "First and last revolution",
             figures.polar(form),
             "Radius deviation around the part, each in its own scale; dashed: the desired form.",
             page,
+            charts.polar(form),
         ),
         Picture(
             "Error spectrum",
             figures.spectrum(form),
             "Amplitude A_n of r = Σ A_n·sin(nφ + ψ_n) by undulations per revolution n.",
             page,
+            [charts.spectrum(form)],
         ),
         Picture(
             "Convergence",
@@ -144,12 +158,14 @@ def _form(form: Form, cycles: Mapping[str, Envelope]) -> FormSection:
             "RMS over the angle and largest magnitude of the true form error by revolution; dots: what each controller "
             "measured in its own cycles, which begin and end elsewhere.",
             f"{page}, docs/learning.md",
+            [charts.convergence(form, cycles)],
         ),
     ]
     if isinstance(form.surface, Lay):
         told = along_in_words(form.surface)
         caption = f"{told[0].upper()}{told[1:]}. What nose and feed leave, by the tool's nose_radius."
-        pictures.append(Picture("Surface along the part", figures.along(form.surface), caption, page))
+        along = figures.along(form.surface), caption, page, charts.along(form.surface)
+        pictures.append(Picture("Surface along the part", *along))
     elif form.surface:
         refused = f"{refused} {form.surface}".strip()
     return FormSection(printable(form.tool), refused, _metrics(form), pictures)
@@ -172,7 +188,8 @@ def _signals(told: Gathered) -> list[Picture]:
             group = max(series.group for series in curves.values())
             if group > 1:
                 caption += f" The band spans the extremes of {group} samples each, the line is its middle."
-            pictures.append(Picture(name, figures.against_time(told, curves, unit, scale), caption, page))
+            drawn = figures.against_time(told, curves, unit, scale)
+            pictures.append(Picture(name, drawn, caption, page, [charts.against_time(told, curves, unit, scale)]))
     return pictures
 
 
@@ -186,7 +203,9 @@ def _timing(told: Gathered) -> Picture | None:
         "only where the speed is given. Latency: from there until the time master had heard that every member had "
         "completed the block; members report several blocks at a time."
     )
-    return Picture("Pace, lateness and latency", figures.timing(host, told.step_ns * 1e-9), caption, "docs/cell.md")
+    step = told.step_ns * 1e-9
+    drawn, specs = figures.timing(host, step), charts.timing(host, step)
+    return Picture("Pace, lateness and latency", drawn, caption, "docs/cell.md", specs)
 
 
 def _nodes(told: Gathered) -> Grid | None:
@@ -210,7 +229,8 @@ def _nodes(told: Gathered) -> Grid | None:
     return Grid(columns, rows, caption, "docs/cell.md", ("node", "worst", "message"))
 
 
-def _losses(told: Gathered) -> list[str]:
+def losses(told: Gathered) -> list[str]:
+    """What was refused, lost or failed, a line each."""
     host = told.host
     found = [f"reading stopped: {told.stopped}"] if told.stopped else []
     for topic, tally in islice(told.topics.items(), _MOST_ROWS):
@@ -304,16 +324,6 @@ def _about(told: Gathered) -> Grid | None:
     return Grid(("key", "text"), _cut(rows, len(given)), caption, "docs/bags.md", ("key", "text"))
 
 
-def _judged(found: Verdict) -> list[Fact]:
-    """Whether a form is in tolerance."""
-    tolerance = f"±{found.tolerance * 1e6:.4g} µm"
-    if found.in_tolerance:
-        facts = [Fact(f"{tolerance}, from revolution {found.since} on", "in tolerance", "good")]
-        return [*facts, Fact("to spare at the end", f"{_number(found.spare * 1e6)} µm", "good")]
-    facts = [Fact(f"{tolerance}, in the last revolution", "not in tolerance", "bad")]
-    return [*facts, Fact("too much", f"{_number(-found.spare * 1e6)} µm", "bad")]
-
-
 def _budget(found: Budget) -> Grid:
     rows = [[part.name, part.percent(), _number(part.rms * 1e6), _number(part.largest * 1e6)] for part in found.rows]
     rows.append(["form error", "100.0", _number(found.rms * 1e6), _number(found.largest * 1e6)])
@@ -336,9 +346,7 @@ def _budgeted(told: Gathered) -> Budget:
 
 def _facts(told: Gathered) -> list[Fact]:
     whole = Fact("recording", "complete", "good") if told.complete else Fact("recording", "incomplete", "bad")
-    judged = [fact for form in told.forms[:1] if form.verdict for fact in _judged(form.verdict)]
     facts = [
-        *judged,
         whole,
         Fact("simulated", f"{told.seconds:.4g} s"),
         Fact("samples", f"{told.samples:,}".replace(",", " ")),
@@ -364,22 +372,32 @@ def render(told: Gathered, name: str, command: str, made_of: Budget | None = Non
     """
     with mpl.rc_context(figures.STYLE), np.errstate(over="ignore", invalid="ignore"):
         cycles = {f"{topic}: {field}": found for (topic, field), found in told.curves.cycles.items() if found.size}
-        forms = [_form(form, cycles) for form in told.forms]
+        forms = [_form(form, cycles, len(told.forms)) for form in told.forms]
         signals, timing = _signals(told), _timing(told)
         if cycles and not any(form.figures for form in forms):
             caption = "The controllers' own measurements, by cycle."
-            signals.append(Picture("Convergence", figures.convergence(None, cycles), caption, "docs/learning.md"))
+            specs = [charts.convergence(None, cycles)]
+            drawn = figures.convergence(None, cycles)
+            signals.append(Picture("Convergence", drawn, caption, "docs/learning.md", specs))
+    pictures = [*(each for form in forms for each in form.figures), *signals, *([timing] if timing else [])]
+    shown = Charts()
+    for number, picture in enumerate(pictures):
+        picture.places = [f"figure-{number}-{k}" for k in range(len(picture.specs))]
+        for place, spec in zip(picture.places, picture.specs, strict=True):
+            shown.add(place, {"": spec})
     text: str = page_template(Path(__file__).with_name("report.html.j2")).render(
         title=f"Report of {printable(name, 80)}",
         command=printable(command),
         version=__version__,
+        charts=shown,
+        judged=judged(told, losses(told), made_of),
+        budget_hint=hint(told, made_of),
         facts=_facts(told),
         budget=_budget(made_of) if made_of else None,
         forms=forms,
         signals=signals,
         timing=timing,
         nodes=_nodes(told),
-        losses=_losses(told),
         states=[printable(state) for state in told.host.states],
         topics=_topics(told),
         events=_events(told),

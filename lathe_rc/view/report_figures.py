@@ -4,6 +4,7 @@
 import base64
 import io
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,8 +27,9 @@ _CYCLE_COLOURS = (FIRST, BEST, "#5b7f3a", "#7d5a9b")
 _WIDTH = 9.2  # [in]
 _TICKS = 8  # font size
 _LONGEST_LABEL = 60  # characters
-_MOST_LENGTH = 1e3  # [m]
+LONGEST_LENGTH = 1e3  #: that is drawn [m]
 _MOST_VALUE = 1e12  # of other signals
+FLOOR = 1e-3  #: size of a form error that a figure takes for the least [µm]
 _ALMOST = 1e-9  # of their size, by which numbers differ that count as two
 STYLE: Any = {"svg.hashsalt": "lathe_rc", "axes.titlesize": 10, "axes.labelsize": 9, "legend.fontsize": 8}
 STYLE |= {"xtick.labelsize": _TICKS, "ytick.labelsize": _TICKS}
@@ -39,10 +41,26 @@ def plain(text: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in shown).replace("$", r"\$")
 
 
-def _um(length: Samples) -> Samples:
+def um(length: Samples) -> Samples:
     """Lengths [m] in µm; absurd ones are cut at 1 km, for figures of a bag that holds just anything."""
-    cut: Samples = np.clip(np.nan_to_num(length), -_MOST_LENGTH, _MOST_LENGTH) * 1e6
+    cut: Samples = np.clip(np.nan_to_num(length), -LONGEST_LENGTH, LONGEST_LENGTH) * 1e6
     return cut
+
+
+def limited(values: Samples) -> Samples:
+    """Other signals; absurd values are cut."""
+    cut: Samples = np.clip(values, -_MOST_VALUE, _MOST_VALUE)
+    return cut
+
+
+def colour_range(rows: Samples) -> tuple[float, float]:
+    """Largest magnitude of a map [µm], and up to which its colours are linear: what is left at the end.
+
+    So both the first cycles and the rest can be seen.
+    """
+    largest = max(float(np.abs(rows).max()), FLOOR)
+    rest = float(np.abs(rows[-max(1, len(rows) // 4) :]).max())
+    return largest, min(max(rest, largest * 1e-4), largest)
 
 
 def _figure(height: float) -> Figure:
@@ -68,12 +86,10 @@ def _band(axes: Axes, place: Samples, low: Samples, high: Samples, colour: str, 
 
 def form_map(form: Form) -> str:
     """Radius deviation by revolution and angle."""
-    rows = _um(form.map.rows())
+    rows = um(form.map.rows())
     figure = _figure(3.6)
     axes = figure.subplots()
-    largest = max(float(np.abs(rows).max()), 1e-3)
-    # Linear up to what is left at the end, so that both the first cycles and the rest can be seen.
-    linear = min(max(float(np.abs(rows[-max(1, len(rows) // 4) :]).max()), largest * 1e-4), largest)
+    largest, linear = colour_range(rows)
     revolutions = np.minimum(np.arange(len(rows) + 1) * form.map.group, form.map.size) + 0.5
     degrees = np.linspace(0, 360, rows.shape[1] + 1)
     norm = SymLogNorm(linear, linscale=1.0, vmin=-largest, vmax=largest, base=10)
@@ -92,8 +108,8 @@ def along(surface: Lay) -> str:
     """The surface along the part over angle and height, and one trace of it."""
     figure = _figure(3.2)
     whole, trace = figure.subplots(1, 2, width_ratios=(3, 2))
-    closed = _um(np.concatenate((surface.surface, surface.surface[:1])))
-    place = np.clip(surface.height, -_MOST_LENGTH, _MOST_LENGTH) * 1e3
+    closed = um(np.concatenate((surface.surface, surface.surface[:1])))
+    place = np.clip(surface.height, -LONGEST_LENGTH, LONGEST_LENGTH) * 1e3
     degrees = np.linspace(0, 360, closed.shape[0])
     mesh = whole.pcolormesh(degrees, place, closed.T, shading="gouraud", cmap="viridis", rasterized=True)
     whole.set(xlabel="spindle angle [°]", ylabel="height [mm]", xticks=range(0, 361, 90))
@@ -112,9 +128,9 @@ def polar(form: Form) -> str:
     for place, (revolution, colour) in enumerate(((form.first, FIRST), (form.last, LAST)), start=1):
         axes = figure.add_subplot(1, 2, place, projection="polar")
         assert isinstance(axes, PolarAxes)
-        deviation = _um(np.append(revolution.profile, revolution.profile[0]))
+        deviation = um(np.append(revolution.profile, revolution.profile[0]))
         angle = np.linspace(0, 2 * np.pi, deviation.size)
-        size = max(float(np.abs(deviation).max()), 1e-3)
+        size = max(float(np.abs(deviation).max()), FLOOR)
         axes.plot(angle, np.zeros_like(angle), color="#444444", lw=1.1, ls="--")
         axes.plot(angle, deviation, color=colour, lw=1.3)
         axes.set_rlim(-2.2 * size, 1.15 * size)
@@ -147,12 +163,12 @@ def spectrum(form: Form) -> str:
     shown = shown_revolutions(form)
     width = 0.8 / len(shown)
     for k, (name, colour, revolution) in enumerate(shown):
-        amplitude = _um(revolution.amplitude[1:])
+        amplitude = um(revolution.amplitude[1:])
         order = np.arange(1, amplitude.size + 1)
         label = f"{name} revolution ({revolution.numbers['revolution']})"
         axes.bar(order + (k - (len(shown) - 1) / 2) * width, amplitude, width, color=colour, label=label)
     axes.set(xlabel="undulations per revolution", ylabel="amplitude [µm]", xlim=(0.4, 50.6))
-    top = max(float(_um(r.amplitude[1:]).max()) for _, _, r in shown)
+    top = max(float(um(r.amplitude[1:]).max()) for _, _, r in shown)
     if top > 0.0:
         axes.set(yscale="log", ylim=(top * 1e-6, top * 2))
     _grid(axes)
@@ -170,10 +186,13 @@ def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> str:
             (form.rms, LAST, "form error, RMS"),
         ):
             place, low, high = series.curve()
-            _band(axes, place + 1, _um(low), _um(high), colour, label)
+            _band(axes, place + 1, um(low), um(high), colour, label)
     for (name, series), colour in zip(cycles.items(), _CYCLE_COLOURS, strict=False):
         place, low, high = series.curve()
-        axes.plot(place + 1, (_um(low) + _um(high)) / 2, ".", color=colour, ms=4, label=plain(name))
+        axes.plot(place + 1, (um(low) + um(high)) / 2, ".", color=colour, ms=4, label=plain(name))
+    if form and form.tolerance:
+        limit = form.tolerance * 1e6
+        axes.axhline(limit, color=_GREY, lw=1.0, ls="--", label=f"tolerance {limit:.3g} µm")
     axes.set(xlabel="revolution or cycle", ylabel="error [µm]", yscale="log")
     _grid(axes)
     axes.legend(loc="upper right")
@@ -193,7 +212,7 @@ def against_time(told: Gathered, curves: Mapping[str, Envelope], unit: str, scal
     axes = figure.subplots()
     for (name, series), colour in zip(curves.items(), _COLOURS, strict=False):
         place, low, high = series.curve()
-        low, high = np.clip([low, high], -_MOST_VALUE, _MOST_VALUE) * scale
+        low, high = limited(np.array([low, high])) * scale
         _band(axes, told.at(place), low, high, colour, plain(name))
     axes.set(xlabel="time since sample 0 [s]", ylabel=unit)
     axes.set_xmargin(0.01)
@@ -212,28 +231,51 @@ def _told_apart(numbers: Samples) -> tuple[float, float] | None:
     return (low, high) if high - low > least else (low - 0.5 - least, high + 0.5 + least)
 
 
-def timing(host: Host, step: float) -> str:
-    """Histograms of pace, and of lateness and latency of blocks where there are any; ``step`` in s."""
-    figure = _figure(2.8)
-    counted = [
-        (title, label, np.sum([each.counts for each in found.values()], axis=0), colour)
-        for title, label, found, colour in (
-            ("lateness", "let go after it was due [ms]", host.lateness, BEST),
-            ("latency", "until completed by all [ms]", host.latency, LAST),
-        )
-        if any(any(each.counts) for each in found.values())
-    ]
-    pace, *others = figure.subplots(1, 1 + len(counted), squeeze=False)[0]
-    numbers = np.clip(host.pace.values(), -_MOST_VALUE, _MOST_VALUE) * step
+@dataclass(frozen=True)
+class Histogram:
+    """Counts of bins.
+
+    Attributes:
+        counts: shape (bins,).
+        edges: shape (bins + 1,).
+        across, up: what the axes say.
+        log: the bins are as wide as they are far from 0.
+    """
+
+    counts: Samples
+    edges: Samples
+    across: str
+    up: str
+    log: bool = False
+
+
+def histograms(host: Host, step: float) -> dict[str, Histogram]:
+    """Of pace, and of lateness and latency of blocks where there are any; ``step`` in s."""
+    numbers = limited(host.pace.values()) * step
     bins = min(30, max(5, numbers.size // 3))
-    pace.hist(numbers, bins=bins, range=_told_apart(numbers), color=_GREY, edgecolor="white", lw=0.5)
-    pace.set(xlabel="simulated by wall time [s/s]", ylabel="reports", title="pace")
-    pace.yaxis.get_major_locator().set_params(integer=True)
-    for axes, (title, label, counts, colour) in zip(others, counted, strict=True):
-        used = np.flatnonzero(counts)
-        edges = 2.0 ** np.arange(used[0] - 1, used[-1] + 1) * 1e-3
-        axes.stairs(counts[used[0] : used[-1] + 1], edges, fill=True, color=colour, edgecolor="white", lw=0.5)
-        axes.set(xscale="log", xlabel=label, ylabel="blocks", title=title)
-    for axes in (pace, *others):
+    counts, edges = np.histogram(numbers, bins=bins, range=_told_apart(numbers))
+    found = {"pace": Histogram(counts, edges, "simulated by wall time [s/s]", "reports")}
+    for name, across, durations in (
+        ("lateness", "let go after it was due [ms]", host.lateness),
+        ("latency", "until completed by all [ms]", host.latency),
+    ):
+        if any(any(each.counts) for each in durations.values()):
+            counts = np.sum([each.counts for each in durations.values()], axis=0)
+            used = np.flatnonzero(counts)
+            edges = 2.0 ** np.arange(used[0] - 1, used[-1] + 1) * 1e-3
+            found[name] = Histogram(counts[used[0] : used[-1] + 1], edges, across, "blocks", log=True)
+    return found
+
+
+def timing(host: Host, step: float) -> str:
+    """The figure of `histograms`."""
+    figure = _figure(2.8)
+    found = histograms(host, step)
+    colours = {"pace": _GREY, "lateness": BEST, "latency": LAST}
+    for axes, (name, each) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items(), strict=True):
+        axes.stairs(each.counts, each.edges, fill=True, color=colours[name], edgecolor="white", lw=0.5)
+        axes.set(xscale="log" if each.log else "linear", xlabel=each.across, ylabel=each.up, title=name)
+        if not each.log:
+            axes.yaxis.get_major_locator().set_params(integer=True)
         _grid(axes)
     return _svg(figure)

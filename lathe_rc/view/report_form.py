@@ -10,7 +10,7 @@ import numpy as np
 
 from lathe_rc import part
 from lathe_rc.analysis.metrology import POINTS, Lay, Measurement, evenly, lay, measure
-from lathe_rc.analysis.tolerance import Judge, Verdict
+from lathe_rc.analysis.tolerance import LAST, Judge, Verdict
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Samples, Signals
@@ -50,16 +50,17 @@ class Form:
         nose_radius: of the tool in the plane of the feed [m]; 0: nobody asks for the surface along the part.
 
     Attributes:
-        tool: see above.
+        tool, tolerance: see above.
         first, last, best: revolutions, the best by RMS; None before there is one.
         rms, largest: envelope by revolution [m].
         map: radius deviation [m], by revolution and angle.
+        newest: radius deviation of the last revolutions at even angles [m], shape (points,) each.
         surface: along the part, or why there is none; None if nobody asks.
         refused: why the form, or its rest, is not measured; empty if it is.
     """
 
     def __init__(self, encoder: str, tool: str, tolerance: float = 0.0, nose_radius: float = 0.0) -> None:
-        self._encoder, self.tool, self._tolerance = encoder, tool, tolerance
+        self._encoder, self.tool, self.tolerance = encoder, tool, tolerance
         self._nose_radius = nose_radius
         self._judge: Judge | None = None
         self._angle, self._error, self._height = np.empty(0), np.empty(0), np.empty(0)
@@ -71,6 +72,7 @@ class Form:
         self.best: Revolution | None = None
         self.rms, self.largest = Envelope(), Envelope()
         self.map = MeanRows(ACROSS)
+        self.newest = deque[Samples](maxlen=LAST)
         self.refused = ""
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
@@ -153,11 +155,12 @@ class Form:
     def _take(self, found: Measurement, whole: int) -> None:
         for row in found.profile[:whole].reshape(whole, ACROSS, POINTS // ACROSS).mean(axis=-1):
             self.map.add(row)
+        self.newest.extend(found.profile[max(0, whole - LAST) : whole].copy())
         rms = found.form.rms[:whole]
         self.rms.add(rms)
         self.largest.add(found.form.largest[:whole])
-        if self._tolerance:
-            self._judge = self._judge or Judge(self._tolerance, self._done)
+        if self.tolerance:
+            self._judge = self._judge or Judge(self.tolerance, self._done)
             self._judge.add(found.form.largest[:whole])
         if self.first is None:
             self.first = self._revolution(found, 0)

@@ -58,6 +58,25 @@ class Tally:
         return (self.count - 1) / (span * 1e-9) if span > 0 else np.nan
 
 
+@dataclass
+class Alike:
+    """Events of a topic that say the same, but for numbers behind a colon.
+
+    Attributes:
+        topic, text: who said what, the first time.
+        alarm: it is of a supervisor, and the cell is not as it should be.
+        first, last: samples at which it was said.
+        count: how many times.
+    """
+
+    topic: str
+    text: str
+    alarm: bool
+    first: int
+    last: int = 0
+    count: int = 0
+
+
 class Curves:
     """Signals and cycles to be drawn; a sink, see `lathe_rc.cell.engine.Sink`.
 
@@ -65,6 +84,7 @@ class Curves:
         signals: envelope by topic and field.
         cycles: the same, of what a controller achieved in each cycle.
         events: the first of them; ``event_count`` counts all.
+        kinds: of events, by topic and what is the same in them; the first of them.
     """
 
     def __init__(self, types: Mapping[str, str]) -> None:
@@ -78,6 +98,7 @@ class Curves:
         self.cycles = {(topic, name): Envelope() for kind, name in _CYCLES.items() for topic in of_type(types, kind)}
         self.events: list[LogEntry] = []
         self.event_count = 0
+        self.kinds: dict[tuple[str, str], Alike] = {}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
@@ -89,7 +110,21 @@ class Curves:
             if self._types[topic] in LOGGED:
                 self.event_count += len(found)
                 room = max(0, _MOST_EVENTS - len(self.events))
-                self.events += [LogEntry(event.index, topic, event_log.text(event)) for event in found[:room]]
+                said = [LogEntry(event.index, topic, event_log.text(event)) for event in found]
+                self.events += said[:room]
+                for event, entry in zip(found, said, strict=True):
+                    self._count(entry, alarm=bool(event.values.get("state")))
+
+    def _count(self, entry: LogEntry, *, alarm: bool) -> None:
+        """Count an event of its kind."""
+        topic, text = entry.topic, entry.text
+        # Of an alarm: monitor and subject, which come before what was found.
+        key = topic, " ".join(text.split()[:2]) if alarm else text.partition(":")[0]
+        if key not in self.kinds and len(self.kinds) < _MOST_EVENTS:
+            self.kinds[key] = Alike(topic, text, alarm, entry.sample)
+        if key in self.kinds:
+            self.kinds[key].last = entry.sample
+            self.kinds[key].count += 1
 
 
 def of_type(types: Mapping[str, str], kind: str) -> list[str]:

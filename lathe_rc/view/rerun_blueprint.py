@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a run opens in Rerun: the part and its error map on the left, curves on the right."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import rerun.blueprint as rrb
 
 from lathe_rc import messages
 from lathe_rc.event_log import LOGGED
 from lathe_rc.view import rerun_part as parts
-from lathe_rc.view.rerun_signals import ERROR, PLOTS, POSITION, curve_path, curves
+from lathe_rc.view.rerun_signals import CYCLES, DRIVE, ERROR, PLOTS, POSITION, curve_path, curves
+from lathe_rc.view.rerun_states import ROOT
 
 _LATEST_S, _LATEST_REVOLUTIONS = 0.3, 5  # before the time cursor, in plots of fast signals
-_FAST = {ERROR, POSITION}
+_FAST = {ERROR, POSITION, DRIVE}
+_COLOURS = ("blue", "orange", "green")  # as words, of the first curves of a plot
 
 
 def _so_far() -> list[rrb.VisibleTimeRange]:
@@ -34,17 +36,29 @@ def _latest() -> list[rrb.VisibleTimeRange]:
 
 
 def _plots(types: Mapping[str, str]) -> dict[str, rrb.TimeSeriesView]:
-    """A plot of curves each, of those that there are."""
+    """A plot of curves each, of those that there are.
+
+    A legend would lie on the curves: where they are few, the title names their colours instead.
+    """
     paths: dict[str, list[str]] = {}
+    labels: dict[str, list[str]] = {}
     for topic, fields in curves(types).items():
         for field, curve in fields.items():
             paths.setdefault(curve.plot, []).append("/" + curve_path(topic, field))
+            labels.setdefault(curve.plot, []).append(curve.label)
+
+    def named(plot: str, unit: str) -> str:
+        few = len(labels[plot]) <= len(_COLOURS) and len(set(labels[plot])) == len(labels[plot]) > 1
+        which = [f"{label} {colour}" for label, colour in zip(labels[plot], _COLOURS, strict=False)] if few else []
+        latest = [f"latest {_LATEST_S:g} s"] if plot in _FAST else []
+        return ": ".join(filter(None, [f"{plot} [{unit}]", ", ".join([*which, *latest])]))
+
     return {
         plot: rrb.TimeSeriesView(
             origin="/signals",
             contents=paths[plot],
-            name=f"{plot} [{unit}]" + (f", latest {_LATEST_S:g} s" if plot in _FAST else ""),
-            plot_legend=rrb.Corner2D.LeftTop,
+            name=named(plot, unit),
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=len(paths[plot]) > len(_COLOURS)),
             time_ranges=_latest() if plot in _FAST else None,
         )
         for plot, unit in PLOTS.items()
@@ -59,7 +73,7 @@ def _part() -> rrb.Vertical:
             origin="/machine",
             name="part, colour: form error",
             eye_controls=rrb.EyeControls3D(
-                position=(1.3 * parts.RADIUS, 3.2 * parts.RADIUS, middle + 1.6 * parts.RADIUS),
+                position=(1.5 * parts.RADIUS, 3.6 * parts.RADIUS, middle + 1.8 * parts.RADIUS),
                 look_target=(-0.15 * parts.RADIUS, 0.0, middle),
                 eye_up=(1.0, 0.0, 0.0),
             ),
@@ -69,7 +83,7 @@ def _part() -> rrb.Vertical:
         ),
         rrb.TensorView(
             origin="/form_error/map",
-            name="form error over angle: log10 |µm|",
+            name="form error over angle, a row a revolution; colours as at the part",
             scalar_mapping=rrb.TensorScalarMapping(colormap=parts.COLOURS, mag_filter="nearest"),
             view_fit="fill",
         ),
@@ -77,33 +91,46 @@ def _part() -> rrb.Vertical:
     )
 
 
-def blueprint(types: Mapping[str, str], *, live: bool = False) -> rrb.Blueprint:
+def blueprint(types: Mapping[str, str], *, live: bool = False, silent: Collection[str] = ()) -> rrb.Blueprint:
     """The layout for a run with these topics.
 
     Args:
         types: message type by topic.
         live: the picture follows what comes in.
+        silent: topics on which nothing was said.
     """
     kinds = set(types.values())
+    said = {kind for topic, kind in types.items() if topic not in silent}
     plots = _plots(types)
     left = _part() if {messages.ENCODER, messages.TOOL} <= kinds else None
+    cycles = sum(kind in CYCLES for kind in types.values())
     top: list[rrb.View] = []
     if left or kinds & {messages.LEARNING, messages.PERIODIC}:
         top.append(
             rrb.TimeSeriesView(
-                origin="/learning", name="learning: log10 of the error in µm", plot_legend=rrb.Corner2D.RightTop
+                origin="/learning",
+                name="form error by revolution [10^y µm]: RMS blue, largest orange",
+                plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=cycles > 1),
             )
         )
     if left:
-        top.append(rrb.BarChartView(origin="/form_error/spectrum", name="form error by harmonic [µm]"))
+        top.append(
+            rrb.BarChartView(
+                origin="/form_error/spectrum",
+                name="form error by harmonic [µm]",
+                plot_legend=rrb.PlotLegend(visible=False),
+            )
+        )
     first = [plots.pop(plot) for plot in (ERROR, POSITION) if plot in plots]
-    rows: list[rrb.View | rrb.Container] = [rrb.Horizontal(*top)] if top else []
+    rows: list[rrb.View | rrb.Container] = [rrb.Horizontal(*top, column_shares=[3, 2][: len(top)])] if top else []
     rows += first
     tabs: list[rrb.View] = list(plots.values())
-    if live or kinds & {*LOGGED}:  # live, what had to be left out stands there
+    if live or said & {*LOGGED}:  # live, what had to be left out stands there
         tabs.append(rrb.TextLogView(origin="/events", name="events"))
     if tabs:
         rows.append(rrb.Tabs(*tabs, active_tab=0))
+    if messages.SAFETY_STATUS in kinds or said & {*LOGGED}:
+        rows.append(rrb.StateTimelineView(origin=f"/{ROOT}", name="states of the supervisor, faults, limits met"))
     right = rrb.Vertical(*rows)
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[4, 5]) if left else right,

@@ -18,6 +18,7 @@ from lathe_rc.errors import LatheError, shown
 from lathe_rc.event_log import LOGGED
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view import rerun_part as parts
+from lathe_rc.view import rerun_states
 from lathe_rc.view.rerun_revolutions import ANGLES, HIGHEST, Revolution, Revolutions
 from lathe_rc.view.rerun_signals import CYCLES, curve_path, curves, envelope
 
@@ -59,6 +60,7 @@ class Scene:
     ) -> None:
         self._recording, self._step_ns = recording, step_ns
         self._types: dict[str, str] = {}
+        self._nominal: set[str] = set()  # supervisors whose first state is shown
         self._outlook = outlook or parts.Outlook()
         self.window = max(1, int(np.ceil(2e9 / (rate * step_ns))))
         self._pose = max(1, int(np.ceil(1e9 / (_POSES * step_ns))))
@@ -91,6 +93,7 @@ class Scene:
             LatheError: the recording cannot be written, or no part can have been turned with such an angle.
         """
         del samples
+        self._begin(first)
         named = {full(topic): signals for topic, signals in dense.items()}
         angle = named[self._encoder]["angle_true"] if self._encoder in named else None
         turns = None if angle is None else angle / (2.0 * np.pi)
@@ -175,6 +178,17 @@ class Scene:
 
     # --- pieces
 
+    def _begin(self, first: int) -> None:
+        """A supervisor says nothing until it changes: until then the cell is nominal."""
+        for topic, kind in self._types.items():
+            if kind == messages.SAFETY_STATUS and topic not in self._nominal:
+                self._nominal.add(topic)
+                path, states = rerun_states.supervisor(topic), rerun_states.COLOURS
+                colours = np.array(list(states.values()), dtype=np.uint32)
+                self._static(path, rr.StateConfiguration(values=list(states), colors=colours))
+                when = self._when(np.array([first]), None)
+                self._send(path, when, rr.StateChange.columns(state=[next(iter(states))]))
+
     def _curve(self, path: str, first: int, values: Samples, turns: Samples | None) -> None:
         """Points of a curve."""
         at = envelope(values, self.window)
@@ -191,6 +205,11 @@ class Scene:
             number = np.array([message.values[cycle.counter] for message in found])
             self._send(f"learning{topic}", self._when(index, number), rr.Scalars.columns(scalars=values))
         elif kind in LOGGED:
+            for message in found:
+                if change := rerun_states.band(message):
+                    path, state = change
+                    when = self._when(np.array([message.index]), None)
+                    self._send(path, when, rr.StateChange.columns(state=[state]))
             texts = [f"{topic.strip('/')}: {event_log.text(message)}" for message in found]
             self._send("events", self._when(index, None), rr.TextLog.columns(text=texts))
 

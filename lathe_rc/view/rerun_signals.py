@@ -27,19 +27,21 @@ class Curve:
     scale: float
 
 
-ERROR, POSITION, FORCE, SPEED, SLIDE, SERVO = "tool error", "positions", "force", "spindle speed", "slides", "servo"
-PLOTS = {ERROR: "µm", POSITION: "µm", FORCE: "N", SPEED: "1/min", SLIDE: "mm", SERVO: "own units"}  #: and their units
+ERROR, POSITION, DRIVE = "tool error", "tool position", "drives"
+FORCE, SPEED, SLIDE, SERVO = "force", "spindle speed", "slides", "servo"
+PLOTS = {ERROR: "µm", POSITION: "µm", FORCE: "N", SPEED: "1/min", DRIVE: "µm", SLIDE: "mm"}  #: and their units
+PLOTS |= {SERVO: "own units"}
 
 _RPM = 60.0 / (2.0 * np.pi)
 _CURVES: dict[str, dict[str, Curve]] = {
     messages.ENCODER: {"speed": Curve(SPEED, "measured", _RPM), "speed_true": Curve(SPEED, "true", _RPM)},
-    messages.COMMAND: {"position": Curve(POSITION, "set", 1e6)},
-    messages.STATE: {"position": Curve(POSITION, "actual", 1e6)},
+    messages.COMMAND: {"position": Curve(DRIVE, "set", 1e6)},
+    messages.STATE: {"position": Curve(DRIVE, "actual", 1e6)},
     messages.TOOL: {
         "error": Curve(ERROR, "true", 1e6),
         "measured_error": Curve(ERROR, "measured", 1e6),
-        "displacement": Curve(POSITION, "actual", 1e6),
         "reference": Curve(POSITION, "desired", 1e6),
+        "displacement": Curve(POSITION, "actual", 1e6),
     },
     messages.CUT: {"force": Curve(FORCE, "true", 1.0), "measured_force": Curve(FORCE, "measured", 1.0)},
     messages.SERVO: {"command": Curve(SERVO, "command", 1.0), "error": Curve(SERVO, "error", 1.0)},

@@ -9,7 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from test_report_browser import Visit
+from test_report_browser import Visit, by_hand
 from test_sweep_page import LAW, LEAD, Q, Shown, bowl, swept
 
 from lathe_rc.sweep import page
@@ -54,10 +54,7 @@ def test_figures_are_drawn_chosen_and_brushed(tmp_path):
     space = Space(grid={LEAD: "1e-3:3e-3:9", Q: "1e-5:1e-3:7:log", LAW: ["constant_angle", "variable"]})
     written = page.write(swept(tmp_path / "sweep", space, bowl))
     text = written.page.read_text(encoding="utf-8")
-    library = text.index("</script>") + len("</script>")
-    driven = tmp_path / "driven.html"
-    driven.write_text(text[:library] + _HAND + text[library:], encoding="utf-8")
-    visit = Visit(driven, tmp_path, "--window-size=900,900")
+    visit = Visit(by_hand(text, _HAND, tmp_path), tmp_path, "--window-size=900,900")
     assert visit.console == []
     assert visit.requests == []
     told = re.search(r"<title>(.*)</title>", visit.document)[1]

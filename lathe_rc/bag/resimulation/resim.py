@@ -29,7 +29,6 @@ from lathe_rc.bag.writing.record import OfflineRecorder, begin
 from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.collect import Finite
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recording import Digester, SparseTopic
@@ -208,7 +207,7 @@ def resimulate(
         samples = cell.master.samples
         assert samples is not None, "a bag has an end"
         writer = begin(output, chosen) if output is not None else None
-        all_sinks: list[Sink] = [Finite(cell), digests, errors, *([compared] if compared else [])]
+        all_sinks: list[Sink] = [digests, errors, *([compared] if compared else [])]
         if writer is not None:
             all_sinks.append(OfflineRecorder(cell, samples, writer))
         engine = Engine(cell)

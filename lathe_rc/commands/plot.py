@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The form error of a run by revolution, drawn in the terminal."""
+
+import math
+
+import numpy as np
+import plotext
+from rich.console import Console
+from rich.text import Text
+
+from lathe_rc import harness, messages
+from lathe_rc.analysis.metrology import turns_before
+
+_HEIGHT = 14  # lines
+_NARROWEST = 40  # characters
+_POINTS = 4  # of a curve for each character across
+_STYLES = {"gray+": "white", "cyan+": "bright_cyan", "orange+": "bright_yellow"}  # of rich, by plotext's colours
+
+
+def show(result: harness.Result, console: Console) -> None:
+    """Draw it if somebody looks: in no pipe and no file, and in no terminal that cannot show it."""
+    seen = console.file.isatty() and not console.is_dumb_terminal and console.width >= _NARROWEST
+    if seen and (text := drawn(result, console.width)):
+        console.print(text)
+
+
+def drawn(result: harness.Result, width: int) -> Text | None:
+    """The plot, a line of names above it; None if there are no two revolutions.
+
+    Args:
+        result: of the run.
+        width: [characters].
+    """
+    rms, largest = np.asarray(result.errors.rms) * 1e6, np.asarray(result.errors.largest) * 1e6
+    if rms.size < 2 or not (np.isfinite(largest).all() and rms.all()):
+        return None
+    encoders = [topic for topic, kind in result.recording.types.items() if kind == messages.ENCODER]
+    first = turns_before(result.recording.dense[encoders[0]]["angle_true"]) + 1
+    groups = np.array_split(np.arange(rms.size), min(rms.size, _POINTS * width))
+    revolution = [first + int(group[-1]) for group in groups]
+    curves = [("largest", "gray+", largest), ("RMS", "cyan+", rms)]
+    if result.verdict:
+        limit = result.verdict.tolerance * 1e6
+        curves.insert(0, (f"tolerance {limit:.4g} µm", "orange+", np.full(rms.size, limit)))
+    plotext.clear_figure()
+    plotext.limit_size(False, False)  # noqa: FBT003 - so it is called
+    plotext.plot_size(width, _HEIGHT)
+    for part in (plotext.canvas_color, plotext.axes_color, plotext.ticks_color):
+        part("default")
+    named = Text("form error [µm] by revolution: ")
+    for label, colour, values in curves:
+        told = [math.log10(values[group].max()) for group in groups]
+        plotext.plot(revolution, told, marker="braille", color=colour)
+        named.append(f" ━ {label}", style=_STYLES[colour])
+    ticks = _decades(min(values.min() for *_, values in curves), max(values.max() for *_, values in curves))
+    plotext.ylim(ticks[0], ticks[-1])
+    plotext.yticks(ticks, [f"{10.0**tick:g}" for tick in ticks])
+    across = np.unique(np.linspace(revolution[0], revolution[-1], max(2, width // 12)).round().astype(int)).tolist()
+    plotext.xticks(across, [str(tick) for tick in across])
+    plot = Text.from_ansi(str(plotext.build()))
+    plotext.clear_figure()
+    return named.append("\n").append_text(plot)
+
+
+def _decades(low: float, high: float) -> list[int]:
+    """Powers of ten from below to above."""
+    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+    return list(range(first, max(last, first + 1) + 1))

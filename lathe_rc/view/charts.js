@@ -1,0 +1,71 @@
+// SPDX-License-Identifier: Apache-2.0
+// Draws the figures of a page in its own colours, light or dark, and as wide as the page is.
+// A figure with a parameter "box" is enlarged by dragging across it; a double click or the button shows it whole.
+const { specs: SPECS, data: DATA, chosen: CHOSEN } = JSON.parse(document.getElementById("figures").textContent);
+const DARK = matchMedia("(prefers-color-scheme: dark)"), ENLARGED = {}, LEAST = 8, MARGIN = 5; // [px]
+function config(width) {
+  const style = getComputedStyle(document.documentElement), told = name => style.getPropertyValue(name).trim();
+  const [ink, soft, line, paper] = ["--ink", "--soft", "--line", "--paper"].map(told);
+  const guide = { labelColor: soft, titleColor: ink, gridColor: line, domainColor: soft, tickColor: soft, labelFontSize: 11, titleFontSize: 11 };
+  const columns = width < 560 ? 1 : 0; // of a legend; 0: as many as it has names
+  return {
+    background: null, font: "system-ui, sans-serif", view: { stroke: null }, axis: guide, legend: { ...guide, columns }, text: { color: ink },
+    title: { color: ink, fontSize: 12 }, rule: { color: soft },
+    range: { category: told("--marks").split(" "), diverging: { scheme: told("--below-zero-above").split(" ") } },
+    style: { "guide-label": { fill: soft, fontSize: 11 }, "guide-title": { fill: ink, fontSize: 11 }, edge: { stroke: soft }, halo: { stroke: paper, strokeWidth: 4, fontSize: 11 } },
+  };
+}
+async function draw(name) {
+  const place = document.getElementById(name), spec = structuredClone(SPECS[name][CHOSEN[name]]);
+  place.closest("figure")?.classList.add("drawn"); // the picture for paper gives way
+  if (!spec) { place.textContent = "Choose two different parameters."; return; }
+  if (spec.padding) spec.width = place.clientWidth - spec.padding.left - spec.padding.right;
+  else { spec.width = place.clientWidth; spec.datasets = DATA; }
+  const own = spec.usermeta || {};
+  if (own.square) {
+    spec.width = spec.height = Math.min(place.clientWidth, own.square) - 2 * MARGIN;
+    spec.autosize = "pad"; // else width would be what the margins leave of it, and height would not
+  }
+  for (const [channel, ends] of Object.entries(ENLARGED[name] || {})) {
+    const encoding = spec.encoding[channel];
+    encoding.scale = { ...encoding.scale, domain: ends, nice: false, ...(encoding.scale?.type == "log" ? {} : { zero: false }) };
+  }
+  const options = { actions: false, ast: true, config: config(place.clientWidth), renderer: own.renderer || (name == "parallel-coordinates" ? "canvas" : "svg") };
+  const { view } = await vegaEmbed(place, spec, options);
+  if (own.box) boxed(name, place, view, own.square);
+}
+function boxed(name, place, view, square) {
+  const enlarge = ends => { if (ends) ENLARGED[name] = ends; else delete ENLARGED[name]; draw(name); };
+  if (ENLARGED[name]) {
+    const button = place.appendChild(document.createElement("button"));
+    button.className = "whole";
+    button.textContent = "whole figure";
+    button.addEventListener("click", () => enlarge());
+  }
+  const drawn = place.querySelector("canvas, svg");
+  drawn.addEventListener("dblclick", () => enlarge());
+  // A finger comes down without having moved there, and on a canvas Vega knows what is under it by moves alone.
+  drawn.addEventListener("pointerdown", event => drawn.dispatchEvent(new PointerEvent("pointermove", event)), true);
+  drawn.addEventListener("pointerdown", () => addEventListener("pointerup", async () => {
+    await view.runAsync();
+    let [across, up] = ["box_x", "box_y"].map(signal => (view.signal(signal) || []).slice().sort((a, b) => a - b));
+    const wide = across.length && across[1] - across[0] >= LEAST, tall = up.length && up[1] - up[0] >= LEAST;
+    if (!wide && !tall) return;
+    if (square) {
+      const half = Math.max(across[1] - across[0], up[1] - up[0]) / 2;
+      [across, up] = [across, up].map(([low, high]) => [(low + high) / 2 - half, (low + high) / 2 + half]);
+    }
+    const ends = (channel, pixels) => pixels.map(pixel => view.scale(channel).invert(pixel)).sort((a, b) => a - b);
+    enlarge({ ...ENLARGED[name], ...(wide || square ? { x: ends("x", across) } : {}), ...(tall || square ? { y: ends("y", up) } : {}) });
+  }, { once: true }));
+}
+function drawAll() { Object.keys(SPECS).forEach(draw); }
+document.querySelectorAll("select[data-figure]").forEach(each => each.addEventListener("change", () => {
+  const name = each.dataset.figure, some = [...document.querySelectorAll(`select[data-figure="${name}"]`)];
+  CHOSEN[name] = some.map(one => one.value).join("-") + (name == "lines" && some.length == 1 ? "-" : "");
+  draw(name);
+}));
+let waiting, width = innerWidth;
+addEventListener("resize", () => { if (innerWidth != width) { width = innerWidth; clearTimeout(waiting); waiting = setTimeout(drawAll, 150); } });
+DARK.addEventListener("change", drawAll);
+drawAll();

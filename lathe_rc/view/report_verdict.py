@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a report says first: whether the part is in tolerance, what went wrong, and what limits the form error.
+
+All of it comes from the one pass through the bag: how the form error ends, how much of it repeats, what the speed did,
+and what the nodes said. What each cause has done, only a budget tells.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lathe_rc import messages
+from lathe_rc.analysis.budget import Budget
+from lathe_rc.cell.stages.command_limits import LIMITED
+from lathe_rc.view.report_figures import um
+from lathe_rc.view.report_form import Form
+from lathe_rc.view.report_gather import Alike, Gathered
+
+GOOD, BAD, WARN = "good", "bad", "warn"
+
+_FEWEST = 4  # revolutions of which is said how they go on
+_CHANGE = 0.05  # of the form error over the last revolutions, below which it stays as it is
+_VARIES = 0.005  # deviation of the speed from which on it is said to vary
+_SOME = 0.1  # share of the power from which on a part is told of
+_MOST = 6  # kinds of things that went wrong
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A sentence, and whether it is good or bad news."""
+
+    text: str
+    mood: str = ""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the page begins with.
+
+    Attributes:
+        verdict: in tolerance or not.
+        wrong: failures and faults.
+        limits: what keeps the form error from being smaller, the first the most.
+    """
+
+    verdict: Finding
+    wrong: Sequence[Finding]
+    limits: Sequence[Finding]
+
+
+def judged(told: Gathered, losses: Sequence[str], made_of: Budget | None) -> Told:
+    """Judge what was gathered.
+
+    Args:
+        told: of the bag.
+        losses: what was refused, lost or failed, a line each.
+        made_of: what the form error is made of, if somebody has asked.
+    """
+    form = next(iter(told.forms), None)
+    happened = list(_happened(told))
+    wrong = [Finding(text, BAD) for text in [*happened, *losses]]
+    limits = [*(_causes(made_of) if made_of else ()), *_limited(told)]
+    if form and not happened:  # else the form error is what those have made of it
+        limits += _form(told, form)
+    return Told(_verdict(form), wrong, limits)
+
+
+def _verdict(form: Form | None) -> Finding:
+    if form is None:
+        return Finding("No form to judge: the bag has no encoder and tool.")
+    if form.refused or form.last is None:
+        return Finding("Not judged: the form cannot be measured to its end.", BAD)
+    if form.verdict is None:
+        last = form.last.numbers
+        return Finding(
+            f"No tolerance to judge by: the form error of the last revolution is {last['rms']:.3g} µm RMS, "
+            f"{last['max']:.3g} µm at most."
+        )
+    text = form.verdict.told()
+    return Finding(f"{text[0].upper()}{text[1:]}.", GOOD if form.verdict.in_tolerance else BAD)
+
+
+def _at(told: Gathered, alike: Alike) -> str:
+    """When it happened."""
+    first, last = (sample * told.step_ns * 1e-9 for sample in (alike.first, alike.last))
+    if alike.count == 1:
+        return f"at {first:.4g} s"
+    return f"{alike.count} times from {first:.4g} s to {last:.4g} s"
+
+
+def _happened(told: Gathered) -> Iterator[str]:
+    """Faults, and what the supervisor did."""
+    kinds = [alike for alike in told.curves.kinds.values() if alike.text.startswith("fault ") or alike.alarm]
+    for alike in kinds[:_MOST]:
+        yield f"{alike.topic.strip('/')}: {alike.text}, {_at(told, alike)}"
+    if len(kinds) > _MOST:
+        yield f"{len(kinds) - _MOST} further kinds of faults and alarms, see the events"
+
+
+def _causes(made_of: Budget) -> Iterator[Finding]:
+    largest = max((*made_of.causes, made_of.rest), key=lambda part: part.share)
+    yield Finding(f"The largest cause, by the budget below: {largest.name}, {largest.percent()} % of the power.")
+
+
+def _limited(told: Gathered) -> Iterator[Finding]:
+    """Who came to a limit."""
+    for alike in told.curves.kinds.values():
+        if alike.text.startswith(LIMITED):
+            node = alike.topic.strip("/").removesuffix("/events")
+            yield Finding(f"{node} came to the limits of its command, {_at(told, alike)}.", WARN)
+
+
+def _form(told: Gathered, form: Form) -> Iterator[Finding]:
+    """How the form error ends, and of what kind it is."""
+    profiles = um(np.array(form.newest))
+    if len(profiles) < _FEWEST:
+        return
+    rms = np.sqrt(np.mean(profiles**2, axis=-1))
+    power = float(np.mean(profiles**2))
+    if not power:
+        return
+    yield from _trend(rms, form)
+    count = len(profiles)
+    mean = profiles.mean(axis=0)
+    changing = float(np.mean((profiles - mean) ** 2)) * count / (count - 1)
+    share = min(changing / power, 1.0)
+    parts = [
+        (1.0 - share, f"repeats from revolution to revolution{_waves(mean)}: what learning and its Q filter leave"),
+        (share, f"changes from revolution to revolution: noise, encoder, vibration, speed{_speed(told)}"),
+    ]
+    for part, text in sorted(parts, reverse=True):
+        if part >= _SOME:
+            yield Finding(f"{part:.0%} of the form error's power in the last {count} revolutions {text}.")
+
+
+def _trend(rms: messages.Samples, form: Form) -> Iterator[Finding]:
+    """Whether learning goes on, by the halves of the last revolutions: all of one below all of the other."""
+    half = len(rms) // 2
+    before, after = rms[:half], rms[-half:]
+    factor = float(after.mean() / before.mean()) if before.mean() else 1.0
+    each = factor ** (1.0 / (len(rms) - half))
+    if after.max() < before.min() and factor < 1.0 - _CHANGE:
+        more = ""
+        if form.verdict and not form.verdict.in_tolerance:
+            turns = math.ceil(math.log(form.tolerance / form.verdict.largest) / math.log(each))
+            more = f"; in tolerance after some {turns} more, if it goes on like this"
+        yield Finding(f"Learning is not over: the form error falls by {1.0 - each:.1%} a revolution{more}.", WARN)
+    elif after.min() > before.max() and factor > 1.0 + _CHANGE:
+        yield Finding(f"The form error grows by {each - 1.0:.1%} a revolution.", BAD)
+
+
+def _waves(mean: messages.Samples) -> str:
+    """The largest undulation of what repeats."""
+    amplitude = np.abs(np.fft.rfft(mean)) * 2.0 / mean.size
+    order = int(np.argmax(amplitude[1:])) + 1
+    return f", most at {order} UPR ({amplitude[order]:.3g} µm)"
+
+
+def _speed(told: Gathered) -> str:
+    """By how much the spindle speed varies."""
+    for (_, name), series in told.curves.signals.items():
+        low, high = series.extremes
+        if name == "speed_true" and low > 0.0 and math.isfinite(high):
+            deviation = (high - low) / (high + low)
+            return f" (which varies by ±{deviation:.1%})" if deviation >= _VARIES else ""
+    return ""
+
+
+def hint(told: Gathered, made_of: Budget | None) -> bool:
+    """Whether a budget could tell more."""
+    return made_of is None and any(form.newest for form in told.forms[:1])

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``lathe completion``: what a shell completes, through the real bash, and how it is installed."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.shell_completion import ShellComplete
+from click.testing import CliRunner
+
+from lathe_rc import cli, completing
+from lathe_rc.commands.completion import completion
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """Looks once at the commands, for all tests of this file."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        completing.known()
+        yield
+
+
+def completed(*words):
+    """What may stand in the place of the last word."""
+    shell = ShellComplete(cli.main, {}, "lathe", "_LATHE_COMPLETE")
+    return [found.value for found in shell.get_completions(list(words[:-1]), words[-1])]
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["res"], ["resim"]),
+        (["run", "supervised_t"], ["supervised_turning", "supervised_two_channel"]),
+        (["run", "piston", "--mode", ""], ["offline", "composed", "processes"]),
+        (["run", "piston", "--set", "too"], ["tool."]),
+        (["run", "piston", "--set", "tool.tol"], ["tool.tolerance="]),
+        (["run", "piston", "--set", "supervisor."], []),  # it has none
+        (["run", "piston", "--group", "tool+rec"], ["tool+recorder"]),
+        (["run", "piston", "--require"], ["--require-tolerance"]),
+        (["sweep", "full_c"], ["full_cell"]),  # short for sweep run
+        (["sweep", "sh"], ["show"]),
+        (["sweep", "piston", "--vary", "tool.tol"], ["tool.tolerance="]),
+        (["tune", "piston", "--free", "learning_controller.lead_t"], ["learning_controller.lead_time="]),
+        (["study", "sp"], ["speed-deviation"]),
+        (["study", "piston", "--set", "height"], ["height_mm="]),
+        (["node", "piezo"], ["piezo_actuator"]),
+        (["completion", ""], ["bash", "zsh", "fish"]),
+    ],
+    ids=" ".join,
+)
+def test_completes(words, found):
+    assert completed(*words) == found
+
+
+def test_what_a_scenario_calls_its_nodes_is_completed_with_the_parameters_of_their_kind(tmp_path):
+    text = "/mine:\n  ros__parameters: {stage: piezo_actuator}\n/**:\n  ros__parameters: {}\n"
+    (tmp_path / "own.yaml").write_text(text)
+    own = str(tmp_path / "own.yaml")
+    assert completed("run", own, "--set", "") == ["mine."]
+    assert completed("run", own, "--set", "mine.hyst")[0] == "mine.hysteresis="
+
+
+def test_a_scenario_that_cannot_be_read_breaks_no_completion(tmp_path):
+    (tmp_path / "broken.yaml").write_text("{: -")
+    assert "tool." in completed("run", str(tmp_path / "broken.yaml"), "--set", "")
+    assert "tool." in completed("run", str(tmp_path / "none.yaml"), "--set", "")
+
+
+def test_all_commands_are_known_with_their_options():
+    """The stand-ins have the options of the commands, so nothing is completed that would be refused."""
+    for name in cli.COMMANDS:
+        with cli.main.make_context("lathe", [name], resilient_parsing=True) as ctx:
+            own = {option for each in cli.imported(name).get_params(ctx) for option in each.opts if option[0] == "-"}
+            known = {option for each in completing.stand_in(name).get_params(ctx) for option in each.opts}
+        assert {option for option in known if option[0] == "-"} - {"-h"} == own - {"-h"}, name
+
+
+def test_completing_imports_no_more_than_it_needs():
+    """Neither NumPy nor ROS 2, of which each takes longer than people wait."""
+    code = "import sys; from click.shell_completion import ShellComplete as S; from lathe_rc import cli; "
+    code += "S(cli.main, {}, 'lathe', 'X').get_completions(['sweep', 'piston', '--vary'], 'tool.'); "
+    code += "print(sorted({'numpy', 'rclpy', 'numba', 'pydantic', 'dask'} & sys.modules.keys()))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.skipif(not shutil.which("bash"), reason="no bash")
+@pytest.mark.parametrize("program", [str(ROOT / "lathe"), "./lathe"])
+def test_bash_completes_lathe_and_the_launcher_of_a_checkout(program):
+    """The printed script, in a real bash: what its function gives for a command line."""
+    printed = CliRunner().invoke(completion, ["bash"]).output
+    lines = [f"{program} run pist", f"{program} run piston --set tool.tol", f"{program} se"]
+    script = printed + "compopt() { echo compopt $@; }\n"
+    for line in lines:
+        words = line.split()
+        script += (
+            f"COMP_WORDS=({line}) COMP_CWORD={len(words) - 1}; _lathe_complete {program} {words[-1]} {words[-2]}; "
+        )
+        script += "printf '%s\\n' \"${COMPREPLY[@]}\"\n"
+    script += "complete -p lathe\n"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stderr == ""
+    assert done.stdout.splitlines() == [
+        "piston",
+        "compopt -o nospace",  # one goes on with the value
+        "tool.tolerance=",
+        "setup",  # of ./lathe alone
+        "complete -o nosort -F _lathe_complete lathe",
+    ]
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_scripts_can_be_read_by_their_shells(shell):
+    if not shutil.which(shell):
+        pytest.skip(f"no {shell}")
+    printed = CliRunner().invoke(completion, [shell]).output
+    subprocess.run([shell, "-n"], input=printed, text=True, check=True)
+
+
+class TestInstall:
+    @pytest.fixture(autouse=True)
+    def home(self, tmp_path, monkeypatch):
+        for name in ("ZDOTDIR", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
+            monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv("HOME", str(tmp_path))
+        return tmp_path
+
+    @pytest.mark.parametrize(
+        ("shell", "rc"), [("bash", ".bashrc"), ("zsh", ".zshrc"), ("fish", ".config/fish/config.fish")]
+    )
+    def test_writes_one_line_once_and_takes_it_out_again(self, home, shell, rc):
+        rc = home / rc
+        rc.parent.mkdir(parents=True, exist_ok=True)
+        rc.write_text("# mine, without an end of line")
+        before = rc.read_text()
+        done = CliRunner().invoke(completion, [shell, "--install"])
+        assert f"{rc}: one line added" in done.output
+        installed = rc.read_text()
+        script = home / ".local/share/lathe_rc" / f"completion.{shell}"
+        assert installed.startswith(f"{before}\n")
+        assert installed.count(str(script)) == 2  # on one line: if it is there, read it
+        assert script.read_text() == CliRunner().invoke(completion, [shell]).output
+        assert "has its line already" in CliRunner().invoke(completion, [shell, "--install"]).output
+        assert rc.read_text() == installed
+        assert "the line is gone" in CliRunner().invoke(completion, [shell, "--remove"]).output
+        assert rc.read_text() == f"{before}\n"
+        assert not script.exists()
+        assert "nothing to remove" in CliRunner().invoke(completion, [shell, "--remove"]).output
+
+    @pytest.mark.skipif(not shutil.which("bash"), reason="no bash")
+    def test_a_new_bash_has_it(self, home):
+        done = CliRunner().invoke(completion, ["--install"], env={"SHELL": "/bin/bash"})
+        assert done.exit_code == 0, done.output
+        environ = {**os.environ, "HOME": str(home)}
+        shell = ["bash", "--norc", "-c", ". ~/.bashrc; complete -p lathe"]
+        told = subprocess.run(shell, capture_output=True, text=True, check=True, env=environ)
+        assert told.stdout == "complete -o nosort -F _lathe_complete lathe\n"
+        CliRunner().invoke(completion, ["bash", "--remove"])
+        assert subprocess.run(shell, capture_output=True, check=False, env=environ).returncode
+
+    def test_a_shell_that_there_is_no_script_for_is_named(self):
+        done = CliRunner().invoke(cli.main, ["completion"], env={"SHELL": "/bin/tcsh"})
+        assert done.exit_code == 2
+        assert "no shell 'tcsh'; allowed: bash, zsh, fish" in done.output

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The plot that ``lathe run`` ends with in a terminal, and only there."""
+
+import fcntl
+import io
+import os
+import pty
+import re
+import struct
+import subprocess
+import sys
+import termios
+
+import numpy as np
+import pytest
+from cells import run, scenario
+from rich.console import Console
+
+from lathe_rc import harness
+from lathe_rc.commands import plot
+
+COMMAND = [sys.executable, "-m", "lathe_rc", "run", "piston", "--revolutions", "4"]
+HEADING = "form error [µm] by revolution"
+COLOUR = "\x1b[96m"  # of the RMS
+
+
+def in_terminal(*options, width, **environment):
+    """What the command writes to a terminal of so many characters across."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, width, 0, 0))
+    own = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES", "NO_COLOR")}
+    own |= {"TERM": "xterm-256color", "PYTHONIOENCODING": "utf-8", **environment}
+    with subprocess.Popen([*COMMAND, *options], stdout=theirs, stderr=subprocess.DEVNULL, env=own) as process:
+        os.close(theirs)
+        text = b""
+        try:
+            while piece := os.read(ours, 65536):
+                text += piece
+        except OSError:  # the other end is closed
+            pass
+        os.close(ours)
+    assert process.returncode == 0
+    return text.decode()
+
+
+def test_the_plot_is_as_wide_as_the_terminal_and_honours_no_color():
+    lines = in_terminal(width=70, NO_COLOR="1").splitlines()
+    top = next(k for k, line in enumerate(lines) if line.startswith(HEADING))
+    assert "tolerance 2 µm" in lines[top]
+    frame = [line for line in lines[top + 1 :] if re.match(r" *[┌└]", line)]
+    assert [len(line.rstrip()) for line in frame] == [70, 70]
+    assert [int(number) for number in re.findall(r"\d+", lines[lines.index(frame[1]) + 1])] == [1, 2, 3, 4]
+    assert any(re.search("[⠁-⣿]", line) for line in lines[top:])
+    assert COLOUR not in "".join(lines)
+
+
+def test_else_it_has_colours():
+    assert COLOUR in in_terminal(width=80)
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(("kind", "width", "drawn"), [("xterm", 80, True), ("dumb", 80, False), ("xterm", 30, False)])
+def test_a_terminal_that_cannot_show_it_gets_none(kind, width, drawn):
+    console = Console(file=Terminal(), width=width, _environ={"TERM": kind})
+    plot.show(run(), console)
+    assert (HEADING in console.file.getvalue()) == drawn
+
+
+def test_neither_a_pipe_nor_json_has_it():
+    piped = subprocess.run(COMMAND, capture_output=True, check=True, env={**os.environ, "FORCE_COLOR": "1"})
+    assert HEADING not in piped.stdout.decode()
+    assert in_terminal("--json", width=80).startswith("{")
+
+
+def test_the_curves_are_where_the_errors_are():
+    """Between the decades that hold them; of a long run no more points than can be seen, and no peak is lost."""
+    result = run(spindle_encoder={"revolutions": 40.0}, tool={"tolerance": 2e-6})
+    console = Console(width=60, force_terminal=True, color_system=None)
+    with console.capture() as caught:
+        console.print(plot.drawn(result, 60))
+    ticks = [float(tick) for tick in re.findall(r"(?m)^ *([\d.]+)┤", caught.get())]
+    assert ticks == sorted(ticks, reverse=True)
+    assert ticks[0] >= result.errors.largest.max() * 1e6 > ticks[0] / 10
+    assert ticks[-1] <= result.errors.rms.min() * 1e6 < ticks[-1] * 10
+
+
+def test_one_revolution_is_no_curve():
+    one = harness.run(scenario(spindle_encoder={"revolutions": 1.2}))
+    assert plot.drawn(one, 80) is None
+    round_ = harness.run(scenario(spindle_encoder={"revolutions": 3.0}))
+    round_.errors.rms[:] = 0.0
+    assert np.all(round_.errors.rms == 0.0)
+    assert plot.drawn(round_, 80) is None
