@@ -5,13 +5,13 @@ import ast
 import functools
 import importlib.util
 import re
-import runpy
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import pages
 import pytest
 from click.testing import CliRunner
 
@@ -31,7 +31,6 @@ FIVE = {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "to
 LAUNCH = ROOT / "launch" / "cell.launch.py"
 
 _LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
-_BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _RUN = re.compile(r"^\$ \./lathe (run .*)$", re.MULTILINE)
 _TEST = re.compile(r"`(test_[a-z0-9_]+)`")
 _CODE = re.compile(r"```.*?```|`[^`]*`", re.DOTALL)
@@ -178,11 +177,9 @@ class TestPages:
 
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=name)
 def test_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The Python of a page runs, all its examples one after the other, as one program."""
+    """The Python of a page runs, all its examples one after the other, and prints what the page shows."""
     monkeypatch.chdir(tmp_path)
-    program = tmp_path / "page.py"
-    program.write_text("\n".join(_BLOCK.findall(page.read_text(encoding="utf-8"))), encoding="utf-8")
-    runpy.run_path(str(program))
+    pages.run_python(page, tmp_path)
 
 
 @pytest.mark.parametrize("path", SCENARIOS, ids=name)
