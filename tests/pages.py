@@ -37,7 +37,7 @@ _FENCE = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILI
 _NOW_AND_THEN = re.compile(r"^(revolution \d+: error |compiling |\[\w+\] \[[\d.]+\] \[\w+\]: waits |.* silent )")
 #: what depends on the machine
 _MACHINE = re.compile(
-    r"in [\d.]+ s: [\d.]+x real time|(?<=^\[INFO\] )\[[\d.]+\]|(?<=Dask's dashboard: ).*|[0-9a-f]{64}|\b\d+ s$"
+    r"in [\d.]+ s: [\d.]+x real time|(?<=^\[INFO\] )\[[\d.]+\]|(?<=Dask's dashboard: ).*|[0-9a-f]{64}|\d+ messages(?=,)"
 )
 _NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[-+]?\d+)?)")
 _NODES = {"node", "container", "replay", "record"}  # commands that are processes of a cell

@@ -36,7 +36,7 @@ from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, UnpublishedError
 from lathe_rc.names import instead
 from lathe_rc.part import ErrorsByRevolution
 
@@ -198,7 +198,15 @@ def resimulate(
         if parameters is not None:
             identify.write_parameters(parameters, chosen, drives)
         changed = original is None or chosen.nodes != original.nodes
-        cell, compared, events = wire(chosen, original, recorded, source)
+        try:
+            cell, compared, events = wire(chosen, original, recorded, source)
+        except UnpublishedError as error:
+            if changed:
+                raise
+            raise InputError(
+                f"{path}: {str(error).partition(';')[0]}: a node that the bag knows by its topics alone did; allowed: "
+                "--scenario FILE with a node of ours in its place (--identify finds its drive)"
+            ) from None
         for name, stage in cell.stages.items():
             for index, action in events.get(name, []):
                 stage.replay(action, index)

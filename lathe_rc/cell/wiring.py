@@ -20,7 +20,7 @@ from lathe_rc.cell.stages.profile import ProfileStage
 from lathe_rc.cell.stages.supervisor import Supervisor
 from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.stages.tool import Tool
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, UnpublishedError
 from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.tip_path import steepest_fall
 
@@ -112,12 +112,12 @@ class Cell:
         """Who publishes what a stage reads.
 
         Raises:
-            InputError: nobody, or as another type.
+            InputError: as another type; `UnpublishedError`: nobody.
         """
         topic = remapped(stage.shared, port.topic)
         source = self.dense.get(topic)
         if source is None:
-            raise InputError(
+            raise UnpublishedError(
                 f"{stage.name} reads {topic}, which no node of the scenario publishes; allowed: a node that does, or "
                 f"another topic by {stage.name}.remap"
             )
