@@ -34,14 +34,17 @@ TIMEOUT = 120  #: [s] for what should have ended
 
 _FENCE = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 #: what comes now and then, depending on how fast it goes
-_NOW_AND_THEN = re.compile(r"^(revolution \d+: error |compiling |\[\w+\] \[[\d.]+\] \[\w+\]: waits |.* silent )")
+_NOW_AND_THEN = re.compile(
+    r"^(revolution \d+: error |compiling |\[\w+\] \[[\d.]+\] \[\w+\]: wait|.* silent |.* refuses: )"
+)
 #: what depends on the machine
 _MACHINE = re.compile(
     r"in [\d.]+ s: [\d.]+x real time|(?<=^\[INFO\] )\[[\d.]+\]|(?<=Dask's dashboard: ).*|[0-9a-f]{64}|\d+ messages(?=,)"
 )
 _NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[-+]?\d+)?)")
 _NODES = {"node", "container", "replay", "record"}  # commands that are processes of a cell
-_SHELL = re.compile(r"[|&;<>*$`]|^\w+=")
+_SHELL = re.compile(r"[|&;<>*$`]|^\w+=")  # needs a shell, outside of quotes
+_QUOTED = re.compile(r"'[^']*'|\"[^\"$`]*\"")
 
 
 class Block(NamedTuple):
@@ -193,7 +196,7 @@ class Reader:
         if words[0] == "cd":
             self._patch.chdir(os.path.expandvars(words[1]))
             return 0, ""
-        if words[0] != "lathe" or words[1] in _NODES or _SHELL.search(text):
+        if words[0] != "lathe" or words[1] in _NODES or _SHELL.search(_QUOTED.sub("", text)):
             process = self._start(text)
             came, _ = process.communicate(timeout=TIMEOUT)
             return process.returncode, came

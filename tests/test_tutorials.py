@@ -10,7 +10,7 @@ import pytest
 
 distributed = pytest.importorskip("distributed")
 
-from lathe_rc.sweep import workers
+from lathe_rc.sweep import sweep
 
 TUTORIALS = sorted((pages.ROOT / "docs" / "tutorials").glob("*.md"))
 
@@ -20,7 +20,7 @@ def own_workers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Sweeps and tuning compute in this process: to start others takes seconds."""
     options = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": ":0"}
     with distributed.Client(set_as_default=False, **options) as client:
-        monkeypatch.setattr(workers, "client_of", lambda *_: contextlib.nullcontext(client))
+        monkeypatch.setattr(sweep, "client_of", lambda *_: contextlib.nullcontext(client))
         yield
 
 
