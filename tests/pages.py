@@ -4,6 +4,7 @@
     ```python                   the examples of a page are one program, in the order of the page
     ```text                     right behind one of them: what it prints
     ```console                  commands behind "$ ", each followed by what it shows, if the page shows that
+    ```text                     behind a console block: what its last command prints, if the block does not show that
     ```console title="…"        one command for a terminal of its own: it goes on beside the next commands
     ```python title="FILE"      a file that the reader saves; so is any other language with a title
 
@@ -65,7 +66,11 @@ class Command(NamedTuple):
 
 def blocks(page: Path) -> list[Block]:
     """All blocks of a page that have a language."""
-    text = page.read_text(encoding="utf-8")
+    return blocks_of(page.read_text(encoding="utf-8"))
+
+
+def blocks_of(text: str) -> list[Block]:
+    """Those of a part of a page."""
     return [
         Block(found[1], found[2] or "", found[3], text.count("\n", 0, found.start()) + 2)
         for found in _FENCE.finditer(text)
@@ -156,6 +161,7 @@ class Reader:
 
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
         self.folder, self._patch = folder, patch
+        self._last: tuple[Command, str] | None = None  # whose output the page has not shown yet
         self._beside: list[tuple[Command, subprocess.Popen[str]]] = []
         tools = folder / ".tools"
         tools.mkdir()
@@ -180,8 +186,14 @@ class Reader:
                 self._beside.append((command, self._start(command.text)))
             elif block.language == "console":
                 for command in commands(block.text):
-                    self._compare(page, command, *self._run(command.text))
+                    code, came = self._run(command.text)
+                    self._compare(page, command, code, came)
+                    self._last = None if command.shown else (command, came)
                 self._wait(page)
+            elif block.language == "text" and self._last:
+                command, came = self._last
+                self._compare(page, Command(command.text, block.text.splitlines()), 0, came)
+                self._last = None
             elif block.title:
                 Path(block.title).write_text(block.text, encoding="utf-8")
 

@@ -2,6 +2,7 @@
 """The tutorials, done by a reader who has nothing but the page: every command runs, and shows what the page shows."""
 
 import contextlib
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,8 @@ distributed = pytest.importorskip("distributed")
 from lathe_rc.sweep import sweep
 
 TUTORIALS = sorted((pages.ROOT / "docs" / "tutorials").glob("*.md"))
+TEACHER = (pages.ROOT / "docs" / "tutorials" / "teacher.md").read_text(encoding="utf-8")
+EXERCISES = re.split(r"^## (?=\d)", TEACHER, flags=re.MULTILINE)[1:]
 
 
 @pytest.fixture
@@ -31,3 +34,15 @@ def test_a_reader_who_follows_a_tutorial_sees_what_it_shows(
 ) -> None:
     with pages.reader(tmp_path, monkeypatch) as reader:
         reader.follow(page)
+
+
+@pytest.mark.parametrize("exercise", EXERCISES, ids=lambda text: text.splitlines()[0])
+def test_a_solution_has_no_number_that_its_command_does_not_print(exercise: str) -> None:
+    """Or that the exercise gives: what the command prints is compared above."""
+    given, _, solution = exercise.partition("<details")
+    printed = "".join(block.text for block in pages.blocks_of(solution))
+    explained = re.sub(r"```.*?```|\]\(.*?\)", "", solution, flags=re.DOTALL)
+    said = re.findall(r"\d+\.\d+", explained)
+    known = {float(number) for number in re.findall(r"\d+(?:\.\d+)?", given + printed)}
+    assert said
+    assert [number for number in said if float(number) not in known] == []
