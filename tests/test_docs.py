@@ -4,6 +4,7 @@
 import ast
 import functools
 import importlib.util
+import pkgutil
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -17,6 +18,7 @@ from click.testing import CliRunner
 
 from lathe_rc import __version__, cli, reference
 from lathe_rc.cell import ros_yaml, scenario
+from lathe_rc.cell.messages import PACKAGE, store
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.wiring import Cell
@@ -24,8 +26,8 @@ from lathe_rc.commands.run import run
 from lathe_rc.errors import InputError, LatheError
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
-WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+WITH_PYTHON = [page for page in PAGES if "```python\n" in page.read_text(encoding="utf-8")]
 SCENARIOS = sorted((ROOT / "config").glob("*.yaml"))
 FIVE = {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder"}
 LAUNCH = ROOT / "launch" / "cell.launch.py"
@@ -133,6 +135,30 @@ def test_every_test_that_a_page_names_exists(page: Path) -> None:
     named = {(number, test) for number, line in lines for test in _TEST.findall(line)}
     known = names_of_tests()
     assert [f"{name(page)}:{number}: no test {test}" for number, test in sorted(named) if test not in known] == []
+
+
+def exists(name: str) -> bool:
+    """Whether a node, NODE.PARAM, Message.field or dotted name of the package exists."""
+    first, _, rest = name.partition(".")
+    if first in TABLES:
+        return not rest or rest in TABLES[first].rows()
+    if first == "lathe_rc":
+        try:
+            pkgutil.resolve_name(name)
+        except (ImportError, AttributeError):
+            return False
+        return True
+    fields = store().fielddefs.get(f"{PACKAGE}/msg/{first}", (None, []))[1]
+    return rest in {field for field, _ in fields}
+
+
+def test_every_name_in_the_table_of_terms_exists() -> None:
+    page = (ROOT / "docs" / "terms.md").read_text(encoding="utf-8")
+    rows = [row.split("|")[1:-1] for row in page.splitlines() if row.startswith("| ")]
+    assert {len(row) for row in rows} == {4}, "a | in a cell has to be written \\lvert"
+    names = [found for row in rows[1:] for found in re.findall(r"`([^`]+)`", row[-1])]
+    assert len(names) > 100
+    assert [found for found in names if not exists(found)] == []
 
 
 @pytest.mark.parametrize("page", ["cell", "safety"])
