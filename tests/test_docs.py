@@ -161,6 +161,14 @@ def test_every_name_in_the_table_of_terms_exists() -> None:
     assert [found for found in names if not exists(found)] == []
 
 
+def test_every_check_of_the_model_is_a_test_of_that_file() -> None:
+    page = (ROOT / "docs" / "model.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`(test_\w+\.py)(?:::(test_\w+))?`", page))
+    there = {file: (ROOT / "tests" / file).read_text(encoding="utf-8") for file, _ in named}
+    assert len(named) > 50
+    assert [f"{file}::{test}" for file, test in sorted(named) if f"def {test}(" not in there[file]] == []
+
+
 @pytest.mark.parametrize("page", ["cell", "safety"])
 def test_every_promise_names_a_test(page: str) -> None:
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")

@@ -38,7 +38,7 @@ def test_a_reader_who_follows_a_tutorial_sees_what_it_shows(
 
 @pytest.mark.parametrize("exercise", EXERCISES, ids=lambda text: text.splitlines()[0])
 def test_a_solution_has_no_number_that_its_command_does_not_print(exercise: str) -> None:
-    """Or that the exercise gives: what the command prints is compared above."""
+    """Each number of a solution is one that its command prints, which is compared above, or that the exercise gives."""
     given, _, solution = exercise.partition("<details")
     printed = "".join(block.text for block in pages.blocks_of(solution))
     explained = re.sub(r"```.*?```|\]\(.*?\)", "", solution, flags=re.DOTALL)
