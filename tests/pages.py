@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the pages show, and a reader who does it: runs their blocks in order, and compares what comes with what is shown.
+"""What the pages show, and a reader who does it: blocks run in order, and what comes is compared with what is shown.
 
     ```python                   the examples of a page are one program, in the order of the page
     ```text                     right behind one of them: what it prints

@@ -6,10 +6,9 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import distributed
 import pages
 import pytest
-
-distributed = pytest.importorskip("distributed")
 
 from lathe_rc.sweep import sweep
 
