@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Package metadata; colcon, pip and the ament index all read it from here."""
 
+import re
 from collections import defaultdict
 from pathlib import Path
 
@@ -32,6 +33,7 @@ NODES = [
     "supervisor",
     "recorder",
 ]
+ALONE = ["container", "replayer", "rerun_bridge", "topic_recorder"]
 
 
 def shared_files() -> list[tuple[str, list[str]]]:
@@ -50,9 +52,11 @@ def requirements(name: str) -> list[str]:
     return [line for line in lines if line and not line.startswith("#")]
 
 
+VERSION = re.search(r'__version__ = "(.+)"', (HERE / "lathe_rc" / "__init__.py").read_text(encoding="utf-8"))[1]
+
 setup(
     name="lathe_rc",
-    version="0.1.0",
+    version=VERSION,
     description="The control cell of a non-circular lathe as ROS 2 nodes",
     long_description=(HERE / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
@@ -73,14 +77,16 @@ setup(
     data_files=shared_files(),
     python_requires=">=3.10",
     install_requires=requirements("runtime"),
-    extras_require={name: requirements(name) for name in ("notebook", "sweep", "view")},
+    extras_require={
+        **{name: requirements(name) for name in ("notebook", "sweep", "view")},
+        # pip builds the messages from their sdist, see msg_defs/pyproject.toml
+        "ros": [*requirements("ros"), f"lathe_rc_msgs=={VERSION}"],
+    },
     entry_points={
         "console_scripts": [
             "lathe = lathe_rc.cli:main",
-            *(
-                f"{node} = lathe_rc.nodes.{node}:main"
-                for node in [*NODES, "container", "replayer", "rerun_bridge", "topic_recorder"]
-            ),
+            *(f"{node} = lathe_rc.nodes.executables:{node}" for node in NODES),
+            *(f"{node} = lathe_rc.nodes.{node}:main" for node in ALONE),
         ],
     },
     zip_safe=False,

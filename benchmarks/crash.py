@@ -20,7 +20,8 @@ from rich.progress import track
 from rich.table import Table
 
 from lathe_rc import harness, resources
-from lathe_rc.bag import reader, recover
+from lathe_rc.bag import reader
+from lathe_rc.bag.repairing import recover
 from lathe_rc.cell import scenario
 from lathe_rc.errors import LatheError
 

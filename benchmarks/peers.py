@@ -24,13 +24,13 @@ from scipy import signal
 
 from benchmarks import sides
 from benchmarks.others.peer import Peer, missing
-from lathe_rc import resources
+from lathe_rc import messages, resources
 from lathe_rc.analysis.metrology import form_errors
-from lathe_rc.cell import messages, scenario
+from lathe_rc.cell import scenario
 from lathe_rc.cell.engine import Engine
-from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.messages import Signals
 from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
 from lathe_rc.plants.linear import second_order
 

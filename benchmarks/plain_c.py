@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.stages.cutting_process import CuttingProcessStage
 from lathe_rc.cell.stages.decoupler import DecouplerStage

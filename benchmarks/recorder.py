@@ -31,18 +31,19 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 from rosbags.rosbag2 import Writer as RosbagWriter
 
 from benchmarks import sides
-from lathe_rc import resources
-from lathe_rc.bag import reader, stream
-from lathe_rc.bag.order import Merger
-from lathe_rc.bag.record import OfflineRecorder, begin
-from lathe_rc.bag.source import Source
-from lathe_rc.bag.writer import BagWriter, Compression, offered_qos
-from lathe_rc.cell import messages, scenario
+from lathe_rc import messages, resources
+from lathe_rc.bag import reader
+from lathe_rc.bag.reading import stream
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.writing.order import Merger
+from lathe_rc.bag.writing.record import OfflineRecorder, begin
+from lathe_rc.bag.writing.writer import BagWriter, Compression, offered_qos
+from lathe_rc.cell import scenario
 from lathe_rc.cell.engine import Engine
-from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.messages import Signals
 
 Action = Callable[[], None]
 

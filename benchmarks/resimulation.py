@@ -13,7 +13,7 @@ from typing import Any
 
 from benchmarks import sides
 from lathe_rc import harness, resources
-from lathe_rc.bag.resim import resimulate
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario
 from lathe_rc.errors import LatheError
 

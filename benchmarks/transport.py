@@ -28,8 +28,7 @@ from typing import Any
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from lathe_rc import harness
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario

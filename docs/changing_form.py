@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import POINTS, measure, undulations
 from lathe_rc.analysis.structures import Channel, steady_error
-from lathe_rc.cell import messages, scenario
+from lathe_rc.cell import scenario
 
 loaded = scenario.load(
     Path(__file__).parents[1] / "config" / "piston.yaml",

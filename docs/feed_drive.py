@@ -7,7 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from lathe_rc.plants.feed import FeedDrive, dc_screw
+from lathe_rc.plants.feed import FeedDrive
+from lathe_rc.plants.feed_models import dc_screw
 from lathe_rc.plants.friction import Friction, mobility
 from lathe_rc.plants.screw import Screw
 

@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import measure
-from lathe_rc.cell import messages, scenario
+from lathe_rc.cell import scenario
 
 HERE = Path(__file__).parent
 CUTOFF = 50.0  # [UPR]

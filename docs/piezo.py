@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.analysis.hysteresis_fit import Loop, identify
-from lathe_rc.cell import messages, scenario
+from lathe_rc.cell import scenario
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuator, PiezoActuatorParameters
 from lathe_rc.cell.stages.series_drive import SeriesDriveParameters, SeriesDriveStage
@@ -37,7 +37,7 @@ def position(set_point: Array, **values: Any) -> Array:
 
 
 def error(**values: Any) -> Array:
-    """What a drive leaves of the last second of a swing at 1 Hz [m]."""
+    """A drive's residual of the last second of a swing at 1 Hz [m]."""
     return np.asarray((position(SLOW, **values) - SLOW)[-RATE:])
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lathe_rc import harness
-from lathe_rc.cell import messages, scenario
+from lathe_rc import harness, messages
+from lathe_rc.cell import scenario
 from lathe_rc.safety.faults import KINDS
 from lathe_rc.safety.state_machine import MEANING, Reaction, State, table
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import trapezoid
 
-from lathe_rc import harness
-from lathe_rc.cell import messages, scenario
+from lathe_rc import harness, messages
+from lathe_rc.cell import scenario
 from lathe_rc.cell.wiring import Cell
 
 WAVES = [2, 5, 10, 15, 20]

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from lathe_rc.signals.profile import Harmonics, ProfileTable
+from lathe_rc.signals.profile import Harmonics
+from lathe_rc.signals.profile_table import ProfileTable
 from lathe_rc.signals.tip_path import TipPath, steepest_fall
 
 HERE = Path(__file__).parent

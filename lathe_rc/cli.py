@@ -15,7 +15,6 @@ from lathe_rc.errors import LatheError, shown
 
 COMMANDS = {
     "bag": "Ask bags what is in them; check and recover them; take a tachogram out.",
-    "bench": "Measure how fast lathe_rc is here.",
     "budget": "Tell what the form error of a scenario is made of.",
     "container": "Run several nodes in one process.",
     "demo": "Turn a piston with ROS 2 processes and draw it.",
@@ -52,10 +51,11 @@ class _Command(click.Command):
         return command.make_context(info_name, args, parent, **extra)
 
 
-class _Group(click.Group):
+class Group(click.Group):
     """Turns the project's errors into one line and an exit code."""
 
     def invoke(self, ctx: click.Context) -> Any:
+        """See `click.Command`."""
         # SIGTERM ends a command as Ctrl-C does: children are ended and bags closed on the way out.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
@@ -63,17 +63,24 @@ class _Group(click.Group):
         except LatheError as error:
             click.echo(f"lathe: {error}", err=True)
             ctx.exit(error.exit_code)
+        except ModuleNotFoundError as error:
+            from lathe_rc import extras
+
+            if not (missing := extras.refusal(error.name)):
+                raise
+            click.echo(f"lathe: {missing}", err=True)
+            ctx.exit(missing.exit_code)
         except MemoryError as error:
             click.echo(f"lathe: not enough memory ({shown(error)})", err=True)
             ctx.exit(LatheError.exit_code)
 
 
 @click.group(
-    cls=_Group,
+    cls=Group,
     commands=[_Command(name, short_help=summary) for name, summary in COMMANDS.items()],
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="./lathe of a checkout also has: setup; test (linters and tests; --system: those that need privileges); "
-    "python SCRIPT ... (in its environment).",
+    "bench (how fast it is here); python SCRIPT ... (in its environment).",
 )
 @click.version_option(__version__)
 def main() -> None:

@@ -11,7 +11,7 @@ class LatheError(Exception):
 
 
 class InputError(LatheError):
-    """What the user gave cannot be used: a parameter, a file, a path, an unstable setting."""
+    """The user's input cannot be used: a parameter, a file, a path, an unstable setting."""
 
     exit_code: ClassVar[int] = 2
 
@@ -31,6 +31,6 @@ class LossyRunError(LatheError):
 
 
 def shown(text: object, longest: int = 200) -> str:
-    """What a library or a file says: its first line, of what prints, and not much of it."""
+    """The message of a library or a file: the beginning of its first line, in characters that print."""
     first = (str(text).strip().splitlines() or [type(text).__name__])[0]
     return "".join(letter if letter.isprintable() else "\ufffd" for letter in first[:longest])

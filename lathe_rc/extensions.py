@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What others add to the cell without a change of it: classes by name, ours and theirs.
+"""Extensions of the cell from other packages: classes by name, ours and theirs.
 
 A class is named by a name of ours, by a name that an installed package offers as an entry point, or, without any
 installation, by where it stands: ``package.module:Class``. A module is looked for where Python looks for it, and then
@@ -15,7 +15,7 @@ import sys
 import sysconfig
 import traceback
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -30,7 +30,7 @@ V = TypeVar("V")
 
 
 class Offers(Mapping[str, V], Generic[V]):
-    """What we and others offer of one sort, by name.
+    """The classes of one sort, ours and those of other packages, by name.
 
     Iteration gives our names and those that installed packages offer; any ``package.module:Name`` is found as well.
 
@@ -56,7 +56,7 @@ class Offers(Mapping[str, V], Generic[V]):
         return sum(1 for _ in self)
 
     def __getitem__(self, name: str) -> V:
-        """What has this name.
+        """The class of this name.
 
         Raises:
             KeyError: nobody offers it.
@@ -77,7 +77,7 @@ class Offers(Mapping[str, V], Generic[V]):
 
     @abstractmethod
     def _checked(self, name: str, found: Any) -> V:
-        """What was imported, if it is one of these."""
+        """The imported object, if it is one of these."""
 
     def _refused(self, name: str, found: Any, wanted: str) -> InputError:
         return InputError(f"{self._what} {shown(name)!r} is {shown(repr(found))}; allowed: {wanted}")
@@ -126,7 +126,7 @@ class Registry(Offers[type[T]], Generic[T]):
 
     def allowed(self) -> str:
         """The names, in words."""
-        return f"{', '.join(self)}, or PACKAGE.MODULE:CLASS"
+        return in_words(self)
 
     def origin(self, name: str) -> Mapping[str, str] | None:
         """Where a class of others comes from: distribution, version, hash of its source; None: it is ours."""
@@ -137,7 +137,7 @@ class Registry(Offers[type[T]], Generic[T]):
 
 
 def find(name: str, what: str) -> Any:
-    """What stands at ``package.module:Name``.
+    """The object at ``package.module:Name``.
 
     Args:
         name: see above.
@@ -187,7 +187,7 @@ def _attribute(module: str, attribute: str, what: str) -> Any:
 
 @cache
 def _offered(group: str) -> Mapping[str, importlib.metadata.EntryPoint]:
-    """What installed packages offer, by name.
+    """The entry points of installed packages, by name.
 
     Raises:
         InputError: two packages offer the same name.
@@ -199,6 +199,12 @@ def _offered(group: str) -> Mapping[str, importlib.metadata.EntryPoint]:
             both = f"{_distribution(other.dist)} and {_distribution(point.dist)}"
             raise InputError(f"{both} offer {point.name!r} ({group}); allowed: one of them; uninstall the other")
     return found
+
+
+def in_words(names: Iterable[str]) -> str:
+    """What may be given where ``names`` are known, and classes of others."""
+    listed = ", ".join(names)
+    return f"{listed}, or PACKAGE.MODULE:CLASS" if listed else "PACKAGE.MODULE:CLASS"
 
 
 def _distribution(dist: importlib.metadata.Distribution | None) -> str:
@@ -304,9 +310,9 @@ class Named(Generic[T]):
         return (*self.special, *self.registry.own)
 
     def allowed(self) -> str:
-        """What the parameter accepts, in words."""
+        """The values that the parameter accepts, in words."""
         names = [*(name or "''" for name in self.special), *self.registry]
-        return f"one of {', '.join(names)}, or PACKAGE.MODULE:CLASS" if names else "PACKAGE.MODULE:CLASS"
+        return f"one of {in_words(names)}" if names else in_words(names)
 
     def others(self, value: object) -> list[str]:
         """The names of classes of other packages in a parameter's value, a name or a list of some."""

@@ -17,7 +17,7 @@ _NO_FILE = "not a file"
 
 
 def contents(path: Path, most: int = MOST) -> bytes:
-    """What is in a file. Pipes and files of the system that would have a reader wait, perhaps for ever, are none.
+    """The content of a file. Pipes and system files, at which a reader could wait for ever, are refused.
 
     Raises:
         OSError: it cannot be read; EFBIG: it is longer than ``most`` bytes.

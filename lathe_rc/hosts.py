@@ -11,7 +11,8 @@ from functools import partial
 from pathlib import Path
 
 from lathe_rc import harness
-from lathe_rc.bag import reader, resim
+from lathe_rc.bag import reader
+from lathe_rc.bag.resimulation import resim
 from lathe_rc.cell import batch
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell

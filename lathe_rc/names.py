@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is said of a name that nobody has: the names that look like it."""
+"""Suggestions for an unknown name: the names that look like it."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -16,7 +16,7 @@ def _in(name: str, other: str) -> bool:
 
 
 def instead(name: str, known: Iterable[str], *, listing: str = "") -> str:
-    """What may stand in the place of an unknown name, in words.
+    """The names that may replace an unknown one, in words.
 
     Args:
         name: that nobody has.

@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
+from lathe_rc import messages
 from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.metrology import FormErrors, Lay, Measurement, evenly, form_errors, lay, measure, turns_before
 from lathe_rc.analysis.tolerance import Verdict, judge
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals, full
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError
+from lathe_rc.messages import Signals, full
 
 _CUTOFF = 50.0  # of the filters for roundness and roughness [undulations per revolution]
 _TOGETHER = 16  # revolutions that are looked at at once
@@ -73,7 +73,7 @@ def surface(recording: Recording, found: Measurement, nose_radius: float) -> Lay
 
 
 def along(found: Lay) -> dict[str, Any]:
-    """What is told of the surface along the part; lengths in µm, the feed in µm a revolution."""
+    """The figures of the surface along the part; lengths in µm, the feed in µm a revolution."""
     rt, ra = found.rt * 1e6, found.ra * 1e6
     return {
         "revolutions": found.revolutions,
@@ -95,7 +95,7 @@ def along_in_words(found: Lay) -> str:
 
 
 def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
-    """What is told of one revolution, counted from 0; lengths in µm."""
+    """The figures of one revolution, counted from 0; lengths in µm."""
     around, waves = found.roundness, found.undulations.amplitude[revolution]
     largest = int(np.argmax(waves[2:])) + 2  # 0 is the size of the part, 1 its place
 
@@ -122,7 +122,7 @@ def _encoder_and_tool(types: Mapping[str, str]) -> list[str | None]:
 
 
 class ErrorsByRevolution:
-    """Form error by revolution of a run that comes in pieces; a sink of the engine and of `lathe_rc.bag.stream`.
+    """Form error by revolution of a run that comes in pieces; a sink of the engine and `lathe_rc.bag.reading.stream`.
 
     Args:
         types: message type by fully qualified topic.
@@ -196,7 +196,7 @@ class FirstAndLast:
             self._tail = self._tail[:, int(np.searchsorted(self._tail[0], past * 2.0 * np.pi)) :]
 
     def numbers(self) -> dict[str, Any] | None:
-        """Revolutions, and what is told of the first and the last; None if there is no complete one."""
+        """Revolutions, and the figures of the first and the last; None if there is no complete one."""
         head = measure(self._head[0] - self._start, self._head[1], roundness_cutoff=_CUTOFF)
         if not head.form.rms.size:
             return None

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """NamedTuples that stand at an address, for kernels: their members are read where they are used.
 
-A kernel takes a NamedTuple of arrays by value: each call hands over seven words an array and counts references to it.
-A placed one is its address. It is laid out in words of 64 bits: of an array where it is and its shape, of a constant
-its value, of a NamedTuple its members. Who lays it out keeps the arrays meanwhile, and changes no word during a call.
+A kernel takes a NamedTuple of arrays by value: each call hands over seven words an array and counts references to it. A
+placed one is its address. It is laid out in words of 64 bits: of an array where it is and its shape, of a constant its
+value, of a NamedTuple its members. The caller that lays it out keeps the arrays meanwhile, and changes no word during a
+call.
 
 Of a NamedTuple that is `sized` the shapes of the arrays are part of the type: the compiler then unrolls the loops over
 matrices of two or six rows. That is for few and small arrays, since each shape is compiled by itself.
@@ -84,7 +85,7 @@ def unfit(value: object, name: str = "") -> str:
 
 
 def _sort(part: Any) -> Any:
-    """What the type of a member depends on: types of NamedTuples are made once for all that are alike."""
+    """The key of a member's type: types of NamedTuples are made once for all that are alike."""
     if isinstance(part, tuple):
         shapes = [each.shape for each in part if isinstance(each, np.ndarray)]
         return type(part), tuple(map(_sort, part)), tuple(shapes) if type(part) in _SIZED else ()
@@ -180,7 +181,7 @@ class _Members(AttributeTemplate):
 
 
 def _load(builder: Any, address: Any, kind: ir.Type) -> Any:
-    """What stands at an address; it does not change during a call, so that it may be read once for a whole loop."""
+    """The value at an address; it does not change during a call, so that it may be read once for a whole loop."""
     loaded = builder.load(builder.inttoptr(address, kind.as_pointer()))
     loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
     return loaded
@@ -226,7 +227,7 @@ def _at(_context: object, _address: Any, kind: Any) -> Any:
 
 
 def _array_of(element: types.Type) -> Any:
-    """What reads an array of some element type, as Numba wants it."""
+    """The reader of an array of some element type, as Numba wants it."""
 
     def array(_context: object, _addresses: Any, _number: Any, _samples: Any) -> Any:
         kind = types.Array(element, 1, "C")

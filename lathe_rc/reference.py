@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 
-from lathe_rc.bag.record import signal_depth
-from lathe_rc.cell import messages
+from lathe_rc import messages
+from lathe_rc.bag.writing.record import signal_depth
 from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Table
 from lathe_rc.cell.replayer import KIND as REPLAYER
 from lathe_rc.cell.replayer import ReplayerParameters

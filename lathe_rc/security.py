@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lathe_rc import harness
-from lathe_rc.cell.messages import ALIVE
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.replayer import KIND as REPLAYER
@@ -19,6 +18,7 @@ from lathe_rc.cell.rerun_bridge import KIND as RERUN_BRIDGE
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.topic_recorder import KIND as TOPIC_RECORDER
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.messages import ALIVE
 from lathe_rc.namespace import absolute, checked
 from lathe_rc.reference import HOST_TOPICS
 from lathe_rc.view.rerun_signals import drawn
@@ -49,7 +49,7 @@ _COMMAND_LINE = "/_ros2cli_*/get_type_description"  # that the nodes of ros2 top
 
 @dataclass(frozen=True, kw_only=True)
 class Profile:
-    """What one node may do. Names are relative to its namespace, or absolute where the whole domain shares them.
+    """The permissions of one node. Names are relative to its namespace, or absolute where the whole domain shares them.
 
     Attributes:
         namespace: of the node; ``/`` or ``/a/b``.
@@ -169,7 +169,7 @@ def policy(
     namespace: str = "/",
     beside: Iterable[str] = (),
 ) -> Policy:
-    """What the processes of a scenario may do.
+    """The permissions of a scenario's processes.
 
     Args:
         scenario: the cell; it gets a recorder if it has none.

@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
+from lathe_rc import extras
 from lathe_rc.errors import LatheError
 
 Start = Literal["fork", "spawn"]  #: of a process: as a copy of one that has imported everything, or from nothing
@@ -82,11 +83,15 @@ class Child:
 class ForkServer:
     """A fork server of this process; it ends when this process does.
 
+    Raises:
+        LatheError: there is no ROS 2 here.
+
     Attributes:
         lost: it has ended before.
     """
 
     def __init__(self) -> None:
+        extras.require("rclpy")
         self._line, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(
@@ -149,7 +154,7 @@ class ForkServer:
                 socket.send_fds(self._line, [json.dumps(request).encode()], [report.fileno(), log])
             child = self._started.get()
         if child is None:
-            self._started.put(None)  # for who asks next
+            self._started.put(None)  # for the next caller
             raise LatheError("the process that starts the nodes has ended: see what it has written")
         return child
 

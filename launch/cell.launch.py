@@ -19,7 +19,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from lathe_rc import harness, resources
-from lathe_rc.bag.writer import refuse_existing
+from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import SharedParameters

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from lathe_rc import harness
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.wire import Encoder
@@ -80,7 +79,7 @@ def held(cell: Scenario, domain: int) -> Iterator[tuple[harness.Processes, Calla
 
 @contextlib.contextmanager
 def files_up_to(size: int) -> Iterator[None]:
-    """No file may grow beyond ``size`` [B]: to who writes one, the disk is full."""
+    """No file may grow beyond ``size`` [B]: for a process that writes one, the disk is full."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:

@@ -16,8 +16,8 @@ from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from lathe_rc.bag.source import read_chunk
-from lathe_rc.bag.trust import read_record
+from lathe_rc.bag.reading.precheck import read_record
+from lathe_rc.bag.reading.unpacking import read_chunk
 
 WORDS = (
     *(b"", b"\n", b"\0", b"nan", b"inf", b"-1", b"1e999", b"9223372036854775808", b"true", b"null", b"[1, 2]", b"{}"),

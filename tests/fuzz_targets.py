@@ -23,12 +23,14 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.analysis import hysteresis_fit, reduced_order, step_fit
-from lathe_rc.bag import check, reader, recover, resim, story
-from lathe_rc.bag.source import Source
-from lathe_rc.bag.writer import BagWriter, offered_qos
-from lathe_rc.cell import messages, scenario, state_file
+from lathe_rc.bag import check, provenance, reader
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.repairing import recover
+from lathe_rc.bag.resimulation import resim
+from lathe_rc.bag.writing.writer import BagWriter, offered_qos
+from lathe_rc.cell import scenario, state_file
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.stages.trajectory import Trajectory, TrajectoryParameters
@@ -38,7 +40,7 @@ from lathe_rc.commands.fit import fit as fit_command
 from lathe_rc.control import memory_file
 from lathe_rc.control.predistortion import Predistortion
 from lathe_rc.errors import LatheError
-from lathe_rc.signals import profile
+from lathe_rc.signals import measured_profile, profile_table
 from lathe_rc.view import report
 from lathe_rc.view.report_gather import gather
 from lathe_rc.view.report_host import DIAGNOSTICS
@@ -136,7 +138,7 @@ def _trajectory(path: Path) -> None:
 
 
 def _profile(path: Path) -> None:
-    profile.ProfileTable(profile.read_csv(path), 64).demand(100.0, 1.0, 1e-4)
+    profile_table.ProfileTable(measured_profile.read_csv(path), 64).demand(100.0, 1.0, 1e-4)
 
 
 _TABLES: Mapping[str, Callable[[Path], object]] = {
@@ -180,7 +182,7 @@ def _csv() -> list[bytes]:
 
 
 def _fits(data: bytes) -> None:
-    """What `lathe fit` makes of a file that can be read."""
+    """`lathe fit` with a file that can be read."""
     with _folder() as folder, np.errstate(all="ignore"):
         (folder / "fuzz.csv").write_bytes(data)
         for command, *options in (("hysteresis",), ("channel", "--figure", str(folder / "fuzz.png"))):
@@ -381,10 +383,10 @@ def _definition_seeds() -> list[bytes]:
 def _abouts(data: bytes) -> None:
     """Texts of a bag: the scenario, then key and text of each file."""
     first, *others = [part.decode(errors="replace") for part in data.split(CUT)]
-    about = {story.SCENARIO: first, **dict(zip(others[::2], others[1::2], strict=False))}
+    about = {provenance.SCENARIO: first, **dict(zip(others[::2], others[1::2], strict=False))}
     with _folder() as folder, refusals():
         (folder / "files").mkdir()
-        found = story.scenario_of(about, folder / "files")
+        found = provenance.scenario_of(about, folder / "files")
         for table in found.nodes.values():
             for row in type(table).rows().values():
                 named = getattr(table, row.name)
@@ -398,9 +400,9 @@ def _about_seeds() -> list[bytes]:
     tool = TABLES["tool"].read("tool", form)
     memory = {"run_id": "r", "memory_file": str(CONFIG / "memory.npz")}
     told = Scenario("fuzz", {"tool": tool, "learning_controller": TABLES["learning_controller"].read("", memory)})
-    about = story.tell(told, [])
-    files = [part for key, text in about.items() if key.startswith(story.FILE) for part in (key, text)]
-    seed = CUT.join(part.encode() for part in (about[story.SCENARIO], *files))
+    about = provenance.tell(told, [])
+    files = [part for key, text in about.items() if key.startswith(provenance.FILE) for part in (key, text)]
+    seed = CUT.join(part.encode() for part in (about[provenance.SCENARIO], *files))
     return [seed, *(text + CUT + b"lathe_rc.file.tool.profile_file" + CUT + b"AAAA" for text in _scenarios())]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the pages show, and a reader who does it: blocks run in order, and what comes is compared with what is shown.
+"""Blocks of the pages, and a reader that runs them in order and compares their output with the page.
 
     ```python                   the examples of a page are one program, in the order of the page
     ```text                     right behind one of them: what it prints
@@ -8,8 +8,8 @@
     ```console title="…"        one command for a terminal of its own: it goes on beside the next commands
     ```python title="FILE"      a file that the reader saves; so is any other language with a title
 
-All other blocks are read, not run. What depends on the machine is never compared, and numbers with a fraction may
-differ by one in their last digit (`different`).
+All other blocks are read, not run. Figures of the machine, such as times, are never compared, and numbers with a
+fraction may differ by one in their last digit (`different`).
 """
 
 import contextlib
@@ -34,11 +34,11 @@ ROOT = Path(__file__).parents[1]
 TIMEOUT = 120  #: [s] for what should have ended
 
 _FENCE = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-#: what comes now and then, depending on how fast it goes
+#: lines that come or not, depending on the load of the machine
 _NOW_AND_THEN = re.compile(
     r"^(revolution \d+: error |compiling |\[\w+\] \[[\d.]+\] \[\w+\]: wait|.* silent |.* refuses: )"
 )
-#: what depends on the machine
+#: figures of the machine
 _MACHINE = re.compile(
     r"in [\d.]+ s: [\d.]+x real time|(?<=^\[INFO\] )\[[\d.]+\]|(?<=Dask's dashboard: ).*|[0-9a-f]{64}|\d+ messages(?=,)"
 )
@@ -234,7 +234,7 @@ class Reader:
         return subprocess.Popen(["bash", "-c", text], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     def _wait(self, page: Path) -> None:
-        """What runs in other terminals has ended when the command of the first one has."""
+        """Wait for the commands in other terminals: they end with the one of the first."""
         while self._beside:
             command, process = self._beside.pop(0)
             came, _ = process.communicate(timeout=TIMEOUT)

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
-from lathe_rc.nodes import declare
+from lathe_rc.nodes import declare, executables
 
 ALONE = ["replayer", "topic_recorder", *(["rerun_bridge"] if importlib.util.find_spec("rerun") else [])]
 
@@ -23,7 +23,10 @@ def run(monkeypatch, capsys, executable, *words):
     monkeypatch.setattr(sys, "argv", [executable, *words])
     monkeypatch.setenv("COLUMNS", "200")
     try:
-        importlib.import_module(f"lathe_rc.nodes.{executable}").main()
+        if executable in TABLES.own:
+            getattr(executables, executable)()
+        else:
+            importlib.import_module(f"lathe_rc.nodes.{executable}").main()
         code = 0
     except SystemExit as exit_:
         code = exit_.code
@@ -70,7 +73,7 @@ OWN, SHARED = "/tool: {ros__parameters: {feed: 1.0}}\n", "/**: {ros__parameters:
 
 
 def feed_of(folder, words, file):
-    """What the node ``tool`` gets, and whether what it does not get is refused."""
+    """The parameters of the node ``tool``, and whether those that it does not get are refused."""
     path = folder / "some.yaml"
     path.write_text(file)
     given = ["--ros-args", *(str(path) if word == "FILE" else word for word in words)]

@@ -17,9 +17,9 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from rosbags.highlevel import AnyReader
 
-from lathe_rc import harness
-from lathe_rc.bag import reader, recover
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
+from lathe_rc.bag import reader
+from lathe_rc.bag.repairing import recover
 from lathe_rc.errors import InputError
 
 EVENTS = {"events": ["revolution 1.5: freeze", "sample 7000: learn"]}

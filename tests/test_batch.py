@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many cells at once: each gets the bits that it gets alone, and one that fails is told of."""
+"""Many cells at once: each gets the bits that it gets alone, and one that fails is reported."""
 
 import gc
 import itertools

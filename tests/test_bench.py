@@ -9,11 +9,12 @@ import pytest
 from click.testing import CliRunner
 from mcap.reader import make_reader
 
-from lathe_rc import cli, harness
+from lathe_rc import harness
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import page, ros, sides, suite, transport
+from benchmarks.__main__ import main
 
 RESULT = {
     "commit": "abc",
@@ -40,7 +41,7 @@ RESULT = {
 
 
 def run(*arguments):
-    return CliRunner().invoke(cli.main, ["bench", *arguments])
+    return CliRunner().invoke(main, ["bench", *arguments])
 
 
 def test_sides_take_turns_and_their_rounds_belong_together():

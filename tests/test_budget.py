@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a form error is made of: the parts add up, each is what it says, and what causes do together is not hidden."""
+"""The parts of a form error add up, each is what it says, and interactions of causes are not hidden."""
 
 import json
 

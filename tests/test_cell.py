@@ -15,7 +15,8 @@ from lathe_rc_msgs.srv import Schedule
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness
-from lathe_rc.bag import reader, recover
+from lathe_rc.bag import reader
+from lathe_rc.bag.repairing import recover
 from lathe_rc.cell.scenario import load
 
 PISTON = Path(__file__).parents[1] / "config" / "piston.yaml"

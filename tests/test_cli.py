@@ -350,7 +350,7 @@ def test_unknown_node_is_refused_with_the_known_ones():
 
 
 def test_summary_of_a_failed_learning_is_json_too():
-    """What diverges runs into the end stops: large numbers, but numbers."""
+    """A diverging command runs into the end stops: large numbers, but numbers."""
     forced = ["--set", "learning_controller.allow_unstable=true", "--set", "learning_controller.lead_time=8e-3"]
     error = told("cell.yaml", *forced, "--revolutions", "60")["error_um"]
     assert all(math.isfinite(rms) for rms in error["per_revolution_rms"])

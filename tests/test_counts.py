@@ -217,7 +217,7 @@ def test_the_end_is_the_first_sample_that_has_reached_the_angle(wanted, seed):
 
 
 def write_counts(path, seconds=0.4, every=5e-4, law=LAW, first=7 * 10**17):
-    """What a real encoder of `COUNTS` counts would have given."""
+    """The readings of a real encoder of `COUNTS` counts."""
     times = np.arange(0.0, seconds, every)
     counts = np.floor(law.at(times)[0] * COUNTS / TURN)
     rows = [f"{first + round(time * 1e9)},{count:.0f}" for time, count in zip(times, counts, strict=True)]
@@ -273,7 +273,7 @@ def test_events_tell_of_speeds_that_the_checks_did_not_count_on(tmp_path):
     path = tmp_path / "counts.csv"
     write_counts(path, 0.2)
     result = harness.run(follower(path, revolutions=2.0, max_deviation=0.02))
-    said = [found.text.partition(":")[0] for found in result.happened if found.topic == "/encoder_device/events"]
+    said = [found.text.partition(":")[0] for found in result.event_log if found.topic == "/encoder_device/events"]
     assert sorted(said) == ["too fast", "too slow"]
     with pytest.raises(InputError, match="at 199 rad/s the cycle leaves"):
         harness.run(follower(path, revolutions=2.0, max_deviation=0.9))

@@ -9,8 +9,11 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.plants.cutting import PAPER, REALISTIC, RIGID, CuttingProcess, Elasticity, Flank, HardSpot, Part, Wear
+from lathe_rc.plants.cutting import CuttingProcess
 from lathe_rc.plants.cutting_force import STEEL, SpecificForce
+from lathe_rc.plants.deflection import PAPER, REALISTIC, RIGID, Elasticity
+from lathe_rc.plants.flank import Flank, Wear
+from lathe_rc.plants.workpiece import HardSpot, Part
 from lathe_rc.signals import speed as speeds
 from lathe_rc.signals.allowance import PAPER_RMS, Allowance, mean_reverting
 from lathe_rc.transfer import LinearSystem, TransferFunction
@@ -29,7 +32,7 @@ def make(**options):
 
 
 def cut(process, samples, lengths=None, **inputs):
-    """What a process makes of its inputs, at constant speed and feed by default."""
+    """The outputs of a process, at constant speed and feed by default."""
     rate = np.broadcast_to(inputs.get("speed", SPEED), samples)
     given_to = {name: np.zeros(samples) for name in INPUTS}
     given_to["angle"] = SPEED * STEP * np.arange(samples)

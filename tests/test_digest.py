@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from cells import run
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.recording import Recording, SparseTopic
 
 SIGNALS = {"angle": np.array([0.0, 0.1, 0.2]), "index_pulse": np.array([1, 0, 0], np.uint8)}

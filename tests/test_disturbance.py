@@ -11,19 +11,20 @@ from cells import scenario
 from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lathe_rc import harness
-from lathe_rc.cell import batch, messages
+from lathe_rc import harness, messages
+from lathe_rc.cell import batch
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.stages.law import Law
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.cli import main
-from lathe_rc.control import disturbance
+from lathe_rc.control import disturbance_memory
 from lathe_rc.control.angle_filter import angle_filter, at, follow
 from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
 from lathe_rc.signals.encoder import Encoder
-from lathe_rc.signals.profile import Piston, derivatives_at, deviation_along, height_along, tabulated
+from lathe_rc.signals.profile import Piston
+from lathe_rc.signals.profile_table import derivatives_at, deviation_along, height_along, tabulated
 from lathe_rc.studies import STUDIES
 
 CONFIG = Path(__file__).parents[1] / "config"
@@ -215,7 +216,7 @@ def test_each_part_of_it_earns_its_place(without, condition, times):
 
 
 def test_the_drive_is_identified_while_it_cuts():
-    """What the force hides it tells by how it answers a speed that varies: to 3 % after 20 revolutions."""
+    """With a varying speed the drive is identified under the force to 3 % after 20 revolutions."""
     made = load("robust_cutting", "controller.allow_unstable=true").varied(drive(0.8, 1.2, 1.0, 1.0))
     cell = Cell(made.nodes)
     keeper = batch.Errors(cell, cell.samples)
@@ -257,13 +258,13 @@ def test_what_is_refused_does_diverge():
 
 
 def test_smoothing_passes_what_is_learned_and_half_at_its_edge():
-    taps = disturbance.smoothing(60.0, 512)
+    taps = disturbance_memory.smoothing(60.0, 512)
     places = np.arange(taps.size) - taps.size // 2
     waves = np.array([0.0, 10.0, 60.0, 200.0])
     response = np.cos(TURN / 512 * np.outer(waves, places)) @ taps
     assert_allclose(response, [1.0, 1.0, 0.5, 0.0], atol=2e-3)
     with pytest.raises(InputError, match="waves per revolution: the filter is wider than a revolution"):
-        disturbance.smoothing(2.0, 512)
+        disturbance_memory.smoothing(2.0, 512)
 
 
 # --- the laws it is compared with

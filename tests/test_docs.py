@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What users read is true: the reference page, links, the examples of the README, scenarios, the launch file."""
+"""The pages are true: the reference page, links, the examples of the README, scenarios, the launch file."""
 
 import ast
 import functools
@@ -18,12 +18,12 @@ from click.testing import CliRunner
 
 from lathe_rc import __version__, cli, reference
 from lathe_rc.cell import ros_yaml, scenario
-from lathe_rc.cell.messages import PACKAGE, store
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.commands.run import run
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import PACKAGE, store
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -46,6 +46,17 @@ def anchors(page: Path) -> set[str]:
     """The headings of a page as links call them."""
     found = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading).strip().lower().replace(" ", "-") for heading in found}
+
+
+_LINES = 400  # of a file of the package that needs no reason
+_REASON = re.compile(r"^Longer than 400 lines: \S", re.MULTILINE)
+
+
+def test_a_file_beyond_400_lines_says_why() -> None:
+    texts = {path: path.read_text(encoding="utf-8") for path in (ROOT / "lathe_rc").rglob("*.py")}
+    long = {path: text for path, text in texts.items() if text.count("\n") > _LINES}
+    said = {path: ast.get_docstring(ast.parse(text)) or "" for path, text in long.items()}
+    assert [name(path) for path, docstring in said.items() if not _REASON.search(docstring)] == []
 
 
 class TestReference:
@@ -182,9 +193,9 @@ def test_one_version_stands_everywhere() -> None:
     said = {
         re.search(pattern, (ROOT / path).read_text(encoding="utf-8"))[1]
         for path, pattern in (
-            ("setup.py", r'version="(.+?)"'),
             ("package.xml", "<version>(.+?)<"),
             ("msg_defs/package.xml", "<version>(.+?)<"),
+            ("CITATION.cff", r"(?m)^version: (.+)$"),
         )
     }
     assert said == {__version__}
@@ -275,7 +286,7 @@ def launch_file(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 class TestLaunch:
     @pytest.fixture
     def start(self, launch_file: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-        """What `ros2 launch` does with the description: the actions that it makes, for given arguments.
+        """The actions that `ros2 launch` makes of the description, for given arguments.
 
         ``including``: a file that it was given instead, which includes ours and sets the arguments.
         """
@@ -366,7 +377,7 @@ class TestLaunch:
 
 
 class TestEndsUnderLaunch:
-    """What launch makes of it: an error means that it ends the others and returns 1."""
+    """The answer of launch: an error means that it ends the others and returns 1."""
 
     @pytest.fixture
     def ended(self, launch_file: ModuleType) -> Callable[..., Any]:

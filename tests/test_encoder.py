@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import undulations
-from lathe_rc.cell import messages, scenario
+from lathe_rc.cell import scenario
 from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
 from lathe_rc.signals.encoder import Encoder

@@ -13,7 +13,7 @@ from test_counts import COUNTS, TURN, follower, write_counts
 from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
-from lathe_rc.bag.resim import resimulate
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.errors import LatheError
 
@@ -67,7 +67,7 @@ def lines(path):
 
 @pytest.mark.parametrize("mode", ["composed", "processes"])
 def test_a_serial_line_leads_a_cell_and_gives_the_bits_of_a_file_of_its_counts(tmp_path, mode):
-    """What came is in the bag: run again from that, every bit comes out."""
+    """The received readings are in the bag: run again from that, every bit comes out."""
     path = tmp_path / "counts.csv"
     write_counts(path, 0.2)
     with serial_line(lines(path)) as (line, watch, _):
@@ -120,7 +120,7 @@ def test_a_topic_leads_a_cell(tmp_path, ghost, domain):
     ],
 )
 def test_when_the_encoder_is_lost_the_others_come_to_their_safe_state(tmp_path, rest, message):
-    """What is missing or wrong is said; the drive retracts while the spindle seems to go on at its last speed."""
+    """Missing and wrong readings are reported; the drive retracts while the spindle seems to keep its last speed."""
     path, pipe = tmp_path / "counts.csv", tmp_path / "pipe"
     write_counts(path, 0.1)
     os.mkfifo(pipe)

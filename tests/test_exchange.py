@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the nodes of one process hand over to each other."""
+"""Blocks that the nodes of one process hand over to each other."""
 
 from types import SimpleNamespace
 

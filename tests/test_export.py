@@ -11,12 +11,11 @@ from cells import scenario
 from click.testing import CliRunner
 from pyarrow import parquet
 
-from lathe_rc import harness
-from lathe_rc.bag import export as exporting
+from lathe_rc import harness, messages
 from lathe_rc.bag import reader
-from lathe_rc.bag.columns import columns, dense_rows, units
-from lathe_rc.bag.formats import FORMATS
-from lathe_rc.cell import messages
+from lathe_rc.bag.exporting import export as exporting
+from lathe_rc.bag.exporting.formats import FORMATS
+from lathe_rc.cell.columns import columns, dense_rows, units
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.commands.export import export
 from lathe_rc.errors import InputError, LatheError

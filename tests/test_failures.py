@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What breaks is named, the rest is ended, and the bag is readable."""
+"""A failed node is named, the others are ended, and the bag is readable."""
 
 import os
 import re
@@ -16,11 +16,10 @@ from cells import told_until_all_have_ended
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from lathe_rc import harness, starting
+from lathe_rc import harness, messages, starting
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
-from lathe_rc.bag.resim import resimulate
-from lathe_rc.cell import messages
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.scenario import load
 from lathe_rc.commands.progress import TROUBLE
 from lathe_rc.errors import InputError, LatheError
@@ -81,7 +80,7 @@ class Finder:
     def find_spec(self, name, path=None, target=None):
         if name == "lathe_rc.nodes.recorder_node":
             sys.meta_path.remove(self)
-            from lathe_rc.bag.writer import BagWriter
+            from lathe_rc.bag.writing.writer import BagWriter
             BagWriter.close = close
 
 sys.meta_path.insert(0, Finder())
@@ -170,7 +169,7 @@ def told_after_the_death_of(node, bag):
 def test_without_the_harness_every_process_of_a_cell_that_lost_a_member_says_so_by_its_exit_code(tmp_path):
     told = told_after_the_death_of("tool", tmp_path / "bag")
     codes = {event["node"]: event["code"] for event in told if event["event"] == "exit"}
-    # Who is killed may take a lock of DDS with it: whoever that holds up is killed and named.
+    # Who is killed may take a lock of DDS with it: whichever that blocks is killed and named.
     held_up = {event["node"] for event in told if event["event"] == "stuck"}
     assert {name for name, code in codes.items() if code == -signal.SIGKILL} == {"tool"} | held_up
     assert {code for code in codes.values() if code != -signal.SIGKILL} == {LatheError.exit_code}
@@ -232,12 +231,12 @@ def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tm
 
 
 def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_is_lost(monkeypatch, tmp_path):
-    monkeypatch.setattr(harness, "_FAREWELL", 1.0)
-    monkeypatch.setattr(harness, "_GRACE", 0.2)  # it writes no log that tells where it is
+    monkeypatch.setattr("lathe_rc.harness.processes._FAREWELL", 1.0)
+    monkeypatch.setattr("lathe_rc.harness.processes._GRACE", 0.2)  # it writes no log that tells where it is
     bag, told = tmp_path / "bag", []
     cell = harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=6.0"]), bag, keep=True)
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
-        # It stands for a process that DDS holds up.
+        # It stands for a process that DDS blocks.
         processes._children["held"] = subprocess.Popen(["/bin/sh", "-c", "trap '' USR1; exec sleep 1000"])
         thread = threading.Thread(target=processes._listen, args=("held", socket.socket(), processes._children["held"]))
         thread.start()

@@ -10,9 +10,8 @@ from click.testing import CliRunner
 from hypothesis import given
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lathe_rc import harness
-from lathe_rc.bag.resim import resimulate
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError, LatheError
@@ -38,7 +37,7 @@ FAULTS = {
 
 
 def disturbed(text, *signals, start=0, lengths=None, seed=0):
-    """What a fault makes of signals that it meets from sample ``start`` on, in blocks."""
+    """Signals with a fault from sample ``start`` on, in blocks."""
     fault = parse(text, "test")
     made = DISTURBANCES[fault.kind](fault, seed=seed, step=STEP, whose="test")
     names = ["angle", "speed", "index_pulse"] if KINDS[fault.kind].what == "encoder" else [fault.target.split(".")[-1]]

@@ -11,7 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_rc.control.limits import CommandLimits
 from lathe_rc.errors import InputError
-from lathe_rc.plants.feed import APPROXIMATE_LAGS, FULL_LAGS, FeedDrive, dc_screw, fourth_order, sampled
+from lathe_rc.plants.feed import FeedDrive
+from lathe_rc.plants.feed_models import APPROXIMATE_LAGS, FULL_LAGS, dc_screw, fourth_order, sampled
 from lathe_rc.transfer import LinearSystem, TransferFunction
 
 STEP = 1 / 64000

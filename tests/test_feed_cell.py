@@ -83,7 +83,7 @@ def held_open():
 
 
 def drift(force):
-    """What wear alone does: a straight line."""
+    """The effect of wear alone: a straight line."""
     time = np.arange(force.size)
     return np.polyval(np.polyfit(time, force, 1), time)
 

@@ -19,10 +19,9 @@ pytest.importorskip("rclpy")
 
 from lathe_rc_msgs.msg import Member
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import form_errors
 from lathe_rc.bag import reader
-from lathe_rc.cell import messages
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.cell.wiring import Unknown
@@ -99,7 +98,7 @@ def driven(recording):
 
 
 def test_the_examples_use_nothing_of_lathe_rc_but_its_messages():
-    """Who has no Python package lathe_rc can run them, and each fits on a screen or two."""
+    """They run without the Python package lathe_rc, and each fits on a screen or two."""
     for path in EXAMPLES.glob("*.py"):
         text = path.read_text(encoding="utf-8")
         used = {name.partition(".")[0] for name in re.findall(r"^(?:from|import) (\S+)", text, re.MULTILINE)}

@@ -9,7 +9,8 @@ from hypothesis import given
 from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_rc.errors import InputError
-from lathe_rc.plants.feed import FeedDrive, dc_screw, fourth_order
+from lathe_rc.plants.feed import FeedDrive
+from lathe_rc.plants.feed_models import dc_screw, fourth_order
 from lathe_rc.plants.friction import Friction, mobility
 
 STEP = 1 / 64000
@@ -38,7 +39,7 @@ def run(machine, command, lengths=None):
 @pytest.mark.parametrize("lags", [(LAG,), (5e-3, LAG)])
 @pytest.mark.parametrize("command", [0.35, 0.6, -1.0])
 def test_steady_force_is_the_stribeck_curve(law, lags, command):
-    """What the motor does not need for the speed of its own equation, F1·(u - v/k), is Fc + (Fs - Fc)·e^… + Fv·v."""
+    """The motor's force beyond that of its own equation, F1·(u - v/k), is Fc + (Fs - Fc)·e^… + Fv·v."""
     friction = rubbing(law)
     speed = run(drive(friction, lags), np.full(64_000, command))[1][-1]
     force = FORCE * (command - speed / GAIN)

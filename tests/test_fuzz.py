@@ -17,13 +17,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import MCAP0_MAGIC
 
-from lathe_rc.bag import story, trust
+from lathe_rc import messages
+from lathe_rc.bag import provenance
 from lathe_rc.bag.check import check
-from lathe_rc.bag.salvage import Salvage
-from lathe_rc.bag.source import MOST_BYTES, Source, unpack
-from lathe_rc.bag.stream import Feeder
-from lathe_rc.bag.writer import BagWriter, offered_qos
-from lathe_rc.cell import messages
+from lathe_rc.bag.reading import precheck
+from lathe_rc.bag.reading.precheck import MOST_BYTES
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.stream import Feeder
+from lathe_rc.bag.reading.unpacking import unpack
+from lathe_rc.bag.repairing.salvage import Salvage
+from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.control import memory_file
 from lathe_rc.errors import InputError, LatheError, shown
 
@@ -341,7 +344,7 @@ def test_file_that_is_packed_twice_or_behind_what_zstd_skips_is_looked_at(tmp_pa
 def test_names_and_numbers_of_a_bag_are_what_they_should_be():
     for name in ("", "a\nb", "\x1b[2J", "x" * 1025, 5, None, "\ud800"):
         with pytest.raises(ValueError, match="characters that print"):
-            trust.check_name(name)
+            precheck.check_name(name)
     with pytest.raises(ValueError, match="does not unpack"):
         unpack("zstd", BOMB, 1000)
     assert shown("\x1b[2Ja\nb") == "\ufffd[2Ja"
@@ -356,7 +359,7 @@ def test_run_of_a_bag_writes_to_no_file_that_the_bag_names(tmp_path):
     precious.write_text("mine")
     (tmp_path / "files").mkdir()
     scenario = f"learning_controller: {{ros__parameters: {{memory_file: {precious}, run_id: r}}}}"
-    found = story.scenario_of({story.SCENARIO: scenario}, tmp_path / "files")
+    found = provenance.scenario_of({provenance.SCENARIO: scenario}, tmp_path / "files")
     named = found.nodes["learning_controller"].memory_file
     memory_file.save(type(precious)(named), np.zeros(4), 4)
     assert precious.read_text() == "mine"
@@ -365,18 +368,18 @@ def test_run_of_a_bag_writes_to_no_file_that_the_bag_names(tmp_path):
 @pytest.mark.parametrize(
     ("about", "said"),
     [
-        ({f"{story.FILE}tool.profile_file": "a"}, "is not base64"),
-        ({f"{story.FILE}tool.profile_file": "\u00e9"}, "is not base64"),
-        ({f"{story.FILE}a=b.c": ""}, "'a' is not shared"),
-        ({f"{story.FILE}a\nb=c.d": ""}, r"'a\\nb' is not shared"),
-        ({f"{story.FILE}tool.a\nb=c: d: e.f": ""}, r"^--set tool\.a:1: not YAML"),
-        ({f"{story.FILE}tool.a\nb": ""}, r"^tool\.a: unknown parameter"),
-        ({story.SCENARIO: "\ud800"}, "not a text file"),
+        ({f"{provenance.FILE}tool.profile_file": "a"}, "is not base64"),
+        ({f"{provenance.FILE}tool.profile_file": "\u00e9"}, "is not base64"),
+        ({f"{provenance.FILE}a=b.c": ""}, "'a' is not shared"),
+        ({f"{provenance.FILE}a\nb=c.d": ""}, r"'a\\nb' is not shared"),
+        ({f"{provenance.FILE}tool.a\nb=c: d: e.f": ""}, r"^--set tool\.a:1: not YAML"),
+        ({f"{provenance.FILE}tool.a\nb": ""}, r"^tool\.a: unknown parameter"),
+        ({provenance.SCENARIO: "\ud800"}, "not a text file"),
     ],
 )
 def test_texts_that_are_no_scenario_are_refused(tmp_path, about, said):
     with refused(said):
-        story.scenario_of({story.SCENARIO: "tool: {ros__parameters: {seed: 1}}", **about}, tmp_path)
+        provenance.scenario_of({provenance.SCENARIO: "tool: {ros__parameters: {seed: 1}}", **about}, tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import doctest
 
 import pytest
 
-from lathe_rc import frames, harness
+from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.cell import batch, recording, scenario
 from lathe_rc.sweep import sweep
@@ -19,7 +19,7 @@ SHOWN = {
     "lathe_rc.cell.recording.Recording": recording.Recording,
     "lathe_rc.cell.batch.run": batch.run,
     "lathe_rc.bag.reader.read": reader.read,
-    "lathe_rc.frames.frame": frames.frame,
+    "lathe_rc.cell.recording.Recording.frame": recording.Recording.frame,
     "lathe_rc.sweep.sweep.run": sweep.run,
 }
 

@@ -119,7 +119,7 @@ def test_adaptive_inverse_beats_the_variable_lead_fivefold(frequency, damping, d
 
 
 def test_inverse_of_the_wrong_model_is_worse_than_the_lead():
-    """What the identification is for."""
+    """The purpose of the identification."""
     given_model = {**ADAPTIVE, "correction_model": "given"}
     variable = largest_error(10.7, lead_time=2e-3, q_time=130e-6)
     assert largest_error(10.7, **given_model, **wrong(1.2, 0.8)) > 2 * variable

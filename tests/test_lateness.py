@@ -33,7 +33,7 @@ def test_no_duration_at_all_has_no_percentiles():
 
 
 def test_a_paced_run_tells_its_lateness_at_its_end():
-    """What is told is whole and in order; what it is depends on the machine."""
+    """The numbers are whole and in order; their values depend on the machine."""
     result = harness.run(scenario(spindle_encoder={"revolutions": 1.0, "speed_factor": 1.0}), mode="composed")
     told = result.lateness
     assert told.blocks == result.blocks

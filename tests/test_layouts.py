@@ -9,9 +9,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from lathe_rc import harness
-from lathe_rc.bag.source import Source
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.scenario import load
 
 ROOT = Path(__file__).parents[1]

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc import harness
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 
@@ -166,7 +165,7 @@ def test_variable_lead_beats_constant_lead_fivefold(frequency):
 
 
 def largest_delay(shared=None, *, spindle=None, controller=None):
-    """What the refusal of an impossible delay allows."""
+    """The delay that the refusal of an impossible one allows."""
     asked = scenario(
         shared, spindle_encoder=spindle or {}, learning_controller={**(controller or {}), "feedback_delay": 100_000}
     )
@@ -254,7 +253,7 @@ def test_setting_at_the_spec_s_limit_converges():
 
 
 def test_stability_counts_at_the_highest_speed():
-    """What converges at 1000 rpm may not at the top of a swing."""
+    """Learning that converges at 1000 rpm may diverge at the top of a swing."""
     controller = {"q_time": 104e-6, "lead_time": 2e-3}
     run(learning_controller=controller)
     with pytest.raises(

@@ -17,7 +17,7 @@ from lathe_rc.studies.speed_deviation import LAWS
 
 @functools.cache
 def study(name, **parameters):
-    """What a study finds, as it is printed."""
+    """The result of a study, as it is printed."""
     subject = STUDIES[name]
     given = read(subject, [f"{key}={value}" for key, value in parameters.items()])
     return json.loads(json.dumps(subject.run(given).to_json(), allow_nan=False))

@@ -14,9 +14,8 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.lifecycle import TransitionCallbackReturn
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.bag import reader
-from lathe_rc.cell import messages
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.stage_node import StageNode

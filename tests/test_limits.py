@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lathe_rc import harness
-from lathe_rc.bag.resim import resimulate
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.control.limits import CommandLimits, limit, limiter
 from lathe_rc.errors import InputError

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``lathe view --live``: what is heard is shown, what is left out is said, and nobody waits for who only watches."""
+"""``lathe view --live``: what is heard is shown, what is left out is said, and no member waits for a viewer."""
 
 import contextlib
 import json
@@ -19,10 +19,9 @@ pytest.importorskip("rerun")
 
 from test_view import TWO, Taken, View, blocks, refused
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.bag import reader
-from lathe_rc.bag.source import Source
-from lathe_rc.cell import messages
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import LatheError
 from lathe_rc.view.rerun_heard import Backlog, Order
@@ -282,7 +281,7 @@ def listens(bridge):
 
 
 def told(bridge):
-    """What it says of the one run that it has shown."""
+    """The output about the one run that it has shown."""
     out, errors = bridge.communicate()
     assert bridge.returncode == 0, errors
     assert "Traceback" not in errors
@@ -311,7 +310,7 @@ def test_a_running_cell_is_shown_as_its_bag(offline, tmp_path):
 
 
 @pytest.mark.parametrize("until_the_end", [False, True])
-def test_a_bridge_that_is_stuck_holds_nobody_up(until_the_end, offline, tmp_path):
+def test_a_bridge_that_is_stuck_delays_no_member(until_the_end, offline, tmp_path):
     with harness.free_domain() as domain, watching(domain, tmp_path) as bridge:
         with cell(tmp_path, domain, "spindle_encoder.speed_factor=0.5") as (processes, begin):
             listens(bridge)

@@ -14,10 +14,13 @@ from lathe_rc.analysis.loaded import compliance, compliance_in_series
 from lathe_rc.analysis.regeneration import Regeneration
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.plants.cutting import RIGID, CuttingProcess, Part
+from lathe_rc.plants.coil import Coil
+from lathe_rc.plants.cutting import CuttingProcess
 from lathe_rc.plants.cutting_force import SpecificForce
-from lathe_rc.plants.loaded import Coil, LoadedDrive, Piezo
+from lathe_rc.plants.deflection import RIGID
+from lathe_rc.plants.loaded import LoadedDrive, Piezo
 from lathe_rc.plants.piezo import Stack
+from lathe_rc.plants.workpiece import Part
 from lathe_rc.transfer import TransferFunction
 
 STEP = 1 / 64000
@@ -59,7 +62,7 @@ def cutting(stiffness=300e3, depth=0.3e-3, lag=2e-3, step=STEP, **options):
 
 
 def turning(samples, step=STEP, speed=SPEED, **given):
-    """What a block takes, at constant speed and a feed of 1 mm."""
+    """The inputs of a block, at constant speed and a feed of 1 mm."""
     rate = np.full(samples, speed)
     found = {"command": np.zeros(samples), "angle": rate * step * np.arange(samples), "speed": rate}
     return found | {"feed_velocity": 1e-3 * rate / (2 * np.pi)} | given

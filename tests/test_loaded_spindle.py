@@ -166,7 +166,7 @@ def test_speed_over_load_is_that_of_the_formula(belt, frequency):
 
 
 def test_the_motor_also_accelerates_the_spindle_as_its_law_says():
-    """What it may add to the torque of the law is what that leaves of the limit."""
+    """It may add as much to the torque of the law as that leaves of the limit."""
     time = STEP * np.arange(6400)
     law = SPEED + 200.0 * time
     spindle = make(loop=SpeedLoop(30.0, 0.1, torque_limit=10.0))

@@ -27,7 +27,8 @@ from lathe_rc.analysis.metrology import (
 from lathe_rc.cell import scenario
 from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
-from lathe_rc.signals.profile import Harmonics, read_csv
+from lathe_rc.signals.measured_profile import read_csv
+from lathe_rc.signals.profile import Harmonics
 
 TURN = 2 * np.pi
 EVEN = np.arange(POINTS) * (TURN / POINTS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bag holds does not depend on who arrives first, and is what rosbags would have encoded and sorted."""
+"""The content of a bag does not depend on the order of arrival, and is as rosbags would have encoded and sorted it."""
 
 from pathlib import Path
 
@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
-from lathe_rc.bag.order import Merger
-from lathe_rc.bag.writer import BagWriter, offered_qos
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import START_NS
+from lathe_rc import messages
+from lathe_rc.bag.writing.order import Merger
+from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import LatheError
+from lathe_rc.messages import START_NS
 
 STEP_NS = 15_625
 KINDS = {"/z": messages.COMMAND, "/encoder": messages.ENCODER, "/a": messages.STATE}

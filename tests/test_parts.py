@@ -20,11 +20,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc import extensions, harness
-from lathe_rc.bag import story
-from lathe_rc.bag.resim import resimulate
-from lathe_rc.bag.source import Source
-from lathe_rc.cell import batch, messages
+from lathe_rc import extensions, harness, messages
+from lathe_rc.bag import provenance
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.resimulation.resim import resimulate
+from lathe_rc.cell import batch
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
@@ -102,7 +102,7 @@ def test_every_host_and_block_size_gives_the_same_bits(recorded, tmp_path, mode,
     bag = tmp_path / "bag"
     assert harness.run(cell({"block_size": block_size}), mode=mode, bag=bag).digest == recorded[1].digest
     with Source(recorded[0]) as one, Source(bag) as other:
-        assert story.origins(other.about) == story.origins(one.about)
+        assert provenance.origins(other.about) == provenance.origins(one.about)
 
 
 def test_a_batch_gives_the_same_bits(recorded):
@@ -350,7 +350,7 @@ def test_what_a_monitor_cannot_watch_is_refused(values, says):
 
 def test_a_monitor_of_others_asks_for_a_retraction_only_where_somebody_listens():
     asked = {"drives": ["coarse"], "clear_position": 1e-4, "monitor_reactions": ["warn", "retract"]}
-    with pytest.raises(InputError, match="monitor parts:Drift asks for retract, but nobody who moves coarse listens"):
+    with pytest.raises(InputError, match="monitor parts:Drift asks for retract, but no node that moves coarse listens"):
         Cell(cell(learning_controller={"reaction_delay": 0}, supervisor=asked).nodes).check()
 
 
@@ -414,15 +414,15 @@ def installed(tmp_path, monkeypatch):
 
 def test_a_bag_says_where_a_stage_of_others_came_from():
     table = NodeParameters.read("filter", {"stage": "test_wiring:Repeater", "run_id": "test"})
-    told = story.tell(Scenario("test", {**scenario().nodes, "filter": table}), [])
-    (origin,) = story.origins(told)
+    told = provenance.tell(Scenario("test", {**scenario().nodes, "filter": table}), [])
+    (origin,) = provenance.origins(told)
     assert (origin.name, origin.used) == ("test_wiring:Repeater", ("filter.stage",))
 
 
 def test_an_installed_part_has_a_name_and_its_bag_says_where_it_came_from(installed, tmp_path):
     harness.run(scenario(learning_controller={"q_filter": "hann"}), bag=tmp_path / "bag")
     with Source(tmp_path / "bag") as source:
-        (origin,) = story.origins(source.about)
+        (origin,) = provenance.origins(source.about)
     assert (origin.name, origin.package) == ("lathe_hann:Hann", "lathe-hann 0.3")
     assert origin.used == ("learning_controller.q_filter",)
     assert origin.source == extensions.source_hash("lathe_hann")
@@ -469,7 +469,7 @@ def test_what_is_no_study_is_refused_in_one_line(name, says):
 def test_a_bag_without_parts_of_others_says_nothing_of_origins(tmp_path):
     harness.run(scenario(spindle_encoder={"revolutions": 1.0}), bag=tmp_path / "bag")
     with Source(tmp_path / "bag") as source:
-        assert story.ORIGINS not in source.about
+        assert provenance.ORIGINS not in source.about
 
 
 def test_a_bag_shows_where_its_parts_came_from(recorded, tmp_path):
@@ -521,19 +521,19 @@ def test_a_bag_is_read_where_its_parts_are_not_installed(recorded, tmp_path):
 
 
 def told_by(path, origin):
-    """What a bag says of itself, with another origin of its parts."""
+    """The metadata of a bag, with another origin of its parts."""
     with Source(path) as source:
         about = dict(source.about)
-    said = json.loads(about[story.ORIGINS])
-    return {**about, story.ORIGINS: json.dumps({name: {**part, **origin} for name, part in said.items()})}
+    said = json.loads(about[provenance.ORIGINS])
+    return {**about, provenance.ORIGINS: json.dumps({name: {**part, **origin} for name, part in said.items()})}
 
 
 def test_what_is_not_here_is_to_be_installed(recorded):
     """If the parts came from a distribution, that is what the refusal names."""
     about = told_by(recorded[0], {"distribution": "lathe-hann", "version": "0.3"})
-    about[story.ORIGINS] = about[story.ORIGINS].replace("parts:Hann", "lathe_hann:Hann")
+    about[provenance.ORIGINS] = about[provenance.ORIGINS].replace("parts:Hann", "lathe_hann:Hann")
     with pytest.raises(InputError, match=r"lathe_hann:Hann, and .*; allowed: install lathe-hann 0\.3$"):
-        story.scenario_of(about, Path())
+        provenance.scenario_of(about, Path())
 
 
 @pytest.mark.parametrize(
@@ -545,15 +545,15 @@ def test_what_is_not_here_is_to_be_installed(recorded):
 )
 def test_a_re_simulation_with_other_parts_than_the_bag_s_warns(recorded, origin, says):
     path, _ = recorded
-    assert story.changes(told_by(path, {})) == []
+    assert provenance.changes(told_by(path, {})) == []
     expected = says.format(here=extensions.source_hash("parts")[:12])
-    assert story.changes(told_by(path, origin)) == [
+    assert provenance.changes(told_by(path, origin)) == [
         f"parts:{name} {expected}" for name in ("Chirp", "Hann", "Lobes", "Drift")
     ]
 
 
 def test_the_command_warns_on_the_standard_error(recorded, monkeypatch):
-    monkeypatch.setattr(story, "changes", lambda _: ["parts:Hann has another source"])
+    monkeypatch.setattr(provenance, "changes", lambda _: ["parts:Hann has another source"])
     found = lathe("resim", recorded[0], "--json")
     assert found.stderr == "lathe: warning: parts:Hann has another source\n"
     assert json.loads(found.stdout)["equal"]
@@ -562,4 +562,4 @@ def test_the_command_warns_on_the_standard_error(recorded, monkeypatch):
 @pytest.mark.parametrize("said", ["", "[]", '{"a": 1}', '{"a": {"used": 5}}', '{"a": {}}', "[" * 100_000])
 def test_what_a_bag_says_of_origins_is_not_believed(said):
     """Broken texts about origins, in a bag of anybody, are none."""
-    assert story.origins({story.ORIGINS: said}) == []
+    assert provenance.origins({provenance.ORIGINS: said}) == []

@@ -8,15 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.cell.track import Track
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import BlockQueue
+from lathe_rc.nodes.refused_messages import ForeignMessage, RefusedMessages
 from lathe_rc.nodes.stage_node import StageNode
-from lathe_rc.nodes.strangers import Stranger, Strangers
 
 SIZE = 4
 
@@ -98,7 +98,7 @@ def test_blocks_in_order_are_taken():
 def test_a_block_that_its_source_should_not_send_is_an_error(data, words):
     with pytest.raises(LatheError, match=words) as error:
         queue().add(data)
-    assert not isinstance(error.value, Stranger)
+    assert not isinstance(error.value, ForeignMessage)
 
 
 def uneven(source) -> bytes:
@@ -111,7 +111,7 @@ def uneven(source) -> bytes:
 def test_arrays_of_different_lengths_are_an_error_of_their_source():
     with pytest.raises(LatheError, match=r"/spindle sends arrays of \[1, 4\] samples in one block") as error:
         queue().add(uneven("/spindle"))
-    assert not isinstance(error.value, Stranger)
+    assert not isinstance(error.value, ForeignMessage)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_arrays_of_different_lengths_are_an_error_of_their_source():
 def test_a_stranger_is_refused_and_changes_nothing(data, words):
     taken = queue()
     for first in (0, 4, 8):
-        with pytest.raises(Stranger, match=words):
+        with pytest.raises(ForeignMessage, match=words):
             taken.add(data)
         taken.add(block(first))
     assert [b.first_index for b in taken.blocks] == [0, 4, 8]
@@ -144,11 +144,11 @@ def test_who_was_heard_before_the_cell_is_forgotten():
     assert [b.source for b in taken.blocks] == ["/spindle"]
 
 
-def test_too_many_strangers_are_counted_together_and_told_once():
+def test_too_many_foreign_messages_are_counted_together_and_told_once():
     told = []
-    strangers = Strangers(told.append)
+    strangers = RefusedMessages(told.append)
     for number in [*range(1000), *range(1000)]:
-        strangers.refuse(Stranger("/encoder", f"/ghost_{number}" + "x" * 10_000, "run", ""))
+        strangers.refuse(ForeignMessage("/encoder", f"/ghost_{number}" + "x" * 10_000, "run", ""))
     assert len(told) == len(strangers.senders) - 1 == 32
     assert sum(strangers.senders.values()) == 2000
     assert len(str(strangers)) < 32 * 400

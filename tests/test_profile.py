@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lathe_rc.errors import InputError
-from lathe_rc.signals import profile
-from lathe_rc.signals.profile import Harmonics, Measured, Piston, Polygon, ProfileTable, read_csv
+from lathe_rc.signals import profile_table
+from lathe_rc.signals.measured_profile import Measured, read_csv
+from lathe_rc.signals.profile import Harmonics, Piston, Polygon
+from lathe_rc.signals.profile_table import ProfileTable
 
 TURN = 2 * np.pi
 ANGLES = np.linspace(-TURN, 2 * TURN, 4001)
@@ -111,7 +113,7 @@ def test_impossible_profile_is_refused(make, message):
 
 def read_table(table, angles, height):
     found = np.empty(angles.size)
-    profile.deviation_along(table.heights, table.table, angles, np.full(angles.size, height), found)
+    profile_table.deviation_along(table.heights, table.table, angles, np.full(angles.size, height), found)
     return found
 
 

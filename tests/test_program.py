@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import COMMAND, ENCODER
+from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.program import Program, Tapes, wired
 from lathe_rc.cell.stage import NEVER, Input, Output, Sparse, Stage
@@ -15,6 +14,7 @@ from lathe_rc.cell.stages.form import FormTable
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import COMMAND, ENCODER
 
 
 @given(

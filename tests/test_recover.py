@@ -17,13 +17,13 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.bag.check import check
-from lathe_rc.bag.recover import recover
-from lathe_rc.bag.salvage import Salvage
-from lathe_rc.bag.source import MOST_BYTES, Source
-from lathe_rc.bag.writer import BagWriter, offered_qos
-from lathe_rc.cell import messages
+from lathe_rc.bag.reading.precheck import MOST_BYTES
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.repairing.recover import recover
+from lathe_rc.bag.repairing.salvage import Salvage
+from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError, LatheError
@@ -294,7 +294,7 @@ HINT = "; lathe bag recover saves the rest"
 
 
 def unreadable(path, make):
-    """What is no readable bag, in a way."""
+    """Folders and files that are no readable bag."""
     if make in ("nothing there", "empty folder"):
         if make == "empty folder":
             path.mkdir()
@@ -402,6 +402,6 @@ def test_a_file_that_unpacks_to_more_than_allowed_is_refused(tmp_path, monkeypat
     path = tmp_path / "bag"
     strange_bag(path, StoragePlugin.SQLITE3, CompressionMode.FILE)
     Source(path).__exit__(None, None, None)
-    monkeypatch.setattr("lathe_rc.bag.source.MOST_UNPACKED", 1000)
+    monkeypatch.setattr("lathe_rc.bag.reading.unpacking.MOST_UNPACKED", 1000)
     with pytest.raises(InputError, match="unpacks to more than 1000 B"):
         Source(path)

@@ -54,7 +54,7 @@ def test_two_lags_come_back(first, second, size):
 
 
 def test_reduced_order_of_the_full_plant():
-    """What no model of this order has is small, a zero more helps, and no denominator near it does better."""
+    """The best model of this order has a small residual, a zero more helps, and no denominator near it does better."""
     channel = measured(FULL_W1, np.arange(401) * 5e-3)
     two = fit(channel, zeros=0, poles=2)
     assert two.rms < 0.01 * channel.response[-1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is refused of a cell's parameters is named by node and parameter, whoever notices it."""
+"""A refused parameter of a cell is named by node and parameter, wherever it is noticed."""
 
 import re
 

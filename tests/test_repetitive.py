@@ -196,7 +196,7 @@ def test_jump_of_the_angle_is_named():
 
 
 def wrong(at, by, lengths, delay):
-    """What is commanded until the angle is lost, and where; from sample ``at`` on it is wrong by up to ``by``."""
+    """The command until the angle is lost, and the sample; from sample ``at`` on the angle is wrong by up to ``by``."""
     controller, samples = make(delay=delay), sum(lengths)
     angle = np.arange(samples) * (SPEED * STEP)
     late = np.concatenate((np.zeros(delay), angle))[:samples]
@@ -221,7 +221,7 @@ def wrong(at, by, lengths, delay):
     lengths=st.lists(st.integers(1, 9000), max_size=8),
 )  # fmt: skip
 def test_a_wrong_angle_is_lost_at_the_same_sample_whatever_the_blocks(at, by, delay, lengths):
-    """What is no longer in the memory is not read, so it does not matter how far learning has come in a block."""
+    """Overwritten points of the memory are not read, so it does not matter how far learning has come in a block."""
     total = max(25_000, sum(lengths))
     expected = wrong(at, by, [total], delay)
     assert wrong(at, by, [*lengths, total - sum(lengths)], delay) == expected

@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 
 from lathe_rc import harness
 from lathe_rc.bag.check import check
-from lathe_rc.bag.source import Source
+from lathe_rc.bag.reading.source import Source
 
 COUNT = 1500
 
@@ -136,7 +136,7 @@ def test_a_bag_of_others_can_be_paused_and_comes_whole(strange, listener):
 
 
 def test_every_message_comes_in_order_with_the_clock(strange, listener):
-    """Every message comes in order with the clock; to who comes late in a round, in the next one.
+    """Every message comes in order with the clock; to a late reader in the next round.
 
     Volatile topics reach those who are there; so the first round may lack its beginning, the second may not.
     """
@@ -150,7 +150,7 @@ def test_every_message_comes_in_order_with_the_clock(strange, listener):
 
 
 def test_what_comes_before_the_start_that_the_metadata_give_is_sent_too(strange, listener, tmp_path):
-    """What comes before the start that the metadata give is sent too, and the disagreement is told."""
+    """Messages before the start that the metadata give are sent too, and the disagreement is reported."""
     shutil.copytree(strange, tmp_path / "bag")
     metadata = yaml.safe_load((strange / "metadata.yaml").read_text())
     metadata["rosbag2_bagfile_information"]["starting_time"]["nanoseconds_since_epoch"] += 5 * 10**8

@@ -15,10 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc import __version__, harness, part
+from lathe_rc import __version__, harness, messages, part
 from lathe_rc.bag import reader
-from lathe_rc.bag.writer import BagWriter, offered_qos
-from lathe_rc.cell import messages
+from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
 from lathe_rc.commands.report import report
 from lathe_rc.errors import InputError
@@ -384,7 +383,7 @@ def test_a_bag_of_something_else_has_a_page_too(tmp_path):
 
 def test_a_gap_is_told_and_what_came_before_is_shown(turned, tmp_path):
     """The same recording without one block of the tool, in the fifth revolution."""
-    from lathe_rc.bag.source import Source
+    from lathe_rc.bag.reading.source import Source
 
     writer = BagWriter(tmp_path / "bag", compression="none", chunk_size=2**16, about={})
     with Source(turned[0]) as source:

@@ -20,8 +20,8 @@ from std_msgs.msg import String
 
 from lathe_rc import harness
 from lathe_rc.bag.check import check
-from lathe_rc.bag.source import Source
-from lathe_rc.bag.writer import offered_qos
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.writing.writer import offered_qos
 from lathe_rc.errors import InputError
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -165,7 +165,7 @@ LOOKS = "from lathe_rc.nodes import topic_recorder; topic_recorder._LOOKS = {}"
 
 
 def test_what_was_missed_is_told(node, tmp_path):
-    """A recorder that was there first tells of what it missed of a publisher that did not wait for it."""
+    """A recorder that was there first reports the messages that it missed of a publisher that did not wait for it."""
     # Nobody is in this domain yet: to look for them for 3 s would find nobody.
     with started("record", tmp_path / "bag", "--once", first=LOOKS.format(4)) as recording:
         assert any("what begins from now on is heard from its first message on" in line for line in recording.stdout)
@@ -181,7 +181,7 @@ def test_what_was_missed_is_told(node, tmp_path):
 
 
 def test_what_was_before_it_is_told_and_no_loss(node, tmp_path):
-    """What was said before a recorder came is told, and is no loss."""
+    """Messages from before the start of a recorder are reported, and are no loss."""
     talker = node.create_publisher(String, "/talk", 10)
     for _ in range(3):
         talker.publish(String(data="nobody hears"))
@@ -238,9 +238,9 @@ def test_what_cannot_be_recorded_is_refused(domain, tmp_path, arguments, said):
 
 
 def test_a_type_that_is_not_installed_is_refused():
-    from lathe_rc.nodes import offered
+    from lathe_rc.nodes import publisher_info
 
     with pytest.raises(InputError, match="message type nowhere_msgs/msg/Thing is not installed"):
-        offered.installed("nowhere_msgs/msg/Thing")
-    store = offered.installed("sensor_msgs/msg/JointState")
+        publisher_info.installed("nowhere_msgs/msg/Thing")
+    store = publisher_info.installed("sensor_msgs/msg/JointState")
     assert store.hash_rihs01("sensor_msgs/msg/JointState") == STORE.hash_rihs01("sensor_msgs/msg/JointState")

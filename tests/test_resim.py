@@ -12,10 +12,10 @@ from numpy.testing import assert_allclose
 
 from lathe_rc import harness, part
 from lathe_rc.analysis.metrology import form_errors
-from lathe_rc.bag import reader, story
-from lathe_rc.bag.resim import resimulate
-from lathe_rc.bag.source import Source
-from lathe_rc.bag.stream import feed
+from lathe_rc.bag import provenance, reader
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.stream import feed
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
@@ -109,7 +109,7 @@ def test_the_recorded_spindle_counts_not_the_law(processes, tmp_path):
     metadata = other / "metadata.yaml"
     metadata.write_text(metadata.read_text().replace("deviation_amplitude: [0.05]", "deviation_amplitude: [0.02]"))
     with Source(other) as source:
-        assert "deviation_amplitude: [0.02]" in source.about[story.SCENARIO]
+        assert "deviation_amplitude: [0.02]" in source.about[provenance.SCENARIO]
     assert resimulate(other).different == []
 
 
@@ -127,9 +127,9 @@ def test_the_bag_holds_the_files_of_its_scenario(tmp_path):
 def test_versions_and_identity_are_in_the_bag(processes):
     path, result = processes
     with Source(path) as source:
-        assert json.loads(source.about[story.VERSIONS])["numpy"] == np.__version__
-        assert source.about[story.RUN_ID] == result.scenario.shared.run_id
-        assert json.loads(source.about[story.HOST_TOPICS]) == ["/diagnostics", "/cell_state"]
+        assert json.loads(source.about[provenance.VERSIONS])["numpy"] == np.__version__
+        assert source.about[provenance.RUN_ID] == result.scenario.shared.run_id
+        assert json.loads(source.about[provenance.HOST_TOPICS]) == ["/diagnostics", "/cell_state"]
 
 
 @pytest.mark.parametrize(

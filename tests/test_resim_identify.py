@@ -12,16 +12,15 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
-from lathe_rc import harness, resources
+from lathe_rc import harness, messages, resources
 from lathe_rc.analysis import drive_fit
-from lathe_rc.bag.resim import resimulate
-from lathe_rc.bag.source import Source
-from lathe_rc.cell import messages
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
 from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
-from lathe_rc.signals.profile import read_csv
+from lathe_rc.signals.measured_profile import read_csv
 
 STEP = 1.0 / 64000.0
 PISTON = resources.find(Path("piston.yaml"))

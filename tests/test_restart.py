@@ -15,11 +15,11 @@ from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check as check_bag
 from lathe_rc.cell import state_file
-from lathe_rc.cell.messages import sample_fields
 from lathe_rc.cell.scenario import load
 from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
+from lathe_rc.messages import sample_fields
 
 CONFIG = Path(__file__).parents[1] / "config"
 BLOCK = 64
@@ -39,7 +39,7 @@ def samples(recording):
 
 
 def commands(cell, table, recording, keep_at, path):
-    """What the controller commands and says, block by block; it is kept and read again before some blocks."""
+    """The outputs of the controller, block by block; its state is kept and read again before some blocks."""
     stage, tracks = Cell(cell.nodes).stages[OWN], {}
     for port in stage.inputs:
         if port.topic not in tracks:
@@ -138,7 +138,7 @@ def loaded(path):
 
 
 class Call:
-    """What pickle makes a call of."""
+    """An object of which pickle makes a call."""
 
     def __init__(self, function, *arguments):
         self.function, self.arguments = function, arguments
@@ -166,7 +166,7 @@ def named(module, name, *arguments):
         pickle.dumps(Path()),
         pickle.dumps(np.zeros(3)),
         named("lathe_rc.analysis.angle_domain", "np.f2py.subprocess.Popen", "true"),
-        named("lathe_rc.bag.writer", "BagWriter", "bag"),
+        named("lathe_rc.bag.writing.writer", "BagWriter", "bag"),
     ],
 )
 def test_what_is_no_state_is_refused(data, tmp_path):

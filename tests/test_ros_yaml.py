@@ -74,7 +74,7 @@ def as_we_read(path):
 
 
 def refusal_of(path):
-    """What our reader says against a file; nothing if it reads it."""
+    """Our reader's error for a file; empty if it reads it."""
     try:
         ros_yaml.read(path)
     except InputError as error:

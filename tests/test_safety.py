@@ -16,9 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lathe_rc import happened, harness
-from lathe_rc.bag.resim import resimulate
-from lathe_rc.cell import messages
+from lathe_rc import event_log, harness, messages
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages import STAGES
@@ -266,9 +265,9 @@ def test_the_page_has_the_tables_of_the_code():
 
 def test_an_alarm_is_told_in_words_whatever_a_bag_says():
     values = {"state": 2, "reaction": 5, "monitor": "error", "subject": "tool", "value": 2.5e-5, "limit": 2e-5}
-    said = happened.text(Sparse("safety/status", messages.SAFETY_STATUS, 7, values))
+    said = event_log.text(Sparse("safety/status", messages.SAFETY_STATUS, 7, values))
     assert said == "error tool 2.5e-05, limit 2e-05: retracting, retract"
-    strange = happened.text(Sparse("safety/status", messages.SAFETY_STATUS, 7, values | {"state": 200, "limit": 0.0}))
+    strange = event_log.text(Sparse("safety/status", messages.SAFETY_STATUS, 7, values | {"state": 200, "limit": 0.0}))
     assert strange == "error tool: ?, retract"
 
 

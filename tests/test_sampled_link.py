@@ -19,7 +19,8 @@ from lathe_rc.control.sampled_link import (
     towards,
 )
 from lathe_rc.errors import InputError
-from lathe_rc.plants.feed import FeedDrive, sampled
+from lathe_rc.plants.feed import FeedDrive
+from lathe_rc.plants.feed_models import sampled
 
 DRIVE = SampledDrive(6.25, 0.08, 0.16)
 STEP = 1 / 64000

@@ -16,7 +16,7 @@ from lathe_rc.analysis.sampled_loop import STEPS, measures, periods_to_settle, r
 from lathe_rc.cli import main
 from lathe_rc.control.sampled_link import NONE, Link, SampledDrive, closed_loop, paper, ripple_free, towards
 from lathe_rc.studies import sampled_servo
-from lathe_rc.studies.sampled_servo import DESIRED, RATIOS, SampledServoParameters
+from lathe_rc.studies.sampled_servo_numbers import DESIRED, RATIOS, SampledServoParameters, first_crossing
 
 DRIVE = SampledDrive(6.25, 0.08, 0.16)
 ROUNDING = 1e-9
@@ -95,7 +95,7 @@ def test_paper_numbers_of_the_loop_without_sampling():
     found = measures(time, analog)
     assert found.overshoot == pytest.approx(0.043, abs=5e-4)
     assert found.settling == pytest.approx(0.332, abs=1e-3)
-    assert sampled_servo.first_crossing(time, analog) == pytest.approx(4.7 * 0.08, abs=0.05 * 0.08)
+    assert first_crossing(time, analog) == pytest.approx(4.7 * 0.08, abs=0.05 * 0.08)
 
 
 def test_samples_of_the_loop_are_those_of_its_function():
@@ -279,7 +279,7 @@ def test_other_drives(values):
 
 
 def test_the_command_prints_what_the_paper_has_and_refuses_what_cannot_be(monkeypatch):
-    """What all studies do, like the width of the table and the figure, is in test_studies.py."""
+    """Checks of all studies, such as the width of the table, are in test_studies.py."""
     monkeypatch.setattr("lathe_rc.commands.study._save", lambda *_: None)
     told = CliRunner(env={"COLUMNS": "80"}).invoke(main, ["study", "sampled-servo", "--set", "t=0.16"])
     assert told.exit_code == 0, told.stderr

@@ -8,7 +8,8 @@ from hypothesis import given
 from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_rc.errors import InputError
-from lathe_rc.plants.feed import FeedDrive, dc_screw
+from lathe_rc.plants.feed import FeedDrive
+from lathe_rc.plants.feed_models import dc_screw
 from lathe_rc.plants.screw import Screw
 
 STEP = 1e-3

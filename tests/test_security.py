@@ -175,7 +175,7 @@ def resolved(profile, name):
 
 
 def allowed(root):
-    """What a policy allows, by enclave, namespace and node; then by list of the graph."""
+    """The permissions of a policy, by enclave, namespace and node; then by list of the graph."""
     return {
         (enclave.get("path"), profile.get("ns"), profile.get("node")): {
             kind: {resolved(profile, name.text) for rules in profile if rule in rules.attrib for name in rules}
@@ -200,7 +200,7 @@ def shown(node, names):
 
 
 def differences(a, b):
-    """What one has and the other has not, by node and list of the graph."""
+    """The difference of two, by node and list of the graph."""
     found = {}
     for node, kinds in a.items():
         for kind, names in kinds.items():
@@ -223,7 +223,7 @@ def observer(domain):
 
 
 def wait(observer, what):
-    """Spin until ``what`` holds, or far too long: who waits looks himself at what is there then."""
+    """Spin until ``what`` holds, or far too long; the caller checks the result."""
     deadline = time.monotonic() + PATIENCE
     while not what() and time.monotonic() < deadline:
         observer[1].spin_once(timeout_sec=0.05)
@@ -369,7 +369,7 @@ def udp_ports(pid):
 
 
 def as_started_by_a_user(monkeypatch):
-    """What nodes in this process have settled holds for those that it starts, too."""
+    """Settings of the nodes in this process hold for those that it starts, too."""
     for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
         monkeypatch.delenv(name, raising=False)
 
@@ -395,7 +395,7 @@ def test_a_node_alone_hears_the_network_only_if_asked_to(wanted, observer, domai
     as_started_by_a_user(monkeypatch)
     if wanted:
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", wanted)
-    with subprocess.Popen([sys.executable, "-m", "lathe_rc.nodes.tool", "--ros-args"]) as process:
+    with subprocess.Popen([sys.executable, "-m", "lathe_rc.nodes.executables", "tool", "--ros-args"]) as process:
         try:
             wait(observer, lambda: "tool" in observer[0].get_node_names())
             assert (multicast(domain) in udp_ports(process.pid)) == (wanted is not None)

@@ -20,6 +20,7 @@ import installer
 import preconditions
 import recipe
 import ros
+import ros_wheels
 import steps
 import system
 import workplace
@@ -338,7 +339,13 @@ def test_every_package_of_every_list_is_in_a_lock():
         for name in ("ros.lock", "python.lock")
         for line in (workplace.REQUIREMENTS / name).read_text().splitlines()
     }
-    lists = ["ros.in", "runtime.in", "build.in", *(group.list for group in recipe.GROUPS.values())]
+    lists = [
+        "ros.in",
+        recipe.MESSAGES_LIST,
+        "runtime.in",
+        "build.in",
+        *(group.list for group in recipe.GROUPS.values()),
+    ]
     for name in lists:
         wanted = (workplace.REQUIREMENTS / name).read_text().splitlines()
         assert {recipe.normal(line) for line in wanted if line and not line.startswith("#")} <= locked, name
@@ -505,13 +512,17 @@ print(lathe_rc.__file__)
 
 
 def test_wheels_paths_are_mended(monkeypatch, tmp_path):
-    monkeypatch.setattr(ros, "VENV", tmp_path)
-    monkeypatch.setattr(ros.sysconfig, "get_path", lambda _name: "/here/include")
+    """In this environment, not in uv's cache, whose files uv links."""
+    monkeypatch.setattr(ros_wheels.sysconfig, "get_path", lambda _name: "/here/include")
     export = tmp_path / "share" / "x" / "cmake" / "export.cmake"
     export.parent.mkdir(parents=True)
     old = "/opt/python/cp311-cp311"
     export.write_text(f'"{old}/include/python3.11;{old}/lib/python3.11/site-packages/numpy/_core/include"')
-    ros.mend_cmake_paths()
+    cached = tmp_path / "cached"
+    cached.hardlink_to(export)
+    before = export.read_text()
+    ros_wheels.mend_cmake_paths(tmp_path, ros.site_packages())
+    assert cached.read_text() == before
     assert export.read_text() == f'"/here/include;{ros.site_packages()}/numpy/_core/include"'
 
 
@@ -522,7 +533,7 @@ def test_command_gets_the_users_arguments_and_directory(copy, tmp_path):
     Path(fake_python(venv, 'pwd; printf "%s\\n" "$@" "$MADE"')).rename(venv / "python")
     key = subprocess.run(
         [workplace.BASE_PYTHON, "-c", "import recipe; print(recipe.Recipe(None)._package_key)"],
-        env={"PYTHONPATH": str(copy / "tools")},
+        env={"PYTHONPATH": os.pathsep.join([str(copy / "tools"), str(copy / "msg_defs")])},
         capture_output=True,
         text=True,
         check=True,
@@ -584,7 +595,7 @@ def test_all_checkers_run_and_any_failure_counts(checkers, failing):
     checkers.failing = failing
     assert (check.main([]) != 0) == bool(failing)
     checkers.ran.remove("kernels")
-    assert checkers.ran == ["ruff check", "ruff format", "mypy"]
+    assert checkers.ran == list(check.LINTERS)
     for name in failing - {"pytest"}:
         assert f"{name} FAILED: see above" in checkers.verdicts
 
@@ -626,5 +637,5 @@ def test_what_the_machine_lacks_is_installed_or_said(monkeypatch, root, installe
 def test_mypy_judges_only_the_locked_numpy(checkers, monkeypatch):
     monkeypatch.setattr(check, "version", lambda _name: "1.26.4")
     assert check.main([]) == 0
-    assert set(checkers.ran) == {"kernels", "ruff check", "ruff format"}
+    assert set(checkers.ran) == {"kernels", *check.LINTERS} - {"mypy"}
     assert any("1.26.4" in line for line in checkers.verdicts)

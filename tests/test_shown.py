@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a prompt or a notebook shows of scenarios, results and recordings, and the figure of a run."""
+"""Scenarios, results and recordings at a prompt or in a notebook, and the figure of a run."""
 
 import warnings
 from pathlib import Path
@@ -11,8 +11,8 @@ from cells import SCENARIOS, run, scenario
 from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.cell.scenario import Scenario, load
+from lathe_rc.drawing import form
 from lathe_rc.errors import InputError
-from lathe_rc.view import figure
 
 LONGEST = 200  # characters of a line that a prompt shows
 
@@ -112,7 +112,7 @@ class TestPlot:
         assert len(form.get_lines()) == 2
 
     def test_of_a_bag_is_that_of_its_run(self, result):
-        assert figure.png(reader.read(result.bag).plot("test")) == figure.png(result.plot())
+        assert form.png(reader.read(result.bag).plot("test")) == form.png(result.plot())
 
     def test_is_shown_by_a_notebook_without_pyplot(self, result):
         assert result.plot()._repr_png_().startswith(b"\x89PNG")
@@ -129,4 +129,4 @@ class TestPlot:
     def test_of_a_round_part_that_is_met_at_once(self):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            figure.png(run(tool={"harmonic_order": [1], "harmonic_amplitude": [0.0], "harmonic_phase": [0.0]}).plot())
+            form.png(run(tool={"harmonic_order": [1], "harmonic_amplitude": [0.0], "harmonic_phase": [0.0]}).plot())

@@ -19,22 +19,21 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.bag.check import check
-from lathe_rc.bag.order import Merger
-from lathe_rc.bag.resim import resimulate
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.bag.snapshot import SNAPSHOT, first_sample
-from lathe_rc.bag.snapshots import Snapshots
-from lathe_rc.bag.writer import offered_qos
-from lathe_rc.cell import messages
+from lathe_rc.bag.writing.order import Merger
+from lathe_rc.bag.writing.snapshots import Snapshots
+from lathe_rc.bag.writing.writer import offered_qos
 from lathe_rc.cell.framing import Framer
-from lathe_rc.cell.messages import START_NS
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import load
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import START_NS
 from lathe_rc.view.report_gather import gather
 
 CONFIG = Path(__file__).parents[1] / "config"
@@ -381,7 +380,7 @@ def test_memory_does_not_grow_with_the_run_nor_with_triggers(tmp_path):
 
 
 def test_snapshot_comes_to_the_disk_in_bounded_pieces(tmp_path):
-    """A trigger writes nothing by itself, and each block that comes a few: the cell is not held up."""
+    """A trigger writes nothing by itself, and each block that comes a few: the cell is not delayed."""
     feed = Feed(tmp_path, chunk_size=4096, compression="none")
     for _ in range(200):
         feed.row()

@@ -80,7 +80,7 @@ def study(*arguments, sets=()):
 
 
 def told(name, sets=()):
-    """What a study finds, as it is printed; no figure is drawn, which takes longest."""
+    """The result of a study, as it is printed; no figure is drawn, which takes longest."""
     subject = STUDIES[name]
     return json.loads(json.dumps(subject.run(read(subject, sets or QUICK[name])).to_json(), allow_nan=False))
 
@@ -403,7 +403,7 @@ def test_measured_response_takes_the_place_of_the_simulated(folder):
 
 
 def test_step_test_has_no_half_step_of_latency():
-    """What is simulated as a measurement is the step response itself, for any drive."""
+    """The simulated measurement is the step response itself, for any drive."""
     for wn, damping, delay in ((1038.0, 0.804, 0.36e-3), (100.0, 3.0, 0.0), (5000.0, 0.1, 1e-3)):
         true = SecondOrder(wn, damping, delay)
         found = drive_models.run(DriveModelsParameters(natural_frequency=wn, damping=damping, delay=delay))

@@ -258,7 +258,7 @@ def test_a_sweep_goes_on_where_it_was_stopped_and_adds_what_is_new(
     assert [each for each in told if each["event"] == "began"] == [{"event": "began", "cells": 4, "computed": 3}]
     assert more.table().column(LEAD).to_pylist() == [1.2e-3, 1.3e-3, 3e-3, 1.1e-3]
     assert more.table().column("cell").to_pylist() == [0, 1, 2, 3]
-    # A further parameter: what is there has the scenario's own value of it.
+    # A further parameter: the rows so far have the scenario's own value of it.
     harness.sweep(piston, Space(grid={LEAD: [1.3e-3], Q: "70e-6"}), tmp_path / "leads", client=client)
     both = Sweep(Folder(tmp_path / "leads"))
     own = piston.nodes["learning_controller"].q_time

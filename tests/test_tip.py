@@ -10,7 +10,8 @@ from numpy.testing import assert_allclose
 from lathe_rc import harness
 from lathe_rc.cell import scenario
 from lathe_rc.errors import InputError
-from lathe_rc.signals.profile import Harmonics, Piston, ProfileTable
+from lathe_rc.signals.profile import Harmonics, Piston
+from lathe_rc.signals.profile_table import ProfileTable
 from lathe_rc.signals.tip_path import TipPath, steepest_fall
 
 TURN = 2 * np.pi

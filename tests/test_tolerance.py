@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from lathe_rc import harness
 from lathe_rc.analysis.tolerance import LAST, Judge, judge
-from lathe_rc.bag import story
+from lathe_rc.bag import provenance
 from lathe_rc.cell.scenario import load
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
@@ -162,8 +162,8 @@ def test_a_report_shows_the_budget_if_it_is_asked_for(turned, tmp_path):
 
 def test_a_bag_whose_scenario_is_none_has_no_tolerance_but_a_reason():
     with pytest.raises(InputError, match=r"^lathe_rc\.scenario of the bag: no nodes; allowed: "):
-        story.tolerances({story.SCENARIO: "[1, 2]"})
-    assert story.tolerances({}) == {}
-    assert story.tolerances({story.SCENARIO: "tool: {ros__parameters: {tolerance: .inf}}"}) == {}
+        provenance.tolerances({provenance.SCENARIO: "[1, 2]"})
+    assert provenance.tolerances({}) == {}
+    assert provenance.tolerances({provenance.SCENARIO: "tool: {ros__parameters: {tolerance: .inf}}"}) == {}
     text = "edge: {ros__parameters: {stage: tool, tolerance: 1e-6, remap: ['tool:=part']}}"
-    assert story.tolerances({story.SCENARIO: text}) == {"part": 1e-6}
+    assert provenance.tolerances({provenance.SCENARIO: text}) == {"part": 1e-6}

@@ -6,7 +6,7 @@ import pytest
 from cells import encoder, run
 from numpy.testing import assert_allclose
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.signals.profile import Piston
 
 TURN = 2 * np.pi

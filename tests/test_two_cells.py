@@ -11,9 +11,8 @@ from click.testing import CliRunner
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from lathe_rc import harness
-from lathe_rc.bag.resim import resimulate
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cli import main
 
 LEFT = scenario({"run_id": "left"}, spindle_encoder={"revolutions": 20.0, "speed_factor": 1.0})  # there for 1.2 s
@@ -30,7 +29,7 @@ def alone(cell, namespace):
 
 
 def mixed(bag, namespace):
-    """What is in a bag and of another cell: topics, and nodes in the diagnostics."""
+    """The foreign part of a bag: topics of another cell, and its nodes in the diagnostics."""
     with AnyReader([bag]) as found:
         topics = {c.topic for c in found.connections if c.topic != "/diagnostics"}
     with next(bag.glob("*.mcap")).open("rb") as stream:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.stages.vibration import Vibration, VibrationParameters
 from lathe_rc.errors import InputError
 from lathe_rc.signals.vibration import band_limited_random, evaluate, harmonic

@@ -13,10 +13,9 @@ rr = pytest.importorskip("rerun")
 rrb = pytest.importorskip("rerun.blueprint")
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
 
-from lathe_rc import harness  # noqa: E402
+from lathe_rc import harness, messages  # noqa: E402
 from lathe_rc.analysis import metrology  # noqa: E402
 from lathe_rc.bag import reader  # noqa: E402
-from lathe_rc.cell import messages  # noqa: E402
 from lathe_rc.cell.stage import Sparse  # noqa: E402
 from lathe_rc.cli import main  # noqa: E402
 from lathe_rc.errors import LatheError  # noqa: E402
@@ -178,7 +177,7 @@ def test_the_tool_touches_what_it_has_turned(turned, shown):
 
 
 def test_every_curve_and_picture_has_a_view(turned, shown):
-    """What nobody would see was logged in vain."""
+    """Everything that is logged has a place in the view."""
 
     def contents(part):
         if isinstance(part, rrb.View):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.wire import Decoder, Encoder, NoBlockError
 
 types = st.sampled_from(sorted(messages.block_types()))

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 from cells import NODES, announced, run, scenario
 
-from lathe_rc import harness
-from lathe_rc.cell import messages
+from lathe_rc import harness, messages
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.stage import Input, Output, Stage
@@ -182,7 +181,7 @@ def test_endless_run_is_refused_offline():
         ),
         (
             "learning_controller.reaction_delay=0",
-            r"monitor \w+ asks for \w+, but nobody who moves coarse listens; allowed: learning_controller.re",
+            r"monitor \w+ asks for \w+, but no node that moves coarse reads safety; allowed: learning_controller.re",
         ),
         ("electrodynamic_actuator.command_stroke=0.275e-3", r"electrodynamic_actuator.command_stroke = 0.000275 m"),
     ],

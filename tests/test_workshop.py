@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from lathe_rc import harness, part
 from lathe_rc.cli import main
-from lathe_rc.signals import profile as profiles
+from lathe_rc.signals import measured_profile
 
 ORDERS, AMPLITUDES = [1, 2, 12], [20e-6, 100e-6, 2e-6]
 
@@ -48,7 +48,7 @@ def test_written_profiles_are_read_back_at_their_heights(turned, tmp_path):
     bag, result = turned
     path = tmp_path / "parts.csv"
     assert lathe("measure", bag, "--revolutions", "1,2", "--profile", path).exit_code == 0
-    back = profiles.read_csv(path)
+    back = measured_profile.read_csv(path)
     angle = 2 * np.pi * np.arange(100) / 100
     for k in (0, 1):
         expected = np.interp(angle, 2 * np.pi * np.arange(4096) / 4096, result.part.profile[k])

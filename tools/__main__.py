@@ -11,6 +11,10 @@ if not (3, 10) <= sys.version_info[:2] <= (3, 14):
     )
     sys.exit(2)
 
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "msg_defs"))  # ros_wheels
+
 from bootstrap import main
 
 sys.exit(main(sys.argv[1:]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ./lathe does: make the environment if it is not there or out of date, then run the command in it."""
+"""./lathe: make the environment if it is not there or out of date, then run the command in it."""
 
 import os
 import signal
@@ -70,6 +70,8 @@ def command(arguments: Sequence[str]) -> list[str]:
     """Return what the Python of the environment is to run."""
     if arguments[:1] == ["test"]:
         return [str(ROOT / "tools" / "check.py"), *arguments[1:]]
+    if arguments[:1] == ["bench"]:
+        return ["-m", "benchmarks", *arguments]
     if arguments[:1] == ["python"]:
         return list(arguments[1:])
     return ["-m", "lathe_rc", *arguments]

@@ -24,6 +24,9 @@ LINTERS = {
     "ruff check": ["ruff", "check", "--quiet"],
     "ruff format": ["ruff", "format", "--check", "--quiet"],
     "mypy": ["mypy", "--no-error-summary"],
+    "spelling": ["codespell"],  # setup.cfg has its settings
+    "prose": [sys.executable, str(ROOT / "tools" / "prose.py")],
+    "imports": ["lint-imports", "--no-logo", "--no-cache"],
 }
 # What would be compiled in the middle of the tests, by several of them at once; the linters leave cores for it.
 KERNELS = [sys.executable, str(ROOT / "tools" / "kernels.py")]
@@ -51,10 +54,13 @@ class Verdicts:
 
 
 def lint(name: str, command: Sequence[str]) -> bool:
-    """Run one linter, say how it went, and return whether it found nothing."""
+    """Run one linter, say how it went and what it found, and return whether that was nothing."""
     start = time.monotonic()
-    passed = subprocess.run(command, check=False).returncode == 0
+    ran = subprocess.run(command, check=False, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    passed = ran.returncode == 0
     print(f"{name:<12} {'passed' if passed else 'FAILED'} ({time.monotonic() - start:.1f} s)", flush=True)
+    if not passed:
+        print(ran.stdout, flush=True)
     return passed
 
 

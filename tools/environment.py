@@ -6,7 +6,8 @@ import shlex
 from collections.abc import Mapping
 from typing import TypedDict
 
-from ros import SourcedRos, split, split_own, wheel_environment
+import ros_wheels
+from ros import SourcedRos, site_packages, split, split_own
 from workplace import ROOT, VENV
 
 # Where Fast DDS is told how fast it is to ask for what it has missed.
@@ -17,7 +18,7 @@ SHELL_OWN = frozenset({"_", "OLDPWD", "PWD", "SHLVL"})
 
 
 class Changes(TypedDict):
-    """What to do to a user's environment before lathe_rc runs in it."""
+    """The changes to a user's environment before lathe_rc runs in it."""
 
     prepend: dict[str, list[str]]
     assign: dict[str, str]
@@ -31,7 +32,7 @@ def is_path_list(name: str) -> bool:
 def own_environment(ros: SourcedRos | None) -> dict[str, str]:
     """Return the least environment in which the virtual environment works: nothing of the user's is in it."""
     environ = {"PATH": os.pathsep.join([str(VENV / "bin"), os.defpath]), "VIRTUAL_ENV": str(VENV)}
-    return environ if ros else environ | wheel_environment()
+    return environ if ros else environ | ros_wheels.environment(VENV, site_packages())
 
 
 def build_environment(ros: SourcedRos | None) -> dict[str, str]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has to be there before anything is made; whatever is not gets one clear line."""
+"""Conditions of the set-up, checked before anything is made; each that is not met gets one clear line."""
 
 import importlib.util
 import os

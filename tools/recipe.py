@@ -16,7 +16,8 @@ from typing import NamedTuple, cast
 
 import installer
 from environment import Changes, build_environment, changes, complete
-from ros import SourcedRos, mend_cmake_paths
+from ros import SourcedRos, site_packages
+from ros_wheels import FAST_DDS_ALONE, PYTHON_ALONE, cmake_options, mend_cmake_paths
 from steps import Step, clear, write_atomically
 from workplace import BASE_PYTHON, BUILD, HOME, INSTALL, LOG, PYTHON, REQUIREMENTS, ROOT, VENV, say
 
@@ -26,8 +27,7 @@ MESSAGES_STAMP = INSTALL / "messages.stamp"
 ENVIRONMENT = INSTALL / "environment.json"  # also the stamp of the package, the last thing made
 
 CHECK_NETWORK = "check the network and the free disk space, then call again"
-# The wheels' middleware reads the introspection of C alone.
-FAST_DDS_ALONE = {"STATIC_ROSIDL_TYPESUPPORT_CPP": "rosidl_typesupport_fastrtps_cpp"}
+MESSAGES_LIST = "../msg_defs/requirements.in"  # as seen from requirements/
 
 
 class Group(NamedTuple):
@@ -69,13 +69,17 @@ class Recipe:
         tools = ROOT / "tools"
         self._packages_key = digest(
             [str(ROOT), str(Path(BASE_PYTHON).resolve()), str(ros)],
-            [*REQUIREMENTS.iterdir(), tools / "recipe.py", tools / "ros.py"],
+            [
+                *REQUIREMENTS.iterdir(),
+                *(ROOT / "msg_defs" / name for name in ("requirements.in", "ros_wheels.py")),
+                *(tools / name for name in ("recipe.py", "ros.py")),
+            ],
         )
-        self._messages_key = digest([self._packages_key], (ROOT / "msg_defs").rglob("*"))
+        self._messages_key = digest([self._packages_key], sources(ROOT / "msg_defs"))
         # lathe_rc is installed as links: only a new file that is not a module needs a new installation.
-        linked = [path for folder in ("config", "launch") for path in (ROOT / folder).rglob("*.*")]
+        linked = [path for folder in ("config", "launch") for path in sources(ROOT / folder)]
         self._package_key = digest(
-            [self._messages_key, *sorted(str(path) for path in linked if path.suffix != ".pyc")],
+            [self._messages_key, *sorted(map(str, linked))],
             [ROOT / "setup.py", ROOT / "setup.cfg", ROOT / "package.xml", tools / "environment.py"],
         )
 
@@ -133,15 +137,15 @@ class Recipe:
             else:
                 uv = installer.pip("--constraint", REQUIREMENTS / "python.lock", "uv")
                 step.run(*uv, environ=build_environment(self._ros))
-                self._install(step, "ros.in", "runtime.in", "build.in")
-                mend_cmake_paths()
+                self._install(step, "ros.in", MESSAGES_LIST, "runtime.in", "build.in")
+                mend_cmake_paths(VENV, site_packages())
 
     def _install_group(self, name: str, lock: int) -> None:
         with Step(f"packages: {name}", GROUPS[name].usual, CHECK_NETWORK, lock) as step:
             self._install(step, GROUPS[name].list)
 
     def _install(self, step: Step, *lists: str) -> None:
-        """Install what files in requirements/ list: beside a sourced ROS 2 with pip, which knows what is there."""
+        """Install what files in requirements/ list: beside a sourced ROS 2 with pip, which knows its packages."""
         environ = build_environment(self._ros)
         if self._ros:
             files = [word for name in lists for word in ("-r", REQUIREMENTS / name)]
@@ -156,10 +160,7 @@ class Recipe:
         with Step("messages", "25 s", advice, lock) as step:
             step.run(
                 *colcon("--paths", ROOT / "msg_defs"),
-                *("--cmake-args", "-GNinja", "-DCMAKE_BUILD_TYPE=Release", "-DBUILD_TESTING=OFF"),
-                *("-DCMAKE_UNITY_BUILD=ON", "-DCMAKE_UNITY_BUILD_BATCH_SIZE=0"),
-                *(() if self._ros else ("-DLATHE_RC_MSGS_CPP=OFF",)),
-                *(f"-DPython3_EXECUTABLE={PYTHON}", f"-DPYTHON_EXECUTABLE={PYTHON}"),
+                *("--cmake-args", *cmake_options(PYTHON), *(() if self._ros else (PYTHON_ALONE,))),
                 environ=self._colcon_environment() | ({} if self._ros else FAST_DDS_ALONE),
             )
 
@@ -218,6 +219,11 @@ def constrain(lock: Iterable[str], found: Iterable[str]) -> list[str]:
 def normal(requirement: str) -> str:
     """Return the normal form of the name in a line such as ``ruamel.yaml==0.18``."""
     return re.sub(r"[-_.]+", "-", re.split(r"[^\w.-]", requirement, maxsplit=1)[0]).lower()
+
+
+def sources(folder: Path) -> list[Path]:
+    """Return the files in a folder, without what Python has compiled from them."""
+    return [path for path in folder.rglob("*.*") if path.suffix != ".pyc"]
 
 
 def read(stamp: Path) -> str | None:

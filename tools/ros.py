@@ -2,7 +2,6 @@
 """The two sources of ROS 2: one that the user has sourced, or the wheels."""
 
 import os
-import re
 import sys
 import sysconfig
 from collections.abc import Mapping
@@ -10,9 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from workplace import HOME, VENV, RefusalError
-
-# What the wheels' CMake files say instead of the paths of the interpreter at hand.
-BUILD_MACHINE = re.compile(r"/opt/python/[^/;\"]+/(?:(include)/python3\.\d+|lib/python3\.\d+/site-packages)")
 
 
 class SourcedRos(NamedTuple):
@@ -72,28 +68,3 @@ def split_own(path_list: str) -> list[str]:
 def site_packages() -> Path:
     """Return the site-packages folder of the virtual environment."""
     return VENV / "lib" / f"python{sysconfig.get_python_version()}" / "site-packages"
-
-
-def mend_cmake_paths() -> None:
-    """Replace the build machine's paths in the wheels' CMake files by those of this interpreter."""
-    include = sysconfig.get_path("include")
-    for cmake in VENV.glob("share/**/*.cmake"):
-        text = cmake.read_text(encoding="utf-8")
-        mended = BUILD_MACHINE.sub(lambda path: include if path[1] else str(site_packages()), text)
-        if mended != text:
-            cmake.write_text(mended, encoding="utf-8")
-
-
-def wheel_environment() -> dict[str, str]:
-    """Return what the wheels need in the environment.
-
-    Their own bootstrap restarts every Python once, to set LD_LIBRARY_PATH in random order. Doing it here, in
-    a fixed order and with their guard variable set, saves the restart.
-    """
-    libraries = [str(VENV / "lib"), *sorted(map(str, site_packages().glob("ros_*.libs")))]
-    return {
-        "AMENT_PREFIX_PATH": str(VENV),
-        "CMAKE_PREFIX_PATH": str(VENV),
-        "LD_LIBRARY_PATH": os.pathsep.join(libraries),
-        "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
-    }

@@ -57,14 +57,14 @@ class Name(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """What a test took: seconds, and how many cases it has."""
+    """The cost of a test: seconds, and the number of its cases."""
 
     seconds: float
     cases: int
 
 
 class Told(NamedTuple):
-    """What a test says of itself: its promise, and what it starts."""
+    """The description of a test: its promise, and the hosts and programs that it starts."""
 
     promise: str
     starts: str

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests of ./lathe test --system need of the machine: Debian packages, and root."""
+"""The needs of ./lathe test --system on the machine: Debian packages, and root."""
 
 import os
 import shutil

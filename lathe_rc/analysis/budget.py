@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a form error is made of: runs with causes switched off, taken apart so that the parts add up.
+"""The parts of a form error: runs with causes switched off, split so that the parts add up.
 
 f(S) is the form error over the angle of a run in which the causes S act and the others are switched off; N are all of
 them. The form error e = f(N) is the sum of
@@ -52,13 +52,13 @@ class Part:
 
 @dataclass(frozen=True)
 class Budget:
-    """What a form error is made of.
+    """The parts of a form error.
 
     Attributes:
         revolutions: the last ones of the run that it speaks of.
         rms, largest: form error in them [m].
         causes: what each cause does alone.
-        rest: what is there without any of them.
+        rest: the error without any of them.
         interactions: what causes do only together; with causes and rest it is the whole.
         pairs: parts of the interactions, by two causes each; empty if those come to less than `TOLD` together.
         left_out: causes that could not be switched off, and why.
@@ -84,7 +84,7 @@ class Budget:
         return self.rest.share + sum(part.share for part in (*self.causes, *self.pairs))
 
     def summary(self) -> dict[str, object]:
-        """What ``lathe budget --json`` prints, lengths in µm."""
+        """The output of ``lathe budget --json``, lengths in µm."""
         return {
             "revolutions": self.revolutions,
             "rms": self.rms * 1e6,
@@ -113,7 +113,7 @@ class Decomposition:
         return frozenset(cause for cause in causes if self._needs[cause] in ("", *causes))
 
     def _context(self, *causes: str) -> Causes:
-        """What some causes need."""
+        """Values that some causes need."""
         return frozenset(self._needs[cause] for cause in causes if self._needs[cause]) - set(causes)
 
     def _couples(self) -> Iterator[tuple[str, str]]:

@@ -41,7 +41,7 @@ _BANDWIDTHS = (500.0, 2000.0, 8000.0)  # [rad/s] of the low-pass
 _DELAYS = 40  # that are tried
 _MOST_STEPS = 60  # of the search
 _STRETCHES = 32  # of the residual, between which its correlation is neglected
-_SINGULAR = 1e6  # condition number from which parameters cannot be told apart at all
+_SINGULAR = 1e6  # condition number from which the command does not distinguish parameters at all
 _ILL = 1000.0  # and from which there is a warning
 _UNKNOWN, _VAGUE = 0.25, 0.05  # standard error over the parameter: refused, warned of
 _TOGETHER = 0.3  # part of a parameter in the direction that is known worst, to be named
@@ -58,7 +58,7 @@ class DriveFit:
         residual_rms: of the simulation error [m].
         nrmse: the same over the RMS of the position about its mean [1].
         condition: condition number of the position's sensitivities to the parameters, each of length 1.
-        vague: parameters that the command hardly tells apart, or that are known to 5 % and worse; should be none.
+        vague: parameters that the command hardly distinguishes, or that are known to 5 % and worse; should be none.
         samples: that were compared.
     """
 
@@ -263,7 +263,7 @@ def _standard_errors(jacobian: Array, residual: Array, lengths: Array, sizes: Ar
     """Standard errors, shape (3,): the larger of those of a white residual and of one that is correlated.
 
     White: σ²·(JᵀJ)⁻¹. Correlated within stretches of the record: (JᵀJ)⁻¹·(Σ g·gᵀ)·(JᵀJ)⁻¹ with g the sum of
-    J·residual over a stretch; that says too little where one stretch alone tells of the drive, as after a step.
+    J·residual over a stretch; that says too little where one stretch alone moves the drive, as after a step.
     """
     inverse = (directions.T / sizes**2) @ directions / np.outer(lengths, lengths)
     edges = np.arange(_STRETCHES) * residual.size // _STRETCHES

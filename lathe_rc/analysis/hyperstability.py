@@ -18,8 +18,8 @@ import control
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.control.periodic import PeriodicGains
-from lathe_rc.plants.feed import fourth_order
+from lathe_rc.control.periodic_gains import PeriodicGains
+from lathe_rc.plants.feed_models import fourth_order
 from lathe_rc.transfer import TransferFunction
 
 Array = npt.NDArray[np.float64]
@@ -54,7 +54,7 @@ def inverse_response(drives: Array, lead: float, lag: float, frequency: Array) -
 
 @dataclass(frozen=True)
 class Positivity:
-    """What eq. 14 asks of χ*.
+    """The condition of eq. 14 on χ*.
 
     Attributes:
         least_gain: χ* from which on Re(1/G) + χ* > 0 for all drives and frequencies [1].

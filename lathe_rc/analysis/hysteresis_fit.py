@@ -59,7 +59,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class Identified:
-    """What a fit found, relative to the half-stroke.
+    """The result of a fit, relative to the half-stroke.
 
     Attributes:
         model: the hysteresis.

@@ -7,7 +7,7 @@ deflection for `lathe_rc.analysis.regeneration`.
 
 import numpy as np
 
-from lathe_rc.plants.loaded import Coil
+from lathe_rc.plants.coil import Coil
 from lathe_rc.transfer import TransferFunction
 
 

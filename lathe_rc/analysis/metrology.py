@@ -342,7 +342,7 @@ def lay(profile: Array, height: Array, nose_radius: float, *, revolutions: int =
 
 @dataclass(frozen=True)
 class Measurement:
-    """What the workshop reads of each complete revolution.
+    """The workshop's figures of each complete revolution.
 
     Attributes:
         profile: deviation of the part's radius from the desired form at even angles [m], shape (revolutions, points).

@@ -8,7 +8,8 @@ import numpy.typing as npt
 
 from lathe_rc.analysis.hyperstability import plant, required_input
 from lathe_rc.analysis.periodic_loop import PeriodicLoop, disturbance, steady_derivatives, transient
-from lathe_rc.control.periodic import PRESETS, PeriodicController, PeriodicGains, samples_in
+from lathe_rc.control.periodic import PeriodicController, samples_in
+from lathe_rc.control.periodic_gains import PRESETS, PeriodicGains
 from lathe_rc.signals.example_002 import PERIOD
 from lathe_rc.transfer import LinearSystem
 
@@ -35,7 +36,7 @@ def ideal_input(drives: Array, time: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """What distinguishes a run.
+    """The parameters that distinguish a run.
 
     Attributes:
         periods: to run.

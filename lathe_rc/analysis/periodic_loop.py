@@ -13,7 +13,7 @@ Array = npt.NDArray[np.float64]
 
 
 def transient(time: Array) -> Array:
-    """What decays in eq. 17; ``time`` in s, any shape."""
+    """The decaying part of eq. 17; ``time`` in s, any shape."""
     return np.asarray(-0.1 * np.exp(-time))
 
 

@@ -37,7 +37,7 @@ def response(plant: Plant, frequency: npt.ArrayLike) -> Complex:
 
 @dataclass(frozen=True)
 class Loop:
-    """What a closed loop does.
+    """The behaviour of a closed loop.
 
     Attributes:
         rise: from 10 to 90 % of a step [s].

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Profiles as CSV files, in the columns that `lathe_rc.signals.profile.read_csv` reads."""
+"""Profiles as CSV files, in the columns that `lathe_rc.signals.measured_profile.read_csv` reads."""
 
 from pathlib import Path
 

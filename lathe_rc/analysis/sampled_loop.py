@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from lathe_rc.control.sampled_link import Link, LinkTable, SampledDrive, closed_loop, correct, largest_pole, rest, table
 from lathe_rc.jit import kernel
-from lathe_rc.plants.feed import DriveTable, Feedback, FeedDrive, hold, load_of, motor_of, move, sampled
+from lathe_rc.plants.feed import DriveTable, Feedback, FeedDrive, hold, load_of, motor_of, move
+from lathe_rc.plants.feed_models import sampled
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -89,7 +90,7 @@ def series(top: Array, bottom: Array, terms: int) -> Array:
 
 @dataclass(frozen=True)
 class Measures:
-    """What a step response is judged by.
+    """Measures of a step response.
 
     Attributes:
         overshoot: relative to the step, 0 for none.
@@ -174,7 +175,7 @@ class StepResponse:
 
     @property
     def offset(self) -> float:
-        """What the load lacks at the end, relative to the step."""
+        """The load's remaining error at the end, relative to the step."""
         return float(1.0 - self.load[-1])
 
 

@@ -63,7 +63,7 @@ class StepResponse:
             )
 
     def residual(self, model: "Model") -> Array:
-        """What the model misses, weighted so that its sum of squares is the mean square over time."""
+        """The model's residual, weighted so that its sum of squares is the mean square over time."""
         between = np.diff(self.time)
         weight = (np.append(between, 0.0) + np.append(0.0, between)) / 2.0
         return np.asarray((model.step(self.time) - self.response) * np.sqrt(weight / weight.sum()))

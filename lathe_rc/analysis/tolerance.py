@@ -3,7 +3,7 @@
 
 The tolerance ±t is that of a line profile (ISO 1101) whose zone is 2t wide, t to each side of the desired form. A
 revolution is in tolerance if its form error is nowhere larger than t; a run, from the revolution on from which all are,
-to its end. What is to spare is told of its last revolutions: the first that is in tolerance hardly is.
+to its end. The margin is that of its last revolutions: the first that is in tolerance hardly is.
 """
 
 from collections import deque
@@ -19,7 +19,7 @@ LAST = 10  #: revolutions at the end of a run that its spare and its budget spea
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is said of a run.
+    """The verdict on a run.
 
     Attributes:
         tolerance: form error that is allowed to each side [m].
@@ -41,7 +41,7 @@ class Verdict:
 
     @property
     def spare(self) -> float:
-        """What is left of the tolerance; negative: by so much it is exceeded; NaN without a revolution [m]."""
+        """The margin to the tolerance; negative: it is exceeded by so much; NaN without a revolution [m]."""
         return self.tolerance - self.largest
 
     def told(self) -> str:

@@ -9,22 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from lathe_rc.bag import story
+from lathe_rc import messages
+from lathe_rc.bag import provenance
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.snapshot import first_sample, span_of
-from lathe_rc.bag.source import Source
-from lathe_rc.cell import messages
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.recording import Digester, SparseTopic
-from lathe_rc.cell.wire import Block, Decoder
+from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, shown
 
 DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, as the harness found them
-_MOST_FINDINGS = 20  # that are told of one topic
+_MOST_FINDINGS = 20  # listed for one topic
 _MOST_DIGESTS = 2**20  # size of that file [B]
 
 
 @dataclass
 class Findings:
-    """What a check found.
+    """The findings of a check.
 
     Attributes:
         wrong: what should not be there: numbers that are none, other digests than recorded.
@@ -106,7 +107,7 @@ def check(path: Path) -> Findings:
     """Look at every message of a bag.
 
     Raises:
-        InputError: not a bag, or one that is cut off or broken: then only `lathe_rc.bag.recover` reads it.
+        InputError: not a bag, or one that is cut off or broken: then only `lathe_rc.bag.repairing.recover` reads it.
     """
     findings, digester = Findings(), Digester()
     sparse: dict[str, SparseTopic] = {}
@@ -133,7 +134,7 @@ def check(path: Path) -> Findings:
         findings.lost.append(f"the snapshot has {findings.samples} samples, and {why}")
     findings.lost += [
         f"{topic}: from sample {first} on its newest value, held: the node was lost"
-        for topic, first in story.held(source.about).items()
+        for topic, first in provenance.held(source.about).items()
     ]
     if dense and not findings.lost and not findings.wrong:
         findings.digests = digester.result(sparse)

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lathe_rc.bag.stream import feed
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import START_NS, Samples, Signals
+from lathe_rc import messages
+from lathe_rc.bag.reading.stream import feed
 from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.messages import START_NS, Samples, Signals
 
 
 class _Whole:
@@ -31,7 +31,7 @@ class _Whole:
 
 
 def read(path: Path) -> Recording:
-    """All signal topics of a bag; memory for all of it is needed, see `lathe_rc.bag.stream` otherwise.
+    """All signal topics of a bag; memory for all of it is needed, see `lathe_rc.bag.reading.stream` otherwise.
 
     Example:
         >>> from pathlib import Path

@@ -46,7 +46,7 @@ class Snapshot:
         self.wanted, self.last = max(wanted, self.wanted), max(last, self.last)
 
     def about(self) -> dict[str, str]:
-        """What its bag says of it."""
+        """The metadata of its bag."""
         told = {"first_sample": self.first, "samples": self.samples, "whole": self.whole, "triggers": self.triggers}
         return {SNAPSHOT: json.dumps(told | ({"further_triggers": self.further} if self.further else {}))}
 

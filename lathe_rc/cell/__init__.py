@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What holds stages together: messages, parameter tables, wiring, the offline engine. Knows no ROS."""
+"""The frame of the stages: messages, parameter tables, wiring, the offline engine. Knows no ROS."""

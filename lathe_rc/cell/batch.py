@@ -19,16 +19,16 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
+from lathe_rc import messages
 from lathe_rc.analysis.metrology import FormErrors, form_errors
-from lathe_rc.cell import messages
 from lathe_rc.cell.collect import Collector, Finite
 from lathe_rc.cell.engine import Engine, Sink
-from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
+from lathe_rc.messages import Signals
 
 K_co = TypeVar("K_co", covariant=True)
 
@@ -43,7 +43,7 @@ class Keeper(Sink, Protocol[K_co]):
         """Relative topics whose sparse messages it takes; others are not made."""
 
     def kept(self) -> K_co:
-        """What is kept, at the end of the run."""
+        """The kept result, at the end of the run."""
 
 
 Make = Callable[[Cell, int], Keeper[K_co]]  #: makes a keeper for a cell and so many samples
@@ -51,7 +51,7 @@ Make = Callable[[Cell, int], Keeper[K_co]]  #: makes a keeper for a cell and so 
 
 @dataclass(frozen=True)
 class Outcome(Generic[K_co]):
-    """What a cell gave.
+    """The outcome of a cell.
 
     Attributes:
         scenario: of the cell.

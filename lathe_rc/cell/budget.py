@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the form error of a scenario is made of: its runs with causes switched off, offline and as a batch."""
+"""The parts of a scenario's form error: its runs with causes switched off, offline and as a batch."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from lathe_rc import messages
 from lathe_rc.analysis.budget import TOLD, Budget, Causes, Decomposition
 from lathe_rc.analysis.metrology import evenly
 from lathe_rc.analysis.tolerance import LAST
-from lathe_rc.cell import batch, messages, models
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc.cell import batch, models
 from lathe_rc.cell.parameters import NodeParameters, Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
@@ -24,6 +24,7 @@ from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.cell.stages.vibration import VibrationParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import Samples, Signals
 
 _TURN = 2.0 * np.pi
 _PREFIXES = ("", "coarse_", "fine_", "cut_")  # of the parameters of a part; those of stages with several have one
@@ -63,7 +64,7 @@ _SPEED = [name for name in SpeedLawParameters.model_fields if name not in NodePa
 
 @dataclass(frozen=True)
 class Cause:
-    """What may be switched off.
+    """A cause that may be switched off.
 
     Attributes:
         off: the values that do it, by NODE.PARAM.
@@ -119,7 +120,7 @@ class _Keep:
         angle = self._kept["angle"]
         if angle.size < 2:
             return _Tail(0, np.empty((0, 0)), angle)
-        # One more than is told of, for the spline; the last may be short of two samples.
+        # One more than is reported, for the spline; the last may be short of two samples.
         before = max(int((angle[-1] + 2.0 * (angle[-1] - angle[-2])) / _TURN) - LAST - 1, 0)
         begin = int(np.searchsorted(angle, before * _TURN))
         error = evenly(angle[begin:] - before * _TURN, self._kept["error"][begin:])
@@ -178,7 +179,7 @@ def _speed(scenario: Scenario) -> dict[str, Cause]:
 
 
 def _feed(scenario: Scenario, height: Samples) -> dict[str, Cause]:
-    """A form that changes along the part: off, the tool stays at the middle of the heights that are told of."""
+    """A form that changes along the part: off, the tool stays at the middle of the heights that are reported."""
     forms = {node: table for node, table in scenario.nodes.items() if isinstance(table, FormParameters)}
     off: dict[str, Value] = {}
     for node, table in forms.items():
@@ -223,7 +224,7 @@ def _flat(stage: LearningController, speeds: Collection[float], cell: Cell) -> d
 
 
 def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
-    """What Q forgets: off, each Q is 1 as far as its channel converges with it."""
+    """The part that Q forgets: off, each Q is 1 as far as its channel converges with it."""
     off: dict[str, Value] = {}
     low, high = cell.master.speed_range()
     for stage in cell.stages.values():
@@ -237,11 +238,11 @@ def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
 
 
 def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[str, str]]:
-    """What may be switched off in a scenario.
+    """The causes that may be switched off in a scenario.
 
     Args:
         scenario: that can work.
-        height: of the tool along the part in the revolutions that are told of [m].
+        height: of the tool along the part in the revolutions that are reported [m].
 
     Returns:
         The causes, each after the one that it needs; and those that cannot be switched off, with the reason.

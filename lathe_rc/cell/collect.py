@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
+from lathe_rc.cell.block import NotFiniteError, check_finite
 from lathe_rc.cell.framing import Framer
-from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wire import NotFiniteError, check_finite
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.names import instead
 
 
@@ -56,7 +56,7 @@ class Finite:
 
 
 def _free_memory() -> int:
-    """What programs can still have without swapping [B]; all that there is where nobody says."""
+    """Memory that programs can still have without swapping [B]; all memory where the system does not say."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             name, _, size = line.partition(":")
@@ -123,7 +123,7 @@ class Collector:
             kept.extend(sparse.get(topic, ()))
 
     def recording(self) -> Recording:
-        """What was collected, by fully qualified topic."""
+        """The collected signals, by fully qualified topic."""
         sparse = {}
         for topic, found in self._sparse.items():
             part = sparse[f"/{topic}"] = SparseTopic()

@@ -7,16 +7,16 @@ from typing import Protocol
 
 import numpy as np
 
-from lathe_rc.cell.messages import MAX_BLOCK, Signals
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.program import Program, Tapes, chunk_of, wired
 from lathe_rc.cell.stage import Sparse, compile_kernels
 from lathe_rc.cell.track import longest_delays
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.messages import MAX_BLOCK, Signals
 
 
 class Sink(Protocol):
-    """What takes the results of a run, piece by piece, in order."""
+    """A sink for the results of a run, piece by piece, in order."""
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Take the samples ``first`` on of every topic and the sparse messages among them, by relative topic."""

@@ -3,7 +3,7 @@
 
 from typing import Any
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.stage import Sparse
 
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a controller takes for its drive, the form and the encoder: given once, with those, unless it shall be another.
+"""A controller's models of its drive, the form and the encoder: given once, with those, unless it shall be another.
 
 A parameter that `lathe_rc.cell.parameters.parameter` marks with a quantity of the drive, and that nobody has given,
 gets the value of the drive that reads what the controller commands. Quantities with the same word before a dot belong
-together: who gives one of them gives all. The same holds for what a table ``asks``: the node that knows it tells it.
+together: a scenario gives all of them or none. The same holds for what a table
+``asks``: the node that knows it tells it.
 """
 
 from collections.abc import Iterator, Mapping
@@ -23,7 +24,7 @@ def _marked(table: type[NodeParameters]) -> Mapping[str, str]:
 
 
 def _together(quantity: str) -> str:
-    """What a quantity is part of; itself, if of nothing."""
+    """The group that a quantity is part of; itself, if of none."""
     return quantity.partition(".")[0]
 
 

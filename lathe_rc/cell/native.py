@@ -126,7 +126,7 @@ class Native:
 
 
 def _cause(told: str) -> str:
-    """What Numba says of code that it cannot compile, in a line: the innermost place, and what is wrong there."""
+    """Numba's reason against code that it cannot compile, in a line: the innermost place, and the error there."""
     places = [found for found in _PLACE.findall(told) if not Path(found[0]).name.startswith("step_")]
     words = [line.strip() for line in told.splitlines()]
     why = next((line for line in reversed(words) if line.startswith(_WRONG)), next(filter(None, words), "no reason"))
@@ -176,7 +176,7 @@ def step_of(stage: type, loop: Step, sample: object) -> Step:
 
 
 def _source(module: str) -> str:
-    """What tells versions of a step apart: ours have a cache each."""
+    """The hash that distinguishes versions of a step: ours have a cache each."""
     return "that of lathe_rc" if is_ours(module) else source_hash(module, imports=True)
 
 

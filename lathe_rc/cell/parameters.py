@@ -6,24 +6,26 @@ ROS descriptors, validation, help and the documentation are made from these tabl
 
 import copy
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from lathe_rc.cell.messages import MAX_BLOCK
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import Named
+from lathe_rc.messages import MAX_BLOCK
 from lathe_rc.names import instead
 
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
 
 T = TypeVar("T", bound="Table")
 
+_LONGEST = 60  # characters of a value in a summary
 _NAMES = {bool: "true or false", int: "an integer", float: "a finite number", str: "a text"}
 
 
@@ -96,7 +98,7 @@ class Row:
         return found
 
     def allowed(self) -> str:
-        """What the parameter accepts, in words."""
+        """The values that the parameter accepts, in words."""
         what = f"one of {', '.join(self.choices)}" if self.choices else _NAMES[self.type]
         what = self.named.allowed() if self.named else what
         text = " ".join(filter(None, (what, self.limits)))
@@ -120,6 +122,17 @@ class Table(BaseModel):
     def rows(cls) -> Mapping[str, Row]:
         """The parameters by name."""
         return _rows(cls)
+
+    def other_than_default(self, names: Collection[str]) -> str:
+        """Those of some parameters that are not at their defaults, in words."""
+        told = []
+        for row in self.rows().values():
+            value = getattr(self, row.name)
+            if value != row.default and row.name != "stage" and row.name in names:
+                text = Path(value).name if row.is_path else str(value)
+                short = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+                told.append(f"{row.name} = {short}" if row.unit == "1" else f"{row.name} = {short} {row.unit}")
+        return ", ".join(told)
 
     @classmethod
     def read(cls: type[T], node: str, values: Mapping[str, object]) -> T:
@@ -150,7 +163,7 @@ class Table(BaseModel):
 def about(node: str, *names: str) -> Iterator[None]:
     """Let a refusal of what is made of some parameters name them: ``node.a, b: ...``; one that does stays as it is.
 
-    Physics and control know nothing of parameters; who makes them of a table does.
+    Physics and control know nothing of parameters; the stage that makes them of a table does.
     """
     try:
         yield
@@ -172,7 +185,7 @@ def _rows(table: type[Table]) -> Mapping[str, Row]:
 
 
 class SharedParameters(Table):
-    """What all nodes of a cell must agree on; may stand under ``/**`` in a parameter file."""
+    """Parameters that all nodes of a cell must agree on; may stand under ``/**`` in a parameter file."""
 
     sample_rate: Annotated[int, Ge(1000), Le(1_000_000)] = parameter(
         64_000, "sampling rate of the cell; the step must be a whole number of nanoseconds", "Hz"
@@ -216,14 +229,14 @@ class SharedParameters(Table):
 
 
 class NodeParameters(SharedParameters):
-    """What every node has.
+    """Parameters that every node has.
 
     Attributes:
         judging: parameters that change no sample and no message of a run, but what is said of it.
     """
 
     listing: ClassVar[str] = "lathe node {} --help"
-    asks: ClassVar[tuple[frozenset[str], ...]] = ()  #: parameters that come from who knows them, unless one is given
+    asks: ClassVar[tuple[frozenset[str], ...]] = ()  #: parameters of the node that knows them, unless given
     judging: ClassVar[frozenset[str]] = frozenset()
 
     stage: str = parameter("", "what the node is; empty: its name says it")
@@ -258,7 +271,7 @@ class NodeParameters(SharedParameters):
         return {}
 
     def known(self) -> Mapping[str, Value]:
-        """What others may know of the node, by their parameter."""
+        """The node's values that other nodes may use, by their parameter."""
         return {}
 
 

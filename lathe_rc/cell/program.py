@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc import messages
 from lathe_rc.cell.native import BROKEN, Integers, broken
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.placed import call, floats
 
 _CHUNK = 1024  # samples that a stage computes in one go, at most: what stages hand on stays in the cache
@@ -258,6 +258,6 @@ class Program:
             self._told[number] = end
 
     def said(self, number: int, end: int) -> list[Sparse]:
-        """What a stage has said since the last call of the samples before ``end``."""
+        """The stage's events since the last call, of the samples before ``end``."""
         said, self._sparse[number] = self._sparse[number], []
         return [message for message in said if message.index < end]

@@ -10,14 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import NOT_SIGNALS, START_NS, Samples, Signals
+from lathe_rc import messages
+from lathe_rc.analysis.metrology import FormErrors, form_errors, turns_before
+from lathe_rc.cell.columns import Column, columns, dense_rows, sparse_rows
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.drawing import html
+from lathe_rc.errors import InputError
+from lathe_rc.messages import NOT_SIGNALS, START_NS, Samples, Signals, full
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from lathe_rc.analysis.metrology import FormErrors
+    from lathe_rc.drawing.form import TurnedForm
 
 _PIECE = 2**15  # samples that are hashed in one go
 
@@ -72,15 +76,27 @@ class Recording:
     first: int = 0
 
     def __repr__(self) -> str:
-        """What it holds, in a line."""
+        """Its content, in a line."""
         size = f"{self.samples} samples ({self.samples * self.step_ns * 1e-9:.3g} s)"
         return f"<Recording: {', '.join([f'{len(self.types)} topics', size, *self.errors.told()])}>"
 
     def _repr_html_(self) -> str:
-        """Its topics as a table, for notebooks."""
-        from lathe_rc.view import notebook
+        """Its topics as a table, with their fields and units, for notebooks."""
+        rows = []
+        for topic, kind in self.types.items():
+            dense = topic in self.dense
+            count = self.samples if dense else len(self.sparse[topic].stamps)
+            fields = ", ".join(column.label for column in columns(kind)[2:])
+            rows.append((topic, f"{count} {'samples' if dense else 'messages'}", fields))
+        return html.table(("topic", "", "fields"), rows) + self.errors_picture()
 
-        return notebook.recording(self)
+    def errors_picture(self) -> str:
+        """The form error by revolution as a picture in HTML; empty without a revolution."""
+        return html.errors_picture(self.errors, self._turns_before() if self.errors.rms.size else 0)
+
+    def _turns_before(self) -> int:
+        """Revolutions before the first that is complete."""
+        return turns_before(self.of_type(messages.ENCODER)["angle_true"])
 
     @property
     def samples(self) -> int:
@@ -88,26 +104,93 @@ class Recording:
         return next((array.size for signals in self.dense.values() for array in signals.values()), 0)
 
     @cached_property
-    def errors(self) -> "FormErrors":
+    def errors(self) -> FormErrors:
         """Form error of each complete revolution; of none if there is no tool."""
-        from lathe_rc.analysis.metrology import form_errors, turns_before
-
         if not {messages.ENCODER, messages.TOOL} <= {self.types[topic] for topic in self.dense}:
             return form_errors(np.empty(0), np.empty(0))
         angle = self.of_type(messages.ENCODER)["angle_true"]
         return form_errors(angle, self.of_type(messages.TOOL)["error"], turns_before(angle))
 
     def frame(self, topic: str) -> Any:
-        """A topic as a table: a row a sample, or a message; see `lathe_rc.frames.frame`."""
-        from lathe_rc import frames
+        """A topic as a table: a row a sample, or a message; of a message with lists, a row an element.
 
-        return frames.frame(self, topic)
+        The columns are those of `lathe_rc.bag.exporting.export`: ``sample``, ``time`` [s] (sample 0 is at 1 s) and the
+        fields of the message. With an encoder in the recording two come before the fields: ``revolution``, counted
+        from 1, and ``spindle_angle``, the true angle in it [rad].
 
-    def plot(self, title: str = "") -> "Figure":
-        """Desired form, form error over angle, form error by revolution; see `lathe_rc.view.figure.draw`."""
-        from lathe_rc.view import figure
+        Args:
+            topic: with or without the leading slash.
 
-        return figure.draw(self, title)
+        Returns:
+            Where pandas is installed, a ``pandas.DataFrame`` with a copy of the samples, ``time`` as its index, and
+            the topic and the unit of each column that has one in ``attrs``. Otherwise a ``pyarrow.Table``, whose
+            fields have the unit in their metadata, as in a Parquet file of an export.
+
+        Raises:
+            InputError: there is no such topic.
+
+        Example:
+            >>> from pathlib import Path
+            >>> from lathe_rc import harness, resources
+            >>> from lathe_rc.cell import scenario
+            >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=3"])
+            >>> tool = harness.run(piston).recording.frame("/tool")
+            >>> (tool["error"].abs() * 1e6).groupby(tool["revolution"]).max().round(1).to_dict()
+            {1: 232.7, 2: 13.4, 3: 4.0}
+            >>> tool.attrs["units"]["error"]
+            'm'
+        """
+        from lathe_rc.cell import frames  # pyarrow takes its time
+
+        name = full(topic)
+        if name not in self.types:
+            raise InputError(f"no topic {topic!r} in the recording; allowed: {', '.join(self.types)}")
+        table: Sequence[Column] = columns(self.types[name])
+        rows: Mapping[str, Samples]
+        if name in self.dense:
+            rows = dense_rows(self.first, self.dense[name], self.step_ns)
+        else:
+            rows = sparse_rows(table, self.messages(name), self.step_ns)
+        if messages.ENCODER in {self.types[known] for known in self.dense}:
+            angle = self.of_type(messages.ENCODER)["angle_true"][rows["sample"] - self.first]
+            table, rows = frames.with_spindle(table, rows, angle)
+        return frames.frame(name, table, rows)
+
+    def plot(self, title: str = "", beside: "tuple[str, Recording] | None" = None) -> "Figure":
+        """Desired form, form error over angle, form error by revolution; see `lathe_rc.drawing.form.draw`.
+
+        Args:
+            title: of the figure.
+            beside: name and recording of another run of the same part, whose errors are drawn as well.
+
+        Raises:
+            InputError: there is no tool, or not one complete revolution.
+        """
+        from lathe_rc.drawing import form  # Matplotlib takes its time
+
+        other = beside and (beside[0], beside[1].turned_form())
+        return form.draw(self.turned_form(), title, other)
+
+    def turned_form(self) -> "TurnedForm":
+        """The form of the part, for a figure.
+
+        Raises:
+            InputError: there is no tool, or not one complete revolution.
+        """
+        from lathe_rc.drawing.form import TurnedForm
+
+        if not self.errors.rms.size:
+            kinds = set(self.types.values())
+            both = (("encoder", messages.ENCODER), ("tool", messages.TOOL))
+            missing = [name for name, kind in both if kind not in kinds]
+            why = (
+                f"no {' and no '.join(missing)}; record both"
+                if missing
+                else "no complete revolution; let it run longer"
+            )
+            raise InputError(f"nothing to draw: the recording has {why}")
+        angle, tool = self.of_type(messages.ENCODER)["angle_true"], self.of_type(messages.TOOL)
+        return TurnedForm(angle, tool["reference"], tool["error"], self.errors, self._turns_before())
 
     def messages(self, topic: str) -> list[Sparse]:
         """The messages of a sparse topic, by its fully qualified name."""

@@ -11,7 +11,7 @@ KIND = "replayer"
 
 
 class ReplayerParameters(Table):
-    """What to send again, and how fast."""
+    """The messages to send again, and their pace."""
 
     bag: str = parameter("", "folder or file of the bag", path=True)
     rate: Annotated[float, Ge(0)] = parameter(1.0, "pace against the bag's time; 0: as fast as the readers follow")

@@ -15,7 +15,7 @@ Kind = Literal["spawn", "serve", "connect", "save"]
 
 
 class RerunBridgeParameters(Table):
-    """What to show live in Rerun, and where."""
+    """The signals to show live in Rerun, and the place for them."""
 
     output: Kind = parameter("spawn", "a window, a page for the browser, a viewer that runs already, or files")
     file: str = parameter(

@@ -33,7 +33,7 @@ _libc.strtod.argtypes = (ctypes.c_char_p, ctypes.POINTER(ctypes.c_char_p))
 
 
 def _number(text: str) -> int | float | None:
-    """What strtol or strtod make of the whole text; None if neither takes all of it."""
+    """The number that strtol or strtod read from the whole text; None if neither takes all of it."""
     data = ctypes.create_string_buffer(text.encode())
     start = ctypes.cast(data, ctypes.c_char_p)
     end = ctypes.c_char_p()

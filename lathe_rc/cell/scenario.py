@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenarios: ROS 2 parameter files that describe a whole cell."""
+"""Scenarios: ROS 2 parameter files that describe a whole cell.
+
+Longer than 400 lines: a scenario's way from its text to its tables, and back.
+"""
 
 import hashlib
 import json
@@ -17,7 +20,9 @@ from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Valu
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stages import MASTERS, STAGES
+from lathe_rc.drawing import html
 from lathe_rc.errors import InputError, shown
+from lathe_rc.extensions import in_words
 from lathe_rc.names import instead
 
 
@@ -31,7 +36,7 @@ class _Tables(Mapping[str, type[NodeParameters]]):
 
     def allowed(self) -> str:
         """The kinds, in words."""
-        return f"{', '.join(self)}, or PACKAGE.MODULE:CLASS"
+        return in_words(self)
 
     def instead(self, kind: str) -> str:
         """The kinds that look like one that there is not, or all of them, in words."""
@@ -60,7 +65,7 @@ _HOST_PARAMETERS = {
 
 
 def kind_of(node: str, stage: object) -> str:
-    """What a node is: its ``stage`` parameter, or its name.
+    """The kind of a node: its ``stage`` parameter, or its name.
 
     Raises:
         InputError: there is no such stage.
@@ -113,17 +118,20 @@ class Scenario:
 
     def _repr_html_(self) -> str:
         """Its nodes and what is set in them, as a table, for notebooks."""
-        from lathe_rc.view import notebook
-
-        return notebook.scenario(self)
+        shared = SharedParameters.model_fields
+        rows = [("all nodes", "", self.shared.other_than_default(shared))] if self.nodes else []
+        for node, table in self.nodes.items():
+            own = table.other_than_default(table.rows().keys() - shared.keys())
+            rows.append((node, self.kind(node) if table.stage else "", own))
+        return html.table((self.name, "kind", "other than default"), rows)
 
     @property
     def shared(self) -> SharedParameters:
-        """What all nodes agree on."""
+        """The parameters that all nodes agree on."""
         return next(iter(self.nodes.values()))
 
     def kind(self, node: str) -> str:
-        """What a node is."""
+        """The kind of a node."""
         return kind_of(node, self.nodes[node].stage)
 
     def of_kind(self, kind: str) -> list[str]:
@@ -186,7 +194,7 @@ class Scenario:
         return rows[name].element()
 
     def value(self, target: str) -> Value:
-        """What a parameter is; see `parameter`."""
+        """The value of a parameter; see `parameter`."""
         whole, element = _element(target)
         node, _, name = whole.rpartition(".")
         found = getattr(self.nodes[node] if node else self.shared, name)

@@ -12,6 +12,9 @@ It computes the block that begins at sample ``first``, from its sample ``start``
 (`DONE`) or until Python has to do something (any other reason, see `Stage.serve`), and is called again from there.
 Inputs are the arrays of float64 of all fields of all input ports in their order, flags are those of uint8, or an empty
 one if there are none, and outputs are the arrays of all fields of all output ports.
+
+Longer than 400 lines: ports, messages, triggers and faults of a stage make one contract, which whoever writes a stage
+has to know as a whole.
 """
 
 import re
@@ -23,12 +26,12 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc import messages
 from lathe_rc.cell.native import Native, Step, is_compiled
 from lathe_rc.cell.parameters import NodeParameters, about, remapped
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.extensions import is_ours
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.names import instead
 from lathe_rc.placed import unfit
 from lathe_rc.safety import faults
@@ -478,14 +481,14 @@ class Stage(ABC):
         raise NotImplementedError(action)
 
     def finish(self, index: int) -> list[Sparse]:
-        """What is still to be said when the run ends with sample ``index``."""
+        """The remaining events when the run ends with sample ``index``."""
         return []
 
     # ---- the compiled step ----------------------------------------------------------------------------
 
     @property
     def memory(self) -> tuple[Any, ...]:
-        """What the step works on, a NamedTuple of arrays and constants; another one may be given after each stop."""
+        """The memory of the step, a NamedTuple of arrays and constants; another one may be given after each stop."""
         return ()
 
     @property
@@ -524,7 +527,7 @@ class Stage(ABC):
         return self._room
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is worth keeping: addresses and room are not."""
+        """The state without addresses and scratch arrays."""
         return {**self.__dict__, "_native": None, "_room": None}
 
     def prepare(self, first: int, samples: int) -> None:  # noqa: B027 - most stages need nothing

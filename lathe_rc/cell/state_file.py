@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a node keeps of itself in a file, so that another process can go on in its place, to the bit.
+"""The state of a node in a file, so that another process can go on in its place, to the bit.
 
 Python's pickle, with limits. Arrays are written as type, shape and bytes, parameter tables not at all: the node that
 reads has its own. Of classes there are only those that a fresh state of the node is made of. A file that another user
@@ -96,14 +96,14 @@ class _Reader(pickle.Unpickler):
 
 
 def dump(state: Mapping[str, object]) -> bytes:
-    """What a file of a state holds."""
+    """The content of a state file."""
     buffer = io.BytesIO()
     _Writer(buffer).dump(dict(state))
     return buffer.getvalue()
 
 
 def save(path: Path, state: Mapping[str, object]) -> None:
-    """Write a state; who reads meanwhile, or after this process was killed, finds the one before or this one.
+    """Write a state; a reader finds the one before or this one, also after this process was killed.
 
     Raises:
         LatheError: it cannot be written.

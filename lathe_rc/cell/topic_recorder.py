@@ -11,7 +11,7 @@ KIND = "topic_recorder"
 
 
 class TopicRecorderParameters(Table):
-    """What to record of any ROS system, and by which time."""
+    """The topics to record of any ROS system, and the clock for them."""
 
     bag: str = parameter("", "folder of the bag; must not exist", path=True)
     topics: list[str] = parameter([], "fully qualified; none: all but hidden ones, /rosout and /parameter_events")

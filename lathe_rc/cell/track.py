@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc import messages
 from lathe_rc.cell.stage import Input
+from lathe_rc.messages import Signals
 
 _MOVED = 0.25  # of the samples, at most, are copied once more to keep them contiguous
 _VIEWS = 256  # that are made once
@@ -50,7 +50,7 @@ class Track:
         self.end = 0  #: index after the newest sample
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is worth keeping: views of arrays would be kept as copies."""
+        """The state without views of arrays, which would be kept as copies."""
         return {**self.__dict__, "_views": {}, "_size": 0, "_newest": {}}
 
     def _at(self, start: int, samples: int) -> Signals:
@@ -83,7 +83,7 @@ class Track:
         return self._at(start, samples)
 
     def restart(self, first: int) -> None:
-        """Begin at sample ``first``, with zeros before it; drops what is there."""
+        """Begin at sample ``first``, with zeros before it; drops all samples."""
         for array in self._arrays.values():
             array[:] = 0
         self._base, self.end = first - self._kept, first

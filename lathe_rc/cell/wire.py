@@ -11,19 +11,17 @@ frame: such a block is encoded anew by rosbags, 10 to 50 µs, and read like ours
 
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import MAX_BLOCK, START_NS, Samples, Signals
+from lathe_rc import messages
+from lathe_rc.cell.block import Block
+from lathe_rc.messages import START_NS, Samples, Signals
 
 _BILLION = 1_000_000_000
-_MOST_FIELDS = 16
-_ZEROS = np.zeros(_MOST_FIELDS * (MAX_BLOCK + 1))
-_AT_ONCE = 8192  # numbers for which memory is made at once, if that are several pieces
 _SHIFT = 4  # CDR aligns to what follows its first four bytes: with so many before, to memory as well
 # What differs from block to block, but for the samples: the stamp, and what follows the texts of a BlockInfo.
 _STAMP = struct.Struct("<iI")  # sec, nanosec
@@ -128,120 +126,6 @@ class _Scratch:
         _STAMP.pack_into(data, self._layout.stamp, *divmod(log_ns, _BILLION))
         _INFO.pack_into(data, self._layout.info, first, step_ns, last, companions)
         return data.tobytes()
-
-
-class Pool:
-    """Memory for the samples of blocks of one type.
-
-    What is handed to readers in the same process is theirs as long as they want it, so each block needs memory of its
-    own; to make it for some blocks at once takes a quarter of the time.
-
-    Args:
-        msgtype: message type.
-    """
-
-    def __init__(self, msgtype: str) -> None:
-        self._fields = messages.sample_fields(msgtype)
-        self._uniform = set(self._fields.values()) == {np.dtype(np.float64)}
-        self._samples = 0
-        self._free: list[Samples] = []
-
-    def take(self, samples: int) -> tuple[Signals, Samples | None]:
-        """Arrays of shape (samples,) by field, not zeroed; and all of them as one, if they are all of one type."""
-        if not self._uniform:
-            return {name: np.empty(samples, dtype) for name, dtype in self._fields.items()}, None
-        if not self._free or samples != self._samples:
-            self._samples, size = samples, samples * len(self._fields)
-            self._free = list(np.empty((max(_AT_ONCE // size, 1), len(self._fields), samples)))
-        whole = self._free.pop()
-        return dict(zip(self._fields, whole, strict=True)), whole
-
-
-@dataclass(slots=True)
-class Block:
-    """A block as it came, its samples views of its bytes; or several in one piece that were computed in this process.
-
-    Attributes:
-        run_id, source, first_index, step_ns, last, companions: see BlockInfo.msg.
-        samples: its length.
-        log_ns: its stamp [ns].
-        signals: arrays of shape (samples,) by field.
-        whole: the same as one array of shape (fields, samples), where it was computed in this process.
-    """
-
-    run_id: str
-    source: str
-    first_index: int
-    step_ns: int
-    last: bool
-    companions: int
-    samples: int
-    log_ns: int
-    signals: Signals
-    whole: Samples | None = None
-
-    def part(self, start: int, stop: int) -> "Block":
-        """Its samples ``start`` to ``stop``, as views."""
-        first, last = self.first_index + start, self.last and stop == self.samples
-        log_ns = START_NS + (first + stop - start - 1) * self.step_ns
-        signals = {name: array[start:stop] for name, array in self.signals.items()}
-        samples = stop - start
-        return Block(self.run_id, self.source, first, self.step_ns, last, self.companions, samples, log_ns, signals)
-
-    def copy_to(self, signals: Signals, *, check: bool = True) -> None:
-        """Copy samples into arrays of shape (samples,), by field.
-
-        Raises:
-            ValueError: a sample is NaN or infinite, unless that has been checked.
-        """
-        for name, array in signals.items():
-            array[:] = self.signals[name]
-            if check:
-                self._check(name, array)
-
-    def check(self) -> None:
-        """Refuse samples that no reader could use.
-
-        Raises:
-            ValueError: a sample is NaN or infinite.
-        """
-        if self.whole is None or self.whole.ravel().dot(_ZEROS[: self.whole.size]) != 0.0:
-            for name, array in self.signals.items():
-                self._check(name, array)
-
-    def _check(self, name: str, array: Samples) -> None:
-        check_finite(self.source, name, array, self.first_index)
-
-
-class NotFiniteError(ValueError):
-    """A sample that no reader could use.
-
-    Attributes:
-        index: of the sample.
-    """
-
-    def __init__(self, message: str, index: int) -> None:
-        super().__init__(message)
-        self.index = index
-
-
-def check_finite(source: str, name: str, array: Samples, first: int) -> None:
-    """Refuse samples that no reader could use.
-
-    Args:
-        source: who publishes them.
-        name: of the field.
-        array: shape (n,), any type; n up to `lathe_rc.cell.messages.MAX_BLOCK`.
-        first: index of the first sample.
-
-    Raises:
-        NotFiniteError: a sample is NaN or infinite; the first.
-    """
-    # 0 times anything finite is 0, and NaN otherwise: one product tells for the whole block.
-    if array.dtype == np.float64 and np.dot(array, _ZEROS[: array.size]) != 0.0:
-        bad = int(np.flatnonzero(~np.isfinite(array))[0])
-        index = first + bad
-        raise NotFiniteError(f"{source} sends {name} = {array[bad]} at sample {index}; allowed: finite numbers", index)
 
 
 class Encoder:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The wired cell: stages in the order in which they compute, topics by name, and the checks before a start."""
+"""The wired cell: stages in the order in which they compute, topics by name, and the checks before a start.
+
+Longer than 400 lines: each check looks at the same wired cell, and a cell is refused by all of them or by none.
+"""
 
 import math
 from collections.abc import Collection, Mapping
@@ -27,7 +30,7 @@ from lathe_rc.signals.tip_path import steepest_fall
 
 @dataclass(frozen=True)
 class Source:
-    """Who publishes a topic."""
+    """The node that publishes a topic."""
 
     node: str
     type: str
@@ -109,7 +112,7 @@ class Cell:
         topics[topic] = source
 
     def source(self, stage: Stage, port: Input) -> Source:
-        """Who publishes what a stage reads.
+        """The publishers of a stage's inputs.
 
         Raises:
             InputError: as another type; `UnpublishedError`: nobody.
@@ -286,8 +289,8 @@ class Cell:
         if asks and nodes and not listening & set(nodes):
             asked = f"monitor {asks.name} asks for {asks.reaction.name.lower()}"
             raise InputError(
-                f"{stage.name}: {asked}, but nobody who moves {drive} listens; allowed: {nodes[0]}.reaction_delay of a "
-                "block or more, or a weaker reaction"
+                f"{stage.name}: {asked}, but no node that moves {drive} reads safety; "
+                f"allowed: {nodes[0]}.reaction_delay of a block or more, or a weaker reaction"
             )
 
     def _check_retraction(self, stage: Supervisor) -> None:
@@ -324,7 +327,7 @@ class Cell:
                 )
 
     def _check_reach(self, stage: Learner, name: str) -> None:
-        """What it takes over, it takes over wherever the drive can be."""
+        """Refuse bounds with which it could not take over from every position of the drive."""
         drive, parameters = self.stages[name], stage.parameters
         assert isinstance(drive, Drive), "it learns"
         reach = parameters.bounds().reach(parameters.retract_time)

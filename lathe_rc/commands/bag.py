@@ -12,13 +12,13 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from lathe_rc import part
-from lathe_rc.bag import story, stream
+from lathe_rc import messages, part
+from lathe_rc.bag import provenance
 from lathe_rc.bag.check import check as check_bag
-from lathe_rc.bag.recover import recover as recover_bag
-from lathe_rc.bag.source import Source
-from lathe_rc.bag.tachogram import make as make_tachogram
-from lathe_rc.cell import messages
+from lathe_rc.bag.reading import stream
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.tachogram import make as make_tachogram
+from lathe_rc.bag.repairing.recover import recover as recover_bag
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 _BAG = click.argument("path", metavar="BAG", type=click.Path(path_type=Path))
@@ -86,15 +86,15 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
             f"{last['rms']:.4g} in {last['revolution']}"
         )
     for key, text in told["about"].items():
-        if key == story.SCENARIO:
+        if key == provenance.SCENARIO:
             console.print("scenario:")
             console.print(Text("  " + text.strip().replace("\n", "\n  ")))
-        elif key == story.ORIGINS:
-            for origin in story.origins({key: text}):
+        elif key == provenance.ORIGINS:
+            for origin in provenance.origins({key: text}):
                 of = f" of {origin.package}" if origin.package else ""
                 console.print(Text(f"{', '.join(origin.used)}: {origin.name}{of}, source {origin.source}"))
-        elif key.startswith(story.FILE):
-            console.print(Text(f"{key.removeprefix(story.FILE)}: a file, {len(text)} characters in base64"))
+        elif key.startswith(provenance.FILE):
+            console.print(Text(f"{key.removeprefix(provenance.FILE)}: a file, {len(text)} characters in base64"))
         else:
             console.print(Text(f"{key.removeprefix('lathe_rc.')}: {text}"))
 

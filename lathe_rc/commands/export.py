@@ -24,7 +24,7 @@ def export(bag: Path, kinds: tuple[str, ...], output: Path | None, topics: tuple
     """Export the signal topics of a recording, with units."""
     if len(kinds) != 1:
         raise InputError(f"{len(kinds)} formats; allowed: one of --csv, --parquet and --npz")
-    from lathe_rc.bag import export as exporting  # Arrow takes a while to load
+    from lathe_rc.bag.exporting import export as exporting
 
     (kind,) = kinds
     name = bag.resolve().name.removesuffix(".mcap")

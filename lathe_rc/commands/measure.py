@@ -12,8 +12,8 @@ from rich.table import Table as RichTable
 
 from lathe_rc import part
 from lathe_rc.analysis.metrology import Lay, Measurement
-from lathe_rc.bag import reader, story
-from lathe_rc.bag.source import Source
+from lathe_rc.bag import provenance, reader
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.recording import Recording
 from lathe_rc.errors import InputError
 
@@ -63,7 +63,7 @@ def _surface(bag: Path, recording: Recording, found: Measurement, nose_mm: float
     if nose_mm:
         return part.surface(recording, found, nose_mm * 1e-3)
     with Source(bag) as source:
-        radius = story.nose_radius(source.about)
+        radius = provenance.nose_radius(source.about)
     try:
         return part.surface(recording, found, radius) if radius else None
     except InputError as error:

@@ -15,7 +15,7 @@ from lathe_rc.extensions import COMMON
 
 @dataclass(frozen=True)
 class Kind:
-    """What can be begun.
+    """A package that ``lathe new`` can begin.
 
     Attributes:
         summary: of the package.

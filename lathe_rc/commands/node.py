@@ -45,10 +45,6 @@ def container(arguments: tuple[str, ...]) -> None:
 
 
 def _nodes(arguments: Sequence[str]) -> int:
-    try:
-        from lathe_rc.nodes import process
-    except ImportError as error:
-        raise InputError(
-            f"no ROS 2 here ({error}); run through ./lathe, source a ROS 2 installation, or use --mode offline"
-        ) from None
+    from lathe_rc.nodes import process
+
     return process.run(*process.split(arguments))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run gave, as tables and lines for the terminal."""
+"""The result of a run, as tables and lines for the terminal."""
 
 from collections.abc import Mapping
 from itertools import groupby
@@ -14,7 +14,7 @@ from lathe_rc.analysis.budget import Budget, Part
 from lathe_rc.analysis.metrology import Lay
 from lathe_rc.cell.durations import Lateness
 
-_MOST_EVENTS = 12  # that are told of a run
+_MOST_EVENTS = 12  # printed of a run
 _ALIKE = 4  # of them that follow one another: those in between are left out
 
 
@@ -31,12 +31,12 @@ def table(result: harness.Result) -> RichTable:
 
 
 def _events(result: harness.Result) -> RichTable:
-    """What happened, as far as there is room; of equal ones that follow one another the first and the last."""
+    """The event log, as far as there is room; of equal ones that follow one another the first and the last."""
     table = RichTable(show_edge=False, header_style="bold")
     for column in ("time [s]", "topic", "what happened"):
         table.add_column(Text(column), justify="left" if table.columns else "right", overflow="fold")
     step, rows = result.scenario.shared.step, list[tuple[str, str, str]]()
-    for _, run in groupby(result.happened, lambda found: (found.topic, found.text.partition(":")[0])):
+    for _, run in groupby(result.event_log, lambda found: (found.topic, found.text.partition(":")[0])):
         alike = [(f"{found.sample * step:.6g}", found.topic, found.text) for found in run]
         rows += alike if len(alike) < _ALIKE else [alike[0], ("", "", f"{len(alike) - 2} more of the kind"), alike[-1]]
     if (left := len(rows) - _MOST_EVENTS) > 0:
@@ -93,7 +93,7 @@ def show(result: harness.Result, further: Mapping[str, Path], *, told: str = "",
     console = Console()
     if result.errors.rms.size:
         console.print(table(result))
-    if result.happened:
+    if result.event_log:
         console.print(_events(result))
     for fact in [*facts(result), *filter(None, [told])]:
         console.print(fact, highlight=False)

@@ -86,13 +86,13 @@ class Watch:
                 error=f"error {event['rms_error'] * 1e6:.3g} µm RMS",
             )
         elif kind == "stall" and event["member"] != self._silent:
-            self._silent = event["member"]  # every other member tells of a silent time master
+            self._silent = event["member"]  # every other member reports a silent time master
             self._bar.console.print(f"{event['member']} is silent at block {event['blocks']}: the cell stands still")
 
 
 TROUBLE: dict[str, Callable[[harness.Event], str]] = {
     "stuck": lambda event: f"{event['node']} did not end{event['place']}; the bag is closed: no longer waited for",
-    "stranger": lambda event: (
+    "foreign_message": lambda event: (
         f"{event['node']} refuses: {event['message']}; publishers: {', '.join(event['publishers'])}"
     ),
     "dead": lambda event: (

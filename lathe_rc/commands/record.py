@@ -6,8 +6,6 @@ from pathlib import Path
 
 import click
 
-from lathe_rc.errors import InputError
-
 
 @click.command()
 @click.argument("bag", type=click.Path(path_type=Path))
@@ -23,10 +21,8 @@ def record(
 
     Exit code 3: messages are missing.
     """
-    try:
-        from lathe_rc.nodes import topic_recorder
-    except ImportError as error:
-        raise InputError(f"no ROS 2 here ({error}); run through ./lathe, or source a ROS 2 installation") from None
+    from lathe_rc.nodes import topic_recorder
+
     values = {"bag": str(bag), "topics": list(topics), "all": everything, "sim_time": sim_time, "once": once}
     if hold is not None:
         values["hold"] = hold

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import click
 
-from lathe_rc.errors import InputError
-
 
 @click.command()
 @click.argument("bag", type=click.Path(path_type=Path))
@@ -22,10 +20,8 @@ def replay(
     bag: Path, rate: float, start: float, end: float, topics: tuple[str, ...], wait: int, *, loop: bool, as_cell: bool
 ) -> None:
     """Send the messages of a BAG again, with /clock; services ~/pause, ~/resume and ~/toggle_paused."""
-    try:
-        from lathe_rc.nodes import replayer
-    except ImportError as error:
-        raise InputError(f"no ROS 2 here ({error}); run through ./lathe, or source a ROS 2 installation") from None
+    from lathe_rc.nodes import replayer
+
     values = {
         "bag": str(bag),
         "rate": rate,

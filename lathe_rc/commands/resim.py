@@ -12,12 +12,13 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 from lathe_rc.analysis import drive_fit
-from lathe_rc.bag import identify, story
-from lathe_rc.bag.identify import Identified
-from lathe_rc.bag.played import asked_for
-from lathe_rc.bag.recorded import Recorded
-from lathe_rc.bag.resim import Resimulation, resimulate
-from lathe_rc.bag.source import Source
+from lathe_rc.bag import provenance
+from lathe_rc.bag.reading.recorded import Recorded
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.resimulation import identify
+from lathe_rc.bag.resimulation.bag_spindle import asked_for
+from lathe_rc.bag.resimulation.identify import Identified
+from lathe_rc.bag.resimulation.resim import Resimulation, resimulate
 from lathe_rc.errors import InputError
 
 _SHOWN = 10  # revolutions
@@ -106,7 +107,7 @@ def _identified_alone(bag: Path, topics: Mapping[str, str], parameters: Path | N
 
 def _has_scenario(bag: Path) -> bool:
     with Source(bag) as source:
-        return story.SCENARIO in source.about
+        return provenance.SCENARIO in source.about
 
 
 @click.command()

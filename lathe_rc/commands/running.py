@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``lathe run`` and ``lathe demo`` do once their arguments are known and all is imported."""
+"""``lathe run`` and ``lathe demo``, once their arguments are known and all is imported."""
 
 import json
 from pathlib import Path
@@ -8,16 +8,15 @@ import click
 from rich.console import Console
 
 from lathe_rc import harness, part
-from lathe_rc.bag.record import recorder_of
+from lathe_rc.bag.writing.record import recorder_of
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.commands import budgeting, outcome, picture
 from lathe_rc.commands import scenario as scenarios
-from lathe_rc.commands.demo import Demo
+from lathe_rc.commands.demos import Demo
 from lathe_rc.commands.progress import Watch
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place
 from lathe_rc.starting import Start
-from lathe_rc.view import figure as figure_of
 
 _NO_SNAPSHOTS = "no snapshots: no --bag was given"
 
@@ -118,7 +117,7 @@ def demo(shown: Demo, revolutions: float, folder: Path) -> None:
         peer = harness.run(scenarios.load(shown.scenario, [*shown.overrides, *shown.peer, length]))
         beside = (shown.peer_name, peer.recording)
     drawn = place.with_suffix(".png")
-    picture.save(figure_of.draw(result.recording, shown.title, beside), drawn)
+    picture.save(result.recording.plot(shown.title, beside), drawn)
     console.print(outcome.table(result))
     if beside:
         console.print(f"{shown.peer_name}: {', '.join(peer.errors.told()[1:])}", highlight=False)

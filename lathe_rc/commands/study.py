@@ -20,7 +20,7 @@ from lathe_rc.studies.study import Result, Study, StudyParameters
 
 
 def _value(row: Row, text: str) -> object:
-    """What ``text`` says about a parameter: 1,2,3 is a list where one is wanted, and a text stands as it is."""
+    """The value that ``text`` gives a parameter: 1,2,3 is a list where one is wanted, and a text stands as it is."""
 
     def scalar(part: str) -> Value:
         return part if row.type is str else ros_yaml.parse_value(part, f"--set {row.name}")
@@ -136,7 +136,7 @@ class _Studies(click.Group):
 
 
 def _summary(name: str) -> str:
-    """What a study is about, and who offers it if we do not; one that cannot be used does not keep the others away."""
+    """The subject of a study, and its package if it is not ours; a broken one does not hide the others."""
     by = STUDIES.offered_by(name)
     try:
         about = STUDIES[name].doc

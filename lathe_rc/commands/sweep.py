@@ -141,7 +141,7 @@ def run(
     *,
     as_json: bool,
 ) -> None:
-    """Compute variations of a SCENARIO into a table; what is there already is not computed again."""
+    """Compute variations of a SCENARIO into a table; its rows are not computed again."""
     check_crew(scheduler, workers)
     loaded = scenarios.load(scenario, overrides, revolutions=revolutions)
     space = space_of(vary, draw, tie, sample, seeds, cells)

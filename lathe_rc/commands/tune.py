@@ -239,7 +239,7 @@ def _results(tuning: Tuning, trial: Trial) -> dict[str, str]:
 
 
 def _cost_of(start: Trial, best: Trial) -> str:
-    """What the best costs in margin, in a sentence; empty if no cell learns."""
+    """The margin that the best costs, in a sentence; empty if no cell learns."""
     if math.isnan(best.score.margin):
         return ""
     if math.isnan(start.score.margin):
@@ -261,7 +261,7 @@ def _improvements(tuning: Tuning) -> list[Trial]:
 
 
 def _told_history(tuning: Tuning) -> str:
-    """What was better than all before, in a line."""
+    """A trial that was better than all before, in a line."""
     column = tuning.aims.goals[0].column
     steps: dict[str, int] = {}
     for trial in _improvements(tuning):

@@ -13,13 +13,13 @@ import click
 import numpy as np
 from rich.console import Console
 
-from lathe_rc.bag import stream
-from lathe_rc.bag.source import Source
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import START_NS
+from lathe_rc import messages
+from lathe_rc.bag.reading import stream
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.rerun_bridge import PORT, RATE, Kind
-from lathe_rc.cell.wire import Block
 from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.messages import START_NS
 from lathe_rc.view.rerun_output import Viewer, end, require, viewer
 
 if TYPE_CHECKING:
@@ -152,10 +152,8 @@ def _show(bag: Path, rate: float, shown: Viewer) -> None:
 
 def _live(values: Mapping[str, object], *, as_json: bool) -> None:
     """Show what runs in this domain until Ctrl-C."""
-    try:
-        from lathe_rc.nodes import rerun_bridge
-    except ImportError as error:
-        raise InputError(f"no ROS 2 here ({error}); run through ./lathe, or source a ROS 2 installation") from None
+    from lathe_rc.nodes import rerun_bridge
+
     runs = rerun_bridge.run(values, ["--ros-args"])
     if as_json:
         click.echo(json.dumps({"runs": [vars(run) | {"file": run.file and str(run.file)} for run in runs]}))

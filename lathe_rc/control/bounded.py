@@ -23,7 +23,7 @@ _WITHIN = 1.0 + 1e-9
 
 @dataclass(frozen=True)
 class Bounds:
-    """What a motion keeps within; what it begins with may be beyond.
+    """Bounds of a motion, which may begin beyond them.
 
     Attributes:
         velocity: [m/s].
@@ -87,7 +87,7 @@ def prepare() -> None:
 
 
 class Mode(IntEnum):
-    """Who commands."""
+    """The side that commands."""
 
     FOLLOW = 0  #: the controller
     HOLD = 1  #: nobody: the command comes to rest
@@ -170,12 +170,12 @@ class Takeover:
 
     @property
     def mode(self) -> Mode:
-        """Who commands; see `change`."""
+        """The side that commands; see `change`."""
         return Mode(self.table.whole[_MODE])
 
     @property
     def newest(self) -> float:
-        """What was given last [m]."""
+        """The last output [m]."""
         return float(self.table.given[1])
 
     @property

@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification of a drive while it runs, from its command u and its measured position x.
 
-    u(t - τ) = x + a1·dx/dt + a2·d²x/dt²        a1 = 2ζ/ωn, a2 = 1/ωn², τ known
-
-Both sides pass the same low-pass (λ/(p + λ))³, whose states give the filtered derivatives: nothing is
-differentiated. Least squares over the cycles that have ended, older ones with a forgetting factor. One harmonic is
-enough for both coefficients; the speed of the spindle may vary.
+Least squares (`lathe_rc.control.drive_regression`, with λ for ω) over the cycles that have ended, older ones with a
+forgetting factor. One harmonic is enough for both coefficients; the speed of the spindle may vary.
 """
 
 from dataclasses import dataclass
@@ -14,12 +11,20 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.control.drive_regression import (
+    STAGES,
+    LowPass,
+    coefficients,
+    derivatives,
+    excited,
+    low_pass,
+    pass_through,
+)
 from lathe_rc.jit import kernel
 
 Array = npt.NDArray[np.float64]
 
 _LOOK_BACK = 2  # samples of the command that a delay with a fraction needs
-_LEAST_EXCITED = 1e-6  # determinant of the normal equations, 1 for independent regressors
 
 
 class IdentifierTable(NamedTuple):
@@ -27,19 +32,15 @@ class IdentifierTable(NamedTuple):
 
     Attributes:
         delay, part: of the command against the position that is seen: whole samples, and the rest in samples.
-        bandwidth: λ [rad/s].
-        step: sampling step [s].
         commands: of the past; sample n stands at n modulo their number, a power of two [m].
-        state: of the filters.
+        low: low-pass of both sides.
         sums: of the normal equations.
     """
 
     delay: int
     part: float
-    bandwidth: float
-    step: float
     commands: Array
-    state: Array
+    low: LowPass
     sums: Array
 
 
@@ -54,34 +55,27 @@ def command_sent(identifier: IdentifierTable, first: int, start: int, stop: int,
 @kernel
 def accumulate(identifier: IdentifierTable, first: int, start: int, stop: int, position: Array) -> None:
     """Filter and sum the measured positions ``start`` to ``stop`` of a block that begins at sample ``first`` [m]."""
-    delay, part, bandwidth, step = identifier.delay, identifier.part, identifier.bandwidth, identifier.step
-    commands, state, sums = identifier.commands, identifier.state, identifier.sums
+    delay, part, low = identifier.delay, identifier.part, identifier.low
+    commands, sums = identifier.commands, identifier.sums
     mask = commands.size - 1
-    half = 0.5 * bandwidth * step  # bilinear rule
-    keep, take = (1.0 - half) / (1.0 + half), half / (1.0 + half)
-    u, x = state[:4], state[4:]
     for k in range(start, stop):
         n = first + k - delay
         if n < _LOOK_BACK:
             continue
-        new_u = (1.0 - part) * commands[n & mask] + part * commands[(n - 1) & mask]
-        new_x = position[k]
-        for stage in range(4):
-            old_u, old_x = u[stage], x[stage]
-            u[stage], x[stage] = new_u, new_x
-            if stage < 3:
-                new_u = keep * u[stage + 1] + take * (new_u + old_u)
-                new_x = keep * x[stage + 1] + take * (new_x + old_x)
-        first_derivative = bandwidth * (x[2] - x[3])
-        second_derivative = bandwidth**2 * (x[1] - 2.0 * x[2] + x[3])
-        rest = u[3] - x[3]
+        pass_through(
+            low.command, (1.0 - part) * commands[n & mask] + part * commands[(n - 1) & mask], low.keep, low.take
+        )
+        pass_through(low.position, position[k], low.keep, low.take)
+        first_derivative, second_derivative = derivatives(low.position, low.bandwidth)
+        u = low.command[STAGES]
+        rest = u - low.position[STAGES]
         sums[0] += first_derivative * first_derivative
         sums[1] += first_derivative * second_derivative
         sums[2] += second_derivative * second_derivative
         sums[3] += first_derivative * rest
         sums[4] += second_derivative * rest
         sums[5] += rest * rest
-        sums[6] += u[3] * u[3]
+        sums[6] += u * u
 
 
 @dataclass(frozen=True)
@@ -130,10 +124,8 @@ class DriveIdentifier:
         self.table = IdentifierTable(
             delay=delay,
             part=max(model_delay / step - whole, 0.0),
-            bandwidth=bandwidth,
-            step=step,
             commands=np.zeros(1 << (delay + block + _LOOK_BACK).bit_length()),
-            state=np.zeros(8),
+            low=low_pass(bandwidth, step),
             sums=np.zeros(7),
         )
 
@@ -146,14 +138,11 @@ class DriveIdentifier:
         command_sent(self.table, first, 0, command.size, command)
 
     def fit(self) -> Identified | None:
-        """What the measurements so far say; None while they say nothing. Older ones weigh less from now on."""
+        """The estimate from the measurements so far, None while there are too few; older ones weigh less each time."""
         s11, s12, s22, s1, s2, rest, command = self.table.sums
         found = None
-        # Relative to independent regressors: the units of the two differ by orders of magnitude.
-        determinant = s11 * s22 - s12 * s12
-        if determinant > _LEAST_EXCITED * s11 * s22 > 0.0:
-            a1 = (s1 * s22 - s2 * s12) / determinant
-            a2 = (s2 * s11 - s1 * s12) / determinant
+        if excited(s11, s12, s22):
+            a1, a2 = coefficients(s11, s12, s22, s1, s2)
             if a1 > 0.0 and a2 > 0.0 and command > 0.0:
                 unexplained = max(rest - a1 * s1 - a2 * s2, 0.0)
                 frequency = float(1.0 / np.sqrt(a2))

@@ -26,7 +26,7 @@ _CLOSE = 1.0 + 1e-9  # of a limit: rounding is no violation
 
 @dataclass(frozen=True)
 class CommandLimits:
-    """What a command keeps within; inf where there is no limit.
+    """Limits of a command; inf where there is none.
 
     Attributes:
         stroke: to each side [m].
@@ -238,7 +238,7 @@ def rest() -> Array:
 
 
 def limiter(limits: CommandLimits, step: float, remembered: int) -> LimiterTable:
-    """What keeps a command within limits; it is at rest at 0 before the first sample.
+    """The limiter of a command; it is at rest at 0 before the first sample.
 
     Args:
         limits: that it keeps within.

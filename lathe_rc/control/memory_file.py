@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a controller has learned, in a file that survives a crash."""
+"""The memory of a controller, in a file that survives a crash."""
 
 import errno
 import io
@@ -21,7 +21,7 @@ _ROOM = 1 << 16  # [B] beside the memory itself: headers, the other numbers, the
 
 
 def save(path: Path, points: Array, grid: int) -> None:
-    """Write a memory: to the side, to the disk, then renamed over what was there.
+    """Write a memory: to the side, to the disk, then renamed over the old file.
 
     Args:
         path: NumPy archive (.npz) to write.

@@ -55,7 +55,7 @@ LEARNING_DELAY = 3  #: samples from a measured error to its place in the memory:
 
 @dataclass(frozen=True)
 class Cycle:
-    """What one cycle achieved, over the grid points of the memory."""
+    """The result of one cycle, over the grid points of the memory."""
 
     number: int  #: from 1
     sample_index: int  #: sample at which its last grid point was learned
@@ -149,7 +149,7 @@ class RepetitiveController:
         whole[CHUNK] = NO_CHUNK
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is worth keeping between two blocks: room for one is not."""
+        """The state between two blocks, without scratch arrays."""
         nothing: dict[str, Any] = dict.fromkeys(_ROOM)
         table = self.table._replace(**nothing)
         return {**self.__dict__, "table": table}

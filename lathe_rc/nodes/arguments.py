@@ -35,7 +35,7 @@ def ask_for_help(words: Sequence[str]) -> bool:
 
 
 def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """What stands before ``--ros-args``, and the rest."""
+    """The arguments before ``--ros-args``, and the rest."""
     end = list(words).index(ROS) if ROS in words else len(words)
     return list(words[:end]), list(words[end:])
 

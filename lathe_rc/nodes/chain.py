@@ -8,14 +8,11 @@ and tracks hold what it would find there. So when anything goes wrong the chain 
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 from lathe_rc.cell.program import Program, Tapes, Wired, chunk_of
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
-
-if TYPE_CHECKING:
-    from lathe_rc.nodes.stage_node import StageNode
+from lathe_rc.nodes.stage_node import StageNode
 
 
 class Chain:
@@ -25,7 +22,7 @@ class Chain:
         nodes: in the order in which their stages compute.
     """
 
-    def __init__(self, nodes: Sequence["StageNode"]) -> None:
+    def __init__(self, nodes: Sequence[StageNode]) -> None:
         self._nodes = list(nodes)
         size = nodes[0].table.block_size
         self._most = min(node.together for node in nodes) * size
@@ -103,7 +100,7 @@ class Chain:
                 node.part(self._inside)
 
 
-def form(node: "StageNode", cell: Cell | None = None) -> None:
+def form(node: StageNode, cell: Cell | None = None) -> None:
     """Make chains of a node and others of its process and cell, none of which has computed yet.
 
     Args:

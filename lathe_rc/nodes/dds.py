@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What comes before the first node of a process: DDS is to stay on this machine, unless the user says otherwise."""
+"""Settings before the first node of a process: DDS is to stay on this machine, unless the user says otherwise."""
 
 import os
 from pathlib import Path
 
-from lathe_rc.nodes import leftovers
+from lathe_rc.nodes import stale_shared_memory
 from lathe_rc.nodes.report import VARIABLE
 
 
@@ -13,4 +13,4 @@ def settle() -> None:
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("fastdds.xml")))
     if VARIABLE not in os.environ:  # else the harness has done it, before the first of its processes
-        leftovers.sweep()
+        stale_shared_memory.sweep()

@@ -28,7 +28,7 @@ _TYPES = {
 
 
 def descriptor(row: Row) -> ParameterDescriptor:
-    """What ROS tools show of a parameter; all are read-only: what changes while running is an event."""
+    """The description of a parameter for ROS tools; all are read-only: changes during a run are events."""
     made = ParameterDescriptor(
         name=row.name,
         type=_TYPES[row.type, row.is_list],
@@ -45,7 +45,7 @@ def descriptor(row: Row) -> ParameterDescriptor:
 
 
 def overrides(node: Node) -> dict[str, Any]:
-    """What the node was given from outside; it must have declared its overrides automatically."""
+    """The overrides that the node was given; it must have declared them automatically."""
     given: dict[str, Any] = {}
     found: dict[str, Any] = node.get_parameters_by_prefix("")
     for name, parameter in found.items():

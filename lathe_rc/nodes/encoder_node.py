@@ -13,7 +13,7 @@ from sensor_msgs.msg import JointState
 from lathe_rc.cell.stages.encoder_device import EncoderDevice, EncoderDeviceParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
-from lathe_rc.nodes.offered import asked
+from lathe_rc.nodes.publisher_info import asked
 from lathe_rc.nodes.spindle_node import SpindleNode
 from lathe_rc.signals.counts import LineReader, Reading
 
@@ -26,7 +26,7 @@ class _EncoderLostError(LatheError):
 
 @contextmanager
 def _losing_it() -> Iterator[None]:
-    """What goes wrong is the encoder's."""
+    """Turn errors inside into the loss of the encoder."""
     try:
         yield
     except LatheError as error:
@@ -110,7 +110,7 @@ class EncoderNode(SpindleNode):
     # ---- run ----------------------------------------------------------------------------------------
 
     def _at_once(self) -> int:
-        """See `SpindleNode`; all that is there, for who has fallen behind has to catch up."""
+        """See `SpindleNode`; all that is there, for an encoder that has fallen behind has to catch up."""
         catches_up = self.stage.live and not self._lost
         return min(self._credit(), self.together) if catches_up else super()._at_once()
 

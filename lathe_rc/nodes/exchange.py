@@ -11,7 +11,8 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from lathe_rc.cell.wire import Block
+from lathe_rc.cell.block import Block
+from lathe_rc.cell.wiring import Cell
 
 
 class Run(NamedTuple):
@@ -39,15 +40,21 @@ class Run(NamedTuple):
 Delivery = Run | bytes  #: blocks, or an encoded message at a chosen sample
 
 
+def _alone(node: Any, cell: Cell | None) -> None:
+    """Let each node compute by itself."""
+
+
 class Exchange:
-    """What a process hands over inside.
+    """Blocks that nodes hand over inside of a process.
 
     Attributes:
         master: takes the Progress of a node, if the time master is in this process.
         stages: nodes with a stage that are active and have not computed yet, see `lathe_rc.nodes.chain`.
+        form: lets a node and those of its cell that wait here compute together, if it is given what they make.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, form: Callable[[Any, Cell | None], None] = _alone) -> None:
+        self.form = form
         self.master: Callable[[Any], None] | None = None
         self.stages: list[Any] = []
         self._inside: set[str] = set()

@@ -6,8 +6,8 @@ interpreter takes a second to import the same. It takes part in no ROS domain it
 says so is replaced by a command: a separate interpreter.
 
 `lathe_rc.starting` asks for processes over a socket and hears over it, as an event each, that one has been stopped or
-continued, or has ended. The standard library's fork server (`multiprocessing.forkserver`) tells of ends alone; but
-nobody else can tell of a stopped process that holds a lock of DDS.
+continued, or has ended. The standard library's fork server (`multiprocessing.forkserver`) reports ends alone; but no
+other process can report a stopped one that holds a lock of DDS.
 
 The libraries of ROS 2 run two threads from their import on, which wait for a tracing session of LTTng. They hold no
 lock meanwhile; forked processes do without them, and so without LTTng.
@@ -59,7 +59,7 @@ def _become(request: dict[str, Any], report: int, log: int) -> int:
 
 
 def _changed(living: set[int]) -> Iterator[dict[str, Any]]:
-    """What has become of processes since the last call; those that have ended are not ``living`` any more."""
+    """Changes of processes since the last call; those that have ended are not ``living`` any more."""
     with contextlib.suppress(ChildProcessError):  # there is none
         while found := os.waitid(os.P_ALL, 0, _CHANGES):
             ended = found.si_code in (os.CLD_EXITED, os.CLD_KILLED, os.CLD_DUMPED)
@@ -81,7 +81,7 @@ def _tell(line: socket.socket, living: set[int]) -> bool:
 
 
 def _see_off(woken: socket.socket, living: set[int]) -> int:
-    """Wait for processes to end when nobody can ask any more; one that DDS holds up is killed. The exit code."""
+    """Wait for processes to end when nobody can ask any more; one that DDS blocks is killed. The exit code."""
     end = time.monotonic() + _FAREWELL
     while living and (left := end - time.monotonic()) > 0.0:
         if select.select([woken], [], [], left)[0]:

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from lathe_rc.bag.record import signal_depth
-from lathe_rc.cell import messages
+from lathe_rc import messages
+from lathe_rc.bag.writing.record import signal_depth
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.parameters import NodeParameters
-from lathe_rc.cell.wire import Block, Decoder, NoBlockError
+from lathe_rc.cell.wire import Decoder, NoBlockError
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.exchange import Run
-from lathe_rc.nodes.strangers import Stranger
+from lathe_rc.nodes.refused_messages import ForeignMessage
 
 
 def message_class(msgtype: str) -> Any:
@@ -28,7 +29,7 @@ def message_class(msgtype: str) -> Any:
 def signal_qos(parameters: NodeParameters, topic: str = "") -> QoSProfile:
     """Reliable, and deep enough for all blocks in flight, which a late match then still receives.
 
-    A reader of a cell with a window keeps all until it takes them: a stranger's flood would push out what belongs.
+    A reader of a cell with a window keeps all until it takes them: a flood from outside would push out what belongs.
     """
     return QoSProfile(
         history=HistoryPolicy.KEEP_ALL if topic and parameters.window else HistoryPolicy.KEEP_LAST,
@@ -43,7 +44,7 @@ def signal_qos(parameters: NodeParameters, topic: str = "") -> QoSProfile:
 def latched_qos(depth: int = 0) -> QoSProfile:
     """Reliable; the newest message of each publisher reaches those who come late.
 
-    Without a depth, for readers: all are kept until they are taken, a stranger's flood pushes none out.
+    Without a depth, for readers: all are kept until they are taken, a flood from outside pushes none out.
     """
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST if depth else HistoryPolicy.KEEP_ALL,
@@ -101,15 +102,15 @@ class BlockQueue:
     def _admit(self, run_id: str, source: str) -> None:
         """Refuse who does not belong."""
         if self._run_id and run_id != self._run_id:
-            raise Stranger(self.topic, source, run_id, f"expected run {self._run_id!r}")
+            raise ForeignMessage(self.topic, source, run_id, f"expected run {self._run_id!r}")
         if source != self.source and (self.source or self._run_id):
-            raise Stranger(self.topic, source, run_id, f"expected {self.source or 'nobody yet'}")
+            raise ForeignMessage(self.topic, source, run_id, f"expected {self.source or 'nobody yet'}")
 
     def add(self, data: bytes) -> Block | None:
         """Check a block and queue it; None if another already stands for it, see `hold`, or if it is a repeat.
 
         Raises:
-            Stranger: another source or run, or no block at all.
+            ForeignMessage: another source or run, or no block at all.
             LatheError: another step, another time than that of its samples, a gap, a repeat, arrays of different
                 lengths, or far more blocks waiting than the window allows.
         """
@@ -118,7 +119,7 @@ class BlockQueue:
         try:
             block = self._decoder.decode(data)
         except NoBlockError as error:
-            raise Stranger(self.topic, "", "", str(error)) from None
+            raise ForeignMessage(self.topic, "", "", str(error)) from None
         except ValueError as error:
             raise LatheError(f"{self.topic}: {error}") from None
         return self.accept(block)
@@ -174,7 +175,7 @@ class BlockQueue:
             yield block
 
     def state(self) -> tuple[int, int, list[Block], Block | None]:
-        """What another process needs to go on: next sample, blocks received, those that wait, and the newest."""
+        """The state that another process needs to go on: next sample, blocks received, waiting and newest."""
         return self.end, self.received, list(self.blocks), self._newest
 
     def resume(self, source: str, state: tuple[int, int, list[Block], Block | None]) -> None:

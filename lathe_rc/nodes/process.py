@@ -33,7 +33,7 @@ from lathe_rc.cell.stages.encoder_device import EncoderDevice
 from lathe_rc.cell.stages.loaded_spindle import LoadedSpindleStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes import arguments, dds, declare
+from lathe_rc.nodes import arguments, chain, dds, declare
 from lathe_rc.nodes.encoder_node import EncoderNode
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.recorder_node import RecorderNode
@@ -67,7 +67,7 @@ def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellN
 
 
 def _words(error: RuntimeError) -> str:
-    """What rcl says, without the file and line of its source."""
+    """The message of rcl, without the file and line of its source."""
     return str(error).splitlines()[0].partition(", at /")[0]
 
 
@@ -196,7 +196,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
         return InputError.exit_code
     stop = _Stop()
     nodes: list[CellNode] = []
-    exchange = Exchange()
+    exchange = Exchange(chain.form)
     try:
         for name, kind in members:
             nodes.append(_make(name, kind, reporter, exchange))
@@ -214,8 +214,8 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
     finally:
         for node in nodes:
             node.finish()
-            if node.strangers.senders:
-                reporter("refused", node.get_name(), senders=node.strangers.senders)
+            if node.refused_messages.senders:
+                reporter("refused", node.get_name(), senders=node.refused_messages.senders)
         # The nodes are not destroyed: Fast DDS may wait for itself for ever while others are leaving, too.
         rclpy.try_shutdown()
 

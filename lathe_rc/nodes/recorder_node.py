@@ -13,22 +13,23 @@ from lathe_rc_msgs.msg import CellState
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
-from lathe_rc.bag import story
-from lathe_rc.bag.order import Merger
-from lathe_rc.bag.record import bag_of, signal_depth
+from lathe_rc import messages
+from lathe_rc.bag import provenance
 from lathe_rc.bag.snapshot import Snapshot
-from lathe_rc.bag.snapshots import Snapshots
-from lathe_rc.bag.writer import FLUSH_PERIOD, Output, offered_qos
-from lathe_rc.cell import messages
+from lathe_rc.bag.writing.order import Merger
+from lathe_rc.bag.writing.record import bag_of, signal_depth
+from lathe_rc.bag.writing.snapshots import Snapshots
+from lathe_rc.bag.writing.writer import FLUSH_PERIOD, Output, offered_qos
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages import MASTERS
-from lathe_rc.cell.wire import Block, Decoder, Encoder
+from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import LatheError, LossyRunError
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import BlockQueue, latched_qos
+from lathe_rc.nodes.refused_messages import ForeignMessage
 from lathe_rc.nodes.shell import CellNode
-from lathe_rc.nodes.strangers import Stranger
 
 _HOST_TOPICS = {
     "/diagnostics": (DiagnosticArray, QoSProfile(depth=100)),
@@ -181,7 +182,7 @@ class RecorderNode(CellNode):
         tables, _ = self.announced(names)
         if tables:
             host = [self.topic(topic) for topic in _HOST_TOPICS]
-            self._open.tell(story.tell(Scenario(self.table.run_id or "cell", tables), host))
+            self._open.tell(provenance.tell(Scenario(self.table.run_id or "cell", tables), host))
 
     def _subscribe(self, topic: str, msgtype: str, source: str, *, sparse: bool, in_cell: bool) -> None:
         self._open.add_topic(topic, msgtype, offered_qos(self._depth, "transient_local"))
@@ -208,7 +209,7 @@ class RecorderNode(CellNode):
                 held[topic] = queue.held_from
         if self._snapshots is not None and not self._safe:
             self._snapshots.trigger(f"cell: lost {', '.join(sorted(lost))}", first)
-        self._open.tell({story.HELD: json.dumps(held)})
+        self._open.tell({provenance.HELD: json.dumps(held)})
         self._merger.forget(lost)
         for topic, queue in self._queues.items():
             while queue.blocks:
@@ -268,18 +269,18 @@ class RecorderNode(CellNode):
         try:
             message = messages.decode(msgtype, data)
         except ValueError as error:
-            raise Stranger(topic, "", "", str(error)) from None
+            raise ForeignMessage(topic, "", "", str(error)) from None
         # Messages that are not of lathe_rc do not say who sent them.
         source, run_id = getattr(message, "source", self._sparse[topic]), getattr(message, "run_id", self.table.run_id)
         if source != self._sparse[topic] or (self.table.run_id and run_id != self.table.run_id):
-            raise Stranger(topic, source, run_id, f"expected {self._sparse[topic]} of run {self.table.run_id!r}")
+            raise ForeignMessage(topic, source, run_id, f"expected {self._sparse[topic]} of run {self.table.run_id!r}")
         sample, rest = divmod(messages.stamp_ns(message) - messages.START_NS, self.table.step_ns)
         begin = self._merger.samples if self._merger else 0
         end = begin + self._depth * self.table.block_size if self._merger else sample + 1
         if sample < begin and source in self._processes:
             return  # from another process that goes on in the place of the first
         if rest or not begin <= sample < end:
-            raise Stranger(topic, source, run_id, f"expected a time of samples {begin} to {end - 1}")
+            raise ForeignMessage(topic, source, run_id, f"expected a time of samples {begin} to {end - 1}")
         if msgtype == messages.JOINTS and self._merger is not None:
             self._expect_joints(topic, sample, begin)
         self._on_sparse(topic, data)
@@ -290,7 +291,7 @@ class RecorderNode(CellNode):
         waiting -= {other for other in waiting if other < begin}
         if sample % period or sample in waiting:
             expected = f"expected one at every sample that is a multiple of {period}"
-            raise Stranger(topic, self._sparse[topic], self.table.run_id, expected)
+            raise ForeignMessage(topic, self._sparse[topic], self.table.run_id, expected)
         waiting.add(sample)
 
     def _on_sparse(self, topic: str, data: bytes) -> None:

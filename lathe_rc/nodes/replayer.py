@@ -20,8 +20,8 @@ from rosbags.interfaces import Qos, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from lathe_rc.bag import story
-from lathe_rc.bag.source import Source
+from lathe_rc.bag import provenance
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.replayer import KIND, ReplayerParameters
@@ -170,7 +170,7 @@ class Replayer:
         self._node.create_subscription(Progress, "/progress", progressed, latched_qos(256))
         # The recorder puts the scenario's files into its bag as well, so they stay as long as the replayer.
         self._folder = tempfile.TemporaryDirectory(prefix="lathe-replay-")
-        scenario = story.scenario_of(self._source.about, Path(self._folder.name))
+        scenario = provenance.scenario_of(self._source.about, Path(self._folder.name))
         cell = Cell(scenario.nodes)
         announced = []
         for name, stage in cell.stages.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process tells the harness that started it: JSON lines over a socket, which also ties their lives together.
+"""Reports of a process to the harness that started it: JSON lines over a socket, which also ties their lives together.
 
 The harness passes one end of a socket pair and its number in ``LATHE_REPORT_FD``. When the other end closes, the
 harness is gone, and so the process ends too.

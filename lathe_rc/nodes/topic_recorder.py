@@ -15,13 +15,13 @@ from rclpy.node import Node
 from rclpy.signals import uninstall_signal_handlers
 from rclpy.subscription import Subscription
 
-from lathe_rc.bag.publication_order import Continuity, PublicationOrder, Recorded
-from lathe_rc.bag.writer import FLUSH_PERIOD, BagWriter
-from lathe_rc.cell import messages
+from lathe_rc import messages
+from lathe_rc.bag.writing.publication_order import Continuity, PublicationOrder, Recorded
+from lathe_rc.bag.writing.writer import FLUSH_PERIOD, BagWriter
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.topic_recorder import KIND, TopicRecorderParameters
 from lathe_rc.errors import InputError, LossyRunError
-from lathe_rc.nodes import alone, arguments, offered
+from lathe_rc.nodes import alone, arguments, publisher_info
 from lathe_rc.nodes.ports import message_class
 
 _CLOCK = "/clock"
@@ -117,7 +117,7 @@ class TopicRecorder:
             raise InputError(f"{topic} has several types: {', '.join(sorted(types))}")
         (msgtype,) = types
         try:
-            kind, store = message_class(msgtype), offered.installed(msgtype)
+            kind, store = message_class(msgtype), publisher_info.installed(msgtype)
             definition, _ = store.generate_msgdef(msgtype, ros_version=2)
         except (InputError, ImportError, AttributeError, ValueError):
             raise InputError(f"{topic}: message type {msgtype} is not installed; install its package") from None
@@ -126,14 +126,14 @@ class TopicRecorder:
             raise InputError(f"{topic}: {msgtype} is defined otherwise by the publisher than it is installed here")
         if topic != _CLOCK or not self._parameters.sim_time:
             self._writer.copy_topic(
-                topic, msgtype, [*map(offered.offered, publishers)], definition=definition, digest=digest
+                topic, msgtype, [*map(publisher_info.offered, publishers)], definition=definition, digest=digest
             )
         self._continuity[topic] = Continuity(whole=topic not in self._present)
         self._inlets[topic] = self._node.create_subscription(
             kind,
             topic,
             cast("Any", partial(self._take, topic)),  # its types know of no callback with the message's info
-            offered.asked(publishers),
+            publisher_info.asked(publishers),
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=lambda _: self._mismatch(topic)),
         )

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is controlled: tool drives and the tool itself."""
+"""The plants: tool drives and the tool itself."""

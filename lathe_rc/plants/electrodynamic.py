@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.jit import kernel
+from lathe_rc.plants.end_stops import between_stops
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
 
 Array = npt.NDArray[np.float64]
@@ -59,13 +60,8 @@ def advance(drive: CoarseTable, command: Array, position: Array, velocity: Array
         new_x = a00 * x + a01 * v + w00 * u0 + w01 * u1 + w02 * u2
         new_v = a10 * x + a11 * v + w10 * u0 + w11 * u1 + w12 * u2
         x, v = new_x, new_v
-        # The end stops are inelastic: the carriage stays there until it is driven back.
-        if x > stroke:
-            x, v = stroke, min(v, 0.0)
-            stopped += 1
-        elif x < -stroke:
-            x, v = -stroke, max(v, 0.0)
-            stopped += 1
+        x, v, stops = between_stops(x, v, stroke)
+        stopped += stops
         delayed = (1.0 - part) * u0 + part * u1
         position[k], velocity[k] = x, v
         current[k] = (spring * (delayed - x) - damper * v) * force_per_current

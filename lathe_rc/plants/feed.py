@@ -4,45 +4,30 @@
     command → sampling → ± limit, held → model with a limited speed → screw → backlash → slide
                                            ↑ friction
 
-Friction is in `lathe_rc.plants.friction`, errors of the screw in `lathe_rc.plants.screw`.
+Limits of the command are in `lathe_rc.plants.feed_limits`, friction in `lathe_rc.plants.friction`, errors of the screw
+in `lathe_rc.plants.screw`.
 
-Models, each the position over the command:
-
-    fourth_order   K/(p⁴ + a4·p³ + a3·p² + a2·p + a1)                (paper 002, eq. 1)
-    dc_screw       k·(1 + Tz·p)/(p·(1 + T_1·p)·(1 + T_2·p)·…)        (paper 004: W2; the screw of W1)
-    sampled        K/(p·(1 + T1·p)) behind a zero-order hold         (paper 003, eq. 2)
-
-The command is in the unit of the model: [m] where it is a wanted position, [V], or a part of full scale. It is held
-from sample to sample, as a power converter holds it, and for that the difference equation is exact. The position of a
-sample does not depend on the command of the same sample.
+The command is in the unit of the model (`lathe_rc.plants.feed_models`): [m] where it is a wanted position, [V], or a
+part of full scale. It is held from sample to sample, as a power converter holds it, and for that the difference
+equation is exact. The position of a sample does not depend on the command of the same sample.
 
 The states are the position of the motor and its derivatives, so that a limit of the speed can hold them: a motor that
 would go beyond its greatest speed stays at it without acceleration, as if its command were no larger than what that
 speed needs. Nothing is left to unwind when the command falls.
-
-Limits of stroke, velocity, acceleration and jerk are those of the motion that the command u asks for. What it asks for
-is where the model settles: of a model that integrates the speed k·u, of any other the position k·u, with its gain k.
-
-    position  |k·u| ≤ stroke, |k·du/dt| ≤ velocity, |k·d²u/dt²| ≤ acceleration, |k·d³u/dt³| ≤ jerk
-    speed     |x∞| ≤ stroke, |k·u| ≤ velocity, |k·du/dt| ≤ acceleration, |k·d²u/dt²| ≤ jerk
-
-x∞ is where the motor would come to rest if the command were 0 from now on: with the denominator p·(a1 + a2·p + …) the
-motor's position x + (a2·dx/dt + a3·d²x/dt² + …)/a1, which moves with k·u.
-How they are kept is in `lathe_rc.control.limits`.
 """
 
-from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import scipy
 
-from lathe_rc.control.limits import CommandLimits, keep_position, keep_velocity, rest
+from lathe_rc.control.limits import CommandLimits, rest
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.placed import sized
 from lathe_rc.plants.backlash import follow
+from lathe_rc.plants.feed_limits import LimitTable, keep_within, limit_table
+from lathe_rc.plants.feed_models import realise, settles
 from lathe_rc.plants.friction import LUGRE, NONE, STRIBECK, Friction, FrictionTable, bend, no_friction, slide
 from lathe_rc.plants.linear import discretise
 from lathe_rc.plants.screw import Screw, ScrewTable, nut, nut_speed, warm
@@ -60,51 +45,6 @@ _UNDISTURBED = np.empty(0)
 _UNTOLD = np.empty(0, np.uint8)
 _FREE = CommandLimits()
 _PERFECT = Screw()
-
-APPROXIMATE_LAGS = (0.17, 0.22)  #: [s] of W1, 11.79/((0.17p+1)(0.22p+1)) (paper 004)
-FULL_LAGS = (0.11304, 0.2679, 0.01659, 0.01659)  #: [s] of the W1 that meets the step data printed in paper 004
-
-
-def fourth_order(
-    gain: float = 19.0, a1: float = 21.5, a2: float = 48.0, a3: float = 46.9, a4: float = 10.2
-) -> TransferFunction:
-    """K/(p⁴ + a4·p³ + a3·p² + a2·p + a1); by default the nominal drive of paper 002.
-
-    The state matrix of eq. 3 has these coefficients with the opposite sign of what is printed.
-    """
-    return TransferFunction((gain,), (1.0, a4, a3, a2, a1))
-
-
-def dc_screw(velocity_gain: float, lags: Sequence[float], zero: float = 0.0) -> TransferFunction:
-    """Motor and screw, k·(1 + Tz·p)/(p·(1 + T_1·p)·…).
-
-    The zero makes room for a lag that another part has: with that of the cutting process, a drive of the lags of W1
-    gives W1 from the command to the force.
-
-    Args:
-        velocity_gain: k [m/s per unit of the command].
-        lags: T_i [s], at least one, and at least two with a zero.
-        zero: Tz [s]; 0 for none.
-
-    Raises:
-        InputError: a lag that is not positive.
-    """
-    if not all(lag > 0.0 for lag in lags):
-        raise InputError(f"lags of the feed drive = {list(lags)} s; allowed: above 0 (leave out what is not there)")
-    bottom = np.array([1.0, 0.0])
-    for lag in lags:
-        bottom = np.polymul(bottom, [lag, 1.0])
-    return TransferFunction((velocity_gain * zero, velocity_gain), tuple(bottom))
-
-
-def sampled(gain: float = 6.25, lag: float = 0.08) -> TransferFunction:
-    """K/(p·(1 + T1·p)), by default the drive of paper 003; its hold is the ``divisor`` of `FeedDrive`.
-
-    Args:
-        gain: K [1/s], with the command in the unit of the position.
-        lag: T1 [s].
-    """
-    return dc_screw(gain, (lag,))
 
 
 @sized
@@ -135,37 +75,6 @@ class DriveTable(NamedTuple):
     friction: FrictionTable
     rubbed: Array
     screw: ScrewTable
-
-
-class LimitTable(NamedTuple):
-    """Limits of a drive's command for kernels, as `lathe_rc.control.limits` has them; all in the command's unit.
-
-    Attributes:
-        stroke, velocity, acceleration, jerk: of the position or the velocity that the command is.
-        step: from one taken command to the next [s].
-        coming: of a velocity: weights of the states in x∞, shape (m,); of a position: empty.
-    """
-
-    stroke: float
-    velocity: float
-    acceleration: float
-    jerk: float
-    step: float
-    coming: Array
-
-
-@inlined
-def _keep(limits: LimitTable, memory: Array, state: Array, command: float) -> bool:
-    """Keep a command within its limits; ``state`` is the drive's. The first of ``memory`` is what is given."""
-    stroke, velocity, acceleration, jerk, step = (
-        limits.stroke, limits.velocity, limits.acceleration, limits.jerk, limits.step
-    )  # fmt: skip
-    if limits.coming.size == 0:
-        return keep_position(stroke, velocity, acceleration, jerk, step, memory, command)
-    coming = 0.0
-    for row in range(limits.coming.size):
-        coming += limits.coming[row] * state[row]
-    return keep_velocity(stroke, velocity, acceleration, jerk, step, memory, coming, command)
 
 
 @kernel
@@ -284,7 +193,7 @@ def advance(
         if (first + k) % divisor == 0:
             wanted, changed = command[k], False
             if feed.kept:
-                changed = _keep(feed.limits, memory, state, wanted)
+                changed = keep_within(feed.limits, memory, state, wanted)
                 wanted = memory[0]
             cut = hold(table, state, wanted)
             saturated += cut
@@ -303,28 +212,8 @@ def advance(
     feed.counts[1] += limited
 
 
-def _realise(model: TransferFunction) -> tuple[Array, Array]:
-    """Matrices a and b of a model, with position and speed as first states.
-
-    The others are the further derivatives, each less what the command adds to it at once (the observability form);
-    a zero that cancels a lag is no obstacle.
-    """
-    top, bottom = (np.trim_zeros(np.array(part), "f") for part in (model.numerator, model.denominator))
-    order = bottom.size - 1
-    if bottom.size - top.size < 2:
-        raise InputError(
-            f"feed drive {model} of degrees {top.size - 1} over {order}; allowed: a numerator lower by two or more, "
-            "since a speed cannot jump (add a lag, or leave out the zero)"
-        )
-    a = np.diag(np.ones(order - 1), 1)
-    a[-1] = -bottom[:0:-1] / bottom[0]
-    impulse = np.eye(1, order + 1)[0]
-    markov = scipy.signal.lfilter(np.concatenate((np.zeros(bottom.size - top.size), top)), bottom, impulse)
-    return a, np.asarray(markov[1:])
-
-
 def _rubbed(model: TransferFunction, friction: Friction, step: float) -> Array:
-    """What 1 N of friction, held over a step, takes from position, speed, …, shape (m,).
+    """The loss of position, speed, … by 1 N of friction, held over a step, shape (m,).
 
     Raises:
         InputError: the friction acts on a lag that the drive does not have.
@@ -334,42 +223,16 @@ def _rubbed(model: TransferFunction, friction: Friction, step: float) -> Array:
         raise InputError(
             f"feed drive {model}: friction with a mobility {friction.mobility}; allowed: one whose poles the drive has"
         )
-    a, b = _realise(TransferFunction(tuple(np.polymul(friction.mobility.numerator, lags)), model.denominator))
+    a, b = realise(TransferFunction(tuple(np.polymul(friction.mobility.numerator, lags)), model.denominator))
     linear = discretise(a, b, 0.0, step, "foh")
     return np.ascontiguousarray(linear.weights[:, 0] + linear.weights[:, 1])
-
-
-def _settles(model: TransferFunction) -> tuple[float, bool]:
-    """What a command of 1 asks for, 0 if neither a position nor a speed, and whether it is a speed."""
-    integrates = model.denominator[-1] == 0.0
-    divisor = model.denominator[-2 if integrates else -1]
-    return (abs(model.numerator[-1] / divisor) if divisor else 0.0), integrates
-
-
-def _limits(model: TransferFunction, limits: CommandLimits, command_limit: float, step: float) -> LimitTable:
-    """The limits of a drive's command, taken every ``step`` [s]."""
-    gain, integrates = _settles(model)
-    if limits.any and not gain:
-        raise InputError(
-            f"feed drive {model}: its command stands for neither a position nor a speed, so that there is no limit of "
-            "stroke, velocity, acceleration or jerk for it; allowed: a gain, and one pole at 0 at most"
-        )
-    gain = gain or 1.0
-    stroke, velocity, acceleration, jerk = (
-        limit / gain for limit in (limits.stroke, limits.velocity, limits.acceleration, limits.jerk)
-    )
-    if integrates:
-        bottom = np.trim_zeros(np.array(model.denominator), "f")
-        coming = bottom[-2::-1] / (bottom[-2] * gain) if limits.any else np.empty(0)
-        return LimitTable(stroke, min(velocity, command_limit), acceleration, jerk, step, coming)
-    return LimitTable(min(stroke, command_limit), velocity, acceleration, jerk, step, np.empty(0))
 
 
 class FeedDrive:
     """The drive as a machine: command in, motion of the slide and of the motor out.
 
     Args:
-        model: position over command, see `fourth_order`, `dc_screw`, `sampled`.
+        model: position over command, see `lathe_rc.plants.feed_models`.
         step: sampling step [s].
         divisor: the command is taken at samples that are multiples of it, and held between.
         command_limit: the command is cut off at ± this, in its unit.
@@ -417,12 +280,12 @@ class FeedDrive:
         for name, value in (("backlash", backlash), ("resolution", resolution)):
             if not 0.0 <= value < np.inf:
                 raise InputError(f"feed drive: {name} = {value:g} m; allowed: 0 for none, or above 0")
-        a, b = _realise(model)
+        a, b = realise(model)
         linear = discretise(a, b, 0.0, step, "foh")
         # What is exact for a command that is linear over a step is so for one that does not change in it.
         held = linear.weights[:, 0] + linear.weights[:, 1]
         # A model that integrates needs a certain command for a certain speed.
-        gain, self.integrates = _settles(model)
+        gain, self.integrates = settles(model)
         needed = speed_limit / gain if self.integrates and gain > 0.0 else np.inf
         if friction and np.isfinite(speed_limit) and held.size > 2:
             raise InputError(
@@ -447,7 +310,7 @@ class FeedDrive:
         self.whole = FeedTable(
             drive=self.table,
             state=self.state,
-            limits=_limits(model, limits, command_limit, divisor * step),
+            limits=limit_table(model, limits, command_limit, divisor * step),
             memory=np.append(rest(), 0.0),
             divisor=divisor,
             resolution=float(resolution),

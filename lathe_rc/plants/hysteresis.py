@@ -223,7 +223,7 @@ def advance_along(kind: int, table: Array, state: Array, start: int, value: Arra
 
 
 class _Operator:
-    """What all operators share."""
+    """The common part of all operators."""
 
     def __init__(self, law: Law, state: Array, steepest: float) -> None:
         self.law, self.state, self.steepest = law, state, steepest
@@ -280,7 +280,7 @@ class PrandtlIshlinskii(_Operator):
         return PrandtlIshlinskii(self.thresholds, self.weights * scale, self.proportional)
 
     def inverse(self) -> "PrandtlIshlinskiiInverse":
-        """What undoes it from its present state on."""
+        """The inverse from its present state on."""
         return PrandtlIshlinskiiInverse(self)
 
 
@@ -346,7 +346,7 @@ class BoucWen(_Operator):
         return BoucWen(self.a * scale, self.beta, self.gamma, self.gain)
 
     def inverse(self) -> "BoucWenInverse":
-        """What undoes it from its present state on."""
+        """The inverse from its present state on."""
         return BoucWenInverse(self)
 
 

@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.plants.end_stops import between_stops
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise
 from lathe_rc.plants.piezo import VOLTAGE, Stack, StackTable, extend
 from lathe_rc.signals.noise import quantise
@@ -122,13 +123,8 @@ def advance(
         for i in range(4):
             state[i] = free[i] + fine[i, 0] * e
         state[4] = e
-        # The end stops are inelastic: the carriage stays there until it is driven back; the tool swings on.
-        if state[0] > carriage_stroke:
-            state[0], state[1] = carriage_stroke, min(state[1], 0.0)
-            stopped += 1
-        elif state[0] < -carriage_stroke:
-            state[0], state[1] = -carriage_stroke, max(state[1], 0.0)
-            stopped += 1
+        state[0], state[1], stops = between_stops(state[0], state[1], carriage_stroke)  # the tool swings on
+        stopped += stops
         carriage[k], carriage_velocity[k] = state[0], state[1]
         if not feedback:
             measured[k] = quantise(state[0] + noise[k], resolution)

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lathe_rc.cell.messages import Signals
 from lathe_rc.errors import InputError, shown
+from lathe_rc.messages import Signals
 
 Array = npt.NDArray[np.float64]
 
@@ -193,7 +193,7 @@ def _allowed(kind: Kind) -> str:
 
 
 class Disturbance:
-    """What a fault of a port makes of the samples while it lasts, and what it leaves.
+    """The effect of a port's fault on the samples while it lasts, and the state after it.
 
     Args:
         fault: see `Fault`.

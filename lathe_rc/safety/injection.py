@@ -5,9 +5,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc import messages
 from lathe_rc.errors import InputError
+from lathe_rc.messages import Signals
 from lathe_rc.safety.faults import DISTURBANCES, KINDS, Disturbance, Fault, Kind
 
 _TRUE = "_true"  # fields with this ending are what really happens
@@ -32,7 +32,7 @@ class Port:
     out: bool
 
     def targets(self, kind: Kind) -> set[str]:
-        """What of this port a kind of fault can be of."""
+        """The fields of this port that a kind of fault can be of."""
         if kind.what == "encoder":
             return {self.topic} if self.out and self.type == messages.ENCODER else set()
         if kind.what != "field":
@@ -98,7 +98,7 @@ class Injection:
         return [*self._inputs, *self._outputs]
 
     def _targets(self, kind: Kind) -> set[str]:
-        """What a kind of fault can be of."""
+        """The targets that a kind of fault can have."""
         if kind.what in self._devices:
             return {kind.what}
         return {target for port in self._ports for target in port.targets(kind)}
@@ -157,7 +157,7 @@ class Injection:
         return bool(self._injected)
 
     def inputs(self, first: int, inputs: Sequence[Signals]) -> list[Signals]:
-        """What the stage gets; what others read as well stays as it is."""
+        """The inputs of the stage; arrays that others read as well stay as they are."""
         changed = list(inputs)
         for place, port in enumerate(self._inputs):
             mine = [injected for injected in self._injected if injected.port is port]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is watched: signals against thresholds, each by a rule of `lathe_rc.safety.rules`, or in plain Python."""
+"""Monitors: signals against thresholds, each by a rule of `lathe_rc.safety.rules`, or in plain Python."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -39,21 +39,38 @@ class Alarm:
     value: float
 
 
-class Monitor:
-    """Watches signals by one of the `rules`; raises one alarm, and no other before it is reset.
+class Watcher:
+    """Watches signals; raises one alarm, and no other before it is reset.
 
     Args:
         name: of the monitor.
         subject: what it watches.
         limit: threshold.
         reaction: what it asks for.
+
+    Attributes:
+        name, subject, limit, reaction: as given.
+    """
+
+    def __init__(self, name: str, subject: str, limit: float, reaction: Reaction) -> None:
+        self.name, self.subject, self.limit, self.reaction = name, subject, limit, reaction
+
+    def reset(self) -> None:
+        """Watch as from the first sample."""
+
+
+class Monitor(Watcher):
+    """Watches by one of the `rules`.
+
+    Args:
+        name, subject, limit, reaction: see `Watcher`.
         rule: which.
         signal: place of the input and field.
         other: the same of a second signal; None: there is none.
         memory: what the rule knows, its limits among it; its `Lookout` has it from then on.
 
     Attributes:
-        name, subject, limit, reaction, rule, signal, other, memory: as given.
+        rule, signal, other, memory: as given.
     """
 
     def __init__(
@@ -68,23 +85,20 @@ class Monitor:
         other: tuple[int, str] | None = None,
         memory: Sequence[float] | Array,
     ) -> None:
-        self.name, self.subject, self.limit, self.reaction = name, subject, limit, reaction
+        super().__init__(name, subject, limit, reaction)
         self.rule, self.signal, self.other = rule, signal, other
         self.memory = np.array(memory, np.float64)
 
     def told(self, value: float) -> float:
-        """What an alarm says of what the rule has found, in the unit of the limit."""
+        """The alarm's text for the rule's finding, in the unit of the limit."""
         return value
-
-    def reset(self) -> None:
-        """Watch as from the first sample."""
 
 
 class Threshold(Monitor):
     """|signal - other - offset| beyond the limit for some samples in a row.
 
     Args:
-        name, subject, limit, reaction: see `Monitor`.
+        name, subject, limit, reaction: see `Watcher`.
         signal: place of the input and field.
         other: the same of what is subtracted; None: nothing.
         offset: subtracted as well.
@@ -113,7 +127,7 @@ class Threshold(Monitor):
         return abs(value - float(self.memory[0]))
 
     def reset(self) -> None:
-        """See `Monitor`."""
+        """See `Watcher`."""
         self.memory[4], self.memory[6] = 0.0, np.nan
 
 
@@ -143,7 +157,7 @@ class Rate(Monitor):
     """How fast a signal changes, over a window of samples.
 
     Args:
-        name, subject, limit, reaction: see `Monitor`; the limit is a rate.
+        name, subject, limit, reaction: see `Watcher`; the limit is a rate.
         signal: place of the input and field.
         window: over so many samples.
         step: sampling step [s].
@@ -179,7 +193,7 @@ class IndexPulses(Monitor):
         super().__init__("index_pulses", "encoder", limit, reaction, rule=INDEX, signal=signal, memory=memory)
 
     def reset(self) -> None:
-        """See `Monitor`."""
+        """See `Watcher`."""
         self.memory[1:] = np.nan, np.nan, 0.0
 
 
@@ -209,7 +223,7 @@ class Growth(Monitor):
         )
 
     def reset(self) -> None:
-        """See `Monitor`."""
+        """See `Watcher`."""
         self.memory[3:] = _UNKNOWN
 
 
@@ -241,19 +255,13 @@ class PlainMonitor(ABC):
         """
 
 
-class Plain:
-    """A `PlainMonitor` with its place in the cell; raises one alarm, and no other before it is reset.
+class Plain(Watcher):
+    """A `PlainMonitor` with its place in the cell.
 
     Args:
-        name: of the monitor.
-        subject: what it watches.
-        limit: threshold.
-        reaction: what it asks for.
+        name, subject, limit, reaction: see `Watcher`.
         signals: places of one input and field, or of two.
         make: of the monitor.
-
-    Attributes:
-        name, subject, limit, reaction: as given.
 
     Raises:
         InputError: it has too long a name, or cannot be made.
@@ -271,7 +279,7 @@ class Plain:
     ) -> None:
         if len(name.encode()) > _LONGEST_NAME:
             raise InputError(f"{name!r} is longer than messages carry; allowed: {_LONGEST_NAME} bytes (an entry point)")
-        self.name, self.subject, self.limit, self.reaction = name, subject, limit, reaction
+        super().__init__(name, subject, limit, reaction)
         self._signals, self._make = signals, make
         self._monitor: PlainMonitor | None = None
         self.reset()
@@ -303,7 +311,7 @@ class Plain:
         return alarm
 
     def reset(self) -> None:
-        """Watch as from the first sample."""
+        """See `Watcher`."""
         with code_of_others(f"monitor {self.name}"):
             self._monitor = self._make()
 

@@ -15,7 +15,7 @@ class State(IntEnum):
 
 
 class Reaction(IntEnum):
-    """What is done about an alarm; the higher one prevails."""
+    """The reaction to an alarm; the higher one prevails."""
 
     NONE = 0
     WARN = 1

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What enters the cell: spindle speed laws, encoder, part profiles."""
+"""Inputs of the cell: spindle speed laws, encoder, part profiles."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an encoder takes an angle for: its disc sits beside the axis, its signals are not a circle.
+"""Errors of an encoder: its disc sits beside the axis, its signals are not a circle.
 
     φ' = φ + e·sin(φ + ψ)                                       eccentricity, once a revolution
     x = cos(N·φ') + p,   y = (1 + g)·sin(N·φ' + a) + q          the two signals, N periods a revolution
@@ -108,7 +108,7 @@ class EncoderErrors:
 
 @inlined
 def _raw(errors: ErrorsTable, angle: float) -> float:
-    """What is seen [rad], before it is set to 0 at the angle 0."""
+    """The encoder's angle [rad], before it is set to 0 at the angle 0."""
     turned = angle + errors.eccentricity * np.sin(angle + errors.phase)
     place = errors.periods * turned
     cosine, sine = np.cos(place), np.sin(place)
@@ -120,7 +120,7 @@ def _raw(errors: ErrorsTable, angle: float) -> float:
 
 @inlined
 def seen(errors: ErrorsTable, angle: float) -> float:
-    """What the encoder takes an angle [rad] for."""
+    """The encoder's reading of an angle [rad]."""
     return _raw(errors, angle) - errors.zero
 
 
@@ -139,6 +139,6 @@ def rate(errors: ErrorsTable, angle: float) -> float:
 
 @kernel
 def seen_along(errors: ErrorsTable, angle: Array, found: Array) -> None:
-    """What is seen of angles, shape (n,)."""
+    """The encoder's reading of angles, shape (n,)."""
     for k in range(angle.size):
         found[k] = seen(errors, angle[k])

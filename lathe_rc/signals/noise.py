@@ -17,7 +17,7 @@ DRAWN = 8192  #: numbers that a stream draws at a time, at most
 
 @inlined
 def quantise(value: float, resolution: float) -> float:
-    """What a converter or sensor of a ``resolution`` makes of a value, in the same unit; 0 for none."""
+    """A value as a converter or sensor of a ``resolution`` gives it, in the same unit; 0 for none."""
     if resolution > 0.0:
         return float(np.rint(value / resolution) * resolution)
     return value

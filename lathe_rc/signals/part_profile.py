@@ -6,7 +6,8 @@ from abc import ABC, abstractmethod
 import numpy as np
 
 from lathe_rc.errors import InputError
-from lathe_rc.signals.profile import Array, ProfileTable, tabulated
+from lathe_rc.signals.profile import Array
+from lathe_rc.signals.profile_table import ProfileTable, tabulated
 
 _TURN = 2.0 * np.pi
 _CLOSED = 1e-9  # how far both ends of a revolution may be apart, by the largest deviation

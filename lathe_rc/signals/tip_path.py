@@ -21,7 +21,8 @@ import numpy.typing as npt
 import scipy
 
 from lathe_rc.errors import InputError
-from lathe_rc.signals.profile import Profile, ProfileTable
+from lathe_rc.signals.profile import Profile
+from lathe_rc.signals.profile_table import ProfileTable
 
 Array = npt.NDArray[np.float64]
 

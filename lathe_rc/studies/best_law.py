@@ -56,7 +56,7 @@ class BestLawParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class BestLawResult:
-    """What each law errs at each condition.
+    """The error of each law at each condition.
 
     Attributes:
         parameters: of the study.

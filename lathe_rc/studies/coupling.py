@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a delay in the loop of drive and cut would falsify, and what it does in the loop of cut and spindle.
+"""The errors that a delay in the loop of drive and cut would cause, and its effect in the loop of cut and spindle.
 
 An electrodynamic drive follows an oval and cuts a part with two keyways. As one stage drive and cut are computed sample
 by sample; as two, the force would reach the drive some samples late. The stability limit is that of
@@ -17,10 +17,12 @@ from rich.console import Group
 
 from lathe_rc.analysis.loaded import compliance
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.plants.cutting import RIGID, CuttingProcess, Part
+from lathe_rc.plants.cutting import CuttingProcess
 from lathe_rc.plants.cutting_force import SpecificForce
+from lathe_rc.plants.deflection import RIGID
 from lathe_rc.plants.loaded import LoadedDrive
 from lathe_rc.plants.spindle import LoadedSpindle, SpeedLoop
+from lathe_rc.plants.workpiece import Part
 from lathe_rc.studies.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:
@@ -55,7 +57,7 @@ class CouplingParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class CouplingResult:
-    """What the delays change.
+    """The effects of the delays.
 
     Attributes:
         parameters: of the study.
@@ -125,7 +127,7 @@ class CouplingResult:
         return Group(drive, "", spindle)
 
     def draw(self, figure: "Figure") -> None:
-        """What the delays do to the edge, to the stable K, and to the spindle's angle."""
+        """The effect of the delays on the edge, the stable K, and the spindle's angle."""
         given = self.parameters
         edge, stable, spindle = figure.subplots(1, 3)
         degrees = np.degrees(self.angle - self.angle[0])
@@ -211,7 +213,7 @@ def _apart(given: CouplingParameters, command: Array, turning: dict[str, Array],
 
 
 def _energy(given: CouplingParameters, velocity: Array, acts: Array, made: Array) -> float:
-    """What a force that acts late brings in, over what the drive and the force of the chip exchange."""
+    """The energy that a late force brings in, over that which the drive and the force of the chip exchange."""
     power = given.radial_ratio * velocity
     return float(((acts - made) * power).sum() / np.abs(made * power).sum())
 

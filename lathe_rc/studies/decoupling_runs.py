@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the study of decoupling computes of both loops at one delay: poles, single loops, steps, disturbance."""
+"""The runs of the study of decoupling at one delay: poles, single loops, steps, disturbance."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -73,7 +73,7 @@ class Course:
     cut: int
 
     def settled(self, values: Array) -> Array:
-        """What comes of a row after the entry."""
+        """A row after the entry."""
         return np.asarray(values[self.time >= SETTLED])
 
     def curve(self, values: Array, unit: float = 1.0) -> tuple[Array, Array]:

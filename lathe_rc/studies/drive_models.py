@@ -197,7 +197,7 @@ def _harmonic(parameters: DriveModelsParameters) -> float:
 
 
 def _simulated(drive: SecondOrder) -> StepResponse:
-    """What a test of the drive would measure."""
+    """The measurement of a test of the drive."""
     slowest = drive.natural_frequency * (drive.damping - np.sqrt(max(drive.damping**2 - 1.0, 0.0)))
     step = (drive.delay + _DECAY / slowest) / _SAMPLES
     machine = ElectrodynamicDrive(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a tolerance of drives costs: one controller, many drives of a batch.
+"""The cost of a tolerance of drives: one controller, many drives of a batch.
 
 The controllers keep the models and settings of the scenario. Natural frequency, damping and delay of every drive are
 drawn independently, normal about the scenario's value, with the tolerance as the standard deviation. A drive with
@@ -115,7 +115,7 @@ class DriveToleranceResult:
 
 
 def _drawn(scenario: Scenario) -> list[str]:
-    """What differs from drive to drive."""
+    """The parameters that differ from drive to drive."""
     drives = [name for name, stage in Cell(scenario.nodes).stages.items() if isinstance(stage, Drive)]
     return [
         f"{node}.{name}"
@@ -134,7 +134,7 @@ def run(parameters: DriveToleranceParameters, track: Track = untracked) -> Drive
     for tolerance in parameters.tolerance:
         laws = dict.fromkeys(_drawn(base), f"normal:{100.0 * tolerance!r}%")
         spaces.append(Space(sampled=laws, sample=f"sobol:{parameters.drives}"))
-    # A folder of its own each: the rows of one are told apart by nothing else.
+    # A folder of its own each: nothing else distinguishes the rows of one from another's.
     asked = [(f"tolerance-{number}", base, space) for number, space in enumerate(spaces)]
     own, *found = sweeps.table(asked, parameters.folder, ["tool.max_error"], track, models="nominal")
     errors = [

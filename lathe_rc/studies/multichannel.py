@@ -13,9 +13,9 @@ import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
+from lathe_rc import messages
 from lathe_rc.analysis.structures import contraction, direct_compensation, iterative, supremum
 from lathe_rc.analysis.tuning import FREQUENCIES, HIGHEST, LEAD_LAG, PLAIN, PRINTED, ROWS, Tuning
-from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.studies import cells
 from lathe_rc.studies.study import Study, StudyParameters, Track, comparison, untracked

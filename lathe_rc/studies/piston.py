@@ -13,8 +13,8 @@ import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.table import Table as RichTable
 
+from lathe_rc import messages
 from lathe_rc.analysis.tuning import PLAIN, ROWS
-from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stages.form import FormParameters
 from lathe_rc.studies import cells

@@ -16,7 +16,6 @@ from annotated_types import Ge, Gt, Le
 from rich.console import Group
 from rich.table import Table as RichTable
 
-from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import Value, parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
@@ -25,6 +24,7 @@ from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.stages.resonant_controller import ResonantController
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.messages import Signals
 from lathe_rc.studies import cells
 from lathe_rc.studies.study import Study, StudyParameters, Track, comparison, untracked
 
@@ -119,7 +119,7 @@ class RobustParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class RobustResult:
-    """What each law achieves under each condition; arrays of shape (conditions, laws, drives), the told drive first.
+    """The error of each law under each condition; arrays of shape (conditions, laws, drives), the told drive first.
 
     Attributes:
         conditions, laws: their names.
@@ -212,7 +212,7 @@ def _figure(value: float) -> str:
 
 @dataclass(frozen=True)
 class _Judged:
-    """What is kept of a run: largest error by revolution [µm], RMS of the last ones [µm], RMS current [A]."""
+    """Kept results of a run: largest error by revolution [µm], RMS of the last ones [µm], RMS current [A]."""
 
     largest: Array
     rms: float

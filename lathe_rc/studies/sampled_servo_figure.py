@@ -10,13 +10,13 @@ import numpy.typing as npt
 from lathe_rc.analysis import sampled_loop
 from lathe_rc.analysis.sampled_loop import Measures
 from lathe_rc.control.sampled_link import ripple_free
-from lathe_rc.studies.sampled_servo import DESIRED, numbers, stable
+from lathe_rc.studies.sampled_servo_numbers import DESIRED, numbers, stable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from lathe_rc.studies.sampled_servo import SampledServoResult
+    from lathe_rc.studies.sampled_servo_numbers import SampledServoNumbers
 
 Array = npt.NDArray[np.float64]
 
@@ -29,7 +29,7 @@ def _line(found: Sequence[Measures | None]) -> Array:
     return np.asarray(np.array([numbers(one) for one in found], dtype=np.float64).T)
 
 
-def draw(result: "SampledServoResult", figure: "Figure") -> None:
+def draw(result: "SampledServoNumbers", figure: "Figure") -> None:
     """Figs 2-4 with what is true between samples, and the backlash."""
     (steps, gain, phase), (overshoot, settling, gap) = figure.subplots(2, 3)
     _draw_steps(result, steps)
@@ -41,12 +41,12 @@ def draw(result: "SampledServoResult", figure: "Figure") -> None:
         axes.legend(fontsize=7, ncols=2 if axes in (overshoot, settling) else 1)
 
 
-def _middle(result: "SampledServoResult") -> int:
+def _middle(result: "SampledServoNumbers") -> int:
     """Place of the period that the figures of one period are for: 0.16 s, or the nearest."""
     return int(np.argmin(np.abs(np.array(result.parameters.t) - 0.16)))
 
 
-def _draw_steps(result: "SampledServoResult", axes: "Axes") -> None:
+def _draw_steps(result: "SampledServoNumbers", axes: "Axes") -> None:
     axes.plot(*result.analog, ":", color="black", label="analog")
     for (name, rows), colour in zip(result.all_links(), _COLOURS[1:], strict=True):
         step = rows[_middle(result)].step
@@ -58,7 +58,7 @@ def _draw_steps(result: "SampledServoResult", axes: "Axes") -> None:
     axes.set_title(f"Fig. 2: step responses, T = {period:g} s; dots at the samples", fontsize=10)
 
 
-def _draw_bode(result: "SampledServoResult", gain: "Axes", phase: "Axes") -> None:
+def _draw_bode(result: "SampledServoNumbers", gain: "Axes", phase: "Axes") -> None:
     design = result.uncorrected[_middle(result)].design
     frequency = design.frequency
     drive = design.drive
@@ -81,7 +81,7 @@ def _draw_bode(result: "SampledServoResult", gain: "Axes", phase: "Axes") -> Non
     phase.set_title("its phase", fontsize=10)
 
 
-def _draw_table(result: "SampledServoResult", overshoot: "Axes", settling: "Axes") -> None:
+def _draw_table(result: "SampledServoNumbers", overshoot: "Axes", settling: "Axes") -> None:
     for half, colour in zip(sorted({row.half_period for row in result.rows}), _COLOURS * 10, strict=False):
         rows = [row for row in result.rows if row.half_period == half]
         ratios = [row.ratio for row in rows]
@@ -102,7 +102,7 @@ def _draw_table(result: "SampledServoResult", overshoot: "Axes", settling: "Axes
     settling.set(yscale="log", ylim=(0.1, 60.0))
 
 
-def _draw_gap(result: "SampledServoResult", axes: "Axes") -> None:
+def _draw_gap(result: "SampledServoNumbers", axes: "Axes") -> None:
     for (name, label), colour in zip((("paper", "paper's"), ("ripple_free", "ripple-free")), _COLOURS[2:], strict=True):
         row = result.links[name][_middle(result)]
         for step, style, place in ((row.load, "-", "load"), (row.motor, "--", "motor")):

@@ -11,7 +11,7 @@ from rich.table import Table as RichTable
 from lathe_rc.analysis import sampled_loop
 from lathe_rc.analysis.sampled_loop import Measures
 from lathe_rc.control.sampled_link import Link
-from lathe_rc.studies.sampled_servo import (
+from lathe_rc.studies.sampled_servo_numbers import (
     DESIRED,
     PRINTED,
     PRINTED_PERIOD,
@@ -24,7 +24,7 @@ from lathe_rc.studies.sampled_servo import (
 from lathe_rc.studies.study import comparison
 
 if TYPE_CHECKING:
-    from lathe_rc.studies.sampled_servo import SampledServoResult
+    from lathe_rc.studies.sampled_servo_numbers import SampledServoNumbers
 
 _SERIES_TOLERANCE = 0.01  # the printed terms have two digits
 
@@ -52,14 +52,14 @@ def _polynomials(link: Link) -> str:
     return f"{gain:.4g}(z - {-zero / gain:.3f})/(z + {pole:.3f})"
 
 
-def table(result: "SampledServoResult") -> Group:
+def table(result: "SampledServoNumbers") -> Group:
     """All of it beside what is printed."""
     parts = (_steps, _drives, _designs, _desired, _links, _gap, _series)
     pieces: list[RichTable | str] = [piece for part in parts for piece in (part(result), "")]
     return Group(*pieces[:-1])
 
 
-def _steps(result: "SampledServoResult") -> RichTable:
+def _steps(result: "SampledServoNumbers") -> RichTable:
     printed = result.parameters.as_printed
     analog = sampled_loop.measures(*result.analog)
     rows: list[Sequence[str]] = [
@@ -80,7 +80,7 @@ def _steps(result: "SampledServoResult") -> RichTable:
     )
 
 
-def _drives(result: "SampledServoResult") -> RichTable:
+def _drives(result: "SampledServoNumbers") -> RichTable:
     rows: list[Sequence[str]] = []
     for row in result.uncorrected:
         drive, pseudo = row.design.drive, sampled_loop.pseudo_frequency(row.design.drive)
@@ -95,7 +95,7 @@ def _drives(result: "SampledServoResult") -> RichTable:
     )
 
 
-def _designs(result: "SampledServoResult") -> RichTable:
+def _designs(result: "SampledServoNumbers") -> RichTable:
     return comparison(
         "Links, largest pole of the loop, gain and phase margin",
         ("link", "T [s]", "D(z)", "pole", "gain", "phase"),
@@ -114,7 +114,7 @@ def _designs(result: "SampledServoResult") -> RichTable:
     )
 
 
-def _desired(result: "SampledServoResult") -> RichTable:
+def _desired(result: "SampledServoNumbers") -> RichTable:
     rows: list[Sequence[str]] = []
     for row in result.rows:
         printed = ("", "")
@@ -137,7 +137,7 @@ def _desired(result: "SampledServoResult") -> RichTable:
     )
 
 
-def _links(result: "SampledServoResult") -> RichTable:
+def _links(result: "SampledServoNumbers") -> RichTable:
     late = f"{result.parameters.delay_ms:g} ms late"
     return comparison(
         "Links on the drive, between samples too; peak: largest command",
@@ -158,7 +158,7 @@ def _links(result: "SampledServoResult") -> RichTable:
     )
 
 
-def _gap(result: "SampledServoResult") -> RichTable:
+def _gap(result: "SampledServoNumbers") -> RichTable:
     return comparison(
         f"Load behind a gap of {result.parameters.backlash:g} of the step: how often it is taken back, what\n"
         "it lacks in the end; measured at the motor or at the load",
@@ -177,7 +177,7 @@ def _gap(result: "SampledServoResult") -> RichTable:
     )
 
 
-def _series(result: "SampledServoResult") -> RichTable:
+def _series(result: "SampledServoNumbers") -> RichTable:
     names = [f"Wж{n}" for n in range(1, len(DESIRED) + 1)]
     columns = [part for name in names for part in (name, "printed")]
     rows: list[Sequence[str]] = [

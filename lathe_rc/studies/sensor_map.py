@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What encoder and position sensor leave of a law that does not know the speed, against the variable lead.
+"""A law that does not know the speed, with errors of encoder and position sensor, against the variable lead.
 
 The cell of `lathe_rc.studies.speed_deviation`, frozen, with the variable lead of paper 000 (eq. 20) and with
 ``disturbance_controller``, over counts, noise, frequencies of the deviation and harmonics of the profile.
@@ -16,12 +16,12 @@ from annotated_types import Ge, Gt, Le
 from rich.console import Group
 from rich.table import Table as RichTable
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc import messages
 from lathe_rc.cell.parameters import Value, parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.messages import Signals
 from lathe_rc.studies import cells
 from lathe_rc.studies.study import Study, StudyParameters, Track, comparison, untracked
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a swinging spindle speed costs each learning law (paper 000, Fig. 6).
+"""The cost of a swinging spindle speed for each learning law (paper 000, Fig. 6).
 
 The cell of ``config/speed_deviation.yaml`` learns a harmonic profile at constant speed; then the speed swings. The
 protocol ``frozen`` holds the memory from there on, ``learning`` goes on learning.
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.studies import cells
 from lathe_rc.studies.study import Study, StudyParameters, Track, comparison, untracked

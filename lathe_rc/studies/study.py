@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a study is: parameters in, a result out that can be printed, drawn and written as JSON."""
+"""The interface of a study: parameters in, a result out that can be printed, drawn and written as JSON."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -45,13 +45,13 @@ def untracked(items: Sequence[T], /) -> Iterable[T]:
 
 
 class Result(Protocol):
-    """What a study found; a frozen dataclass."""
+    """The result of a study; a frozen dataclass."""
 
     def to_json(self) -> dict[str, Any]:
         """Everything in numbers, finite or None."""
 
     def table(self) -> "RenderableType":
-        """What was computed beside what the paper prints, at most 80 columns wide."""
+        """The computed numbers beside those of the paper, at most 80 columns wide."""
 
     def draw(self, figure: "Figure") -> None:
         """Fill an empty figure."""

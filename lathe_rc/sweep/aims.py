@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a tuning wants of a cell: goals, subjects, and over which share of the cells.
+"""Aims of a tuning: goals, subjects, and the share of the cells that has to meet them.
 
 A goal is a column of a row (`lathe_rc.sweep.row`): as small as it can be, with a minus before it as large as it can be.
 A subject is a limit of a column. What counts of several cells, plants and spindles, is the worst of them or a
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.wiring import Cell
@@ -52,7 +52,7 @@ class Subject(NamedTuple):
 
 
 class Score(NamedTuple):
-    """What came of the cells of a trial.
+    """The score of the cells of a trial.
 
     Attributes:
         costs: of the goals, less is better; infinite where a cell that counts has no value.
@@ -72,7 +72,7 @@ class Score(NamedTuple):
 
 @dataclass(frozen=True)
 class Aims:
-    """What is wanted.
+    """The aims of a tuning.
 
     Attributes:
         goals: one, or two and more to be traded off.
@@ -93,7 +93,7 @@ class Aims:
         return list(dict.fromkeys(["status", "margin", *named]))
 
     def score(self, rows: Iterable[Mapping[str, Any]]) -> Score:
-        """What came of the cells of a trial.
+        """The score of the cells of a trial.
 
         Args:
             rows: with `columns`, one or more.
@@ -144,7 +144,7 @@ def aims(
     measures: Sequence[str] = (),
     percentile: float = 100.0,
 ) -> Aims:
-    """What texts want.
+    """The aims in texts.
 
     Args:
         scenario: that is tuned.

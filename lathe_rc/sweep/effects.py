@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the rows of a sweep say of a goal: which parameter it depends on, how much, and how many cells keep to it.
+"""Effects on a goal from the rows of a sweep: which parameter it depends on, how much, and how many cells keep to it.
 
 With y the goal of the n cells that have one and the parameter's values in m bins b of n_b cells each,
 
@@ -125,7 +125,7 @@ def _quantile_bins(values: Samples, count: int) -> Index:
 
 @dataclass(frozen=True)
 class Effect:
-    """What a parameter does to a goal.
+    """The effect of a parameter on a goal.
 
     Attributes:
         share: of the goal's variance that it explains by itself; None: too few cells, or a goal that does not vary.
@@ -137,7 +137,7 @@ class Effect:
 
 
 def effect(axis: Axis, goal: Samples, *, exact: bool = False) -> Effect:
-    """What a parameter does to a goal.
+    """The effect of a parameter on a goal.
 
     Args:
         axis: the parameter.
@@ -172,7 +172,7 @@ class Yield:
 
     Attributes:
         goal: of the cells that have one, ascending.
-        cells: all of them: who came to nothing keeps to no limit.
+        cells: all of them; a failed one keeps to no limit.
         above: the goal is to be large, not small.
     """
 

@@ -36,7 +36,7 @@ _SHOWN = {"m": "median", "s": "smallest", "l": "largest"}
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """What the cells are judged by.
+    """A goal by which the cells are judged.
 
     Attributes:
         name: of its column.
@@ -91,7 +91,7 @@ def effect_said(effect: Effect) -> tuple[str, str]:
 
 
 def _grouped(group: Index, count: int, goal: Samples) -> dict[str, Samples]:
-    """What the cells of each group came to, by column."""
+    """The results of the cells of each group, by column."""
     inside = group >= 0
     known = inside & np.isfinite(goal)
     done = np.bincount(group[known], minlength=count)

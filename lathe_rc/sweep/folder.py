@@ -134,7 +134,7 @@ class Folder:
 
     @property
     def targets(self) -> list[str]:
-        """What differs between the cells."""
+        """The parameters that differ between the cells."""
         tuned: Sequence[str] = self.tuning["targets"] if self.tuning else ()
         named = [*tuned, *(target for space in self.spaces for target in space.targets())]
         return [target for target in dict.fromkeys(named) if target != "seed"]
@@ -189,7 +189,7 @@ class Folder:
         return cast("dict[str, Any]", found[0])
 
     def values(self, number: int) -> dict[str, Value]:
-        """What was varied in a cell.
+        """The varied values of a cell.
 
         Raises:
             InputError: there is no such cell, or it is not computed.
@@ -212,7 +212,7 @@ class Folder:
 
 
 def _difference(there: Mapping[str, Any] | None, asked: Mapping[str, Any] | None) -> str:
-    """What a folder holds that is not what is asked for, in words."""
+    """The difference between the content of a folder and the request, in words."""
     if there is None or asked is None:
         return "a sweep" if there is None else "a tuning"
     name = next(name for name in there if there[name] != asked[name])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What formulas give for the parameters of a cell, to compare a search with.
+"""Parameters of a cell by formulas, to compare a search with.
 
 Of a learning controller (`lathe_rc.analysis.learning`), with Q, drive and interpolators as they run:
 
@@ -45,7 +45,7 @@ _FAR = 2.0  # the longest of them, in lags of the drive
 
 
 class Found(NamedTuple):
-    """What a formula gives.
+    """A value by a formula.
 
     Attributes:
         value: of the parameter.
@@ -57,7 +57,7 @@ class Found(NamedTuple):
 
 
 def settings(scenario: Scenario, targets: Collection[str], margin: float = MARGIN) -> dict[str, Found]:
-    """What formulas give for those of some parameters for which there is one.
+    """The values by formulas, for those of some parameters that have one.
 
     Args:
         scenario: of the cell; what is not among the targets stays as it says.

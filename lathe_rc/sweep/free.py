@@ -39,7 +39,7 @@ class Free(NamedTuple):
             trial.suggest_float(target, found.low, found.high, log=found.log)
 
     def told(self, value: Value) -> Any:
-        """What Optuna knows a value as."""
+        """The form of a value in Optuna."""
         return value if self.choices is None else _known(value)
 
     def holds(self, value: Value) -> bool:

@@ -55,7 +55,7 @@ _LIGHT = {
 
 @dataclass(frozen=True)
 class Written:
-    """What `write` has written.
+    """The files that `write` has written.
 
     Attributes:
         page: the HTML file.
@@ -203,7 +203,7 @@ def _limits(seen: Seen) -> str:
 
 
 def _sections(seen: Seen, done: Yield, drawn: _Drawn) -> dict[str, Any]:
-    """What the template shows of cells that have a goal, and the figures."""
+    """The sections of the template for cells that have a goal, and the figures."""
     grids = {goal.name: is_grid(seen.axes, goal.values) for goal in seen.goals}
     effects = {goal.name: [_effect(axis, goal, grid=grids[goal.name]) for axis in seen.axes] for goal in seen.goals}
     mine = effects[seen.goal.name]
@@ -312,7 +312,7 @@ def _best(seen: Seen) -> dict[str, Any]:
 
 
 def _yields(seen: Seen, done: Yield) -> list[str]:
-    """What is said of the yield, a sentence each."""
+    """The sentences about the yield."""
     unit = f" {seen.goal.unit}" if seen.goal.unit else ""
     bound = "at least" if done.above else "at most"
     points = {share: done.point(share) for share in (0.95, 0.99)}

@@ -66,7 +66,7 @@ def _scaled(axis: Axis) -> tuple[Samples, float, float]:
 
 
 def _ticks(axis: Axis, low: float, high: float) -> list[tuple[float, str]]:
-    """Places on the axis from 0 to 1, and what stands there."""
+    """Places on the axis from 0 to 1, and their labels."""
     if axis.texts:
         return [((place - low) / (high - low), text) for place, text in enumerate(axis.texts)]
     few = axis.distinct

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a sweep keeps of a cell: one row of its table.
+"""The row of a cell in the table of a sweep.
 
 | column | what |
 |---|---|
@@ -28,13 +28,12 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from lathe_rc import messages
 from lathe_rc.analysis.metrology import FormErrors, form_errors
 from lathe_rc.analysis.tolerance import judge
-from lathe_rc.cell import messages
 from lathe_rc.cell.batch import Errors
 from lathe_rc.cell.collect import Finite
 from lathe_rc.cell.engine import Engine
-from lathe_rc.cell.messages import Signals
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
@@ -44,6 +43,7 @@ from lathe_rc.cell.stages.obedience import OUT_OF_REACH
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError, LatheError
+from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 from lathe_rc.sweep.revision import revision
 
@@ -97,7 +97,7 @@ class Measure(NamedTuple):
 
 
 def measure(text: str, scenario: Scenario) -> Measure:
-    """What ``TOPIC.FIELD:STATISTIC`` asks for.
+    """The measure that ``TOPIC.FIELD:STATISTIC`` asks for.
 
     Raises:
         InputError: the scenario has no such topic, the topic no such field, or there is no such statistic.
@@ -165,7 +165,7 @@ class _Keeper(Errors):
 
 
 def digest(recording: Recording, measures: Sequence[Measure]) -> str | None:
-    """What stands in the row of a cell that was run again.
+    """The digest in the row of a cell that was run again.
 
     SHA-256 of all samples, little-endian, of the form error; of a cell without a tool, of what is measured. None where
     there is neither.

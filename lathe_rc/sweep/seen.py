@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is looked at of a sweep: its parameters as axes, its goals, and what the cells came to."""
+"""The data of a sweep's page: its parameters as axes, its goals, and the results of the cells."""
 
 from functools import cached_property
 from typing import cast
@@ -19,7 +19,7 @@ from lathe_rc.sweep.folder import Folder
 GOAL = "tool.max_error"
 _LARGE = ("margin",)  # goals that are better the larger they are
 _UNITS = {"tool.in_tolerance_from": "revolutions"}
-_MOST_TEXTS = 24  # that are told apart
+_MOST_TEXTS = 24  # that have a colour each
 
 
 class Seen:

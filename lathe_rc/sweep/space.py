@@ -92,11 +92,11 @@ class Space:
     sample_seed: int = 0
 
     def to_json(self) -> dict[str, Any]:
-        """What ``Space(**told)`` makes the same space of."""
+        """The arguments of the same space, for ``Space(**told)``."""
         return cast("dict[str, Any]", json.loads(json.dumps(asdict(self), default=list)))
 
     def targets(self) -> list[str]:
-        """What differs between the cells, in the order of the columns."""
+        """The parameters that differ between the cells, in the order of the columns."""
         seed = ["seed"] if self.seeds > 1 else []
         named = [name for cell in self.given for name in cell]
         return list(dict.fromkeys([*named, *self.grid, *self.sampled, *self.ties, *seed]))

@@ -39,7 +39,7 @@ BATCH = 8  #: trials that are asked for at once
 _STUDY = "tuning"
 _POPULATION = 3 * BATCH  # of NSGA-II
 _UNKNOWN = 1e9  # what the samplers are told in place of a cost that there is not: beyond all that there are
-_BY, _SCORE = "by", "score"  # attributes of a trial: who computes it, what came of it
+_BY, _SCORE = "by", "score"  # attributes of a trial: its worker, its result
 
 
 class _Lock(JournalFileOpenLock):
@@ -230,7 +230,7 @@ class Study:
         self._study.tell(number, known)
 
     def tuning(self) -> Tuning:
-        """What is there."""
+        """The tuning so far."""
         found = []
         for trial in self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             costs, violations, margin = cast("tuple[list[float], list[float], float]", trial.user_attrs[_SCORE])

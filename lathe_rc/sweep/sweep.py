@@ -33,7 +33,7 @@ _WRITE = 10.0  # [s] between writes of what has come
 
 @dataclass(frozen=True, repr=False)
 class Sweep:
-    """What a sweep gave.
+    """The result of a sweep.
 
     Attributes:
         folder: where it is.
@@ -42,7 +42,7 @@ class Sweep:
     folder: Folder
 
     def __repr__(self) -> str:
-        """What it is of, and how many cells came to what."""
+        """The scenario, and the numbers of cells by outcome."""
         told = ", ".join(f"{count} {status}" for status, count in self.statuses().items())
         return f"<Sweep of {self.folder.scenario.name} in {self.folder.path}: {told or 'nothing computed'}>"
 
@@ -137,7 +137,7 @@ def run(
 def crew_for(
     scenario: Scenario, client: distributed.Client | None, scheduler: str | None, workers: int | None, watch: Watch
 ) -> Iterator[distributed.Client]:
-    """Who computes cells of a scenario, once its kernels are compiled; arguments and events as in `run`."""
+    """The workers for cells of a scenario, once its kernels are compiled; arguments and events as in `run`."""
     for stages in compile_ahead(Cell(scenario.nodes).stages.values()):
         watch({"event": "compiling", "nodes": stages})
     with nullcontext(client) if client else client_of(scheduler, workers) as crew:
@@ -146,7 +146,7 @@ def crew_for(
 
 
 def order_of(folder: Folder) -> Order:
-    """What all jobs of a folder have in common."""
+    """The order that all jobs of a folder share."""
     scenario = folder.scenario
     text = scenario.to_yaml(given=True)
     return Order(scenario.name, text, scenario.identity, folder.targets, folder.measures, folder.schema)

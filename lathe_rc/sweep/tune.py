@@ -2,7 +2,7 @@
 """Tuning: parameters of a cell searched by Optuna, its trials computed by the workers of a sweep; see `run`.
 
 DIR/trials.log       Optuna's journal: what was asked, and what came of it
-DIR/running/         a lock for each program that computes; who died is known by it
+DIR/running/         a lock for each program that computes; by it a program that died is noticed
 DIR/best.yaml        the cell with the best trial's parameters
 DIR/front/           of several goals, the cells of all trials that no other is better than
 DIR, the rest        see `lathe_rc.sweep.folder`: cell n of trial m is the row m * (cells of a trial) + n
@@ -69,7 +69,7 @@ def run(
         workers: processes of this machine.
         client: of Dask, in place of both.
         watch: called with the events of `lathe_rc.sweep.sweep.run`, ``began`` with the trials that are there, and with
-            ``told`` (tuning: what is there), after each batch.
+            ``told`` (tuning: all trials so far), after each batch.
 
     Raises:
         InputError: what is asked for cannot be, or the folder holds something else.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a tuning gave: its trials, the best of them, and what formulas give."""
+"""The result of a tuning: its trials, the best of them, and the values by formulas."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,7 @@ class Trial(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class Tuning:
-    """What a tuning gave.
+    """The result of a tuning.
 
     Attributes:
         folder: where it is.
@@ -53,7 +53,7 @@ class Tuning:
     formulas: Mapping[str, Found] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        """What it is of, and what its best is."""
+        """The scenario and its best trial."""
         told = "nothing feasible"
         if best := self.best:
             costs = zip(self.aims.goals, best.score.costs, strict=True)

@@ -51,7 +51,7 @@ class Job(NamedTuple):
 
 
 class Order(NamedTuple):
-    """What all jobs have in common; travels to the workers as it is.
+    """The data that all jobs share; travels to the workers as it is.
 
     Attributes:
         name: of the scenario.

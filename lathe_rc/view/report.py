@@ -3,6 +3,8 @@
 
 Whatever comes from the bag is somebody else's text: it is escaped by the template, cut to a length, and shown without
 characters that do not print.
+
+Longer than 400 lines: each table and picture of the page has its function here, in the order of the page.
 """
 
 import json
@@ -16,12 +18,11 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from lathe_rc import __version__
+from lathe_rc import __version__, messages
 from lathe_rc.analysis.budget import TOLD, Budget
 from lathe_rc.analysis.metrology import Lay
 from lathe_rc.analysis.tolerance import Verdict
-from lathe_rc.bag.story import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS, origins, scenario_of
-from lathe_rc.cell import messages
+from lathe_rc.bag.provenance import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS, origins, scenario_of
 from lathe_rc.cell.budget import budget
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place, replacing
@@ -70,7 +71,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class FormSection:
-    """What is told of one tool."""
+    """The figures of one tool."""
 
     tool: str
     refused: str
@@ -183,7 +184,7 @@ def _timing(told: Gathered) -> Picture | None:
         f"Pace: simulated time by wall time, in {host.pace.size} intervals between reports of the time master on "
         "/diagnostics. Lateness: from the moment at which a block was due to that at which the time master let it go; "
         "only where the speed is given. Latency: from there until the time master had heard that every member had "
-        "completed the block; members tell of several blocks at a time."
+        "completed the block; members report several blocks at a time."
     )
     return Picture("Pace, lateness and latency", figures.timing(host, told.step_ns * 1e-9), caption, "docs/cell.md")
 
@@ -299,7 +300,7 @@ def _about(told: Gathered) -> Grid | None:
         [printable(key), f"{len(text)} characters of base64" if key.startswith(FILE) else printable(text)]
         for key, text in sorted(given.items())
     )
-    caption = "What else the bag says of itself."
+    caption = "Further metadata of the bag."
     return Grid(("key", "text"), _cut(rows, len(given)), caption, "docs/bags.md", ("key", "text"))
 
 
@@ -366,7 +367,7 @@ def render(told: Gathered, name: str, command: str, made_of: Budget | None = Non
         forms = [_form(form, cycles) for form in told.forms]
         signals, timing = _signals(told), _timing(told)
         if cycles and not any(form.figures for form in forms):
-            caption = "What each controller measured in its own cycles."
+            caption = "The controllers' own measurements, by cycle."
             signals.append(Picture("Convergence", figures.convergence(None, cycles), caption, "docs/learning.md"))
     text: str = page_template(Path(__file__).with_name("report.html.j2")).render(
         title=f"Report of {printable(name, 80)}",

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 
 from lathe_rc.analysis.metrology import Lay
-from lathe_rc.cell.messages import Samples
+from lathe_rc.messages import Samples
 from lathe_rc.view.report_form import Form, Revolution
 from lathe_rc.view.report_gather import Gathered
 from lathe_rc.view.report_host import Host
@@ -28,7 +28,7 @@ _TICKS = 8  # font size
 _LONGEST_LABEL = 60  # characters
 _MOST_LENGTH = 1e3  # [m]
 _MOST_VALUE = 1e12  # of other signals
-_ALMOST = 1e-9  # of their size, by which numbers that are told apart differ
+_ALMOST = 1e-9  # of their size, by which numbers differ that count as two
 STYLE: Any = {"svg.hashsalt": "lathe_rc", "axes.titlesize": 10, "axes.labelsize": 9, "legend.fontsize": 8}
 STYLE |= {"xtick.labelsize": _TICKS, "ytick.labelsize": _TICKS}
 

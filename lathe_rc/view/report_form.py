@@ -11,9 +11,9 @@ import numpy as np
 from lathe_rc import part
 from lathe_rc.analysis.metrology import POINTS, Lay, Measurement, evenly, lay, measure
 from lathe_rc.analysis.tolerance import Judge, Verdict
-from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.view.report_series import Envelope, MeanRows
 
 ACROSS = 512  #: angles of the map
@@ -27,7 +27,7 @@ _TURN = 2.0 * np.pi
 
 @dataclass(frozen=True)
 class Revolution:
-    """A revolution that is told of.
+    """A revolution in the report.
 
     Attributes:
         numbers: see `lathe_rc.part.numbers`.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a report tells of a bag, gathered in one pass and in memory that does not grow with the bag."""
+"""The figures of a report, gathered in one pass over the bag and in memory that does not grow with it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,18 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from lathe_rc import happened
-from lathe_rc.bag import story
+from lathe_rc import event_log, messages
+from lathe_rc.bag import provenance
+from lathe_rc.bag.provenance import nose_radius
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.stream import Feeder
 from lathe_rc.bag.snapshot import first_sample, span_of
-from lathe_rc.bag.source import Source
-from lathe_rc.bag.story import nose_radius
-from lathe_rc.bag.stream import Feeder
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.happened import HAPPENED, Happening
+from lathe_rc.event_log import LOGGED, LogEntry
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_host import TYPES as HOST_TYPES
 from lathe_rc.view.report_host import Host
@@ -77,7 +76,7 @@ class Curves:
             for name in names
         }
         self.cycles = {(topic, name): Envelope() for kind, name in _CYCLES.items() for topic in of_type(types, kind)}
-        self.events: list[Happening] = []
+        self.events: list[LogEntry] = []
         self.event_count = 0
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
@@ -87,10 +86,10 @@ class Curves:
         for (topic, name), envelope in self.cycles.items():
             envelope.add(np.array([message.values[name] for message in sparse.get(topic, [])], dtype=float))
         for topic, found in sparse.items():
-            if self._types[topic] in HAPPENED:
+            if self._types[topic] in LOGGED:
                 self.event_count += len(found)
                 room = max(0, _MOST_EVENTS - len(self.events))
-                self.events += [Happening(event.index, topic, happened.text(event)) for event in found[:room]]
+                self.events += [LogEntry(event.index, topic, event_log.text(event)) for event in found[:room]]
 
 
 def of_type(types: Mapping[str, str], kind: str) -> list[str]:
@@ -147,7 +146,7 @@ class Gathered:
 def _tolerances(about: Mapping[str, str]) -> tuple[Mapping[str, float], str]:
     """Tolerances by relative topic of the tool, and why they cannot be had."""
     try:
-        return story.tolerances(about), ""
+        return provenance.tolerances(about), ""
     except InputError as error:
         return {}, str(error)
 

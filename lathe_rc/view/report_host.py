@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the recorded host topics say: how the nodes fared, and how late the cell was."""
+"""The recorded host topics: the state of the nodes, and how late the cell was."""
 
 from dataclasses import dataclass, field
 from typing import Any
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
 from lathe_rc.view.report_series import Thinned
 
@@ -22,7 +22,7 @@ _MOST_VALUES = 64  # of a status
 
 @dataclass
 class Node:
-    """What a node said of itself, the newest.
+    """The newest state that a node has reported.
 
     Attributes:
         reports: how many times.

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from lathe_rc.cell.messages import Samples
+from lathe_rc.messages import Samples
 
 _MOST_VALUES = 8192
 

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 import rerun.blueprint as rrb
 
-from lathe_rc.cell import messages
-from lathe_rc.happened import HAPPENED
+from lathe_rc import messages
+from lathe_rc.event_log import LOGGED
 from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.rerun_signals import ERROR, PLOTS, POSITION, curve_path, curves
 
@@ -24,7 +24,7 @@ def _so_far() -> list[rrb.VisibleTimeRange]:
 
 
 def _latest() -> list[rrb.VisibleTimeRange]:
-    """What lies shortly before the time cursor: the plot takes its scale from that."""
+    """The range shortly before the time cursor: the plot takes its scale from that."""
     starts = {
         "time": rrb.TimeRangeBoundary.cursor_relative(seconds=-_LATEST_S),
         "revolution": rrb.TimeRangeBoundary.cursor_relative(seq=-_LATEST_REVOLUTIONS),
@@ -100,7 +100,7 @@ def blueprint(types: Mapping[str, str], *, live: bool = False) -> rrb.Blueprint:
     rows: list[rrb.View | rrb.Container] = [rrb.Horizontal(*top)] if top else []
     rows += first
     tabs: list[rrb.View] = list(plots.values())
-    if live or kinds & {*HAPPENED}:  # live, what had to be left out stands there
+    if live or kinds & {*LOGGED}:  # live, what had to be left out stands there
         tabs.append(rrb.TextLogView(origin="/events", name="events"))
     if tabs:
         rows.append(rrb.Tabs(*tabs, active_tab=0))

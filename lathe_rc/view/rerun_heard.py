@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is heard of running cells: kept until it can be shown, and told apart by run."""
+"""Messages of running cells: kept until they can be shown, separated by run."""
 
 import threading
 from collections import deque
@@ -10,7 +10,7 @@ Message = tuple[str, str, bytes]  # fully qualified topic, message type, encoded
 
 
 class Backlog:
-    """What has been heard and not been shown yet. When it is full, all of it is left out: what follows is whole again.
+    """Messages that have not been shown yet. When it is full, all of them are left out: later pieces are whole again.
 
     To leave out every second message instead would leave no piece without a gap.
 
@@ -37,7 +37,7 @@ class Backlog:
             self._news.notify()
 
     def close(self) -> None:
-        """Let the reader end when it has taken what is there."""
+        """Let the reader end when it has taken all pieces."""
         with self._news:
             self._closed = True
             self._news.notify()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs as they are heard, shown while they go on; knows nothing of ROS.
 
-Who only watches holds nobody up. What comes faster than it can be shown is left out, counted and said; a run that
+The view delays no member. Messages that come faster than it can show are left out, counted and reported; a run that
 begins anew, under whatever name, is a recording of its own.
 """
 
@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Signals
+from lathe_rc import messages
+from lathe_rc.cell.block import Block
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wire import Block, Decoder
+from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError, shown
+from lathe_rc.messages import Signals
 from lathe_rc.view.rerun_blueprint import blueprint
 from lathe_rc.view.rerun_heard import Order
 from lathe_rc.view.rerun_pieces import Pieces
@@ -31,7 +32,7 @@ _FLUSH = 30.0  # [s] for a viewer to take the rest of a recording
 
 @dataclass(frozen=True)
 class Shown:
-    """What a view has of a run.
+    """The view of a run.
 
     Attributes:
         run_id: of the run.
@@ -164,7 +165,7 @@ class Live:
         say: tells people.
 
     Attributes:
-        present: message type by topic, of what is there to be heard; a run begins with these.
+        present: message type by topic, of all topics that can be heard; a run begins with these.
         shown: the runs that are over.
     """
 

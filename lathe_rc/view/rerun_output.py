@@ -2,7 +2,6 @@
 """Where a view goes: a file, a window, a page for the browser, or a viewer that runs already."""
 
 import contextlib
-import importlib.util
 import os
 import signal
 import socket
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote, urlsplit
 
+from lathe_rc import extras
 from lathe_rc.cell.rerun_bridge import PORT, Kind
 from lathe_rc.errors import InputError, LatheError
 
@@ -31,8 +31,7 @@ def require() -> None:
     Raises:
         LatheError: it is not.
     """
-    if importlib.util.find_spec("rerun_bindings") is None:
-        raise LatheError("rerun is not installed; install it with: ./lathe setup view (or pip install rerun-sdk)")
+    extras.require("rerun_bindings")
     os.environ.setdefault("RUST_LOG", "off")  # what goes wrong is told by the command
 
 

@@ -42,7 +42,7 @@ def colours(error: Array) -> npt.NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class Outlook:
-    """What is known of a run before it is drawn.
+    """Facts of a run before it is drawn.
 
     Attributes:
         revolutions: that will be turned; 0: unknown.

@@ -2,22 +2,22 @@
 """Blocks of many topics, as they come, made into pieces of one length that all topics share.
 
 For a bag this fixes where the pieces begin, so that a picture does not depend on how the bag was cut. Live, it joins
-what several publishers send, and goes on where something is missing: who only watches has no claim on every block.
+what several publishers send, and goes on where something is missing: a viewer has no claim on every block.
 """
 
 from collections.abc import Mapping
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.engine import Sink
-from lathe_rc.cell.messages import Samples, Signals, full
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view.rerun_signals import wanted
 
 _AHEAD = 4  # pieces that wait for the topics that are late
 
 
 class _Part:
-    """What has come of one topic for one piece."""
+    """The part of a piece that has come of one topic."""
 
     def __init__(self, msgtype: str, size: int) -> None:
         fields = wanted(msgtype)
@@ -45,7 +45,7 @@ class Pieces:
         sink: gets them, by fully qualified topic.
 
     Attributes:
-        first: sample that the first piece begins with. Who joins amid a run begins where all topics are there whole.
+        first: sample that the first piece begins with. A view that joins amid a run begins where all topics are whole.
         lost: pieces that were handed on without some topic, or not at all.
     """
 

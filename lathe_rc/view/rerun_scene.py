@@ -12,12 +12,11 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from lathe_rc import happened
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals, full
+from lathe_rc import event_log, messages
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import LatheError, shown
-from lathe_rc.happened import HAPPENED
+from lathe_rc.event_log import LOGGED
+from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.rerun_revolutions import ANGLES, HIGHEST, Revolution, Revolutions
 from lathe_rc.view.rerun_signals import CYCLES, curve_path, curves, envelope
@@ -26,12 +25,12 @@ _POSES = 250.0  # of part and tool in a second
 _ROWS = 512  # of the map
 _BARS = np.arange(1, HIGHEST + 1) - 0.5  # left edges: Rerun draws bars to the right of their place
 _GROWTH = 8  # the map is sent again when it has this part more rows
-# Colours of Okabe and Ito, which most colour-blind people can tell apart.
+# Colours of Okabe and Ito, which most colour-blind people can distinguish.
 _PALETTE = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (240, 228, 66), (213, 94, 0))
 
 
 class Scene:
-    """Logs pieces of a run; a sink of `lathe_rc.bag.stream.feed`, or behind `lathe_rc.view.rerun_pieces.Pieces`.
+    """Logs pieces of a run; a sink of `bag.reading.stream.feed`, or behind `lathe_rc.view.rerun_pieces.Pieces`.
 
     A piece may lack topics, and there may be gaps between pieces. Curves have the same points however a run is cut if
     pieces begin at multiples of ``window``.
@@ -184,15 +183,15 @@ class Scene:
         self._send(path, self._when(first + at, number), rr.Scalars.columns(scalars=values[at]))
 
     def _tell(self, topic: str, found: list[Sparse]) -> None:
-        """What controllers say of their cycles, and events."""
+        """The controllers' reports of their cycles, and events."""
         index, kind = np.array([message.index for message in found]), found[0].type
         if kind in CYCLES:
             cycle = CYCLES[kind]
             values = parts.log_um(np.array([message.values[cycle.error] for message in found], dtype=np.float64))
             number = np.array([message.values[cycle.counter] for message in found])
             self._send(f"learning{topic}", self._when(index, number), rr.Scalars.columns(scalars=values))
-        elif kind in HAPPENED:
-            texts = [f"{topic.strip('/')}: {happened.text(message)}" for message in found]
+        elif kind in LOGGED:
+            texts = [f"{topic.strip('/')}: {event_log.text(message)}" for message in found]
             self._send("events", self._when(index, None), rr.TextLog.columns(text=texts))
 
     def _part(self, first: int, angle: Samples, tool: Signals) -> None:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, full
-from lathe_rc.happened import HAPPENED
+from lathe_rc import messages
+from lathe_rc.event_log import LOGGED
+from lathe_rc.messages import Samples, full
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ _SLIDE = {"position": Curve(SLIDE, "actual", 1e3)}  # of a state that a servo co
 
 @dataclass(frozen=True)
 class Cycle:
-    """How controllers tell of a cycle: field of its error [m], field of its number, and a word for the error."""
+    """How controllers report a cycle: field of its error [m], field of its number, and a word for the error."""
 
     error: str
     counter: str
@@ -68,7 +68,7 @@ _PART = {
 
 
 def curves(types: Mapping[str, str]) -> dict[str, dict[str, Curve]]:
-    """What is drawn of a recording, by fully qualified topic and field.
+    """The drawn curves of a recording, by fully qualified topic and field.
 
     Args:
         types: message type by topic.
@@ -87,7 +87,7 @@ def wanted(msgtype: str) -> set[str]:
 
 def drawn(msgtype: str) -> bool:
     """Whether a scene has any use for messages of a type."""
-    return bool(wanted(msgtype)) or msgtype in CYCLES or msgtype in HAPPENED
+    return bool(wanted(msgtype)) or msgtype in CYCLES or msgtype in LOGGED
 
 
 def curve_path(topic: str, field: str) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tests of the system share."""
+"""Fixtures of the system tests."""
 
 import subprocess
 

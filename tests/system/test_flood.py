@@ -8,9 +8,8 @@ import pytest
 from cells import block, scenario
 from lathe_rc_msgs.msg import EncoderBlock, Member
 
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.bag import reader
-from lathe_rc.cell import messages
 from lathe_rc.nodes.ports import latched_qos
 
 pytestmark = pytest.mark.system
@@ -23,20 +22,20 @@ def resident(pid):
 
 
 def test_a_flood_takes_no_memory(ghost, domain, tmp_path):
-    """While the cell goes slowly; nearly all the nodes have to do is what comes then."""
+    """While the cell goes slowly; the flood is nearly all that the nodes have to work on."""
     plain = scenario(spindle_encoder={"revolutions": 30.0, "speed_factor": 0.05})
     cell = harness.with_recorder(plain, tmp_path / "bag", keep=True)
     encoder = ghost.create_publisher(EncoderBlock, "/encoder", latched_qos(500))
     members = ghost.create_publisher(Member, "/members", latched_qos(500))
 
     def flood(publisher, make, end):
-        """Half as many at a time as the publisher keeps; ``end`` makes a message of /end that the tool tells of."""
+        """Half as many at a time as the publisher keeps; ``end`` makes a message of /end that the tool reports."""
         for part in range(7):
             for count in range(250 * part, 250 * (part + 1)):
                 publisher.publish(make(count))
             publisher.publish(end(f"end of part {part}"))
             told = f"{publisher.topic_name}: message of run 'end of part {part}' from /end; expected run 'test'"
-            processes.wait_for("stranger", "tool", message=told)
+            processes.wait_for("foreign_message", "tool", message=told)
 
     with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
         processes.wait_for("cycle")

@@ -21,7 +21,8 @@ from cells import scenario, told_until_all_have_ended
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness
-from lathe_rc.bag import reader, recover
+from lathe_rc.bag import reader
+from lathe_rc.bag.repairing import recover
 
 pytestmark = pytest.mark.system
 

@@ -81,7 +81,7 @@ def test_every_figure_of_the_report_renders(page, tmp_path):
 
 
 def test_a_page_of_many_figures_is_not_blank(page, tmp_path):
-    """What the browser paints has the colours of the figures."""
+    """The browser paints the figures in their colours."""
     from matplotlib.image import imread
 
     shot = tmp_path / "shot.png"

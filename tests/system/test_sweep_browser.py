@@ -17,7 +17,8 @@ from lathe_rc.sweep.space import Space
 
 pytestmark = pytest.mark.system
 
-# Runs in the page once its figures stand: chooses another pair, drags along the first axis, and tells what is there.
+# Runs in the page once its figures stand: chooses another pair, drags along the first axis, and writes its findings
+# into the title.
 _HAND = """<script>
 const VIEWS = {}, embed = vegaEmbed;
 vegaEmbed = async (place, ...rest) => (VIEWS[place.id] = await embed(place, ...rest));

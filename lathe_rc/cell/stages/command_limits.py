@@ -6,12 +6,12 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.control.limits import CommandLimits, LimiterTable, limit, limiter
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 
 LIMITED, FREE = "limited", "free"  #: events: a sample is clipped; none has been for a while
 _TELL = 0.1  # [s] after which a command that goes on being clipped says how often
@@ -19,7 +19,7 @@ _QUIET = 10e-3  # [s] without a clipped sample until a command is free again
 
 
 class LimitedParameters(NodeParameters):
-    """What the command is kept within, on its way to the drive."""
+    """Limits of the command on its way to the drive."""
 
     command_stroke: Annotated[float, Ge(0)] = parameter(
         0.0, "the command is kept within this to each side; 0: none", "m"
@@ -66,7 +66,7 @@ class LimitedCommand:
 
 @kernel
 def limited(limits: LimiterTable, first: int, command: Samples) -> Samples:
-    """What the drive gets [m], shape (n,), of samples ``first`` on; see `LimitedCommand`."""
+    """The drive's input [m], shape (n,), of samples ``first`` on; see `LimitedCommand`."""
     if limits.clipped.size == 1:
         return command
     given = np.empty_like(command)
@@ -111,7 +111,7 @@ class Clipping:
         return found
 
     def finish(self, index: int) -> list[Sparse]:
-        """What has not been said yet of the samples up to ``index``, if there is anything."""
+        """The events of the samples up to ``index`` that have not been published yet."""
         if self._clipped == self._before:
             return []
         action = f"{LIMITED}:{self._which} {self._clipped - self._before} samples were clipped"

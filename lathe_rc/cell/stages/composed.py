@@ -10,7 +10,7 @@ T = TypeVar("T", bound=NodeParameters)
 
 
 class ComposedParameters(NodeParameters):
-    """What the parts share."""
+    """Parameters that the parts share."""
 
     discretisation: Discretisation = parameter("foh", "foh: exact for commands linear between samples; or tustin")
 

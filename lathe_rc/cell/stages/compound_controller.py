@@ -14,10 +14,8 @@ from annotated_types import Ge, Gt
 
 from lathe_rc.analysis.learning import Array, Complex, Response
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, feed_forward
+from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, ForwardTable, fed_forward
 from lathe_rc.cell.stages.law import Now
-from lathe_rc.control.angle_filter import AngleFilterTable, at, follow
-from lathe_rc.control.disturbance import FormAhead
 from lathe_rc.jit import kernel
 
 
@@ -31,24 +29,16 @@ class CompoundControllerParameters(FormLawParameters):
 
 
 class Memory(NamedTuple):
-    """What the law works on.
+    """Memory of the law.
 
     Attributes:
-        spindle: filter of the angle.
-        form: that is turned.
-        a1, a2, ahead: of the model [s, s², s].
-        late: samples until an error is seen.
+        forward: the form through the inverse of the drive.
         proportional, integral, derivative: of the PID, the latter two per sample.
         keep: of a sample before in the low-pass of the derivative.
         state: integral, filtered derivative, error before, shape (3,).
     """
 
-    spindle: AngleFilterTable
-    form: FormAhead
-    a1: float
-    a2: float
-    ahead: float
-    late: int
+    forward: ForwardTable
     proportional: float
     integral: float
     derivative: float
@@ -59,13 +49,11 @@ class Memory(NamedTuple):
 @kernel
 def sample(memory: Memory, now: Now) -> float:
     """See `Law`."""
-    spindle, state = memory.spindle, memory.state
-    follow(spindle, now.angle)
-    angle, speed, acceleration = at(spindle, memory.ahead)
-    command = feed_forward(memory.form, memory.a1, memory.a2, angle, speed, acceleration)
-    if now.sample < memory.late:
+    state, late = memory.state, memory.forward.late
+    command = fed_forward(memory.forward, now.angle)
+    if now.sample < late:
         return command
-    if now.sample == memory.late:
+    if now.sample == late:
         state[2] = now.error
     if now.learning:
         state[0] += memory.integral * now.error
@@ -91,11 +79,7 @@ class CompoundController(FormLaw):
         parameters = self.parameters
         step = parameters.step
         return Memory(
-            self.make_filter(),
-            self.form,
-            *parameters.inverse,
-            parameters.model_delay,
-            parameters.feedback_delay,
+            self.make_forward(),
             parameters.proportional,
             parameters.integral * step,
             parameters.derivative / step,

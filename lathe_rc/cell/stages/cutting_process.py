@@ -7,28 +7,19 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
+from lathe_rc import messages
 from lathe_rc.analysis.shaft import STEEL_MODULUS, Shaft, Support
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-from lathe_rc.plants.cutting import (
-    PAPER,
-    REALISTIC,
-    RIGID,
-    CutTable,
-    CuttingProcess,
-    Elasticity,
-    Flank,
-    HardSpot,
-    Part,
-    Wear,
-    cut_along,
-    failure,
-)
+from lathe_rc.messages import Samples, Signals
+from lathe_rc.plants.chip import CutTable, failure
+from lathe_rc.plants.cutting import CuttingProcess, cut_along
 from lathe_rc.plants.cutting_force import SpecificForce
+from lathe_rc.plants.deflection import PAPER, REALISTIC, RIGID, Elasticity
+from lathe_rc.plants.flank import Flank, Wear
+from lathe_rc.plants.workpiece import HardSpot, Part
 from lathe_rc.safety.faults import Fault
 from lathe_rc.signals.allowance import Allowance, AllowanceTable, allow, mean_reverting, unbounded
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
@@ -44,7 +35,7 @@ _HEIGHTS = 201  # places along a shaft between which its compliance is linear
 
 
 class CuttingProcessParameters(NodeParameters):
-    """What moves the edge, the material, the blank, the part, and what gives way."""
+    """Parameters of the edge, the material, the blank and the part, and of everything that gives way."""
 
     moved_by: list[Literal["tool", "cross", "longitudinal"]] = parameter(
         ["cross", "longitudinal"], "what moves the edge: the tool drives, the cross feed, the longitudinal feed"
@@ -198,7 +189,7 @@ class CuttingProcessParameters(NodeParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         cut: the machine.

@@ -5,13 +5,13 @@ from typing import Annotated, Literal, NamedTuple
 
 from annotated_types import Ge, Gt
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Stage
 from lathe_rc.control.decoupler import LAG, LEAK, PRESETS, Channels, Decoupler, compensators, decouple_along
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 from lathe_rc.transfer import System, TransferFunction
 
 _CHANNELS = ("w1", "w2", "w3", "w4")
@@ -62,7 +62,7 @@ class DecouplerParameters(NodeParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on: K1 and K2 with their states."""
+    """Memory of the step: K1 and K2 with their states."""
 
     k1: System
     state1: Samples

@@ -17,17 +17,8 @@ from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, feed_forward
 from lathe_rc.cell.stages.law import Now
 from lathe_rc.control.angle_filter import AngleFilterTable, at, follow
-from lathe_rc.control.disturbance import (
-    LEAK,
-    DisturbanceTable,
-    FormAhead,
-    commanded,
-    disturbance,
-    expected,
-    forget,
-    observed,
-    smoothing,
-)
+from lathe_rc.control.disturbance import DisturbanceTable, FormAhead, commanded, disturbance, forget, observed
+from lathe_rc.control.disturbance_memory import LEAK, expected, smoothing
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 
@@ -58,7 +49,7 @@ class DisturbanceControllerParameters(FormLawParameters):
     )
 
     def make(self, node: str) -> DisturbanceTable:
-        """What a node knows before its first sample.
+        """The state before the first sample.
 
         Raises:
             InputError: a memory that cannot be made.
@@ -85,7 +76,7 @@ class DisturbanceControllerParameters(FormLawParameters):
 
 
 class Memory(NamedTuple):
-    """What the law works on.
+    """Memory of the law.
 
     Attributes:
         spindle: filter of the angle.
@@ -113,7 +104,7 @@ def sample(memory: Memory, now: Now) -> float:
         found = observed(known, memory.form, now.sample, angle, speed, now.position, now.learning)
     angle, speed, acceleration = at(spindle, memory.ahead)
     command = feed_forward(memory.form, known.model[0], known.model[1], angle, speed, acceleration)
-    command -= expected(known, angle, speed) + found
+    command -= expected(known.memory, angle, speed) + found
     commanded(known, now.sample, command)
     return command
 

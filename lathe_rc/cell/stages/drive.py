@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all drives of the tool have in common, for the checks before a start."""
+"""The common part of all drives of the tool, for the checks before a start."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from lathe_rc.cell.stage import Stage
 
 @dataclass(frozen=True)
 class Limits:
-    """What a drive can follow."""
+    """The motion that a drive can follow."""
 
     stroke: float  #: [m] to each side
     velocity: float  #: [m/s]
@@ -26,5 +26,5 @@ class Drive(Stage):
         """Response of the displacement to each command that a controller may learn, by topic before remapping."""
 
     def limits(self) -> Mapping[str, Limits]:
-        """What the drive can follow, by state topic before remapping; for drives that carry the whole profile."""
+        """The limits of the drive, by state topic before remapping; for drives that carry the whole profile."""
         return {}

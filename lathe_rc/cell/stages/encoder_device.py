@@ -8,13 +8,12 @@ from typing import Annotated, Literal
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from lathe_rc import resources
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc import messages, resources
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Joint, Output, Sparse
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.signals.counts import CountedAngle, CsvReader
 
 TOO_FAST, TOO_SLOW, LATE = "too fast", "too slow", "late"  #: events that come about by themselves
@@ -57,7 +56,7 @@ class EncoderDeviceParameters(TimeMasterParameters):
         0.5, "topic, line: how far the cell may fall behind the readings; farther is an error", "s"
     )
     max_deviation: Annotated[float, Gt(0), Lt(1)] = parameter(
-        0.2, "the checks before the start count on speeds this near to the nominal one; events tell of others", "1"
+        0.2, "the checks before the start count on speeds this near to the nominal one; events report others", "1"
     )
     max_acceleration: Annotated[float, Ge(0)] = parameter(
         200.0, "the checks before the start count on no greater acceleration of the spindle", "rad/s^2"
@@ -218,7 +217,7 @@ class EncoderDevice(TimeMaster):
         return self._say(first, out["speed"])
 
     def _say(self, first: int, speed: Samples) -> list[Sparse]:
-        """What is to be told of these samples; of the speed once."""
+        """Events of these samples; those of the speed once."""
         low, high = self.speed_range()
         said = []
         for what, outside in ((TOO_FAST, speed > high), (TOO_SLOW, speed < low)):

@@ -7,8 +7,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc import messages
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse, Stage
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedParameters, remembered
@@ -24,7 +23,8 @@ from lathe_rc.cell.stages.obedience import (
 )
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-from lathe_rc.plants import feed
+from lathe_rc.messages import Samples, Signals
+from lathe_rc.plants import feed_models
 from lathe_rc.plants.feed import Feedback, FeedDrive, FeedTable, advance
 from lathe_rc.plants.friction import Friction, mobility
 from lathe_rc.plants.screw import Screw
@@ -117,10 +117,10 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
             InputError: see `lathe_rc.plants.feed`.
         """
         if self.model == "fourth_order":
-            return feed.fourth_order(self.gain, self.a1, self.a2, self.a3, self.a4)
+            return feed_models.fourth_order(self.gain, self.a1, self.a2, self.a3, self.a4)
         if self.model == "sampled":
-            return feed.sampled(self.sampled_gain, self.sampled_lag)
-        return feed.dc_screw(self.velocity_gain, self.lags or [0.045], self.zero)
+            return feed_models.sampled(self.sampled_gain, self.sampled_lag)
+        return feed_models.dc_screw(self.velocity_gain, self.lags or [0.045], self.zero)
 
     def rubbing(self, node: str) -> Friction | None:
         """The friction of a node, if it has any.
@@ -181,7 +181,7 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         drive: the machine.

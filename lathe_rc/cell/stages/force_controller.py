@@ -6,8 +6,7 @@ from typing import Annotated, NamedTuple
 
 from annotated_types import Ge, Gt
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc import messages
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.cell.stages.obedience import listens
@@ -15,6 +14,7 @@ from lathe_rc.cell.stages.servo import Listener, ServoParameters, listener, pid_
 from lathe_rc.cell.stages.trajectory import Course, Trajectory, follow
 from lathe_rc.control.pid import FORCE, PidTable
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.safety.state_machine import Reaction
 
 
@@ -33,7 +33,7 @@ class ForceControllerParameters(ServoParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on."""
+    """Memory of the step."""
 
     course: Course
     pid: PidTable

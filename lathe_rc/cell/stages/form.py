@@ -8,26 +8,18 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from lathe_rc import resources
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc import messages, resources
 from lathe_rc.cell.parameters import NodeParameters, Value, about, parameter
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 from lathe_rc.plants.tool import equal
+from lathe_rc.signals.measured_profile import read_csv
 from lathe_rc.signals.part_profile import PartProfile, checked
-from lathe_rc.signals.profile import (
-    Harmonics,
-    Piston,
-    Polygon,
-    Profile,
-    deviation_along,
-    height_along,
-    read_csv,
-    tabulated,
-)
+from lathe_rc.signals.profile import Harmonics, Piston, Polygon, Profile
+from lathe_rc.signals.profile_table import deviation_along, height_along, tabulated
 from lathe_rc.signals.tip_path import TipPath
 
 _OWN = ("harmonics", "piston", "polygon", "csv")
@@ -128,11 +120,11 @@ class FormTable(NamedTuple):
     """A `Form` for kernels.
 
     Attributes:
-        heights, table: see `lathe_rc.signals.profile.ProfileTable`; of where the tool has to be.
+        heights, table: see `lathe_rc.signals.profile_table.ProfileTable`; of where the tool has to be.
         told: table of what the controllers take that for.
         alike: whether both are the same.
         slide: number of the first input of the longitudinal slide, if that makes the height; 0: it does not.
-        feed, start, part: otherwise, see `lathe_rc.signals.profile.height_along`.
+        feed, start, part: otherwise, see `lathe_rc.signals.profile_table.height_along`.
     """
 
     heights: Samples

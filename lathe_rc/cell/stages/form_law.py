@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What laws have in common that know the form of the part: they feed it forward through the inverse of the drive.
+"""The common part of laws that know the form of the part: they feed it forward through the inverse of the drive.
 
     u = r(φ⁺) + a1·Ω⁺·r'(φ⁺) + a2·(Ω⁺²·r''(φ⁺) + (dΩ/dt)·r'(φ⁺)),    φ⁺ = φ(t + τ), Ω⁺ = Ω(t + τ)
 
@@ -8,7 +8,7 @@ right at any speed. Angle, speed and dΩ/dt are those of `lathe_rc.control.angle
 """
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -16,11 +16,11 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc.cell.parameters import Value, parameter
 from lathe_rc.cell.stages.form import FORM, Form, FormParameters
 from lathe_rc.cell.stages.law import Law, LawParameters
-from lathe_rc.control.angle_filter import AngleFilterTable, angle_filter
+from lathe_rc.control.angle_filter import AngleFilterTable, angle_filter, at, follow
 from lathe_rc.control.disturbance import FormAhead
 from lathe_rc.errors import InputError
-from lathe_rc.jit import kernel
-from lathe_rc.signals.profile import derivatives_at
+from lathe_rc.jit import inlined, kernel
+from lathe_rc.signals.profile_table import derivatives_at
 
 
 class FormLawParameters(LawParameters, FormParameters):
@@ -62,6 +62,24 @@ class FormLawParameters(LawParameters, FormParameters):
         return 2.0 * self.model_damping / self.model_natural_frequency, 1.0 / self.model_natural_frequency**2
 
 
+class ForwardTable(NamedTuple):
+    """Feed-forward through the model that is given, for kernels.
+
+    Attributes:
+        spindle: filter of the angle.
+        form: that is turned.
+        a1, a2, ahead: of the model [s, s², s].
+        late: samples until an error is seen.
+    """
+
+    spindle: AngleFilterTable
+    form: FormAhead
+    a1: float
+    a2: float
+    ahead: float
+    late: int
+
+
 class FormLaw(Law):
     """Base of laws that know the form.
 
@@ -99,6 +117,13 @@ class FormLaw(Law):
             parameters.expected_frequency,
         )
 
+    def make_forward(self) -> ForwardTable:
+        """The feed-forward before sample 0."""
+        parameters = self.parameters
+        return ForwardTable(
+            self.make_filter(), self.form, *parameters.inverse, parameters.model_delay, parameters.feedback_delay
+        )
+
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
         """See `Learner`: half a revolution, since what is late must not meet what is learned."""
         return int(np.pi / (speed * self.parameters.step))
@@ -109,3 +134,11 @@ def feed_forward(form: FormAhead, a1: float, a2: float, angle: float, speed: flo
     """The command [m] that brings a drive to the form at an angle [rad], a speed [rad/s] and dΩ/dt [rad/s²]."""
     value, slope, bow = derivatives_at(form.heights, form.table, form.feed, form.start, form.part, angle)
     return value + a1 * speed * slope + a2 * (speed * speed * bow + acceleration * slope)
+
+
+@inlined
+def fed_forward(forward: ForwardTable, angle: float) -> float:
+    """The command [m] of a sample with the angle that the encoder has measured [rad]."""
+    follow(forward.spindle, angle)
+    ahead, speed, acceleration = at(forward.spindle, forward.ahead)
+    return feed_forward(forward.form, forward.a1, forward.a2, ahead, speed, acceleration)

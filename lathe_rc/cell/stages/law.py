@@ -27,9 +27,8 @@ import numpy as np
 import numpy.typing as npt
 from annotated_types import Ge
 
+from lathe_rc import messages
 from lathe_rc.analysis.learning import Array, Complex, Response, supremum
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
 from lathe_rc.cell.stages.learner import Learner, LearnerParameters
@@ -48,6 +47,7 @@ from lathe_rc.cell.stages.sampled import Sampled, checked
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import code_of_others
 from lathe_rc.jit import inlined
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.safety.state_machine import Reaction
 
 _TURN = 2.0 * np.pi
@@ -55,7 +55,7 @@ _DIVERGED = 1  # why a step stops
 
 
 class LawParameters(LearnerParameters):
-    """What every law has."""
+    """Parameters that every law has."""
 
     stop_ratio: Annotated[float, Ge(0)] = parameter(
         2.0,
@@ -65,7 +65,7 @@ class LawParameters(LearnerParameters):
 
 
 class Now(NamedTuple):
-    """What a law knows at a sample.
+    """The inputs of a law at a sample.
 
     Attributes:
         sample: index of the sample.
@@ -130,7 +130,7 @@ def _grows(guard: GuardTable, angle: float, error: float, form: float) -> bool:
 
 
 class LawMemory(NamedTuple):
-    """What the step of a law works on.
+    """Memory of the step of a law.
 
     Attributes:
         law: its own.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all controllers that learn a drive have in common: what they tell for the checks before a start."""
+"""The common part of all controllers that learn a drive, for the checks before a start."""
 
 from abc import abstractmethod
 from collections.abc import Collection
@@ -82,7 +82,7 @@ class Learner(Stage):
         return None
 
     def _make_obedience(self, settled: int) -> Obedience | None:
-        """What obeys the supervisor, if it does; errors of ``settled`` samples after a takeover are not learned."""
+        """The obedience to the supervisor, if any; errors of ``settled`` samples after a takeover are not learned."""
         parameters = self.parameters
         if not parameters.reaction_delay:
             return None

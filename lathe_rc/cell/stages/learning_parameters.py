@@ -147,7 +147,7 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
 
     @property
     def preview_time(self) -> float:
-        """What the lead law answers [s]: T0, or with the exact correction the model's delay alone."""
+        """The time that the lead law compensates [s]: T0, or with the exact correction the model's delay alone."""
         return self.model_delay if self.correction == "exact" else self.lead_time
 
     @property

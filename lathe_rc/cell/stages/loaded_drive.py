@@ -8,9 +8,8 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 from pydantic import create_model
 
+from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedCommand, limited, remembered
@@ -25,8 +24,11 @@ from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import CommandLimits, LimiterTable, limiter
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-from lathe_rc.plants.cutting import CutTable
-from lathe_rc.plants.loaded import Coil, LoadedDrive, LoadedTable, Piezo, advance_loaded, failure
+from lathe_rc.messages import Samples
+from lathe_rc.plants.chip import CutTable
+from lathe_rc.plants.coil import Coil
+from lathe_rc.plants.loaded import LoadedDrive, Piezo
+from lathe_rc.plants.loaded_motion import LoadedTable, advance_loaded, failure
 from lathe_rc.signals.allowance import AllowanceTable, allow
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
@@ -85,7 +87,7 @@ class LoadedFineParameters(PiezoActuatorParameters):
 
 
 class LoadedParameters(ComposedParameters):
-    """What drives under the cutting force have beyond the parameters of drives and cut."""
+    """Parameters of drives under the cutting force beyond those of drives and cut."""
 
     radial_ratio: Annotated[float, Ge(0), Le(2)] = parameter(
         0.4, "radial part of the cutting force, which pushes the tool out of the part, over the main one"
@@ -163,7 +165,7 @@ LoadedSeriesDriveParameters = create_model(
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         retraction, limits, limits_fine: of the commands.

@@ -7,13 +7,13 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc import messages
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, remembered
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderParameters
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.plants.spindle import Belt, LoadedSpindle, SpeedLoop, SpindleTable, failure, turn
 from lathe_rc.signals.encoder import EncoderTable, follow_law, read_off
 
@@ -62,7 +62,7 @@ class LoadedSpindleParameters(SpindleEncoderParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         encoder: with the law.

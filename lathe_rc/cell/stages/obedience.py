@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a controller or a feed drive does when the supervisor asks for a reaction."""
+"""Reactions of a controller or a feed drive to the supervisor."""
 
 import math
 from typing import Annotated, NamedTuple
@@ -8,14 +8,14 @@ import numpy as np
 import numpy.typing as npt
 from annotated_types import Gt
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc import messages
 from lathe_rc.cell.parameters import ObedientParameters, parameter
 from lathe_rc.cell.stage import Input, Sparse
 from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, take_over
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 from lathe_rc.safety.state_machine import Reaction
 
 OUT_OF_REACH = "out of reach"  #: event of a takeover that could not begin where the command was
@@ -41,7 +41,7 @@ class FeedObedientParameters(ObedientParameters):
     )
 
     def obedience(self, name: str, *, speed: bool, limit: float, settled: int) -> "Obedience":
-        """What obeys for a command of the feed.
+        """The obedience for a command of the feed.
 
         A command for a speed goes to 0, one for a position stays: so the slide stands. Nothing is taken out of the
         part along the slide.
@@ -123,7 +123,7 @@ def apply(obedience: ObedienceTable, command: Samples) -> None:
 
 NOBODY = ObedienceTable(
     np.zeros(2, np.int64), np.zeros(1), TakeoverTable(np.zeros(0), np.zeros(2, np.int64), np.zeros(2), np.zeros(2))
-)  #: for who listens to nobody
+)  #: of a node without a supervisor
 
 
 class Obedience:

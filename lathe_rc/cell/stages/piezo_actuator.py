@@ -8,9 +8,8 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
+from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
@@ -19,6 +18,7 @@ from lathe_rc.cell.stages.set_point import SetPoint, SetPointParameters, sum_up
 from lathe_rc.control.limits import LimiterTable
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 from lathe_rc.plants.hysteresis import (
     THRESHOLDS,
     WEIGHTS,
@@ -88,7 +88,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
             return self._plays(self.play_thresholds, self.play_weights, self.play_proportional)
 
     def _identified(self, named: _Named) -> PrandtlIshlinskii | BoucWen | None:
-        """What the linearisation takes for the hysteresis."""
+        """The linearisation's model of the hysteresis."""
         if not self.identified_weights:
             with named("identified_weights"):
                 if self.identified_thresholds or self.identified_proportional:
@@ -144,7 +144,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on."""
+    """Memory of the step."""
 
     signs: Samples
     limits: LimiterTable

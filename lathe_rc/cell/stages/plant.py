@@ -25,8 +25,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 from annotated_types import Ge, Gt
 
+from lathe_rc import messages
 from lathe_rc.analysis.learning import Array, Complex, Response
-from lathe_rc.cell import messages
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
@@ -52,7 +52,7 @@ class PlantParameters(LimitedParameters, RetractionParameters):
 
 
 class PlantMemory(NamedTuple):
-    """What the step of a drive works on.
+    """Memory of the step of a drive.
 
     Attributes:
         retraction: what it does by itself when members are lost.

@@ -9,9 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 
-from lathe_rc import resources
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
+from lathe_rc import messages, resources
 from lathe_rc.cell.native import Step
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
@@ -21,10 +19,12 @@ from lathe_rc.cell.stages.servo import Listener, ServoParameters, listener, pid_
 from lathe_rc.cell.stages.trajectory import Course, Trajectory, follow
 from lathe_rc.control import periodic
 from lathe_rc.control.periodic import PeriodicController, PeriodicLaw, PeriodicState
+from lathe_rc.control.periodic_gains import PRESETS
 from lathe_rc.control.pid import POSITION, Pid, PidTable
 from lathe_rc.control.predistortion import PathTable, Predistortion, offset_along
 from lathe_rc.control.sampled_link import HeldLink, SampledLink, correct_along
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.example_002 import PERIOD
 
@@ -84,7 +84,7 @@ _TOLD = 1  # why a step stops: the log is full
 
 
 class Wanted(NamedTuple):
-    """What is controlled, for the steps of all laws.
+    """The controlled quantity, for the steps of all laws.
 
     Attributes:
         course: of the set point.
@@ -101,7 +101,7 @@ class Wanted(NamedTuple):
 
 
 class PidMemory(NamedTuple):
-    """What the step of the PID works on."""
+    """Memory of the step of the PID."""
 
     wanted: Wanted
     pid: PidTable
@@ -109,14 +109,14 @@ class PidMemory(NamedTuple):
 
 
 class LinkMemory(NamedTuple):
-    """What the step of the sampled link works on."""
+    """Memory of the step of the sampled link."""
 
     wanted: Wanted
     link: HeldLink
 
 
 class PeriodicMemory(NamedTuple):
-    """What the step of the periodic law works on.
+    """Memory of the step of the periodic law.
 
     Attributes:
         wanted: see above.
@@ -289,7 +289,7 @@ class PositionController(Stage):
                 )
         with about(self.name, "period", "memory_filter", "divisor"):
             return PeriodicController(
-                periodic.PRESETS[parameters.periodic_gains],
+                PRESETS[parameters.periodic_gains],
                 period=parameters.period,
                 limit=parameters.command_limit,
                 step_s=parameters.step * parameters.divisor,

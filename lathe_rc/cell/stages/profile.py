@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The desired form under the tool as a node of its own, for drives that need it before the tool computes."""
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached, Stage
 from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, evaluate
 from lathe_rc.jit import kernel

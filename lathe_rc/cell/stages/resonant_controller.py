@@ -19,10 +19,9 @@ from annotated_types import Ge, Gt, Le
 
 from lathe_rc.analysis.learning import Array, Complex, Response
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, feed_forward
+from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, ForwardTable, fed_forward
 from lathe_rc.cell.stages.law import Now
-from lathe_rc.control.angle_filter import AngleFilterTable, at, follow
-from lathe_rc.control.disturbance import FormAhead
+from lathe_rc.control.angle_filter import at
 from lathe_rc.jit import kernel
 
 
@@ -34,24 +33,16 @@ class ResonantControllerParameters(FormLawParameters):
 
 
 class Memory(NamedTuple):
-    """What the law works on.
+    """Memory of the law.
 
     Attributes:
-        spindle: filter of the angle.
-        form: that is turned.
-        a1, a2, ahead: of the model [s, s², s].
-        late: samples until an error is seen.
+        forward: the form through the inverse of the drive.
         step: sampling step [s].
         gain: 2g·step.
         amplitudes: a and b by order, shape (2, K + 1) [m].
     """
 
-    spindle: AngleFilterTable
-    form: FormAhead
-    a1: float
-    a2: float
-    ahead: float
-    late: int
+    forward: ForwardTable
     step: float
     gain: float
     amplitudes: Array
@@ -60,15 +51,14 @@ class Memory(NamedTuple):
 @kernel
 def sample(memory: Memory, now: Now) -> float:
     """See `Law`."""
-    spindle, a1, a2, amplitudes = memory.spindle, memory.a1, memory.a2, memory.amplitudes
-    follow(spindle, now.angle)
-    angle, speed, acceleration = at(spindle, memory.ahead)
-    command = feed_forward(memory.form, a1, a2, angle, speed, acceleration)
-    if now.sample >= memory.late and now.learning:
-        past, turning, _ = at(spindle, -memory.late * memory.step)
+    forward, amplitudes = memory.forward, memory.amplitudes
+    command = fed_forward(forward, now.angle)
+    spindle, a1, a2 = forward.spindle, forward.a1, forward.a2
+    if now.sample >= forward.late and now.learning:
+        past, turning, _ = at(spindle, -forward.late * memory.step)
         amplitudes[0, 0] += 0.5 * memory.gain * now.error
         # cos and sin of k·(φ - Ωτ) by rotation; 1/Wi = (1 + a1·p + a2·p²)·e^{pτ} has the rest of the phase.
-        one, two = np.cos(past - turning * memory.ahead), np.sin(past - turning * memory.ahead)
+        one, two = np.cos(past - turning * forward.ahead), np.sin(past - turning * forward.ahead)
         cosine, sine = one, two
         for k in range(1, amplitudes.shape[1]):
             p = k * turning
@@ -100,11 +90,7 @@ class ResonantController(FormLaw):
         """See `Law`."""
         parameters = self.parameters
         return Memory(
-            self.make_filter(),
-            self.form,
-            *parameters.inverse,
-            parameters.model_delay,
-            parameters.feedback_delay,
+            self.make_forward(),
             parameters.step,
             2.0 * parameters.rate * parameters.step,
             np.zeros((2, parameters.highest_order + 1)),

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a drive of the tool does by itself when members of the cell are lost: nobody need command it."""
+"""How a drive of the tool retracts by itself, without a command, when members of the cell are lost."""
 
 from typing import Annotated
 
 from annotated_types import Gt
 
-from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, follows, take_over
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 
 
 class BoundedParameters(NodeParameters):
-    """What a command that is taken over keeps within."""
+    """Bounds of a command that is taken over."""
 
     retract_velocity: Annotated[float, Gt(0)] = parameter(0.1, "largest velocity of a takeover", "m/s")
     retract_acceleration: Annotated[float, Gt(0)] = parameter(50.0, "its largest acceleration", "m/s^2")
@@ -55,7 +55,7 @@ class OwnRetraction:
 
 @kernel
 def followed(takeover: TakeoverTable, command: Samples) -> Samples:
-    """What the drive follows [m], shape (n,)."""
+    """The command that the drive follows [m], shape (n,)."""
     own = command if follows(takeover) else command.copy()
     take_over(takeover, own)
     return own

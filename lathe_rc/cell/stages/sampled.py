@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What laws and drives of one's own have in common: a step that calls a function of theirs for each sample."""
+"""The common part of users' laws and drives: a step that calls a function of theirs for each sample."""
 
 from abc import abstractmethod
 from collections.abc import Callable

@@ -8,9 +8,8 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 from pydantic import create_model
 
+from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, limited
@@ -23,6 +22,7 @@ from lathe_rc.cell.stages.set_point import SetPoint, sum_up
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import LimiterTable
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 from lathe_rc.plants.series import SeriesDrive, SeriesTable, advance
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
@@ -31,7 +31,7 @@ _FINE = "fine_"  # begins the parameters of the fine drive
 
 
 class SeriesParameters(ComposedParameters):
-    """What the series drive has beyond the parameters of both drives."""
+    """Parameters of the series drive beyond those of both drives."""
 
     mass_ratio: Annotated[float, Ge(0), Le(1)] = parameter(0.1, "mass of the tool over coarse_moving_mass", "1")
 
@@ -64,7 +64,7 @@ SeriesDriveParameters = create_model(
 
 
 class Memory(NamedTuple):
-    """What the step works on; the noise is that of the carriage's sensor, which the machine itself rounds."""
+    """Memory of the step; the noise is that of the carriage's sensor, which the machine itself rounds."""
 
     retraction: TakeoverTable
     limits: LimiterTable

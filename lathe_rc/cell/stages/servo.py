@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What servo controllers have in common: a PID, converters, and a feedback edge."""
+"""The common part of servo controllers: a PID, converters, and a feedback edge."""
 
 from typing import Annotated, Literal, NamedTuple
 
 from annotated_types import Ge, Gt, Le
 
-from lathe_rc.cell.messages import Samples
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE
 from lathe_rc.cell.stages.obedience import (
@@ -22,6 +21,7 @@ from lathe_rc.cell.stages.obedience import (
 from lathe_rc.cell.stages.trajectory import TrajectoryParameters
 from lathe_rc.control.pid import Pid, PidGains, PidTable, control_along, lets_learn
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 from lathe_rc.safety.state_machine import Reaction
 
 
@@ -52,7 +52,7 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
     )
 
     def obeys(self, name: str) -> Obedience | None:
-        """What obeys the supervisor for a node; None if nobody is listened to.
+        """The obedience of a node; None if it reads no supervisor.
 
         Raises:
             InputError: see `FeedObedientParameters.obedience`; so no command is ever out of reach.
@@ -83,7 +83,7 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
 
 
 class Listener(NamedTuple):
-    """Who may have to obey, for kernels.
+    """The obedience of a node, if it has any, for kernels.
 
     Attributes:
         obedience: to the supervisor, if it ``listens``.

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fine drive is asked for: a learned command, the reference, displacements to compensate."""
+"""The set point of a fine drive: a learned command, the reference, displacements to compensate."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 
 
 class SetPointParameters(NodeParameters):

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from annotated_types import Ge, Le
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.native import Step
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
@@ -89,7 +89,7 @@ class SpindleEncoder(TimeMaster):
         self.declare(inputs=loads, outputs=outputs, tells=bool(loads))
 
     def _loads(self) -> Sequence[Input]:
-        """What it reads of what loads it."""
+        """The inputs from its loads."""
         return ()
 
     def _lag(self) -> float:

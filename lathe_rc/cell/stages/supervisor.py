@@ -1,22 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watches the cell and says what is to be done; who listens reads it as feedback with a declared delay."""
+"""Watches the cell and asks for reactions; nodes read them as feedback with a declared delay."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from annotated_types import Ge, Le
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples, Signals
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc import messages
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage, cut
+from lathe_rc.cell.stages.supervisor_parameters import MONITORS, SupervisorParameters
 from lathe_rc.errors import InputError
-from lathe_rc.extensions import Named, Registry, code_of_others
+from lathe_rc.extensions import code_of_others
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.safety import state_machine
 from lathe_rc.safety.monitors import (
     Alarm,
@@ -27,14 +26,12 @@ from lathe_rc.safety.monitors import (
     Lookout,
     Monitor,
     Plain,
-    PlainMonitor,
     Rate,
     Threshold,
+    Watcher,
 )
 from lathe_rc.safety.rules import Watch, clear, walk
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
-
-Asked = Literal["warn", "freeze", "fall_back", "hold", "retract", "stop"]
 
 MEMBERS_LOST = "members_lost"  #: stands for a monitor where the host says that members of the cell are lost
 RESET_REFUSED = "reset refused"  #: the same: while the tool is on its way out, or after a stop
@@ -48,94 +45,12 @@ _WATCHED = {
     "margin": messages.MARGIN,
 }  # types of topics by the last part of their names
 
-#: by name, those of other packages: ours have thresholds of their own
-MONITORS: Registry[PlainMonitor] = Registry("monitor", PlainMonitor, {}, "lathe_rc.monitors")
-
-
-class SupervisorParameters(NodeParameters):
-    """Thresholds, each 0 for a monitor that is off, and what is asked for beyond them."""
-
-    drives: list[str] = parameter(
-        [], "drives of the tool that are watched, by the names of their topics; the first takes the tool out"
-    )
-    slides: list[Literal["cross", "longitudinal"]] = parameter([], "slides that are watched")
-
-    speed_limit: Annotated[float, Ge(0)] = parameter(
-        0.0, "encoder: measured speed, deviation from the nominal", "rad/s"
-    )
-    speed_reaction: Asked = parameter("stop", "what is asked for then")
-    acceleration_limit: Annotated[float, Ge(0)] = parameter(0.0, "encoder: change of the measured speed", "rad/s^2")
-    acceleration_window: Annotated[int, Ge(1), Le(65536)] = parameter(640, "over so many samples", "sample")
-    acceleration_reaction: Asked = parameter("stop", "what is asked for then")
-    index_limit: Annotated[float, Ge(0), Le(3)] = parameter(
-        0.0, "encoder: measured angle from index pulse to index pulse, deviation from a revolution", "rad"
-    )
-    index_reaction: Asked = parameter("retract", "what is asked for then")
-    following_limit: list[Annotated[float, Ge(0)]] = parameter(
-        [], "drives: command - measured position, the drive's own lag included; one for each, or none", "m"
-    )
-    following_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
-    following_reaction: Asked = parameter("retract", "what is asked for then")
-    stroke_limit: list[Annotated[float, Ge(0)]] = parameter(
-        [], "drives: measured position to each side; one for each, or none", "m"
-    )
-    stroke_reaction: Asked = parameter("retract", "what is asked for then")
-    effort_limit: list[Annotated[float, Ge(0)]] = parameter(
-        [], "drives: current or voltage at which one is taken to be saturated; one for each, or none", "A or V"
-    )
-    effort_time: Annotated[float, Ge(0)] = parameter(5e-3, "for so long", "s")
-    effort_reaction: Asked = parameter("freeze", "what is asked for then")
-    error_limit: Annotated[float, Ge(0)] = parameter(0.0, "tool: measured error", "m")
-    error_after: Annotated[float, Ge(0)] = parameter(
-        10.0, "after so many from the start or a reset: they are there to learn", "rev"
-    )
-    error_reaction: Asked = parameter("retract", "what is asked for then")
-    growth_limit: Annotated[float, Ge(0)] = parameter(
-        0.0, "tool: RMS error of a revolution over that of the one before"
-    )
-    growth_cycles: Annotated[int, Ge(1), Le(1000)] = parameter(3, "so many times in a row", "rev")
-    growth_floor: Annotated[float, Ge(0)] = parameter(1e-6, "RMS error that does not count", "m")
-    growth_reaction: Asked = parameter("freeze", "what is asked for then")
-    margin_limit: list[Annotated[float, Ge(0)]] = parameter(
-        [],
-        "drives: smallest stability margin of the channel that commands one, which has publish_margin; one for each, "
-        "or none",
-    )
-    margin_after: Annotated[float, Ge(0)] = parameter(
-        10.0, "after so many from the start or a reset: the drive has to be identified", "rev"
-    )
-    margin_reaction: Asked = parameter("freeze", "what is asked for then")
-    force_limit: Annotated[float, Ge(0)] = parameter(0.0, "cut: measured force", "N")
-    force_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
-    force_low: Annotated[float, Ge(0)] = parameter(0.0, "cut: measured force below this is lost", "N")
-    force_after: Annotated[float, Ge(0)] = parameter(10.0, "after so many from the start or a reset", "rev")
-    force_reaction: Asked = parameter("retract", "what is asked for beyond either")
-    slide_limit: list[Annotated[float, Ge(0)]] = parameter(
-        [], "slides: measured position to each side; one for each, or none", "m"
-    )
-    slide_reaction: Asked = parameter("hold", "what is asked for then")
-    monitors: list[Annotated[str, Named(MONITORS)]] = parameter([], "monitors of others")
-    monitor_signals: list[str] = parameter(
-        [], "what each of them watches, as TOPIC.FIELD, like tool.measured_error or coarse/state.effort"
-    )
-    monitor_others: list[str] = parameter(
-        [], "a second signal for each, an empty text where there is none; empty: for none of them"
-    )
-    monitor_limits: list[float] = parameter([], "threshold of each, in the unit of what it finds")
-    monitor_reactions: list[Asked] = parameter([], "what each of them asks for")
-
-    clear_position: Annotated[float, Ge(0)] = parameter(
-        0.25e-3, "the tool is out of the part where the first drive's measured position is beyond this", "m"
-    )
-    clear_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
-
-
 _STATE, _REACTION, _TOLD = range(3)  # places in the state of a step
 _ANSWER = 1  # why it stops: the state changes within the block, or there is something to tell
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         watch: the monitors.
@@ -191,7 +106,7 @@ class Supervisor(Stage):
         super().__init__(name, parameters)
         self.parameters = parameters
         self._inputs = [Input("encoder", messages.ENCODER, ("angle", "speed", "index_pulse"))]
-        self.monitors: list[Monitor | Plain] = []
+        self.monitors: list[Watcher] = []
         self._state = np.array([State.NOMINAL, Reaction.NONE, 0], np.int64)
         self._told: list[str] = []  # what others than monitors have done to the state since the last sample
         self._out = self._reads(f"{parameters.drives[0]}/state", messages.STATE, _SENSOR) if parameters.drives else None
@@ -224,14 +139,14 @@ class Supervisor(Stage):
         return max(1, round(seconds * self.shared.sample_rate))
 
     def _each(self, name: str, of: Sequence[str]) -> list[tuple[str, float]]:
-        """What is watched with its limit, for a list of limits that are on."""
+        """The watched signals with their limits, for a list of limits that are on."""
         limits: list[float] = getattr(self.parameters, name)
         if limits and len(limits) != len(of):
             raise InputError(f"{self.name}.{name} = {limits}; allowed: one for each of {', '.join(of) or 'none'}")
         return [(subject, limit) for subject, limit in zip(of, limits or [0.0] * len(of), strict=True) if limit]
 
     def _reaction(self, name: str, text: str = "") -> Reaction:
-        """What a parameter asks for, or one of its texts."""
+        """The reaction that a parameter asks for, or one of its texts."""
         asked = Reaction[(text or getattr(self.parameters, name)).upper()]
         if asked >= Reaction.RETRACT and not self.parameters.drives:
             raise InputError(
@@ -436,9 +351,9 @@ class Supervisor(Stage):
         self._fill(safety, inputs, first, place, reached, sparse)
         return sparse
 
-    def _found(self, first: int, reached: int, inputs: Sequence[Signals]) -> Sequence[tuple[Monitor | Plain, Alarm]]:
+    def _found(self, first: int, reached: int, inputs: Sequence[Signals]) -> Sequence[tuple[Watcher, Alarm]]:
         """Alarms in the samples up to ``reached``, by sample."""
-        found: list[tuple[Monitor | Plain, Alarm]] = [*self._lookout.found()]
+        found: list[tuple[Watcher, Alarm]] = [*self._lookout.found()]
         piece = cut(inputs, 0, reached) if self._plain else ()
         for monitor in self._plain:
             alarm = monitor.find(first, piece)

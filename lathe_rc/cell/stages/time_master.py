@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What gives the cell its time and angle: a spindle that is emulated, a real encoder, or one that was recorded."""
+"""The source of the cell's time and angle: an emulated spindle, a real encoder, or a recorded one."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -91,7 +91,7 @@ class TimeMaster(Stage):
         return round(self.parameters.revolutions * 2.0 * np.pi / self.shared.nominal_speed / self.shared.step)
 
     def place_triggers(self) -> None:
-        """Who makes the angle knows when events by revolutions come."""
+        """The stage that makes the angle knows when events by revolutions come."""
         self._triggers = [self._by_sample(trigger) for trigger in self._triggers]
 
     def _by_sample(self, trigger: Trigger) -> Trigger:

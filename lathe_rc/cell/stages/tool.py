@@ -7,7 +7,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from annotated_types import Ge, Le, MinLen
 
-from lathe_rc.cell import messages
+from lathe_rc import messages
 from lathe_rc.cell.parameters import Value, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
 from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, evaluate
@@ -52,7 +52,7 @@ class ToolParameters(FormParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         form: of the part; without a table if a profile node has it.

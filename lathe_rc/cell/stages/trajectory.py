@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a servo controller is told to follow, over time."""
+"""The set point of a servo controller, over time."""
 
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -9,10 +9,10 @@ import numpy.typing as npt
 from annotated_types import Ge
 
 from lathe_rc import resources
-from lathe_rc.cell.messages import MAX_BLOCK, Samples
 from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import MAX_BLOCK, Samples
 from lathe_rc.signals.example_002 import fill_reference
 from lathe_rc.signals.table import read_table
 

@@ -7,12 +7,12 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from lathe_rc.cell import messages
-from lathe_rc.cell.messages import Samples
+from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
 from lathe_rc.signals import vibration
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
@@ -32,7 +32,7 @@ class VibrationParameters(NodeParameters):
 
 
 class Memory(NamedTuple):
-    """What the step works on."""
+    """Memory of the step."""
 
     lines: Samples
     period: float

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that tables are exported to, piece by piece."""
+
+import json
+import shutil
+import zipfile
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import csv, parquet
+
+from lathe_rc.cell.columns import TEXT, Column
+from lathe_rc.cell.frames import arrow_schema
+from lathe_rc.errors import LatheError
+from lathe_rc.messages import Samples
+
+_MOST_TEXT = 4096  # characters of a text in an NPZ file, where every element is as wide as the widest
+
+
+class Rows(Protocol):
+    """A table that is being written."""
+
+    def write(self, rows: Mapping[str, Samples], /) -> None:
+        """Append; by column name, shape (rows,)."""
+
+    def close(self) -> None:
+        """Finish it."""
+
+
+class Format(ABC):
+    """One of the ways to export; all tables of a bag go to the same place.
+
+    Args:
+        place: file or folder to make; must not exist.
+    """
+
+    folder = True  #: whether the place is a folder with a file for each topic
+
+    def __init__(self, place: Path) -> None:
+        self.place = place
+
+    @abstractmethod
+    def table(self, topic: str, columns: Sequence[Column]) -> Rows:
+        """Begin the table of a topic."""
+
+    @abstractmethod
+    def finish(self) -> None:
+        """All tables are closed: complete what they share."""
+
+
+class _ArrowRows:
+    """A table written by a writer of pyarrow."""
+
+    def __init__(self, writer: Any, schema: Any) -> None:
+        self._writer, self._schema = writer, schema
+
+    def write(self, rows: Mapping[str, Samples]) -> None:
+        """See `Rows`."""
+        arrays = [pa.array(array, field.type) for array, field in zip(rows.values(), self._schema, strict=True)]
+        self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
+
+    def close(self) -> None:
+        """See `Rows`."""
+        self._writer.close()
+
+
+def file_name(topic: str) -> str:
+    """A topic as part of a file name; topics of ROS have no dots."""
+    return topic.strip("/").replace("/", ".")
+
+
+class _FileEach(Format):
+    """Tables have nothing in common."""
+
+    def finish(self) -> None:
+        """See `Format`."""
+
+
+class Csv(_FileEach):
+    """A file a topic, with units in the header; numbers have the digits that give the same bits again."""
+
+    def table(self, topic: str, columns: Sequence[Column]) -> Rows:
+        """See `Format`."""
+        schema = arrow_schema(columns, lambda column: column.label)
+        path = self.place / f"{file_name(topic)}.csv"
+        options = csv.WriteOptions(quoting_style="needed")
+        return _ArrowRows(csv.CSVWriter(path, schema, write_options=options), schema)
+
+
+class Parquet(_FileEach):
+    """A file a topic, with units in the metadata of the fields."""
+
+    def table(self, topic: str, columns: Sequence[Column]) -> Rows:
+        """See `Format`."""
+        schema = arrow_schema(columns, lambda column: column.name)
+        path = self.place / f"{file_name(topic)}.parquet"
+        return _ArrowRows(parquet.ParquetWriter(path, schema, compression="zstd"), schema)
+
+
+class _Spool:
+    """A column on the disk until all its rows are known: a member of an archive has its length in front."""
+
+    def __init__(self, path: Path, column: Column) -> None:
+        self._path, self._column = path, column
+        self._rows, self._width = 0, 1
+        path.touch(exist_ok=False)
+
+    def add(self, values: Samples) -> None:
+        """Append; the file is open no longer than that, since a bag has more columns than a process may have files."""
+        self._rows += values.size
+        with self._path.open("ab") as file:
+            if self._column.dtype != TEXT:
+                file.write(np.ascontiguousarray(values, self._column.dtype.newbyteorder("<")).data)
+                return
+            for text in values:
+                self._width = max(self._width, len(text))
+                if self._width > _MOST_TEXT:
+                    raise LatheError(
+                        f"{self._column.name}: a text of {len(text)} characters; allowed in NPZ: up to {_MOST_TEXT} "
+                        "(use --csv or --parquet)"
+                    )
+                file.write(json.dumps(text).encode() + b"\n")
+
+    def copy_to(self, member: BinaryIO) -> None:
+        """Write the column as a .npy file and remove the spool."""
+        text = self._column.dtype == TEXT
+        dtype = np.dtype(f"<U{self._width}") if text else self._column.dtype.newbyteorder("<")
+        np.lib.format.write_array_header_1_0(
+            member, {"descr": dtype.str, "fortran_order": False, "shape": (self._rows,)}
+        )
+        with self._path.open("rb") as file:
+            if text:
+                member.writelines(np.array(json.loads(line), dtype).tobytes() for line in file)
+            else:
+                shutil.copyfileobj(file, member, 2**20)
+        self._path.unlink()
+
+
+class _NpzRows:
+    """The columns of a topic, on their way to the archive."""
+
+    def __init__(self, spools: Mapping[str, _Spool]) -> None:
+        self._spools = spools
+
+    def write(self, rows: Mapping[str, Samples]) -> None:
+        """See `Rows`."""
+        for name, values in rows.items():
+            self._spools[name].add(values)
+
+    def close(self) -> None:
+        """See `Rows`."""
+
+
+class Npz(Format):
+    """One NumPy archive, an array a column: ``tool/error``; ``units`` has pairs of name and unit."""
+
+    folder = False
+
+    def __init__(self, place: Path) -> None:
+        super().__init__(place)
+        self._spools: dict[str, _Spool] = {}
+        self._units: list[tuple[str, str]] = []
+
+    def table(self, topic: str, columns: Sequence[Column]) -> Rows:
+        """See `Format`."""
+        spools = {}
+        for column in columns:
+            name = f"{topic.strip('/')}/{column.name}"
+            spool = _Spool(self.place.with_name(f"column-{len(self._spools)}"), column)
+            self._spools[name] = spools[column.name] = spool
+            self._units.append((name, column.unit))
+        return _NpzRows(spools)
+
+    def finish(self) -> None:
+        """See `Format`."""
+        with zipfile.ZipFile(self.place, "x") as archive:
+            # A ZipInfo of its own has no date: the same bag gives the same file.
+            with archive.open(zipfile.ZipInfo("units.npy"), "w") as member:
+                np.lib.format.write_array(member, np.array(self._units).reshape(-1, 2), allow_pickle=False)
+            for name, spool in self._spools.items():
+                with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                    spool.copy_to(member)  # type: ignore[arg-type]  # typeshed: only IO[bytes]
+
+
+FORMATS: Mapping[str, type[Format]] = {"csv": Csv, "parquet": Parquet, "npz": Npz}

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenario, files and versions of a bag's run, kept in the bag, so that it can be read months later."""
+
+import base64
+import contextlib
+import json
+import math
+import platform
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from lathe_rc import __version__, extensions
+from lathe_rc.cell import ros_yaml
+from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.recorder import RecorderParameters
+from lathe_rc.cell.scenario import Scenario, kind_of
+from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.stages.tool import Tool
+from lathe_rc.errors import InputError, shown
+from lathe_rc.files import contents
+
+SCENARIO, NAME, VERSIONS = "lathe_rc.scenario", "lathe_rc.name", "lathe_rc.versions"
+RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"
+FILE = "lathe_rc.file."  #: and NODE.PARAM: what was in the file that the parameter names
+ORIGINS = "lathe_rc.origins"  #: where classes of others come from, if there are any
+HELD = "lathe_rc.held"  #: samples from which on the newest value of a topic stands for those of a lost node
+RECOVERED = "lathe_rc.recovered"  #: that the bag was completed, and what that cost
+_MOST_FILE = 2**19  # longest such file that is kept [B]
+_LONGEST_NAME = 80  # characters of a file
+_HASH = 12  # characters that are shown of one
+_MOST_ORIGINS = 256
+_PACKAGES = ("numpy", "scipy", "numba", "mcap", "rosbags")
+
+
+def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
+    """The texts that go into a bag's metadata.
+
+    Args:
+        scenario: with the parameters that the nodes really have.
+        host_topics: recorded beside the signals.
+    """
+    nodes: dict[str, NodeParameters] = {}
+    files: dict[str, str] = {}
+    for name, table in scenario.nodes.items():
+        if isinstance(table, RecorderParameters):
+            continue
+        nodes[name] = table
+        for row in type(table).rows().values():
+            # A file that there is not yet, or that is longer, is none of these.
+            with contextlib.suppress(OSError):
+                if row.is_path:
+                    kept = contents(Path(str(getattr(table, row.name))), _MOST_FILE)
+                    files[f"{FILE}{name}.{row.name}"] = base64.b64encode(kept).decode()
+    return {
+        RUN_ID: scenario.shared.run_id,
+        NAME: scenario.name,
+        HOST_TOPICS: json.dumps(list(host_topics)),
+        VERSIONS: json.dumps(_versions()),
+        SCENARIO: Scenario(scenario.name, nodes).to_yaml(),
+        **({ORIGINS: json.dumps(found)} if (found := _origins(nodes)) else {}),
+        **files,
+    }
+
+
+def _origins(nodes: Mapping[str, NodeParameters]) -> dict[str, dict[str, object]]:
+    """Of each class of others where it comes from, see `Registry.origin`, and the parameters that name it."""
+    named: list[tuple[str, Mapping[str, str] | None]] = []
+    for node, table in nodes.items():
+        kind = kind_of(node, table.stage)
+        if kind in STAGES:
+            named.append((f"{node}.stage", STAGES.origin(kind)))
+        for name, row in type(table).rows().items():
+            if row.named is not None:
+                others = row.named.others(getattr(table, name))
+                named += [(f"{node}.{name}", row.named.registry.origin(each)) for each in dict.fromkeys(others)]
+    used: dict[str, list[str]] = {}
+    found: dict[str, dict[str, object]] = {}
+    for parameter, origin in named:
+        if origin is not None:
+            own = used.setdefault(origin["class"], [])
+            own.append(parameter)
+            found[origin["class"]] = {key: text for key, text in origin.items() if key != "class"} | {"used": own}
+    return found
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a class of others came from when a bag was made.
+
+    Attributes:
+        name: of the class, as ``package.module:Class``.
+        distribution, version: of the package; empty: it was not installed as one.
+        source: hash of its source.
+        used: parameters that name it, as NODE.PARAM.
+    """
+
+    name: str
+    distribution: str
+    version: str
+    source: str
+    used: tuple[str, ...]
+
+    @property
+    def package(self) -> str:
+        """Distribution and version; empty if it was not installed as one."""
+        return f"{self.distribution} {self.version}".strip()
+
+
+def origins(about: Mapping[str, str]) -> list[Origin]:
+    """Where the classes of others in a bag came from; empty if there are none, or what the bag says of them is none."""
+    found: list[Origin] = []
+    try:
+        for name, said in list(json.loads(about.get(ORIGINS, "{}")).items())[:_MOST_ORIGINS]:
+            texts = [str(said.get(key, "")) for key in ("distribution", "version", "source")]
+            distribution, version, source = (shown(text) if text else "" for text in texts)
+            used = tuple(shown(each) for each in said["used"][:_MOST_ORIGINS])
+            found.append(Origin(shown(name), distribution, version, source, used))
+    except (ValueError, TypeError, AttributeError, KeyError, RecursionError):
+        return []
+    return found
+
+
+def _check_installed(about: Mapping[str, str]) -> None:
+    """Refuse a bag whose classes of others are not here.
+
+    Raises:
+        InputError: names one, and what to install.
+    """
+    for origin in origins(about):
+        try:
+            extensions.find(origin.name, "it")
+        except InputError as error:
+            module = origin.name.partition(":")[0].partition(".")[0]
+            allowed = f"put {module} where Python looks for it (the current folder, or PYTHONPATH)"
+            if origin.package:
+                allowed = f"install {origin.package}"
+            raise InputError(
+                f"{', '.join(origin.used)}: the bag was made with {origin.name}, and {error}; allowed: {allowed}"
+            ) from None
+
+
+def changes(about: Mapping[str, str]) -> list[str]:
+    """Changes since a bag was made in the classes of others, all of which are installed; a line for each class."""
+    found = []
+    for origin in origins(about):
+        extensions.find(origin.name, origin.name)
+        now = extensions.origin(origin.name.partition(":")[0])
+        version = now.get("version", "")
+        if version != origin.version:
+            what = f"version {version or 'none'} here, and {origin.version or 'none'} when the bag was made"
+        elif now["source"] != origin.source:
+            what = f"source {now['source'][:_HASH]} here, and {origin.source[:_HASH]} when the bag was made"
+        else:
+            continue
+        found.append(f"{origin.name} has {what}")
+    return found
+
+
+def held(about: Mapping[str, str]) -> dict[str, int]:
+    """Samples from which on the newest value of a topic stands for those of a lost node; empty if no node was lost."""
+    try:
+        told = json.loads(about.get(HELD, "{}"))
+        return {str(topic)[:256]: int(first) for topic, first in list(told.items())[:256]}
+    except (ValueError, TypeError, AttributeError, RecursionError, OverflowError):
+        raise InputError(f"{HELD} of the bag is not what a recorder writes; recover the bag") from None
+
+
+def namespace(about: Mapping[str, str]) -> str:
+    """Namespace of the cell, as it stands before its topics; empty if it has none, or the bag does not tell."""
+    try:
+        topics = [str(topic)[:256] for topic in json.loads(about.get(HOST_TOPICS, "[]"))[:256]]
+    except (ValueError, TypeError, RecursionError, KeyError):
+        return ""
+    return next((topic.removesuffix("/cell_state") for topic in topics if topic.endswith("/cell_state")), "")
+
+
+def tolerances(about: Mapping[str, str]) -> dict[str, float]:
+    """Tolerance [m] by relative topic of each tool that has one, as the scenario of a bag says; empty if there is none.
+
+    Raises:
+        InputError: the bag's scenario is no parameter file.
+    """
+    found: dict[str, float] = {}
+    for node, values in ros_yaml.parse(about[SCENARIO], f"{SCENARIO} of the bag").items() if SCENARIO in about else ():
+        allowed, remap = values.get("tolerance", 0.0), values.get("remap", [])
+        if str(values.get("stage") or node) == Tool.kind and isinstance(allowed, float) and 0.0 < allowed < math.inf:
+            rules = [str(rule).partition(":=") for rule in remap] if isinstance(remap, list) else []
+            found[next((new for old, _, new in rules if old == "tool"), "tool")] = allowed
+    return found
+
+
+def _versions() -> dict[str, str]:
+    found = {"lathe_rc": __version__, "python": platform.python_version(), "machine": platform.machine()}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found
+
+
+def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str] = ()) -> Scenario:
+    """The scenario that a bag was made with.
+
+    Its files are written to ``folder``, which must last as long as it. Files that it names and the bag does not hold
+    are copied there: a run of what somebody else recorded writes to no file that it names.
+
+    Raises:
+        InputError: the bag has none, or one that this version does not accept.
+    """
+    if SCENARIO not in about:
+        raise InputError("the bag holds no scenario; it was not made by lathe_rc, or its recorder never saw the cell")
+    _check_installed(about)
+    file = folder / "scenario.yaml"
+    file.write_bytes(about[SCENARIO].encode(errors="surrogatepass"))
+    sets: list[str] = []
+    for key, text in about.items():
+        node, dot, name = key.removeprefix(FILE).rpartition(".")
+        if not key.startswith(FILE) or not dot:
+            continue
+        place = folder / f"file{len(sets)}"
+        try:
+            place.write_bytes(base64.b64decode(text))
+        except ValueError:
+            raise InputError(
+                f"{key[:80]!r} of the bag is not base64; recover the bag, or set {node[:80]!r} anew"
+            ) from None
+        sets.append(f"{node}.{name}={place}")
+    sets += _copied(scenarios.load(file, sets, complete=True), folder)
+    loaded = scenarios.load(file, [*sets, *overrides], complete=True)
+    return Scenario(about.get(NAME, "") or loaded.name, loaded.nodes)
+
+
+def nose_radius(about: Mapping[str, str]) -> float:
+    """Radius of the tool's nose that the scenario of a bag names [m]; 0 where it names none."""
+    for text in re.findall(r"\bnose_radius: ([\d.e+-]{1,30})(?![^\s,}])", about.get(SCENARIO, "")):
+        with contextlib.suppress(ValueError):
+            if 0.0 < float(text) < math.inf:
+                return float(text)
+    return 0.0
+
+
+def _copied(scenario: Scenario, folder: Path) -> list[str]:
+    """Copy files from elsewhere that a scenario names to ``folder``; what to set so that it names these."""
+    sets: list[str] = []
+    for node, table in scenario.nodes.items():
+        for row in type(table).rows().values():
+            named = Path(str(getattr(table, row.name))) if row.is_path else Path()
+            if not named.name or named.is_relative_to(folder.resolve()):
+                continue
+            place = folder / f"named{len(sets)}" / re.sub(r"[^\w.-]", "_", named.name)[-_LONGEST_NAME:]
+            place.parent.mkdir(exist_ok=True)
+            try:
+                # A memory is written, perhaps, before it is read.
+                with contextlib.suppress(FileNotFoundError):
+                    place.write_bytes(contents(named))
+            except OSError as error:
+                raise InputError(f"{node}.{row.name} = {str(named)[:200]!r}: {error.strerror}; set another") from None
+            sets.append(f"{node}.{row.name}={place}")
+    return sets

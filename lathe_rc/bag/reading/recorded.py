@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The dense topics of a bag that may lack some, under the names that a cell has for them, checked as they are read."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lathe_rc import messages
+from lathe_rc.bag import provenance
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.stream import Tape
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import Samples, Signals
+
+
+@dataclass(frozen=True)
+class Spindle:
+    """How the recorded spindle turned.
+
+    Attributes:
+        topic: of the bag.
+        samples: length of the record.
+        has_truth: the true angle was recorded; otherwise the measured one has to do.
+        speed: lowest and highest [rad/s].
+        turns: whole turns before sample 0 [rad].
+    """
+
+    topic: str
+    samples: int
+    has_truth: bool
+    speed: tuple[float, float]
+    turns: float
+
+    @property
+    def angle(self) -> str:
+        """Field with the angle of the part."""
+        return "angle_true" if self.has_truth else "angle"
+
+
+class Recorded:
+    """The parts of a cell that a bag holds.
+
+    Args:
+        source: the bag.
+        names: topic of the bag by relative topic of the cell, where it is another than that with a slash.
+
+    Attributes:
+        path: of the bag.
+        namespace: of the cell that it was recorded from; empty if it had none.
+
+    Raises:
+        InputError: a topic is named that the bag has not.
+    """
+
+    def __init__(self, source: Source, names: Mapping[str, str]) -> None:
+        self.path, self.namespace = source.path, provenance.namespace(source.about)
+        self._source, self._names = source, dict(names)
+        for name, topic in names.items():
+            if topic not in source.topics:
+                raise InputError(f"--topic {name}={topic}: {self.path} has no such topic; it has {self.holdings()}")
+
+    def holdings(self) -> str:
+        """The bag's topics with blocks, in words."""
+        found = {t: said for t, said in self._source.topics.items() if said.type in messages.block_types()}
+        told = [f"{topic} ({said.type.rpartition('/')[2]})" for topic, said in sorted(found.items()) if said.count]
+        return ", ".join(told) or "no topic with blocks of lathe_rc_msgs"
+
+    def check_names(self, known: Sequence[str]) -> None:
+        """Refuse names that the cell does not have.
+
+        Raises:
+            InputError: one of `names` is not among ``known``.
+        """
+        for name, topic in self._names.items():
+            if name not in known:
+                raise InputError(f"--topic {name}={topic}: the cell has no {name}; allowed: {', '.join(sorted(known))}")
+
+    def find(self, name: str, msgtype: str) -> str | None:
+        """The bag's topic for a relative topic of the cell; None if it has none.
+
+        Raises:
+            InputError: it is of another type.
+        """
+        topic = self._names.get(name, self.namespace + messages.full(name))
+        said = self._source.topics.get(topic)
+        if said is None or not said.count:
+            return None
+        if said.type != msgtype:
+            raise InputError(f"{self.path}: {topic} is {said.type}; allowed: {msgtype} (--topic {name}=/TOPIC)")
+        return topic
+
+    def lacks(self, name: str, msgtype: str) -> str:
+        """The message about a missing topic; names those of its type in the bag."""
+        others = [t for t, said in sorted(self._source.topics.items()) if said.type == msgtype and said.count]
+        options = " or ".join(f"--topic {name}={topic}" for topic in others or ["/TOPIC"])
+        return f"{msgtype.rpartition('/')[2]} on {messages.full(name)} (or {options})"
+
+    def tape(self, topic: str) -> Tape:
+        """A topic to be read along with a run."""
+        return Tape(self._source, topic)
+
+    def step_ns(self, topic: str) -> int:
+        """Sampling step [ns]; 0 if there is no block."""
+        return self._source.step_ns(topic)
+
+    def pieces(self, topic: str, fields: Sequence[str]) -> Iterator[tuple[int, Signals]]:
+        """First sample and some fields of each block, arrays of shape (n,).
+
+        Raises:
+            LatheError: samples are missing or repeated, the step changes, or a number is not finite.
+        """
+        end, step_ns = 0, 0
+        for block in self._source.blocks(topic):
+            where = f"{self.path}: {topic}"
+            if block.first_index != end:
+                raise LatheError(f"{where} goes from sample {end} to {block.first_index}; allowed: all, from 0 on")
+            if step_ns not in (0, block.step_ns) or not block.step_ns:
+                raise LatheError(f"{where}: the step changes from {step_ns} to {block.step_ns} ns at sample {end}")
+            for name in fields:
+                wrong = np.flatnonzero(~np.isfinite(block.signals[name]))
+                if wrong.size:
+                    value, place = block.signals[name][wrong[0]], end + wrong[0]
+                    raise LatheError(f"{where}: {name} = {value} at sample {place}; allowed: finite numbers")
+            yield end, {name: block.signals[name] for name in fields}
+            end, step_ns = end + block.samples, block.step_ns
+        if not end:
+            raise LatheError(f"{self.path}: {topic} has no block, though the bag counts some")
+
+    def whole(self, topic: str, field: str, most: int | None = None) -> Samples:
+        """A field, or at most its first so many samples, shape (n,).
+
+        Raises:
+            LatheError: see `pieces`.
+        """
+        found: list[Samples] = []
+        for first, signals in self.pieces(topic, [field]):
+            if most is not None and first >= most:
+                break
+            found.append(signals[field])
+        return np.concatenate(found)[:most]
+
+    def length(self, topic: str, field: str) -> int:
+        """Samples of a topic, all looked at.
+
+        Raises:
+            LatheError: see `pieces`.
+        """
+        return sum(signals[field].size for _, signals in self.pieces(topic, [field]))
+
+    def spindle(self, name: str) -> Spindle:
+        """The recorded spindle, all of it looked at.
+
+        Args:
+            name: the encoder's relative topic in the cell.
+
+        Raises:
+            InputError: there is no encoder.
+            LatheError: see `pieces`; or the angle goes back or jumps.
+        """
+        topic = self.find(name, messages.ENCODER)
+        if topic is None:
+            raise InputError(
+                f"{self.path}: no encoder, and a re-simulation needs the recorded spindle: "
+                f"{self.lacks(name, messages.ENCODER)}; the bag has {self.holdings()}"
+            )
+        fields = ["angle", "speed", "angle_true", "speed_true"]
+        has_truth = any(np.any(signals["angle_true"]) for _, signals in self.pieces(topic, fields))
+        angle, speed = ("angle_true", "speed_true") if has_truth else ("angle", "speed")
+        low, high, last, samples = np.inf, -np.inf, np.nan, 0
+        start = 0.0
+        for first, signals in self.pieces(topic, fields):
+            if not first:
+                start = last = float(signals[angle][0])
+            advance = np.diff(signals[angle], prepend=last)
+            wrong = np.flatnonzero((advance < 0.0) | (advance > np.pi))
+            if wrong.size:
+                raise LatheError(
+                    f"{self.path}: {topic}: {angle} goes by {advance[wrong[0]]:.4g} rad at sample {first + wrong[0]}; "
+                    "allowed: 0 up to half a turn: a spindle that turns one way, its angle unwrapped"
+                )
+            low, high = min(low, float(signals[speed].min())), max(high, float(signals[speed].max()))
+            last, samples = float(signals[angle][-1]), first + signals[angle].size
+        turns = 2.0 * np.pi * np.floor(start / (2.0 * np.pi))
+        return Spindle(topic, samples, has_truth, (low, high), float(turns))

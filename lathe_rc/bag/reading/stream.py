@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags piece by piece: what they hold goes to sinks as from an offline run, in as little memory."""
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lathe_rc import messages
+from lathe_rc.bag.reading.chunk_messages import Places
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.snapshot import first_sample
+from lathe_rc.cell.block import Block
+from lathe_rc.cell.engine import Sink
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wire import Decoder
+from lathe_rc.errors import LatheError, shown
+from lathe_rc.messages import START_NS, Signals
+
+_TOGETHER, _TOGETHER_BYTES = 64, 2**18  # messages of a topic that are read at once, and their size
+_AHEAD = 64  # pieces that one topic may be ahead of another
+_MOST_WAITING = 2**18  # messages of a sparse topic ahead of the blocks
+
+
+@dataclass(frozen=True)
+class BagHeader:
+    """The header of a bag of the cell, once it has been read.
+
+    Attributes:
+        types: message type by fully qualified signal topic.
+        samples: index after the last of every dense topic: their number, but in a snapshot.
+        left: samples that some topics have beyond that: the recording was interrupted; 0 if it was not.
+        step_ns: sampling step [ns]; 0 if the bag has no dense topic.
+        run_id: identity of the run.
+        about: texts that the bag says of itself.
+    """
+
+    types: Mapping[str, str]
+    samples: int
+    left: int
+    step_ns: int
+    run_id: str
+    about: Mapping[str, str]
+
+
+class _Dense:
+    """Blocks of a topic that have not been handed on, from sample ``first`` on."""
+
+    def __init__(self, topic: str, msgtype: str, first: int = 0) -> None:
+        self.topic, self.type = topic, msgtype
+        self.blocks: deque[Block] = deque()
+        self.first = self.end = first
+        self.newest: Block | None = None
+        self._messages: list[bytes] = []
+        self._bytes = 0
+        self._decoder = Decoder(msgtype)
+
+    def add(self, data: bytes) -> bool:
+        """Take a message; tells whether it is worth asking for what can be handed on: messages are read some at once.
+
+        Raises:
+            LatheError: see `read`.
+        """
+        self._messages.append(data)
+        self._bytes += len(data)
+        if len(self._messages) < _TOGETHER and self._bytes < _TOGETHER_BYTES:
+            return False
+        self.read()
+        return True
+
+    def read(self) -> None:
+        """Read the messages that have been taken.
+
+        Raises:
+            LatheError: see `read_all`.
+        """
+        messages, self._messages, self._bytes = self._messages, [], 0
+        ends = np.cumsum([0, *map(len, messages)])
+        self.read_all(b"".join(messages), np.stack([ends[:-1], ends[1:]], axis=1))
+
+    def read_all(self, whole: bytes, places: Places) -> None:
+        """Read messages that stand somewhere in ``whole``; begin and end of each, shape (messages, 2).
+
+        Raises:
+            LatheError: samples are missing or repeated, or a block is broken.
+        """
+        try:
+            for block in self._decoder.decode_all(whole, places):
+                self._append(block)
+        except ValueError as error:
+            raise LatheError(f"{self.topic}: {shown(error)}") from None
+
+    def _append(self, block: Block) -> None:
+        if block.first_index != self.end:
+            raise LatheError(f"{self.topic} goes from sample {self.end} to {block.first_index}")
+        if self.newest and block.step_ns != self.newest.step_ns:
+            raise LatheError(f"{self.topic}: the step changes from {self.newest.step_ns} to {block.step_ns} ns")
+        self.end += block.samples
+        self.newest = block
+        self.blocks.append(block)
+
+    def take(self, samples: int) -> Signals:
+        """The next samples, as arrays of their own."""
+        signals = messages.allocate(self.type, samples)
+        self.take_into(signals)
+        return signals
+
+    def take_into(self, signals: Signals) -> None:
+        """Fill arrays of shape (samples,) with the next samples."""
+        filled, samples = 0, next(iter(signals.values())).size
+        while filled < samples:
+            block = self.blocks[0]
+            skip = self.first - block.first_index
+            count = min(block.samples - skip, samples - filled)
+            for name, array in signals.items():
+                array[filled : filled + count] = block.signals[name][skip : skip + count]
+            filled += count
+            self.first += count
+            if skip + count == block.samples:
+                self.blocks.popleft()
+
+
+class Feeder:
+    """Turns messages of signal topics into pieces; for a bag, or for what is heard live.
+
+    Args:
+        types: message type by fully qualified topic; others than signal topics are left out.
+        sinks: get the pieces.
+        piece: samples in a piece.
+        first: where all begin.
+
+    Attributes:
+        types: of the signal topics.
+        first: the first sample that has not been handed on.
+    """
+
+    def __init__(self, types: Mapping[str, str], sinks: Iterable[Sink], piece: int, first: int = 0) -> None:
+        self.types = {topic: msgtype for topic, msgtype in types.items() if msgtype in messages.signal_types()}
+        self._dense = {t: _Dense(t, kind, first) for t, kind in self.types.items() if kind in messages.block_types()}
+        self._sparse: dict[str, list[tuple[int, Mapping[str, Any]]]] = {
+            topic: [] for topic in self.types if topic not in self._dense
+        }
+        self._sinks, self._piece = list(sinks), piece
+        self.first = first
+
+    @property
+    def step_ns(self) -> int:
+        """Sampling step [ns]; 0 before the first block."""
+        return next((dense.newest.step_ns for dense in self._dense.values() if dense.newest), 0)
+
+    @property
+    def run_id(self) -> str:
+        """Identity of the run."""
+        return next((dense.newest.run_id for dense in self._dense.values() if dense.newest), "")
+
+    def add(self, topic: str, log_ns: int, data: bytes) -> None:
+        """Take a message.
+
+        Raises:
+            LatheError: samples are missing, or a topic stands still while others go on.
+        """
+        dense = self._dense.get(topic)
+        if dense is None:
+            if not self._dense:
+                return  # nothing that they could be handed on with
+            if len(self._sparse[topic]) >= _MOST_WAITING:
+                raise LatheError(f"{topic}: more than {_MOST_WAITING} messages without the blocks of their time")
+            try:
+                self._sparse[topic].append((log_ns, messages.values_of(self.types[topic], data)))
+            except ValueError as error:
+                raise LatheError(f"{topic}: at {log_ns} ns: {shown(error)}") from None
+            return
+        if dense.add(data) and dense.end - self.first >= self._piece:
+            self._hand_on(self._piece)
+
+    def _hand_on(self, samples: int) -> None:
+        ends = {topic: dense.end for topic, dense in self._dense.items()}
+        while (ready := min(ends.values())) - self.first >= samples:
+            self._give(samples)
+        slow = min(ends, key=lambda topic: ends[topic])
+        if max(ends.values()) - ready > _AHEAD * self._piece:
+            raise LatheError(f"{slow} ends at sample {ready}, others at {max(ends.values())}")
+
+    def _give(self, samples: int) -> None:
+        end_ns = START_NS + (self.first + samples) * self.step_ns
+        pieces = {topic: dense.take(samples) for topic, dense in self._dense.items()}
+        sparse: dict[str, list[Sparse]] = {}
+        for topic, waiting in self._sparse.items():
+            count = next((k for k, (stamp, _) in enumerate(waiting) if stamp >= end_ns), len(waiting))
+            sparse[topic] = [
+                Sparse(topic, self.types[topic], (stamp - START_NS) // self.step_ns, dict(values))
+                for stamp, values in waiting[:count]
+            ]
+            del waiting[:count]
+        for sink in self._sinks:
+            sink.chunk(self.first, samples, pieces, sparse)
+        self.first += samples
+
+    def finish(self) -> int:
+        """Hand on the rest.
+
+        Returns:
+            Samples that some topics have more than others: 0 if the recording is complete.
+        """
+        if not self._dense:
+            return 0
+        for dense in self._dense.values():
+            dense.read()
+        ends = [dense.end for dense in self._dense.values()]
+        while min(ends) - self.first > self._piece:
+            self._give(self._piece)
+        if min(ends) > self.first:
+            self._give(min(ends) - self.first)
+        return max(ends) - min(ends)
+
+
+class Tape:
+    """A dense topic of a bag, read as it is needed.
+
+    Args:
+        source: the bag; open as long as it is read.
+        topic: fully qualified.
+    """
+
+    def __init__(self, source: Source, topic: str) -> None:
+        self._dense = _Dense(topic, source.topics[topic].type)
+        self._batches = source.batches({topic})
+
+    def take(self, samples: int) -> Signals:
+        """The next samples, arrays of shape (samples,); see `take_into`."""
+        signals = messages.allocate(self._dense.type, samples)
+        self.take_into(signals)
+        return signals
+
+    def take_into(self, signals: Signals) -> None:
+        """Fill arrays of shape (samples,) with the next samples.
+
+        Raises:
+            LatheError: there are not so many, or some are missing.
+        """
+        samples = next(iter(signals.values())).size
+        while self._dense.end - self._dense.first < samples:
+            found = next(self._batches, None)
+            if found is None:
+                raise LatheError(f"{self._dense.topic} ends at sample {self._dense.end}")
+            self._dense.read_all(found.whole, found.places[:, 2:])
+        self._dense.take_into(signals)
+
+
+def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536) -> BagHeader:
+    """Read a bag of the cell and hand its signals to sinks, in pieces.
+
+    Args:
+        path: the bag.
+        sinks: get every sample once, in order; topics are fully qualified.
+        piece: samples in a piece; the last may be shorter.
+
+    Raises:
+        InputError: not a bag.
+        LatheError: samples are missing or repeated.
+    """
+    with Source(path) as source:
+        types = {topic: kind.type for topic, kind in source.topics.items()}
+        feeder = Feeder(types, sinks, piece, first_sample(source.about))
+        for topic, log_ns, data in source.messages(set(feeder.types)):
+            try:
+                feeder.add(topic, log_ns, data)
+            except LatheError as error:
+                raise type(error)(f"{path}: {error}") from None
+        left = feeder.finish()
+        return BagHeader(feeder.types, feeder.first, left, feeder.step_ns, feeder.run_id, dict(source.about))

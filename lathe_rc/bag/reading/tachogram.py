@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The speed of a recorded spindle as a tachogram that a speed law can follow."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lathe_rc import messages
+from lathe_rc.bag.reading.recorded import Recorded
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.errors import InputError
+from lathe_rc.messages import Samples
+from lathe_rc.signals import tachogram
+
+_RPM = 30.0 / np.pi  # for 1 rad/s
+
+
+@dataclass(frozen=True)
+class Made:
+    """The files that have been written.
+
+    Attributes:
+        points: rows of the file.
+        samples: of the recording.
+        largest: greatest distance of the file's lines from a recorded speed [1/min].
+        field: of the encoder that the speed was taken from.
+    """
+
+    points: int
+    samples: int
+    largest: float
+    field: str
+
+
+def make(bag: Path, output: Path, tolerance: float, topic: str = "") -> Made:
+    """Write the speed of a recorded spindle to a CSV file with as few rows as lines between them allow.
+
+    Args:
+        bag: the recording.
+        output: the file; an existing one is replaced.
+        tolerance: greatest distance of the lines from a recorded speed [1/min].
+        topic: of the encoder; empty: the only one.
+
+    Raises:
+        InputError: not a bag, no encoder or several, or a place that cannot be written to.
+        LatheError: samples are missing or not finite, or the spindle does not turn one way.
+    """
+    with Source(bag) as source:
+        recorded = Recorded(source, {"encoder": _chosen(source, topic)})
+        spindle = recorded.spindle("encoder")
+        field = "speed_true" if spindle.has_truth else "speed"
+        step = recorded.step_ns(spindle.topic) * 1e-9
+
+        def pieces() -> Iterator[tuple[Samples, Samples]]:
+            for first, signals in recorded.pieces(spindle.topic, [field]):
+                speed = signals[field] * _RPM
+                yield step * np.arange(first, first + speed.size), speed
+
+        if spindle.speed[0] <= 0.0:
+            raise InputError(
+                f"{bag}: {spindle.topic}: {field} falls to {spindle.speed[0] * _RPM:.4g} rpm; allowed: above 0"
+            )
+        thinner = tachogram.Thinner(tolerance)
+        for time, speed in pieces():
+            thinner.add(time, speed)
+        time, rpm = thinner.finish()
+        largest = max(float(np.abs(np.interp(t, time, rpm) - speed).max()) for t, speed in pieces())
+    tachogram.write(output, time, rpm, f"{field} of {spindle.topic} in {bag.name}, within {tolerance:g} rpm")
+    return Made(time.size, spindle.samples, largest, field)
+
+
+def _chosen(source: Source, topic: str) -> str:
+    """The encoder's topic."""
+    found = sorted(t for t, said in source.topics.items() if said.type == messages.ENCODER and said.count)
+    if topic and topic not in found:
+        raise InputError(f"--topic {topic}: {source.path} has no such encoder; allowed: {', '.join(found) or 'none'}")
+    if not topic and len(found) != 1:
+        raise InputError(
+            f"{source.path}: {len(found)} encoders ({', '.join(found) or 'none'}); allowed: one, or --topic TOPIC"
+        )
+    return topic or found[0]

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Unpacking chunks, messages and whole files of a bag, never to more than they say or than is allowed."""
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import lz4.frame
+import zstandard
+from isal.isal_zlib import crc32
+
+from lathe_rc.bag.reading.precheck import MOST_BYTES
+from lathe_rc.errors import shown
+
+MOST_UNPACKED = 2**36  #: of a file that is compressed as a whole [B]
+
+_PIECE = 2**20  # of a file that is unpacked [B]
+_CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
+
+
+def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
+    """The records of a chunk; never more than it says.
+
+    Raises:
+        ValueError: it does not unpack to ``size`` bytes, or not at all.
+    """
+    if not 0 <= size <= MOST_BYTES:
+        raise ValueError(f"{size} B when unpacked; allowed: up to {MOST_BYTES}")
+    try:
+        if compression == "zstd":
+            unpacker = zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True)
+            whole = unpacker.read(size + 1)
+        elif compression == "lz4":
+            whole = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+        elif compression == "":
+            whole = bytes(data)
+        else:
+            raise ValueError(f"compression {compression[:64]!r} is not known; allowed: zstd, lz4, none")
+    except (zstandard.ZstdError, RuntimeError) as error:
+        raise ValueError(shown(error)) from None
+    if len(whole) != size:
+        raise ValueError(f"it does not unpack to the {size} B that it says")
+    return whole
+
+
+def unpacked_size(data: bytes) -> int:
+    """Size that a zstd frame says it has [B], from its first 18 bytes; -1 if it says nothing or is none."""
+    try:
+        return int(zstandard.frame_content_size(data))
+    except zstandard.ZstdError:
+        return -1
+
+
+def unpack_file(path: Path) -> Iterator[bytes]:
+    """The content of a file that is compressed as a whole, piece by piece.
+
+    Raises:
+        ValueError: it is longer than allowed.
+        ZstdError: it is broken.
+    """
+    size = 0
+    with path.open("rb") as stream:
+        reader = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
+        while piece := reader.read(_PIECE):
+            size += len(piece)
+            if size > MOST_UNPACKED:
+                raise ValueError(f"{path.name} unpacks to more than {MOST_UNPACKED} B, which is not allowed")
+            yield piece
+
+
+def read_chunk(content: bytes, place: int) -> bytes:
+    """The records of a chunk that stands at byte ``place``.
+
+    Raises:
+        ValueError: it is broken.
+    """
+    try:
+        _, _, size, crc, name = _CHUNK.unpack_from(content)
+        start = _CHUNK.size + name
+        name_of = content[_CHUNK.size : start].decode("utf-8", "replace")
+        whole = unpack(name_of, memoryview(content)[start + 8 :], size)
+    except (ValueError, struct.error) as error:
+        raise ValueError(f"chunk at byte {place}: {shown(error)}") from None
+    if crc and crc32(whole) != crc:
+        raise ValueError(f"chunk at byte {place}: its checksum is wrong")
+    return whole

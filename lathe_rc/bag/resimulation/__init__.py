@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Computing a recorded run again behind its spindle."""

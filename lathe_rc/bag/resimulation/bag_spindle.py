@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A cell whose spindle is the one of a bag."""
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc import messages
+from lathe_rc.bag.reading.recorded import Recorded, Spindle
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.stream import Tape
+from lathe_rc.bag.resimulation.compare import Comparison, positions
+from lathe_rc.cell.parameters import remapped
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stage import DONE, Fields, Reached
+from lathe_rc.cell.stages.time_master import TimeMaster
+from lathe_rc.cell.stages.tool import Tool
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
+
+
+class Memory(NamedTuple):
+    """Memory of the step: samples that have been read.
+
+    Attributes:
+        span: index of the first, and of the one after the last.
+        angle, speed, angle_true, speed_true, index_pulse: of them, from element 0 on.
+    """
+
+    span: npt.NDArray[np.int64]
+    angle: Samples
+    speed: Samples
+    angle_true: Samples
+    speed_true: Samples
+    index_pulse: Samples
+
+
+@kernel
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
+    """See `lathe_rc.cell.stage`."""
+    angle, speed, angle_true, speed_true, index_pulse = outputs
+    at, n = first - memory.span[0], angle.size
+    angle[:], speed[:] = memory.angle[at : at + n], memory.speed[at : at + n]
+    angle_true[:], speed_true[:] = memory.angle_true[at : at + n], memory.speed_true[at : at + n]
+    index_pulse[:] = memory.index_pulse[at : at + n]
+    return n, DONE
+
+
+class _PlayedSpindle(TimeMaster):
+    """The spindle as it was recorded."""
+
+    step = staticmethod(step)
+
+    def __init__(self, made: TimeMaster, tape: Tape, samples: int, said: Spindle | None = None) -> None:
+        super().__init__(made.name, made.parameters)
+        self._made, self.law = made, made.law
+        self._tape, self.samples, self._said = tape, samples, said
+        self.place_triggers()
+        self.declare(outputs=made.outputs)
+        self._ready = messages.allocate(messages.ENCODER, messages.MAX_BLOCK)
+        self._span = np.zeros(2, np.int64)
+
+    def speed_range(self) -> tuple[float, float]:
+        """Of the law, which the bag's scenario has; without one, as recorded [rad/s]."""
+        return self._said.speed if self._said else self._made.speed_range()
+
+    def largest_acceleration(self) -> float:
+        """Of the scenario's."""
+        return self._made.largest_acceleration()
+
+    def sample_at(self, angle: float) -> int:
+        """Of the scenario's."""
+        return self._made.sample_at(angle)
+
+    @property
+    def memory(self) -> Memory:
+        """See `Stage`."""
+        return Memory(self._span, *self._ready.values())
+
+    def prepare(self, first: int, samples: int) -> None:
+        """See `Stage`: read ahead.
+
+        Raises:
+            LatheError: the recording has not so many samples, or some are missing.
+        """
+        begin, end = self._span.tolist()
+        if first + samples <= end:
+            return
+        left = end - first
+        for array in self._ready.values():
+            array[:left] = array[first - begin : end - begin].copy()
+        self._span[:] = first, end
+        signals = {name: array[left:samples] for name, array in self._ready.items()}
+        self._tape.take_into(signals)
+        self._span[1] = first + samples
+        if self._said and not self._said.has_truth:
+            signals["angle_true"][:], signals["speed_true"][:] = signals["angle"], signals["speed"]
+        if self._said:
+            signals["angle"] -= self._said.turns
+            signals["angle_true"] -= self._said.turns
+
+    def replay(self, action: str, index: int) -> None:
+        """See `Stage`: as it was said."""
+        self._scheduled.append((index, action))
+
+    def act(self, action: str, index: int) -> None:
+        """Faults of the encoder are in the recording already."""
+
+
+Events = dict[str, list[tuple[int, str]]]  #: sample and action of the events of each node
+
+
+def wire(
+    chosen: Scenario, original: Scenario | None, recorded: Recorded, source: Source
+) -> tuple[Cell, Comparison | None, Events]:
+    """A cell with the recorded spindle in it, checked.
+
+    Args:
+        chosen: the scenario that shall run.
+        original: that of the bag; None: ``chosen`` takes the place of one.
+        recorded: what the bag holds.
+        source: the bag.
+
+    Returns:
+        The cell; what compares its tool's position with the recorded one, if the bag has that and not its error; and
+        the bag's events, as they took effect. A scenario that is not the bag's keeps its own events.
+
+    Raises:
+        InputError: no encoder, another step than the scenario's, or what the checks before a start refuse.
+        LatheError: samples that are needed are missing or not finite.
+    """
+    nodes = dict(chosen.nodes)
+    if original is not None:
+        nodes = {name: table.model_copy(update={"events": [], "faults": []}) for name, table in nodes.items()}
+    cell = Cell(nodes)
+    master = cell.master
+    recorded.check_names([*cell.dense])
+    name = remapped(master.shared, "encoder")
+    tool = next((stage for stage in cell.stages.values() if isinstance(stage, Tool)), None)
+    topics = positions(recorded, tool) if tool else []
+    spindle = None if original is not None else recorded.spindle(name)
+    topic = spindle.topic if spindle else recorded.find(name, messages.ENCODER) or messages.full(name)
+    samples = spindle.samples if spindle else _samples(source, topic)
+    if original is not None and any(kind == "displacement" for _, kind in topics):
+        topics = []  # its error was recorded, too
+    samples = min([samples, *(recorded.length(of, kind) for of, kind in topics)])
+    for of in (topic, *(of for of, _ in topics)):
+        step_ns = recorded.step_ns(of)
+        if step_ns != master.shared.step_ns:
+            raise InputError(
+                f"{source.path}: {of} has a step of {step_ns} ns, the scenario one of {master.shared.step_ns} ns; "
+                f"allowed: sample_rate = {1e9 / step_ns:.10g} Hz under /**"
+            )
+    cell.stages[master.name] = _PlayedSpindle(master, recorded.tape(topic), samples, spindle)
+    cell.check()
+    compared = Comparison(recorded, cell, tool, topics) if tool and topics else None
+    return cell, compared, _events(source) if original is not None else {}
+
+
+def asked_for(recorded: Recorded, *, identified: bool = False) -> str:
+    """The signals of a bag without a scenario, the missing ones, and the options that supply them; one line.
+
+    Args:
+        recorded: what it has.
+        identified: the drive has been identified.
+    """
+    encoder = recorded.find("encoder", messages.ENCODER)
+    missing = ["drives, controllers and the form of the part (--scenario FILE)"]
+    if encoder is None:
+        missing.insert(0, f"the spindle: {recorded.lacks('encoder', messages.ENCODER)}")
+    state = recorded.find("coarse/state", messages.STATE) or recorded.find("tool", messages.TOOL)
+    if state is None:
+        missing.append(f"to compare with, the tool's position: {recorded.lacks('coarse/state', messages.STATE)}")
+    elif recorded.find("coarse/command", messages.COMMAND) is None:
+        missing.append(f"to identify the drive, its command: {recorded.lacks('coarse/command', messages.COMMAND)}")
+    elif not identified:
+        missing.append("the drive's model (--identify finds it)")
+    return f"the bag holds no scenario; it has {recorded.holdings()}; missing: {'; '.join(missing)}"
+
+
+def _samples(source: Source, topic: str) -> int:
+    """Samples of a dense topic: its last block says."""
+    if topic not in source.topics or source.topics[topic].type != messages.ENCODER:
+        raise InputError(f"{source.path}: no encoder on {topic}; a re-simulation needs the recorded spindle")
+    step_ns = source.step_ns(topic)
+    if not step_ns:
+        raise InputError(f"{source.path}: {topic} has no block")
+    # Log times may be those of another clock: then all blocks are looked at.
+    late = source.last_ns - 2 * messages.MAX_BLOCK * step_ns
+    (last,) = deque(source.blocks(topic, start_ns=late), 1) or deque(source.blocks(topic), 1)
+    return last.first_index + last.samples
+
+
+def _events(source: Source) -> dict[str, list[tuple[int, str]]]:
+    """Sample and action of the events of each node, as they took effect."""
+    topics = {topic for topic, said in source.topics.items() if said.type == messages.EVENT}
+    found: dict[str, list[tuple[int, str]]] = {}
+    for topic, _, data in source.messages(topics):
+        try:
+            event = messages.decode(messages.EVENT, data)
+        except ValueError as error:
+            raise LatheError(f"{source.path}: {topic}: {error}") from None
+        found.setdefault(event.source.strip("/").rpartition("/")[2], []).append((int(event.sample_index), event.action))
+    return found

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models of drives and the form of the part, identified from the signals of a bag."""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from lathe_rc import messages
+from lathe_rc.analysis import drive_fit, profile_csv
+from lathe_rc.analysis.drive_fit import DriveFit
+from lathe_rc.analysis.metrology import evenly
+from lathe_rc.bag.reading.recorded import Recorded
+from lathe_rc.cell import models
+from lathe_rc.cell.parameters import NodeParameters, remapped
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters
+from lathe_rc.errors import InputError
+from lathe_rc.files import replacing
+
+_FORM_POINTS = 720
+
+
+@dataclass(frozen=True)
+class Identified:
+    """A drive, identified.
+
+    Attributes:
+        node: whose parameters they are.
+        command: topic of the bag.
+        position: topic and field of the bag.
+        fit: its model.
+        before: the scenario's values of the same parameters; None without a scenario.
+    """
+
+    node: str
+    command: str
+    position: tuple[str, str]
+    fit: DriveFit
+    before: Mapping[str, float] | None
+
+
+def drives(recorded: Recorded, scenario: Scenario | None) -> list[Identified]:
+    """Identify the electrodynamic drives of a scenario, or without one that of the default topics.
+
+    Raises:
+        InputError: there is none, the bag lacks its command or position, or they say too little.
+        LatheError: samples are missing or not finite.
+    """
+    kind = ElectrodynamicActuator.kind
+    if scenario is None:
+        tables: dict[str, NodeParameters] = {kind: ElectrodynamicActuatorParameters()}
+    else:
+        tables = {name: scenario.nodes[name] for name in scenario.of_kind(kind)}
+    if not tables:
+        raise InputError(
+            f"--identify: no {kind} in the scenario; other drives are not identified: set their parameters"
+        )
+    return [_drive(recorded, name, table, known=scenario is not None) for name, table in tables.items()]
+
+
+def _drive(recorded: Recorded, node: str, table: NodeParameters, *, known: bool) -> Identified:
+    assert isinstance(table, ElectrodynamicActuatorParameters), "of_kind() says so"
+    names = {what: remapped(table, f"coarse/{what}") for what in ("command", "state")}
+    command = recorded.find(names["command"], messages.COMMAND)
+    state = recorded.find(names["state"], messages.STATE)
+    tool = recorded.find("tool", messages.TOOL)
+    position = (state, "measured_position") if state else (tool, "displacement") if tool else None
+    if command is None or position is None:
+        missing = [
+            what
+            for what, found in (
+                (f"its command: {recorded.lacks(names['command'], messages.COMMAND)}", command),
+                (f"its position: {recorded.lacks(names['state'], messages.STATE)}", position),
+            )
+            if found is None
+        ]
+        raise InputError(
+            f"{recorded.path}: {node} cannot be identified without {'; nor without '.join(missing)}; the bag has "
+            f"{recorded.holdings()}; leave --identify out and give the drive's parameters with --scenario FILE"
+        )
+    topic, field = position
+    assert topic is not None, "one of the two is there"
+    steps = [recorded.step_ns(of) for of in (command, topic)]
+    if steps[0] != steps[1]:
+        raise InputError(
+            f"{recorded.path}: steps of {steps[0]} ns on {command}, {steps[1]} ns on {topic}; record both alike"
+        )
+    arrays = [recorded.whole(*of, drive_fit.MOST) for of in ((command, "position"), (topic, field))]
+    common = min(array.size for array in arrays)
+    try:
+        fit = drive_fit.fit(
+            arrays[0][:common],
+            arrays[1][:common],
+            steps[0] * 1e-9,
+            method=table.discretisation,
+            stroke=table.stroke if known else np.inf,
+        )
+    except InputError as error:
+        raise InputError(f"{recorded.path}: {node} from {command} and {topic}: {error}") from None
+    before = {name: float(getattr(table, name)) for name in drive_fit.PARAMETERS} if known else None
+    return Identified(node, command, (topic, field), fit, before)
+
+
+def with_identified(scenario: Scenario, found: Sequence[Identified]) -> Scenario:
+    """The scenario with the identified parameters in place of its own.
+
+    Raises:
+        InputError: a value that the drive's table refuses.
+    """
+    nodes = dict(scenario.nodes)
+    for drive in found:
+        table = nodes[drive.node]
+        nodes[drive.node] = type(table).read(drive.node, {**table.model_dump(), **drive.fit.values})
+    return Scenario(scenario.name, models.resolved(nodes))
+
+
+def write_parameters(path: Path, scenario: Scenario | None, found: Sequence[Identified]) -> None:
+    """Write a parameter file: the whole scenario, or without one what was identified.
+
+    Files that the scenario names are copied beside it, since those of a bag do not last.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    try:
+        if scenario is None:
+            tree = {f"/{drive.node}": {"ros__parameters": dict(drive.fit.values)} for drive in found}
+            text = yaml.safe_dump(tree, sort_keys=False)
+        else:
+            nodes = {name: _with_files(path, name, table) for name, table in scenario.nodes.items()}
+            text = Scenario(scenario.name, nodes).to_yaml()
+        with replacing(path) as file:
+            file.write(text.encode())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def _with_files(path: Path, node: str, table: NodeParameters) -> NodeParameters:
+    """A node's table with its files copied beside ``path``, and no identity: the values have changed."""
+    update: dict[str, str] = {"run_id": ""}
+    for row in type(table).rows().values():
+        file = Path(str(getattr(table, row.name))) if row.is_path else Path()
+        if row.is_path and file.is_file():
+            beside = path.with_name(f"{path.stem}.{node}.{row.name}{file.suffix}")
+            if not (beside.exists() and beside.samefile(file)):
+                shutil.copyfile(file, beside)
+            update[row.name] = beside.name
+    return table.model_copy(update=update)
+
+
+@dataclass(frozen=True)
+class Form:
+    """The tool's position over the spindle angle, averaged.
+
+    Attributes:
+        radius: at even angles from 0 on [m], shape (points,).
+        revolutions: first and last that count, from 1.
+        scatter: RMS of a revolution's difference from the average [m].
+    """
+
+    radius: np.ndarray
+    revolutions: tuple[int, int]
+    scatter: float
+
+
+def form(recorded: Recorded) -> Form:
+    """The tool's recorded position averaged by angle, over the later half of the revolutions.
+
+    Raises:
+        InputError: no encoder, no position, or not one complete revolution.
+        LatheError: samples are missing or not finite.
+    """
+    tool = recorded.find("tool", messages.TOOL)
+    state = recorded.find("coarse/state", messages.STATE)
+    if not tool and not state:
+        raise InputError(
+            f"{recorded.path}: no form without the tool's position: {recorded.lacks('tool', messages.TOOL)}, or "
+            f"{recorded.lacks('coarse/state', messages.STATE)}; the bag has {recorded.holdings()}"
+        )
+    source = (tool, "displacement") if tool else (state or "", "measured_position")
+    spindle = recorded.spindle("encoder")
+    arrays = [recorded.whole(topic, field) for topic, field in ((spindle.topic, spindle.angle), source)]
+    common = min(array.size for array in arrays)
+    angle, position = arrays[0][:common] - spindle.turns, arrays[1][:common]
+    # An encoder of few counts stands still for some samples: the first of each counts.
+    new = np.diff(angle, prepend=-np.inf) > 0.0
+    every = evenly(angle[new], position[new], _FORM_POINTS)
+    if not every.size:
+        raise InputError(f"{recorded.path}: no form: not one complete revolution was recorded")
+    first = every.shape[0] // 2
+    average = every[first:].mean(axis=0)
+    return Form(average, (first + 1, every.shape[0]), float(np.sqrt(np.mean((every[first:] - average) ** 2))))
+
+
+def write_form(path: Path, found: Form) -> None:
+    """Write a form as a CSV file that a tool's ``profile_file`` takes.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    first, last = found.revolutions
+    scatter = f"{found.scatter * 1e6:.4g} um RMS"
+    profile_csv.write(path, found.radius, comment=f"tool position, revolutions {first} to {last}, scatter {scatter}")

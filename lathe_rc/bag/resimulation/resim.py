@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Re-simulation: what the spindle did is taken from a bag, everything behind it computes again.
+
+With nothing changed every bit must come out as it was recorded. With another controller the run shows what that
+controller would have made of the same spindle, disturbances and form.
+
+A bag that does not say what made it is served with a scenario beside it: the spindle is the recorded one, the rest
+is the scenario's, with the drive identified from the recorded command and position if that is asked for.
+"""
+
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from lathe_rc import messages, resources
+from lathe_rc.bag import check, provenance
+from lathe_rc.bag.reading.recorded import Recorded
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.stream import feed
+from lathe_rc.bag.resimulation import identify
+from lathe_rc.bag.resimulation.bag_spindle import asked_for, wire
+from lathe_rc.bag.resimulation.identify import Identified
+from lathe_rc.bag.snapshot import first_sample
+from lathe_rc.bag.writing.record import OfflineRecorder, begin
+from lathe_rc.bag.writing.writer import refuse_existing
+from lathe_rc.cell import models, ros_yaml
+from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.collect import Finite
+from lathe_rc.cell.engine import Engine, Sink
+from lathe_rc.cell.parameters import SharedParameters
+from lathe_rc.cell.recording import Digester, SparseTopic
+from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError, UnpublishedError
+from lathe_rc.messages import Samples, Signals
+from lathe_rc.names import instead
+from lathe_rc.part import ErrorsByRevolution
+
+
+@dataclass(frozen=True)
+class Resimulation:
+    """The result of a re-simulation.
+
+    Attributes:
+        scenario: what ran.
+        changed: whether it is another than that of the bag, or the bag has none.
+        samples: length of the run.
+        wall_s: it took [s].
+        digest: of each signal topic.
+        recorded: the same of the bag; empty if the recording is not complete.
+        rms: form error by revolution [m], shape (revolutions,); empty without a tool.
+        recorded_rms: the same of the bag.
+        between_rms: difference of the recorded and the re-simulated tool position by revolution, RMS [m], where
+            the recorded error is not in the bag but made from them; otherwise empty.
+        positions: topics and fields of the bag that this position is; otherwise empty.
+        drives: that were identified.
+        warnings: what has changed since the bag was made, of classes of others.
+    """
+
+    scenario: Scenario
+    changed: bool
+    samples: int
+    wall_s: float
+    digest: Mapping[str, str]
+    recorded: Mapping[str, str]
+    rms: Samples = field(repr=False)
+    recorded_rms: Samples = field(repr=False)
+    between_rms: Samples = field(repr=False)
+    positions: list[tuple[str, str]]
+    drives: list[Identified]
+    warnings: list[str]
+
+    @property
+    def different(self) -> list[str]:
+        """Topics that are not as they were recorded."""
+        return [topic for topic in sorted(self.recorded) if self.digest.get(topic) != self.recorded[topic]]
+
+    @property
+    def missing(self) -> list[str]:
+        """Topics that were not recorded."""
+        return sorted(self.digest.keys() - self.recorded.keys())
+
+    @property
+    def simulated_s(self) -> float:
+        """Simulated time [s]."""
+        return self.samples * self.scenario.shared.step
+
+
+class _Digests:
+    """Digests of an offline run, its topics made fully qualified; a sink."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._step_ns = cell.master.shared.step_ns
+        self._digester = Digester()
+        self._sparse = {f"/{topic}": SparseTopic() for topic in cell.sparse}
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        for topic, signals in dense.items():
+            self._digester.dense(f"/{topic}", signals)
+        for topic, found in sparse.items():
+            for message in found:
+                stamp = messages.START_NS + message.index * self._step_ns
+                head = {"sample_index": message.index} if message.type.startswith(messages.PACKAGE) else {}
+                self._sparse[f"/{topic}"].append(stamp, head | message.values)
+
+    def result(self) -> dict[str, str]:
+        return self._digester.result(self._sparse)
+
+
+def with_controller(scenario: Scenario, file: Path) -> Scenario:
+    """Replace the nodes that a parameter file names; what all nodes share stays as it was.
+
+    Raises:
+        InputError: a node that the scenario has not, or a parameter that is refused.
+    """
+    shared = {name: getattr(scenario.shared, name) for name in SharedParameters.model_fields}
+    nodes = dict(scenario.nodes)
+    for name, values in ros_yaml.read(file).items():
+        if name == "/**":
+            continue
+        if name not in nodes:
+            raise InputError(f"{file}: no node {name!r} in the bag's scenario; {instead(name, nodes)}")
+        own = {key: value for key, value in values.items() if key not in SharedParameters.model_fields}
+        stage = own.get("stage") or nodes[name].stage
+        kind = kind_of(name, stage)
+        nodes[name] = TABLES[kind].read(name, {**shared, "remap": nodes[name].remap, **own, "stage": stage})
+    return Scenario(scenario.name, models.resolved(nodes))
+
+
+def _refuse_part(source: Source) -> None:
+    held = provenance.held(source.about)
+    if held:
+        topic, sample = next(iter(held.items()))
+        raise InputError(
+            f"{source.path}: nodes were lost on the way, {topic} is held from sample {sample} on; allowed: a bag of a "
+            "run that nothing interrupted"
+        )
+    first = first_sample(source.about)
+    if first:
+        raise InputError(
+            f"{source.path} is a snapshot from sample {first} on: the start of the run, from which controllers and "
+            "drives have their state, is missing; allowed: a bag from sample 0 on (recorder.mode = both records the "
+            "whole run beside the snapshots)"
+        )
+
+
+def resimulate(
+    path: Path,
+    overrides: Sequence[str] = (),
+    *,
+    scenario: Path | None = None,
+    controller: Path | None = None,
+    topics: Mapping[str, str] | None = None,
+    identified: bool = False,
+    parameters: Path | None = None,
+    output: Path | None = None,
+) -> Resimulation:
+    """Run the cell of a bag again behind its recorded spindle.
+
+    Args:
+        path: the bag.
+        overrides: ``NODE.PARAM=VALUE``; not of the spindle, if the scenario is the bag's.
+        scenario: parameter file that takes the place of the bag's scenario; None: the bag has one.
+        controller: parameter file whose nodes replace those of the scenario.
+        topics: topic of the bag by relative topic of the cell, where they are called otherwise.
+        identified: the electrodynamic drives are those identified from the bag.
+        parameters: file to write the scenario to that runs; None: none is written.
+        output: folder of a bag to write the result to; must not exist; None: none is written.
+
+    Raises:
+        InputError: the bag has no encoder, or no scenario and none is given; the changes cannot work; a drive
+            cannot be identified.
+        LatheError: samples that are needed are missing or not finite.
+    """
+    if output is not None:
+        refuse_existing(output)
+    with Source(path) as source, tempfile.TemporaryDirectory(prefix="lathe-resim-") as folder:
+        _refuse_part(source)
+        recorded = Recorded(source, topics or {})
+        original = None if scenario is not None else _of_bag(recorded, source, Path(folder))
+        if scenario is not None:
+            chosen = scenarios.load(resources.scenario(scenario), overrides)
+        else:
+            assert original is not None, "it is the other source of a scenario"
+            _refuse_overrides(original, overrides)
+            chosen = provenance.scenario_of(source.about, Path(folder), overrides) if overrides else original
+        if controller is not None:
+            chosen = with_controller(chosen, controller)
+        warnings = provenance.changes(source.about) if original is not None else []
+        _refuse_events(chosen, original)
+        drives = identify.drives(recorded, chosen) if identified else []
+        chosen = identify.with_identified(chosen, drives)
+        if parameters is not None:
+            identify.write_parameters(parameters, chosen, drives)
+        changed = original is None or chosen.nodes != original.nodes
+        with _without_strangers(path, changed=changed):
+            cell, compared, events = wire(chosen, original, recorded, source)
+        for name, stage in cell.stages.items():
+            for index, action in events.get(name, []):
+                stage.replay(action, index)
+        digests = _Digests(cell)
+        errors = ErrorsByRevolution({f"/{name}": said.type for name, said in cell.dense.items()})
+        samples = cell.master.samples
+        assert samples is not None, "a bag has an end"
+        writer = begin(output, chosen) if output is not None else None
+        all_sinks: list[Sink] = [Finite(cell), digests, errors, *([compared] if compared else [])]
+        if writer is not None:
+            all_sinks.append(OfflineRecorder(cell, samples, writer))
+        engine = Engine(cell)
+        start = time.monotonic()
+        try:
+            engine.run(all_sinks)
+        finally:
+            if writer is not None:
+                writer.close()
+        digest = digests.result()
+        wall = time.monotonic() - start
+    found = recorded_digests(path) if original is not None else {}
+    digest_of_bag = {topic.removeprefix(recorded.namespace): digest for topic, digest in found.items()}
+    before = errors
+    if changed and compared is None:
+        before = ErrorsByRevolution({name: said.type for name, said in source.topics.items()})
+        feed(path, [before])
+    return Resimulation(
+        scenario=chosen,
+        changed=changed,
+        samples=samples,
+        wall_s=wall,
+        digest=digest,
+        recorded=digest_of_bag,
+        rms=errors.rms(),
+        recorded_rms=compared.recorded_rms() if compared else before.rms(),
+        between_rms=compared.between_rms() if compared else np.empty(0),
+        positions=compared.topics if compared else [],
+        drives=drives,
+        warnings=warnings,
+    )
+
+
+def _of_bag(recorded: Recorded, source: Source, folder: Path) -> Scenario:
+    """The bag's scenario.
+
+    Raises:
+        InputError: it has none; says what it has and what is asked for.
+    """
+    if provenance.SCENARIO not in source.about:
+        raise InputError(f"{source.path}: {asked_for(recorded)}")
+    return provenance.scenario_of(source.about, folder)
+
+
+@contextmanager
+def _without_strangers(path: Path, *, changed: bool) -> Iterator[None]:
+    """Say what to do where nobody publishes what a cell reads since nodes of others did: the bag has no more of them.
+
+    Args:
+        path: the bag.
+        changed: whether the cell is another than the recorded one; then it may be for another reason.
+    """
+    try:
+        yield
+    except UnpublishedError as error:
+        if changed:
+            raise
+        raise InputError(
+            f"{path}: {str(error).partition(';')[0]}: a node that the bag knows by its topics alone did; allowed: "
+            "--scenario FILE with a node of ours in its place (--identify finds its drive)"
+        ) from None
+
+
+_PAST = (
+    "events and faults come from the bag, as they took effect; leave them as they are, or run the scenario with others"
+)
+
+
+def _refuse_overrides(original: Scenario, overrides: Sequence[str]) -> None:
+    spindle = original.masters[0]
+    for text in overrides:
+        name = text.partition("=")[0].strip()
+        if name.endswith((".events", ".faults")):
+            raise InputError(f"--set {text!r}: {_PAST}")
+        if name.partition(".")[0] == spindle or "." not in name:
+            raise InputError(f"--set {text!r}: the spindle and what all nodes share come from the bag; set others")
+
+
+def _refuse_events(chosen: Scenario, original: Scenario | None) -> None:
+    """Refuse to be asked for others than the bag has; a controller's own that has none gets those of the bag."""
+    if original is None:
+        return
+    for name, table in chosen.nodes.items():
+        for what in ("events", "faults"):
+            asked = getattr(table, what)
+            if asked and asked != getattr(original.nodes[name], what):
+                raise InputError(f"{name}.{what} = {asked}: {_PAST}")
+
+
+def recorded_digests(path: Path) -> dict[str, str]:
+    """Digests of a bag: those that were recorded, or made now from all of it; empty if it is not complete."""
+    return check.recorded(path) or check.check(path).digests

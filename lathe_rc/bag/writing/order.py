@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The order of signal messages in a bag: by log time, then topic, then index, whoever arrived first."""
+
+from collections import Counter
+from collections.abc import Collection, Mapping
+from typing import NamedTuple
+
+from lathe_rc.bag.writing.rows import Dense, Plan, Sheet
+from lathe_rc.bag.writing.writer import Output
+from lathe_rc.cell.block import Block
+from lathe_rc.errors import LatheError
+from lathe_rc.messages import START_NS, Samples, Signals
+
+_ROWS = 16  # of a sheet
+_MOST = 2**63  # messages
+
+
+class _Single(NamedTuple):
+    """A message at a chosen sample, or a block without its row; sorts as bags are sorted."""
+
+    log_ns: int
+    topic: str
+    sequence: int
+    data: bytes
+
+
+class Merger:
+    """Collects the messages of all signal topics and writes them in the order of a bag.
+
+    A row of blocks leaves when every dense topic has brought its block and every source the sparse messages that the
+    block counts: then nothing with an earlier time can still come.
+
+    Args:
+        writer: the bag, or what makes bags; its topics must have been added.
+        dense: message type and source by fully qualified dense topic.
+        sparse: source by fully qualified sparse topic.
+        run_id: identity of the run.
+        step_ns: sampling step [ns].
+        samples: of a block; the last may be shorter.
+
+    Attributes:
+        rows: written so far.
+        samples: written so far, of each dense topic.
+        log_ns: time of the last of them.
+        complete: the last block of every topic has been written.
+    """
+
+    def __init__(
+        self,
+        writer: Output,
+        dense: Mapping[str, tuple[str, str]],
+        sparse: Mapping[str, str],
+        *,
+        run_id: str,
+        step_ns: int,
+        samples: int,
+    ) -> None:
+        self._writer, self._run_id, self._step_ns, self._length = writer, run_id, step_ns, samples
+        self._topics = [Dense(topic, *dense[topic], writer.channel(topic)) for topic in sorted(dense)]
+        self._places = {each.topic: place for place, each in enumerate(self._topics)}
+        self._ends = [0] * len(self._topics)  # rows that each topic has brought
+        self._late = len(self._topics)  # topics that have not brought the next row
+        self._final: int | None = None  # the last row
+        self._finals = 0  # topics that have brought it
+        self._plan = Plan(self._topics, run_id, step_ns, samples)
+        self._sheets: dict[int, Sheet] = {}  # by number
+        self._free: list[Sheet] = []
+        self._tail: Sheet | None = None  # the last row, if it is shorter
+        self._sparse = sparse
+        self._repeats: Counter[tuple[str, int, bytes]] = Counter()
+        self._sequence = dict.fromkeys(sparse, 0)
+        self._received = dict.fromkeys(sparse.values(), 0)
+        self._needs: list[tuple[int, str, int]] = []  # row, source and the messages that it says it has sent
+        self._waiting: list[_Single] = []
+        self.rows = self.samples = 0
+        self.log_ns = START_NS
+        self.complete = False
+
+    # ---- what comes in ------------------------------------------------------------------------------
+
+    def add_block(self, topic: str, block: Block, data: bytes | None = None) -> bool:
+        """Take a block; returns whether every topic has one now, so that it is worth asking `release`.
+
+        Args:
+            topic: fully qualified.
+            block: the block.
+            data: its message, if there is one.
+
+        Raises:
+            LatheError: another run, or topics are cut into different blocks.
+        """
+        place = self._places[topic]
+        if block.run_id != self._run_id:
+            raise LatheError(f"{topic}: block of run {block.run_id!r} from {block.source}; expected {self._run_id!r}")
+        row = self._check(place, block.first_index, block.samples, last=block.last)
+        sheet, within = self._find(row, block.samples)
+        sheet.put(place, within, block, data)
+        source = self._topics[place].source
+        if block.companions > self._received.get(source, 0):
+            self._needs.append((row, source, block.companions))
+        return self._brought(place, row + 1)
+
+    def add_blocks(self, topic: str, first: int, signals: Signals, companions: Samples, *, last: bool) -> bool:
+        """Take consecutive blocks whose sparse messages have all been added; returns as `add_block` does.
+
+        Args:
+            topic: fully qualified.
+            first: index of the first sample.
+            signals: arrays of shape (n,) by field.
+            companions: what each block says of them, shape (blocks,).
+            last: the run ends with them.
+
+        Raises:
+            LatheError: see `add_block`.
+        """
+        place, samples, done = self._places[topic], next(iter(signals.values())).size, 0
+        while done < samples:
+            length = min(self._length, samples - done)
+            row = self._check(place, first + done, length, last=last and done + length == samples)
+            sheet, within = self._find(row, length)
+            count = min((samples - done) // length, len(sheet.bytes) - within)
+            stop = done + count * length
+            if last and stop == samples and count > 1:
+                self._end(place, row + count - 1)
+            part = {name: array[done:stop] for name, array in signals.items()}
+            numbers = companions[done // self._length :][:count]
+            sheet.put_many(place, within, part, numbers, last=last and stop == samples)
+            self._brought(place, row + count)
+            done = stop
+        return not self._late
+
+    def add_sparse(self, topic: str, log_ns: int, data: bytes) -> None:
+        """Take a sparse message."""
+        if self._repeats[topic, log_ns, data]:
+            self._repeats[topic, log_ns, data] -= 1
+            return
+        self._sequence[topic] += 1
+        self._waiting.append(_Single(log_ns, topic, self._sequence[topic], data))
+        self._received[self._sparse[topic]] += 1
+
+    def restarted(self, source: str) -> None:
+        """Another process goes on in the place of a source: what waits of its sparse messages comes once more."""
+        self._repeats |= Counter(
+            (each.topic, each.log_ns, each.data) for each in self._waiting if self._sparse[each.topic] == source
+        )
+
+    def forget(self, sources: Collection[str]) -> None:
+        """Wait for no more sparse messages of sources that are lost."""
+        self._received |= dict.fromkeys(sources, _MOST)
+        self._needs = [need for need in self._needs if need[1] not in sources]
+
+    def _check(self, place: int, first: int, samples: int, *, last: bool) -> int:
+        """The row of the next block of a topic."""
+        row = self._ends[place]
+        short = samples != self._length and not (last and (self._tail is None or self._tail.plan.samples == samples))
+        if first != row * self._length or short or (self._final is not None and row > self._final):
+            raise LatheError(
+                f"topics are not cut into the same blocks: {self._topics[place].topic} brings {samples} samples "
+                f"from {first}; expected {self._length} from {row * self._length}, fewer only at the end of the run"
+            )
+        if last:
+            self._end(place, row)
+        return row
+
+    def _end(self, place: int, row: int) -> None:
+        if self._final not in (None, row) or any(end > row + 1 for end in self._ends):
+            raise LatheError(
+                f"topics are not cut into the same blocks: {self._topics[place].topic} ends with block {row}, "
+                "others elsewhere"
+            )
+        self._final = row
+        self._finals += 1
+
+    def _brought(self, place: int, end: int) -> bool:
+        if self._ends[place] == self.rows:
+            self._late -= 1
+        self._ends[place] = end
+        return not self._late
+
+    def _find(self, row: int, samples: int) -> tuple[Sheet, int]:
+        """The sheet of a row, and its place there."""
+        if samples != self._length:
+            if self._tail is None:
+                self._tail = Sheet(Plan(self._topics, self._run_id, self._step_ns, samples), 1)
+                self._tail.begin(row * self._length)
+            return self._tail, 0
+        number, within = divmod(row, _ROWS)
+        sheet = self._sheets.get(number)
+        if sheet is None:
+            sheet = self._sheets[number] = self._free.pop() if self._free else Sheet(self._plan, _ROWS)
+            sheet.begin(number * _ROWS * self._length)
+        return sheet, within
+
+    # ---- what goes out ------------------------------------------------------------------------------
+
+    def _at(self, row: int) -> tuple[Sheet, int]:
+        """The sheet of a row that has come, and its place there."""
+        return self._find(row, self._length if row != self._final or self._tail is None else self._tail.plan.samples)
+
+    def release(self) -> None:
+        """Write what is complete.
+
+        Raises:
+            LatheError: not all topics end with the same block; the disk does not take it.
+        """
+        ready = min(self._ends)
+        if self._needs:
+            self._needs = [need for need in self._needs if self._received.get(need[1], 0) < need[2]]
+            ready = min([ready, *(row for row, _, _ in self._needs)])
+        if self._final is not None and ready > self._final and self._finals < len(self._topics):
+            raise LatheError("topics are not cut into the same blocks: not all end with the same one (`last`)")
+        while self.rows < ready:
+            self._write(*self._at(self.rows), self._together(ready))
+        self._late = sum(end == ready for end in self._ends)
+
+    def _together(self, ready: int) -> int:
+        """Where the rows end that can be written at once: they are on one sheet, and no sparse message is between."""
+        end = min(ready, (self.rows // _ROWS + 1) * _ROWS)
+        if self._tail is not None and self.rows != self._final and end > (self._final or 0):
+            end -= 1
+        if self._waiting:
+            earliest = min(single.log_ns for single in self._waiting)
+            end = min(end, (earliest - START_NS) // self._step_ns // self._length)
+        return max(end, self.rows + 1)
+
+    def _write(self, sheet: Sheet, within: int, end: int) -> None:
+        """Write rows up to ``end``, all of one sheet, and ahead of them the sparse messages of the first."""
+        first = self.rows
+        first_ns = START_NS + (first * self._length + sheet.plan.samples - 1) * self._step_ns
+        due = sorted(single for single in self._waiting if single.log_ns <= first_ns) if self._waiting else []
+        if due:
+            self._waiting = [single for single in self._waiting if single.log_ns > first_ns]
+        if due and due[-1].log_ns == first_ns:
+            # Among messages of one time the topic decides: this row has to be taken apart.
+            due += [_Single(first_ns, each.topic, 0, sheet.message(k, within)) for k, each in enumerate(self._topics)]
+            first += 1
+        for single in sorted(due):
+            self._writer.write(single.topic, single.log_ns, single.data)
+        if first < end:
+            skip = first - self.rows
+            data = sheet.bytes[within + skip : within + end - self.rows].tobytes()
+            self._writer.write_rows(sheet.plan.mcap, first_ns + skip * sheet.plan.mcap.period_ns, data)
+        self.rows, self.samples = end, (end - 1) * self._length + sheet.plan.samples
+        self.log_ns = START_NS + (self.samples - 1) * self._step_ns
+        self.complete = self._final is not None and end > self._final
+        if end % _ROWS == 0 and sheet is not self._tail:
+            self._free.append(self._sheets.pop(end // _ROWS - 1))
+
+    def write_rest(self) -> None:
+        """Write everything that is left, sorted: what an interrupted run has of its last blocks.
+
+        Raises:
+            LatheError: the disk does not take it.
+        """
+        left, self._waiting = self._waiting, []
+        for place, end in enumerate(self._ends):
+            for row in range(self.rows, end):
+                sheet, within = self._at(row)
+                stamp = START_NS + (row * self._length + sheet.plan.samples - 1) * self._step_ns
+                left.append(_Single(stamp, self._topics[place].topic, 0, sheet.message(place, within)))
+        for single in sorted(left):
+            self._writer.write(single.topic, single.log_ns, single.data)

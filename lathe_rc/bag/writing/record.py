@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recording an offline run: the messages that a cell of ROS nodes would have sent, in the same order."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from lathe_rc import messages
+from lathe_rc.bag import provenance
+from lathe_rc.bag.writing.order import Merger
+from lathe_rc.bag.writing.snapshots import Snapshots
+from lathe_rc.bag.writing.tee import Both
+from lathe_rc.bag.writing.writer import BagWriter, Output, offered_qos
+from lathe_rc.cell.framing import Framer
+from lathe_rc.cell.parameters import SharedParameters
+from lathe_rc.cell.recorder import KIND, RecorderParameters
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.messages import Signals
+
+_SPARE, _FREE_RUNNING = 32, 1024  # messages
+
+
+def signal_depth(shared: SharedParameters) -> int:
+    """Queue length of signal topics: all blocks in flight and some more; many where nothing holds the spindle back.
+
+    A reader of a feedback edge may be a window behind itself, and the publisher a window ahead of it.
+    """
+    return 2 * (shared.window or _FREE_RUNNING) + _SPARE
+
+
+def bag_of(path: Path, table: RecorderParameters, snapshots: Snapshots | None) -> Output:
+    """The outputs of a recorder: the bag of the whole run unless only snapshots are wanted, and these if there are any.
+
+    Raises:
+        InputError: the folder exists or cannot be made.
+    """
+    if snapshots is not None and table.mode == "snapshot":
+        return snapshots
+    bag = BagWriter(path, compression=table.compression, chunk_size=table.chunk_size, about={})
+    return bag if snapshots is None else Both(bag, snapshots)
+
+
+def begin(path: Path, scenario: Scenario, snapshots: Snapshots | None = None) -> Output:
+    """A bag for an offline run of a scenario, as its recorder would write it.
+
+    Args:
+        path: its folder.
+        scenario: what runs.
+        snapshots: of `begin_snapshots`; None: whatever the scenario says, the whole run is recorded.
+
+    Raises:
+        InputError: the folder exists or cannot be made.
+    """
+    output = bag_of(path, recorder_of(scenario)[1], snapshots)
+    output.tell(provenance.tell(scenario, []))
+    return output
+
+
+def recorder_of(scenario: Scenario) -> tuple[str, RecorderParameters]:
+    """Name and table of a scenario's recorder; what a recorder is by itself if it has none."""
+    for name, table in scenario.nodes.items():
+        if isinstance(table, RecorderParameters):
+            return name, table
+    shared = {name: getattr(scenario.shared, name) for name in SharedParameters.model_fields}
+    return KIND, RecorderParameters(**shared)
+
+
+def begin_snapshots(path: Path, scenario: Scenario, cell: Cell) -> Snapshots | None:
+    """The snapshots that a scenario's recorder makes beside the bag in ``path``, if it makes any.
+
+    Raises:
+        InputError: see `Snapshots` and its `prepare`.
+    """
+    name, table = recorder_of(scenario)
+    if table.mode == "continuous":
+        return None
+    snapshots = Snapshots(table.snapshots_of(path), table, name=name)
+    snapshots.prepare(_dense(cell), list(cell.stages))
+    return snapshots
+
+
+def _dense(cell: Cell) -> dict[str, tuple[str, str]]:
+    """Message type and source by fully qualified dense topic."""
+    return {f"/{topic}": (source.type, f"/{source.node}") for topic, source in cell.dense.items()}
+
+
+class OfflineRecorder:
+    """Cuts the chunks of the engine into blocks and writes them; a sink of the engine.
+
+    Args:
+        cell: the cell that runs.
+        samples: length of the run.
+        writer: the bag.
+        snapshots: what is in the bag's place or beside it, if there is.
+    """
+
+    def __init__(self, cell: Cell, samples: int, writer: Output, snapshots: Snapshots | None = None) -> None:
+        shared = cell.master.shared
+        self._snapshots = snapshots
+        self._cell, self._samples, self._writer = cell, samples, writer
+        self._block, self._step_ns = shared.block_size, shared.step_ns
+        self._framers = {name: Framer(shared.run_id, f"/{name}", shared.step_ns) for name in cell.stages}
+        qos = offered_qos(signal_depth(shared), "transient_local")
+        for topic, source in sorted({**cell.dense, **cell.sparse}.items()):
+            writer.add_topic(f"/{topic}", source.type, qos)
+
+        self._merger = Merger(
+            writer,
+            _dense(cell),
+            {f"/{topic}": f"/{source.node}" for topic, source in cell.sparse.items()},
+            run_id=shared.run_id,
+            step_ns=shared.step_ns,
+            samples=shared.block_size,
+        )
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        ends = first + np.minimum(np.arange(self._block, samples + self._block, self._block), samples)
+        before = {name: framer.companions for name, framer in self._framers.items()}
+        sent: dict[str, list[int]] = {}  # samples of the sparse messages of each node
+        for topic, found in sparse.items():
+            node = self._cell.sparse[topic].node
+            for message in found:
+                framed = self._framers[node].sparse(message)
+                self._merger.add_sparse(f"/{topic}", messages.stamp_ns(framed), messages.encode(message.type, framed))
+            sent.setdefault(node, []).extend(message.index for message in found)
+        for topic, signals in dense.items():
+            node = self._cell.dense[topic].node
+            companions = before[node] + np.searchsorted(np.sort(sent.get(node, [])), ends)
+            last = first + samples == self._samples
+            self._merger.add_blocks(f"/{topic}", first, signals, companions, last=last)
+        self._merger.release()
+
+    def close(self) -> None:
+        """End the recording, also of a run that does not come to its end.
+
+        Raises:
+            LatheError: the disk does not take it.
+        """
+        try:
+            if self._snapshots is not None and not self._merger.complete:
+                self._snapshots.interrupt("interrupted")
+        finally:
+            self._writer.close()

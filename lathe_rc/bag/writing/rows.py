@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows of a bag: the blocks with the same samples, of all dense topics, one after the other.
+
+All rows are the same bytes but for a few numbers and the samples. So they are laid out once, and what a block costs
+is to copy its samples to their place.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lathe_rc.bag.writing.mcap_file import TIMES, RowPlan, message_head
+from lathe_rc.cell.block import Block
+from lathe_rc.cell.wire import NUMBERS, Layout
+from lathe_rc.messages import START_NS, Samples, Signals
+
+_BILLION = 1_000_000_000
+
+
+class Dense(NamedTuple):
+    """A topic of blocks.
+
+    Attributes:
+        topic: fully qualified.
+        type: message type.
+        source: fully qualified name of the node that makes them.
+        channel: its number in the file.
+    """
+
+    topic: str
+    type: str
+    source: str
+    channel: int
+
+
+class Plan:
+    """Where everything stands in rows of one length of block.
+
+    Args:
+        topics: the dense topics, in their order.
+        run_id: identity of the run.
+        step_ns: sampling step [ns].
+        samples: length of the blocks.
+
+    Attributes:
+        step_ns, samples: see above.
+        layouts: of the messages.
+        places: where they begin.
+        template: a row with all its numbers and samples 0, shape (bytes,).
+        mcap: what the file has to know of it.
+    """
+
+    def __init__(self, topics: list[Dense], run_id: str, step_ns: int, samples: int) -> None:
+        self.step_ns, self.samples = step_ns, samples
+        self.layouts = [Layout(dense.type, run_id, dense.source, samples) for dense in topics]
+        self.places: list[int] = []
+        template = b""
+        for dense, layout in zip(topics, self.layouts, strict=True):
+            template += message_head(dense.channel, 0, len(layout.template))
+            self.places.append(len(template))
+            template += layout.template
+        self.template = np.frombuffer(template, np.uint8)
+        places = {dense.channel: place for dense, place in zip(topics, self.places, strict=True)}
+        self.mcap = RowPlan(places, len(template), samples * step_ns)
+
+
+class Sheet:
+    """Some rows in memory.
+
+    Args:
+        plan: where everything stands.
+        rows: how many.
+
+    Attributes:
+        plan: see above.
+        bytes: the rows, shape (rows, bytes).
+    """
+
+    def __init__(self, plan: Plan, rows: int) -> None:
+        self.plan = plan
+        self.bytes = np.empty((rows, plan.template.size), np.uint8)
+        self.bytes[:] = plan.template
+        layouts = list(zip(plan.layouts, plan.places, strict=True))
+        messages = [self._view(layout.dtype, place) for layout, place in layouts]
+        # A record array makes a view anew each time that it is asked for a field; these are asked all the time.
+        self._numbers = [{name: message[name] for name in NUMBERS} for message in messages]
+        self._samples = [
+            {name: message[name] for name in layout.fields}
+            for message, layout in zip(messages, plan.layouts, strict=True)
+        ]
+        self._wholes = [self._whole(layout, place) for layout, place in layouts]
+        self._times = [self._view(np.dtype("<u8"), place - back) for _, place in layouts for back in TIMES]
+        for numbers in self._numbers:
+            numbers["step_ns"][:] = plan.step_ns
+
+    def _view(self, dtype: np.dtype[Any], place: int) -> Samples:
+        view: Samples = np.ndarray(len(self.bytes), dtype, self.bytes.data, place, self.bytes.strides[0])
+        return view
+
+    def _whole(self, layout: Layout, place: int) -> Samples | None:
+        """All samples of a message as one array, shape (rows, fields, samples), if they are of one type."""
+        places = [start for dtype, start in layout.fields.values() if dtype == np.float64]
+        gaps = set(np.diff(places).tolist()) or {0}
+        if len(places) != len(layout.fields) or len(gaps) > 1:
+            return None
+        shape, strides = (len(self.bytes), len(places), layout.samples), (self.bytes.strides[0], gaps.pop(), 8)
+        whole: Samples = np.ndarray(shape, np.float64, self.bytes.data, place + places[0], strides)
+        return whole
+
+    def begin(self, first: int) -> None:
+        """Let the first row begin at sample ``first``."""
+        firsts = first + np.arange(len(self.bytes)) * self.plan.samples
+        times = START_NS + (firsts + self.plan.samples - 1) * self.plan.step_ns
+        for place in self._times:
+            place[:] = times
+        seconds, nanoseconds = np.divmod(times, _BILLION)
+        for numbers in self._numbers:
+            numbers["sec"][:], numbers["nanosec"][:], numbers["first_index"][:] = seconds, nanoseconds, firsts
+            numbers["last"][:] = False
+
+    def put(self, place: int, row: int, block: Block, data: bytes | None) -> None:
+        """Set one block, that of the topic number ``place``; copy its message if there is one."""
+        if data is not None:
+            start = self.plan.places[place]
+            self.bytes[row, start : start + len(data)] = np.frombuffer(data, np.uint8)
+            return
+        whole = self._wholes[place]
+        if whole is not None and block.whole is not None:
+            whole[row] = block.whole
+        else:
+            for name, samples in self._samples[place].items():
+                samples[row] = block.signals[name]
+        numbers = self._numbers[place]
+        numbers["companions"][row] = block.companions
+        if block.last:
+            numbers["last"][row] = True
+
+    def put_many(self, place: int, row: int, signals: Signals, companions: Samples, *, last: bool) -> None:
+        """Set consecutive blocks of a topic, arrays of shape (blocks * samples,) by field, from a row on."""
+        stop = row + companions.size
+        for name, samples in self._samples[place].items():
+            samples[row:stop] = signals[name].reshape(companions.size, self.plan.samples)
+        numbers = self._numbers[place]
+        numbers["companions"][row:stop] = companions
+        numbers["last"][stop - 1] = last
+
+    def message(self, place: int, row: int) -> bytes:
+        """The message of a topic."""
+        start = self.plan.places[place]
+        return self.bytes[row, start : start + len(self.plan.layouts[place].template)].tobytes()

@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The last seconds of a run in memory, and a snapshot of them at every trigger.
+
+All times are samples, and a snapshot consists of whole rows of blocks. So what it holds depends on its triggers alone,
+and its messages are those that a recording of the whole run has there.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Collection, Mapping
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import NamedTuple
+
+from rosbags.interfaces import Qos
+
+from lathe_rc import messages
+from lathe_rc.bag.snapshot import Snapshot
+from lathe_rc.bag.writing.mcap_file import RowPlan
+from lathe_rc.bag.writing.rows import Dense, Plan
+from lathe_rc.bag.writing.writer import BagWriter, refuse_existing
+from lathe_rc.cell.recorder import RecorderParameters
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import START_NS
+from lathe_rc.names import instead
+
+_CATCH_UP = 4  # messages or rows that go to the disk for each that comes, until a snapshot has caught up
+_SPARE_ROWS = 2  # kept beyond the time before a trigger: a trigger may lie in the row before the newest
+_IN_FLIGHT = 16  # rows more that may be in memory: they come some at once
+_LATCHED = f"{messages.PACKAGE}/msg/CellState"
+_HEARD = (messages.EVENT, messages.SAFETY_STATUS)  # what may be a trigger
+
+
+class _Item(NamedTuple):
+    """A message of a topic, or a row."""
+
+    log_ns: int
+    key: str | RowPlan
+    data: bytes | memoryview
+
+
+def _ignore(snapshot: Snapshot) -> None:
+    """Tell nobody."""
+
+
+class Snapshots:
+    """Keeps what came last, and writes a bag of it at every trigger; an `Output` of messages in the order of a bag.
+
+    A trigger whose time before overlaps or touches the newest snapshot extends that one: no sample is written twice,
+    and one bag at most is open. It is closed when no trigger can extend it any more.
+
+    Args:
+        folder: of the bags; must not exist.
+        table: of the recorder.
+        name: of the recorder.
+        namespace: of the cell, ends with a slash; left out of the names of nodes.
+        told: gets each snapshot when it has been begun, and when it has been closed.
+
+    Attributes:
+        folder: see above.
+        bags: closed so far.
+        held: memory that the messages take which are kept [B].
+
+    Raises:
+        InputError: the folder exists.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        table: RecorderParameters,
+        *,
+        name: str,
+        namespace: str = "/",
+        told: Callable[[Snapshot], None] = _ignore,
+    ) -> None:
+        refuse_existing(folder)
+        self.folder, self._table, self._name, self._namespace, self._told = folder, table, name, namespace, told
+        self._pre, self._post = (math.ceil(round(s * table.sample_rate, 6)) for s in (table.pre, table.post))
+        self._margin_ns = (self._pre + _SPARE_ROWS * table.block_size) * table.step_ns
+        self._about: dict[str, str] = {}
+        self._topics: dict[str, tuple[str, Qos]] = {}
+        self._latched: dict[str, bytes | memoryview] = {}  # newest message that is not kept any more, by topic
+        self._kept: deque[_Item] = deque()  # an open snapshot has them, or does not need them
+        self._waiting: deque[_Item] = deque()  # an open snapshot has not come to them yet
+        self._open: tuple[Snapshot, BagWriter] | None = None
+        self._newest_ns = self._flushed_ns = START_NS - table.step_ns
+        self._interrupted = False
+        self.bags = 0
+        self.held = 0
+
+    # ---- before the start ---------------------------------------------------------------------------
+
+    def prepare(self, dense: Mapping[str, tuple[str, str]], nodes: Collection[str]) -> int:
+        """See whether snapshots of a cell can be made, and make their folder.
+
+        Args:
+            dense: message type and source by fully qualified dense topic.
+            nodes: names that triggers may name.
+
+        Returns:
+            Memory that the time before a trigger takes [B].
+
+        Raises:
+            InputError: it is more than the table allows; a trigger is of a node that there is not; the folder cannot be
+                made.
+        """
+        self._check_triggers(nodes)
+        needed = self._needed(dense)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self.folder}: cannot be made ({error.strerror})") from None
+        return needed
+
+    def _needed(self, dense: Mapping[str, tuple[str, str]]) -> int:
+        table = self._table
+        topics = [Dense(topic, *dense[topic], 0) for topic in sorted(dense)]
+        row = Plan(topics, table.run_id, table.step_ns, table.block_size).template.size
+        rows = -(-self._pre // table.block_size) + _SPARE_ROWS + _IN_FLIGHT
+        if rows * row > table.memory:
+            most = max(table.memory // row - _SPARE_ROWS - _IN_FLIGHT, 0) * table.block_size * table.step
+            raise InputError(
+                f"{self._name}.pre = {table.pre:g} s takes {rows * row} B of memory, {row} B for {table.block_size} "
+                f"samples of all topics; {self._name}.memory = {table.memory} B allows pre = {most:.3g} s: "
+                "shorten pre or raise memory"
+            )
+        return rows * row
+
+    def _check_triggers(self, nodes: Collection[str]) -> None:
+        for pattern in self._table.triggers:
+            node, colon, _ = pattern.partition(": ")
+            if colon and not any(fnmatchcase(name, node) for name in nodes):
+                known = instead(node, sorted(nodes))
+                raise InputError(f"{self._name}.triggers = {pattern!r}: no node {node!r} in the cell; {known}")
+
+    # ---- what comes in ------------------------------------------------------------------------------
+
+    def tell(self, about: Mapping[str, str]) -> None:
+        """See `Output`; every bag says so."""
+        self._about.update(about)
+        if self._open is not None:
+            self._open[1].tell(about)
+
+    def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
+        """See `Output`."""
+        self._topics[topic] = msgtype, qos
+        if self._open is not None:
+            self._open[1].add_topic(topic, msgtype, qos)
+
+    def channel(self, topic: str) -> int:
+        """See `Output`; a file counts its channels from 1."""
+        return list(self._topics).index(topic) + 1
+
+    def write(self, topic: str, log_ns: int, data: bytes) -> None:
+        """See `Output`; an event or an alarm may be a trigger.
+
+        Raises:
+            LatheError: the disk does not take it, or too much is kept.
+        """
+        self._take(_Item(log_ns, topic, data))
+        if self._table.triggers and self._topics[topic][0] in _HEARD:
+            self._hear(topic, data)
+
+    def write_rows(self, plan: RowPlan, first_ns: int, data: bytes) -> None:
+        """See `Output`.
+
+        Raises:
+            LatheError: the disk does not take it, or too much is kept.
+        """
+        whole = memoryview(data)
+        for row, start in enumerate(range(0, len(data), plan.size)):
+            self._take(_Item(first_ns + row * plan.period_ns, plan, whole[start : start + plan.size]))
+
+    def _hear(self, topic: str, data: bytes) -> None:
+        msgtype = self._topics[topic][0]
+        try:
+            heard = messages.decode(msgtype, data)
+        except ValueError as error:
+            raise LatheError(f"{topic}: {error}") from None
+        what = heard.action if msgtype == messages.EVENT else f"{heard.monitor} {heard.subject}".strip()
+        cause = f"{heard.source.removeprefix(self._namespace)}: {what}"
+        if any(fnmatchcase(cause, pattern) for pattern in self._table.triggers):
+            self.trigger(cause, int(heard.sample_index))
+
+    def _take(self, item: _Item) -> None:
+        if not isinstance(item.key, str) or self._topics[item.key][0] in messages.signal_types():
+            self._newest_ns = max(self._newest_ns, item.log_ns)
+        self.held += len(item.data)
+        if self._open is None:
+            self._kept.append(item)
+        else:
+            self._waiting.append(item)
+            self._catch_up(_CATCH_UP)
+            if self._newest_ns > self._stamp(self._open[0].last) + self._margin_ns:
+                self._end()
+        self._forget()
+        if self.held > self._table.memory:
+            raise LatheError(
+                f"{self._name}: {self.held} B are kept for pre = {self._table.pre:g} s; allowed: memory = "
+                f"{self._table.memory} B: shorten pre or raise memory"
+            )
+
+    def _forget(self) -> None:
+        """Let go what no trigger can ask for any more."""
+        oldest_ns = self._newest_ns - self._margin_ns
+        while self._kept and self._kept[0].log_ns < oldest_ns:
+            item = self._kept.popleft()
+            self.held -= len(item.data)
+            if isinstance(item.key, str) and self._topics[item.key][0] == _LATCHED:
+                self._latched[item.key] = item.data
+
+    # ---- triggers -----------------------------------------------------------------------------------
+
+    def _stamp(self, sample: int) -> int:
+        return START_NS + sample * self._table.step_ns
+
+    @property
+    def next_sample(self) -> int:
+        """The sample after the newest that came."""
+        return (self._newest_ns - START_NS) // self._table.step_ns + 1
+
+    def trigger(self, cause: str, sample: int | None = None) -> Snapshot:
+        """Let there be a snapshot around a sample.
+
+        Args:
+            cause: for people.
+            sample: None: the next.
+
+        Raises:
+            LatheError: the bag cannot be made.
+        """
+        at, block = self.next_sample if sample is None else sample, self._table.block_size
+        first = max(at - self._pre, 0) // block * block
+        last = ((at + self._post) // block + 1) * block - 1
+        if self._open is not None and first > self._open[0].last + 1:
+            self._end()
+        if self._open is not None:
+            found = self._open[0]
+            found.add(at, cause, at + self._post, last)
+            return found
+        found = Snapshot(self.folder / f"sample_{at:010}", first, last)
+        found.add(at, cause, at + self._post, last)
+        self._begin(found)
+        return found
+
+    def _begin(self, snapshot: Snapshot) -> None:
+        table = self._table
+        try:
+            bag = BagWriter(snapshot.path, compression=table.compression, chunk_size=table.chunk_size, about={})
+        except InputError as error:
+            raise LatheError(str(error)) from None
+        self._open = snapshot, bag
+        self._waiting, self._kept = self._kept, self._waiting
+        for topic, (msgtype, qos) in self._topics.items():
+            bag.add_topic(topic, msgtype, qos)
+        bag.tell({**self._about, **snapshot.about()})
+        for topic, data in self._latched.items():
+            bag.write(topic, self._stamp(snapshot.first), data)
+        self._told(snapshot)
+
+    # ---- what goes out ------------------------------------------------------------------------------
+
+    def _write(self, item: _Item, snapshot: Snapshot, bag: BagWriter) -> None:
+        """Write what belongs into a snapshot; the latched message from before its first sample as if it came then."""
+        first_ns = self._stamp(snapshot.first)
+        if isinstance(item.key, RowPlan):
+            if item.log_ns >= first_ns:
+                bag.write_rows(item.key, item.log_ns, bytes(item.data))
+        elif item.log_ns >= first_ns or self._topics[item.key][0] == _LATCHED:
+            bag.write(item.key, max(item.log_ns, first_ns), item.data)
+
+    def _catch_up(self, count: int) -> None:
+        """Write at most ``count`` items that wait."""
+        assert self._open is not None, "its callers have looked"
+        snapshot, bag = self._open
+        last_ns = self._stamp(snapshot.last)
+        while count and self._waiting and self._waiting[0].log_ns <= last_ns:
+            item = self._waiting.popleft()
+            self._kept.append(item)
+            self._write(item, snapshot, bag)
+            count -= 1
+
+    def _end(self) -> None:
+        """Close the open snapshot with what there is of it."""
+        assert self._open is not None, "its callers have looked"
+        (snapshot, bag), self._open = self._open, None
+        waiting, self._waiting = self._waiting, deque()
+        self._kept.extend(waiting)
+        end = min(self.next_sample, snapshot.last + 1)
+        snapshot.samples, snapshot.whole = max(end - snapshot.first, 0), end > snapshot.wanted and not self._interrupted
+        try:
+            for item in waiting:
+                if item.log_ns <= self._stamp(snapshot.last):
+                    self._write(item, snapshot, bag)
+            bag.tell(snapshot.about())
+        finally:
+            bag.close()
+        self.bags += 1
+        self._told(snapshot)
+
+    def flush(self) -> None:
+        """See `Output`; when nothing has come since the last time, so that writing all that waits delays no node.
+
+        Raises:
+            LatheError: the disk does not take it.
+        """
+        if self._open is not None:
+            if self._newest_ns == self._flushed_ns:
+                self._catch_up(len(self._waiting))
+            self._open[1].flush()
+        self._flushed_ns = self._newest_ns
+
+    def interrupt(self, cause: str) -> None:
+        """The run does not come to its end: that is a trigger, if any signal has come; what follows is not complete.
+
+        Raises:
+            LatheError: the bag cannot be made.
+        """
+        if self.next_sample:
+            self.trigger(cause)
+            self._interrupted = True
+
+    def close(self) -> None:
+        """Close the open snapshot; the folder goes if there was none.
+
+        Raises:
+            LatheError: the disk does not take it.
+        """
+        if self._open is not None:
+            self._end()
+        if self.folder.is_dir() and not any(self.folder.iterdir()):
+            self.folder.rmdir()

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signal topics as tables: columns with units, one row a sample or a message."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any, cast
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from lathe_rc import messages
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.messages import NOT_SIGNALS, START_NS, Samples, Signals
+
+TEXT = np.dtype(object)  #: element type of texts
+_FIELD = re.compile(r"\S+\s+(\w+)\s*#(.*)")
+_UNIT = re.compile(r"\[([^\[\]]+)\]")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a topic's table.
+
+    Attributes:
+        name: of the message's field; ``sample`` and ``time`` come first in every table.
+        dtype: of its elements; `TEXT` for texts.
+        unit: empty where the message's definition has none.
+    """
+
+    name: str
+    dtype: np.dtype[Any]
+    unit: str = ""
+
+    @property
+    def label(self) -> str:
+        """Name and unit, like ``angle [rad]``."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+
+_FIRST = (Column("sample", np.dtype(np.int64)), Column("time", np.dtype(np.float64), "s"))
+
+
+@cache
+def units(msgtype: str) -> Mapping[str, str]:
+    """Unit by field, from the comments of the type's .msg file; where it depends on the sender, like ``m or N``.
+
+    Types that are not of lathe_rc say nothing that could be read.
+    """
+    package, _, name = msgtype.partition("/msg/")
+    if package != messages.PACKAGE:
+        return {}
+    text = (files("lathe_rc") / "msg_defs" / "msg" / f"{name}.msg").read_text(encoding="utf-8")
+    found = (_FIELD.fullmatch(line.strip()) for line in text.splitlines())
+    return {field[1]: " or ".join(dict.fromkeys(_UNIT.findall(field[2]))) for field in found if field}
+
+
+@cache
+def columns(msgtype: str) -> tuple[Column, ...]:
+    """The table of a signal topic of this type."""
+    known = units(msgtype)
+    if msgtype in messages.block_types():
+        fields = messages.sample_fields(msgtype)
+    else:
+        left_out = {*NOT_SIGNALS, "sample_index"}
+        given = messages.store().fielddefs[msgtype][1]
+        fields = {name: _element(kind, detail) for name, (kind, detail) in given if name not in left_out}
+    return (*_FIRST, *(Column(name, dtype, known.get(name, "")) for name, dtype in fields.items()))
+
+
+def _element(kind: Nodetype, detail: Any) -> np.dtype[Any]:
+    """Element type of a field that is a number, a text, or a list of them."""
+    base = detail if kind == Nodetype.BASE else cast("Any", detail)[0][1]
+    return TEXT if base[0] == "string" else np.dtype(base[0])
+
+
+def dense_rows(first: int, signals: Signals, step_ns: int) -> dict[str, Samples]:
+    """The columns of consecutive samples ``first`` on, shape (samples,)."""
+    sample = np.arange(first, first + next(iter(signals.values())).size)
+    return {"sample": sample, "time": _seconds(sample, step_ns), **signals}
+
+
+def sparse_rows(table: Sequence[Column], found: Sequence[Sparse], step_ns: int) -> dict[str, Samples]:
+    """The columns of messages at chosen samples; a message with lists has a row for each element."""
+    cells: dict[str, list[Any]] = {column.name: [] for column in table}
+    for message in found:
+        parts = {column.name: message.values[column.name] for column in table[len(_FIRST) :]}
+        lists = {name: list(part) for name, part in parts.items() if isinstance(part, (list, np.ndarray))}
+        rows = max([1, *map(len, lists.values())])
+        cells["sample"] += [message.index] * rows
+        for column in table[len(_FIRST) :]:
+            missing: Any = "" if column.dtype == TEXT else np.nan
+            given = lists.get(column.name)
+            padded = [parts[column.name]] * rows if given is None else given + [missing] * (rows - len(given))
+            cells[column.name] += padded
+    sample = np.array(cells["sample"], dtype=np.int64)
+    rest = {column.name: np.array(cells[column.name], column.dtype) for column in table[len(_FIRST) :]}
+    return {"sample": sample, "time": _seconds(sample, step_ns), **rest}
+
+
+def _seconds(sample: Samples, step_ns: int) -> Samples:
+    seconds: Samples = (START_NS + sample * step_ns) / 1e9
+    return seconds

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables as those of other libraries: pandas where it is installed, otherwise Arrow."""
+
+import importlib.util
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from lathe_rc.cell.columns import TEXT, Column
+from lathe_rc.messages import Samples
+
+_SPINDLE = (Column("revolution", np.dtype(np.int64)), Column("spindle_angle", np.dtype(np.float64), "rad"))
+
+
+def arrow_schema(columns: Sequence[Column], name: Callable[[Column], str]) -> Any:
+    """Arrow's view of a table; the units are metadata of the fields."""
+    return pa.schema(
+        [
+            pa.field(
+                name(column),
+                pa.string() if column.dtype == TEXT else pa.from_numpy_dtype(column.dtype),
+                metadata={"unit": column.unit} if column.unit else None,
+            )
+            for column in columns
+        ]
+    )
+
+
+def with_spindle(
+    table: Sequence[Column], rows: Mapping[str, Samples], angle: Samples
+) -> tuple[Sequence[Column], Mapping[str, Samples]]:
+    """A table with the spindle's revolution and the angle in it after the first two columns.
+
+    Args:
+        table: columns.
+        rows: their values, shape (rows,), in this order.
+        angle: true angle of the spindle in each row [rad], shape (rows,).
+    """
+    turns = np.floor(angle / (2.0 * np.pi))
+    spindle = {"revolution": turns.astype(np.int64) + 1, "spindle_angle": angle - 2.0 * np.pi * turns}
+    first, fields = list(rows.items())[:2], list(rows.items())[2:]
+    return (*table[:2], *_SPINDLE, *table[2:]), dict([*first, *spindle.items(), *fields])
+
+
+def frame(topic: str, table: Sequence[Column], rows: Mapping[str, Samples]) -> Any:
+    """A table as a ``pandas.DataFrame`` where pandas is installed, otherwise a ``pyarrow.Table``.
+
+    Args:
+        topic: fully qualified.
+        table: columns, `time` among them.
+        rows: their values, shape (rows,).
+    """
+    if importlib.util.find_spec("pandas") is None:
+        fields = arrow_schema(table, lambda column: column.name)
+        return pa.Table.from_arrays([pa.array(rows[field.name], field.type) for field in fields], schema=fields)
+    import pandas as pd
+
+    made = pd.DataFrame(rows).set_index("time")
+    made.attrs = {"topic": topic, "units": {column.name: column.unit for column in table if column.unit}}
+    return made

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the learning controller does with each sample."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.cell.stage import DONE, Fields, Reached
+from lathe_rc.cell.stages.obedience import OBEY, ObedienceTable, apply, may_learn, obeyed, piece
+from lathe_rc.control import angle_memory
+from lathe_rc.control.angle_memory import AngleMemory
+from lathe_rc.control.identification import IdentifierTable, accumulate, command_sent
+from lathe_rc.control.lead import PreviewTable, look_ahead
+from lathe_rc.jit import inlined, kernel
+from lathe_rc.messages import Samples
+from lathe_rc.safety.state_machine import Reaction
+
+# Places in the state of a step: whether it is inside a piece of a block, where that begins and ends, and whether the
+# angle is lost, and since which sample, if that has not been told yet.
+_INSIDE, _BEGIN, _END, _LOST, LOST_AT = range(5)
+
+
+class Memory(NamedTuple):
+    """What the step works on.
+
+    Attributes:
+        control: the memory of the channel.
+        preview: its lead law.
+        identifier: of its drive, if it ``identifies``.
+        obedience: to the supervisor, if it ``listens``.
+        nominal: speed of the spindle [rad/s].
+        period: sampling step [s].
+        by_time: whether time stands for the angle.
+        falls_back: whether the lead angle is that of the nominal speed where the supervisor asks to fall back.
+        rates: whether the correction needs the rates of the lead.
+        finer: how many finer drives the error has in it.
+        margin: of the newest cycle, shape (1,).
+        state: see above.
+    """
+
+    control: AngleMemory
+    preview: PreviewTable
+    identifier: IdentifierTable
+    obedience: ObedienceTable
+    nominal: float
+    period: float
+    by_time: bool
+    falls_back: bool
+    rates: bool
+    finer: int
+    identifies: bool
+    listens: bool
+    margin: Samples
+    state: npt.NDArray[np.int64]
+
+
+@inlined
+def _angle(memory: Memory, first: int, late: int, measured: Samples) -> Samples:
+    """The angle that the memory goes by [rad], ``late`` samples before the samples ``first`` on."""
+    if not memory.by_time:
+        return measured
+    angle = np.empty(measured.size)
+    for k in range(angle.size):
+        angle[k] = memory.nominal * (memory.period * (first + k))
+    if late:
+        angle -= memory.nominal * (memory.period * late)
+    return angle
+
+
+@inlined
+def _begin(memory: Memory, first: int, start: int, stop: int, inputs: Fields) -> None:
+    """Look ahead along a piece of a block, and take its errors."""
+    control, samples = memory.control, stop - start
+    speed, error = inputs[1][start:stop], inputs[3][start:stop]
+    if memory.by_time or (memory.falls_back and obeyed(memory.obedience) >= Reaction.FALL_BACK.value):
+        speed = np.full(samples, memory.nominal)
+    if memory.finer:
+        error = error.copy()
+        for finer in range(memory.finer):
+            error += inputs[4 + finer][start:stop]
+    ahead = control.ahead
+    look_ahead(
+        memory.preview, first + start, memory.rates, speed, ahead[0, :samples], ahead[1, :samples], ahead[2, :samples]
+    )
+    angle = _angle(memory, first + start, 0, inputs[0][start:stop])
+    past_angle = _angle(memory, first + start, control.delay, inputs[2][start:stop])
+    angle_memory.begin(control, first + start, angle, past_angle, error)
+
+
+@inlined
+def _lose(memory: Memory, start: int, stop: int, command: Samples) -> None:
+    """Without an angle the command stays, from sample ``start`` of a block on."""
+    command[start:stop] = command[start - 1] if start > memory.state[_BEGIN] else memory.obedience.takeover.given[1]
+
+
+@kernel
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
+    """See `lathe_rc.cell.stage`."""
+    control, state, command = memory.control, memory.state, outputs[0]
+    n = command.size
+    while start < n or state[_INSIDE]:
+        if not state[_INSIDE]:
+            stop = n
+            if memory.listens:
+                stop = piece(memory.obedience, start, flags[0])
+                if stop == start:
+                    return start, OBEY
+                control.whole[angle_memory.LEARNS] = may_learn(memory.obedience)
+            state[_INSIDE], state[_BEGIN], state[_END] = 1, start, stop
+            if not state[_LOST]:
+                _begin(memory, first, start, stop, inputs)
+        begin, stop = state[_BEGIN], state[_END]
+        reached, reason = stop, DONE
+        if state[_LOST]:
+            _lose(memory, start, stop, command)
+        else:
+            angle = _angle(memory, first + begin, 0, inputs[0][begin:stop])
+            reached, reason = angle_memory.advance(control, first + begin, start - begin, angle, command[begin:stop])
+            reached += begin
+            if reason in (angle_memory.AHEAD, angle_memory.BEHIND, angle_memory.JUMPED) and memory.listens:
+                state[_LOST], state[LOST_AT] = 1, first + reached
+                _lose(memory, reached, stop, command)
+                reached, reason = stop, DONE
+            elif memory.identifies:
+                accumulate(memory.identifier, first, start, reached, inputs[4 + memory.finer])
+                command_sent(memory.identifier, first, start, reached, command)
+        for published in range(1, len(outputs)):
+            outputs[published][start:reached] = memory.margin[0]
+        if reason != DONE:
+            return reached, reason
+        if memory.listens:
+            apply(memory.obedience, command[begin:stop])
+        state[_INSIDE] = 0
+        start = stop
+    return n, DONE

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The event log of a run in words: events of nodes, and what the supervisor says."""
+
+from dataclasses import dataclass
+
+from lathe_rc import messages
+from lathe_rc.cell.recording import Recording
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.safety.state_machine import Reaction, State
+
+_STATES, _REACTIONS = {int(s): s.name.lower() for s in State}, {int(r): r.name.lower() for r in Reaction}
+
+LOGGED = (messages.EVENT, messages.SAFETY_STATUS)  #: types of messages that say so
+
+
+@dataclass(frozen=True)
+class LogEntry:
+    """An event at a sample.
+
+    Attributes:
+        sample: from which on.
+        topic: on which it was said.
+        text: what.
+    """
+
+    sample: int
+    topic: str
+    text: str
+
+
+def entries(recording: Recording) -> list[LogEntry]:
+    """The entries of a run, in order."""
+    topics = [topic for topic in recording.sparse if recording.types[topic] in LOGGED]
+    said = [message for topic in topics for message in recording.messages(topic)]
+    found = [LogEntry(message.index, message.topic, text(message)) for message in said]
+    return sorted(found, key=lambda entry: entry.sample)
+
+
+def text(message: Sparse) -> str:
+    """One line for a message of these types; nothing in it is trusted."""
+    values = message.values
+    if message.type == messages.EVENT:
+        return str(values["action"])
+    state, reaction = _STATES.get(values["state"], "?"), _REACTIONS.get(values["reaction"], "?")
+    found = f" {values['value']:.4g}, limit {values['limit']:.4g}" if values["limit"] else ""
+    return f"{values['monitor']} {values['subject']}{found}: {state}, {reaction}"

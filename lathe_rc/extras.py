@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Packages that not every installation has, and how to install them."""
+
+import importlib.util
+
+from lathe_rc.errors import LatheError
+
+_MODULES = {
+    "ros": (
+        *("diagnostic_msgs", "domain_coordinator", "lathe_rc_msgs", "lifecycle_msgs", "rclpy", "rosgraph_msgs"),
+        *("sensor_msgs", "std_msgs", "std_srvs"),
+    ),
+    "sweep": (*("altair", "bokeh", "cmaes", "dask", "distributed", "filelock", "optuna", "simpleeval", "vl_convert"),),
+    "view": ("rerun", "rerun_bindings"),
+}
+_EXTRAS = {module: extra for extra, modules in _MODULES.items() for module in modules}
+_CHECKOUT = {
+    "ros": "run it by ./lathe of a checkout, source a ROS 2 installation",
+    "sweep": "./lathe setup sweep in a checkout",
+    "view": "./lathe setup view in a checkout",
+}
+
+
+def refusal(module: str | None) -> LatheError | None:
+    """The error for a module that cannot be imported; None: it belongs to no extra."""
+    extra = _EXTRAS.get((module or "").partition(".")[0])
+    if extra is None:
+        return None
+    return LatheError(f"no module {module} here: {_CHECKOUT[extra]}, or pip install 'lathe_rc[{extra}]'")
+
+
+def require(module: str) -> None:
+    """Check that a module of an extra is installed, without importing it.
+
+    Raises:
+        LatheError: it is not; says how to install it.
+    """
+    if importlib.util.find_spec(module) is None:
+        missing = refusal(module)
+        assert missing is not None, "it belongs to an extra"
+        raise missing

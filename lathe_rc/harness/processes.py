@@ -1,0 +1,400 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The processes of a cell: how they start, what they report, and how they end."""
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import TYPE_CHECKING
+
+from lathe_rc import starting
+from lathe_rc.bag.writing.record import recorder_of
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.extensions import search_path
+from lathe_rc.namespace import absolute
+from lathe_rc.nodes import stale_shared_memory
+from lathe_rc.nodes.report import THROUGHPUT
+from lathe_rc.starting import Child, Start
+
+if TYPE_CHECKING:
+    pass
+
+from lathe_rc.harness.events import Event, how_it_ended, ignore
+
+_SILENCE_LIMIT = 120.0  # [s] without any event: the first start on a machine compiles kernels
+_FAREWELL = 10.0  # [s] without any event once the run is complete and its bag closed
+_GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
+_MOST_RESTARTS = 8  # of a process
+_SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
+_NO_SIGN_OF_LIFE = {
+    "stall",
+    "foreign_message",
+    "stopped",
+    "continued",
+    "waits",
+}  # events of a cell that stands
+_LOOK = 0.05  # [s] between looks at what a process has written
+
+
+def with_recorder(scenario: Scenario, bag: Path, *, keep: bool, snapshots: Path | None = None) -> Scenario:
+    """The scenario as its processes run it: with a recorder on ``bag``, and a spindle that waits for all members.
+
+    With ``snapshots`` it makes those too, in that folder; what is not to be kept has none.
+    """
+    nodes = dict(scenario.nodes)
+    name, table = recorder_of(scenario)
+    changes: dict[str, object] = {"bag": str(bag.resolve())}
+    if not keep:
+        changes |= {"compression": "none", "mode": "continuous"}
+    elif snapshots is not None:
+        changes |= {"mode": "both", "snapshots": str(snapshots.resolve())}
+    nodes[name] = table.model_copy(update=changes)
+    for master in scenario.masters:
+        others = [node for node in nodes if node != master]
+        nodes[master] = nodes[master].model_copy(update={"members": others})
+    return Scenario(scenario.name, nodes)
+
+
+@contextlib.contextmanager
+def free_domain(number: int | None = None) -> Iterator[int]:
+    """A ROS domain that nobody else on this machine uses; ``number`` if one is given."""
+    if number is not None:
+        yield number
+        return
+    from domain_coordinator import domain_id
+
+    with domain_id() as free:
+        yield int(free)
+
+
+class Processes:
+    """The processes of a cell, from start to end; a context manager that leaves none behind.
+
+    Args:
+        scenario: with a recorder, as `with_recorder` makes it.
+        groups: names of the nodes in each process.
+        domain: ROS domain; None: a free one.
+        namespace: ROS namespace of all nodes.
+        start: see `run`.
+        prefix: words that run a command somewhere else, as those of ``ip netns exec``, by the first node of a process,
+            which is then an interpreter of its own.
+
+    Attributes:
+        pids: process of each node.
+        domain: the ROS domain in use.
+        refused: messages from outside the cell that the nodes refused, by sender; known when they have ended.
+        not_reached: events that the run was too short for, by node; the same.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        groups: Sequence[Sequence[str]],
+        *,
+        domain: int | None = None,
+        namespace: str = "/",
+        start: Start = "fork",
+        prefix: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    ) -> None:
+        self._scenario, self._groups, self._wanted_domain = scenario, groups, domain
+        self._namespace, self._fresh, self._prefix = namespace, start == "spawn", prefix
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._stack = contextlib.ExitStack()
+        self._children: dict[str, Child] = {}
+        self._threads: list[threading.Thread] = []
+        self._abandoned: set[str] = set()
+        self._ended: set[str] = set()
+        self._newest: dict[str, Event] = {}
+        self._lost: list[tuple[str, str]] = []  # nodes that the cell goes to its safe state without, and why
+        self._restarts: Counter[str] = Counter()
+        self.pids: dict[str, int] = {}
+        self.refused: Counter[str] = Counter()
+        self.not_reached: dict[str, list[str]] = {}
+        self.domain = -1
+
+    def __enter__(self) -> "Processes":
+        """Start them."""
+        try:
+            self.domain = self._stack.enter_context(free_domain(self._wanted_domain))
+            self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-log-")))
+            self._file = self._folder / "scenario.yaml"
+            self._file.write_text(self._scenario.to_yaml(), encoding="utf-8")
+            stale_shared_memory.sweep()
+            for group in self._groups:
+                self._start(group)
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End them."""
+        self.stop()
+
+    def _start(self, group: Sequence[str]) -> None:
+        environment = os.environ | {"ROS_DOMAIN_ID": str(self.domain), "ROS_LOG_DIR": str(self._folder)}
+        environment["PYTHONPATH"] = search_path()
+        if all(getattr(table, "speed_factor", 0.0) == 0.0 for table in self._scenario.nodes.values()):
+            environment[THROUGHPUT] = "1"
+        name = "+".join(group)
+        arguments = [
+            *(f"{node}:{self._scenario.kind(node)}" for node in group),
+            *("--ros-args", "--params-file", str(self._file), "-r", f"__ns:={self._namespace}"),
+            *("--enclave", absolute(self._namespace, group[0])),
+        ]
+        ours, theirs = socket.socketpair()
+        with theirs, (self._folder / f"{group[0]}.log").open("ab") as log:
+            child = starting.server().start(
+                arguments,
+                environment=environment,
+                report=theirs,
+                log=log.fileno(),
+                changed=partial(self._changed, name),
+                command=self._command(group[0], arguments),
+            )
+        self._children[name] = child
+        for node in group:
+            self.pids[node] = child.pid
+        listener = threading.Thread(target=self._listen, args=(name, ours, child), daemon=True)
+        listener.start()
+        self._threads.append(listener)
+
+    def _command(self, first: str, arguments: Sequence[str]) -> list[str]:
+        """The command that starts a process as an interpreter of its own; empty where it is to be forked."""
+        prefix = self._prefix.get(first, ())
+        words = [*prefix, sys.executable, "-m", "lathe_rc.nodes.container", *arguments]
+        return words if prefix or self._fresh else []
+
+    def _listen(self, name: str, line: socket.socket, child: Child) -> None:
+        """Turn a process's reports, and its end, into events."""
+        with line, line.makefile("r", encoding="utf-8") as reports:
+            with contextlib.suppress(OSError):
+                for report in reports:
+                    self._events.put(json.loads(report))
+            code = child.wait()
+        self._say("exit", name, code=code)
+
+    def _say(self, event: str, name: str, **values: object) -> None:
+        """An event of the harness's own, as nodes report theirs."""
+        self._events.put({"event": event, "node": name, "monotonic_ns": time.monotonic_ns(), **values})
+
+    def _changed(self, name: str, state: str, number: int) -> None:
+        """Turn into an event that a process has been stopped by a signal, or continued.
+
+        A process that is stopped with a lock of DDS in its hands blocks all that send to it, the time master among
+        them: then nobody else can say so.
+        """
+        self._say(state, name, signal=number, waits=self._waits)
+
+    def events(self, silence: float) -> Iterator[Event]:
+        """Events as they come.
+
+        Raises:
+            LatheError: nothing was heard for ``silence`` seconds.
+        """
+        heard = time.monotonic()
+        while True:
+            wait = _FAREWELL if self._complete else min(silence, self._settling) if self._lost else silence
+            try:
+                event = self._events.get(timeout=max(heard + wait - time.monotonic(), 0.0))
+            except queue.Empty:
+                if self._complete and self._running:
+                    self._end_the_silent()
+                    continue
+                running = ", ".join(f"{name}{self._place(name)}" for name in self._running)
+                raise LatheError(
+                    self._with_the_lost(
+                        f"no node has reported anything for {wait:.0f} s; still running: {running}{self._tails()}"
+                    )
+                ) from None
+            self._newest[event["event"]] = event
+            if event["event"] not in _NO_SIGN_OF_LIFE:
+                heard = time.monotonic()
+            if event["event"] == "refused":
+                self.refused.update(event["senders"])
+            if event["event"] == "not_reached":
+                self.not_reached[event["node"]] = event["events"]
+            if event["event"] == "exit" and not self._restarted(event):
+                self._ended.add(event["node"])
+            yield event
+
+    @property
+    def _settling(self) -> float:
+        """How long a cell may take to its safe state without an event [s]."""
+        return _SETTLING + max(getattr(table, "restart_time", 0.0) for table in self._scenario.nodes.values())
+
+    def _restarted(self, event: Event) -> bool:
+        """Start a process that was killed once more, if others can take the place of all its nodes."""
+        name = event["node"]
+        group = name.split("+")
+        kept = all(getattr(self._scenario.nodes.get(node), "restart_file", "") for node in group)
+        if event["code"] >= 0 or not kept or not self._goes_on(name):
+            return False
+        self._restarts[name] += 1
+        if self._restarts[name] > _MOST_RESTARTS:
+            return False
+        self._start(group)
+        self._say("restarted", name, pid=self._children[name].pid)
+        return True
+
+    def _goes_on(self, name: str) -> bool:
+        """Whether the cell does something about the end of a node or process: it waits, and goes to its safe state."""
+        masters = set(self._scenario.masters)
+        waits = all(self._scenario.nodes[master].window for master in masters)
+        return waits and "block0" in self._newest and not self._complete and not masters & set(name.split("+"))
+
+    @property
+    def _waits(self) -> bool:
+        """Whether the cell waits for a member that stands still, however long."""
+        masters = (self._scenario.nodes[name] for name in self._scenario.masters)
+        return all(getattr(master, "stall_reaction", "") == "wait" for master in masters)
+
+    @property
+    def _running(self) -> list[str]:
+        return [name for name in self._children if name not in self._ended]
+
+    @property
+    def _complete(self) -> bool:
+        """Whether all samples are in a bag that is closed: nothing can be lost any more."""
+        return bool(self._newest.get("closed", {}).get("complete"))
+
+    def _end_the_silent(self) -> None:
+        """End processes that the run does not need any more, and that do not end by themselves; names them.
+
+        DDS may block one: a neighbour that left took a lock of the shared memory with it.
+        """
+        for name in self._running:
+            self._abandoned.add(name)
+            self._say("stuck", name, place=self._place(name))
+            self._children[name].kill()
+
+    def wait_for(self, kind: str, node: str | None = None, **values: object) -> Event:
+        """Wait for an event of a kind, from a node, with certain values.
+
+        Raises:
+            LatheError: a process ended with a failure first.
+        """
+        for event in self.events(_SILENCE_LIMIT):
+            wanted = {"event": kind, **values} | ({"node": node} if node else {})
+            if wanted.items() <= event.items():
+                return event
+            self._raise_failure(event)
+        raise AssertionError
+
+    def wait_for_end(self, watch: Callable[[Event], None] = ignore) -> dict[str, Event]:
+        """Wait until every process has ended.
+
+        Returns:
+            The last event of each kind.
+
+        Raises:
+            LatheError: a node failed or was killed; says which.
+        """
+        for event in self.events(_SILENCE_LIMIT):
+            watch(event)
+            self._raise_failure(event)
+            if self._ended == set(self._children):
+                break
+        if "safe" in self._newest or (self._lost and not self._complete):
+            raise LatheError(self._with_the_lost(f"the run did not come to its end{self._tails()}"))
+        if not {"block0", "complete", "closed"} <= set(self._newest):
+            raise LatheError(f"the nodes ended before the run did{self._tails()}")
+        return self._newest
+
+    def _raise_failure(self, event: Event) -> None:
+        """Raise what went wrong first; nodes that gave up because of another ("abandoned") are no cause."""
+        node = event["node"]
+        if event["event"] == "abandoned":
+            self._is_no_cause(node)
+        if event["event"] == "masterless":
+            raise LatheError(self._with_the_lost(event["message"]))
+        if event["event"] == "error":
+            kinds = {InputError.exit_code: InputError, LossyRunError.exit_code: LossyRunError}
+            self._lose(node, event["message"], kinds.get(event["exit_code"], LatheError))
+            self._is_no_cause(node)
+        if event["event"] == "exit" and event["code"] < 0 and self._complete:
+            return  # a library crashed while it left; whoever watches has been told
+        if event["event"] == "exit" and event["code"] > 0 and "safe" in self._newest:
+            return  # all say so whose cell went there
+        if event["event"] == "exit" and event["code"] and node in self._ended - self._abandoned:
+            self._lose(node, f"{how_it_ended(event)}{self._crash(node) if event['code'] < 0 else self._tail(node)}")
+
+    def _is_no_cause(self, node: str) -> None:
+        """The end of the process of a node needs no other explanation."""
+        self._abandoned.update(name for name in self._children if node in name.split("+"))
+
+    def _lose(self, name: str, why: str, error: type[LatheError] = LatheError) -> None:
+        """Raise why a node or process has ended, or keep it until the time master says how the cell went on."""
+        if not self._goes_on(name):
+            raise error(self._with_the_lost(why))
+        self._lost.append((name, why))
+
+    def _with_the_lost(self, message: str) -> str:
+        """A message after what became of nodes, as far as it does not say that itself."""
+        further = [why for name, why in self._lost if why.removeprefix(f"{name}: ") not in message]
+        return "; ".join([*further, message])
+
+    def _log(self, name: str) -> list[str]:
+        """The lines that a process has written."""
+        log = self._folder / f"{name.split('+', maxsplit=1)[0]}.log"
+        return log.read_text(encoding="utf-8", errors="replace").strip().splitlines() if log.exists() else []
+
+    def _tail(self, name: str) -> str:
+        """The last line of a process's log."""
+        lines = self._log(name)
+        return f": {lines[-1].strip()}" if lines else ""
+
+    def _crash(self, name: str) -> str:
+        """Where a library has crashed, if one has: the innermost call that `faulthandler` has written."""
+        lines = self._log(name)
+        start = next((place for place, line in enumerate(lines) if line.startswith("Current thread")), len(lines))
+        return f" in {lines[start + 1].strip()}" if start + 1 < len(lines) else ""
+
+    def _place(self, name: str) -> str:
+        """Where a process is that says nothing, by its innermost call."""
+        child, before = self._children[name], len(self._log(name))
+        with contextlib.suppress(ProcessLookupError):
+            child.send_signal(signal.SIGUSR1)
+        deadline = time.monotonic() + _GRACE
+        while time.monotonic() < deadline and child.poll() is None:
+            said = [line.strip() for line in self._log(name)[before:]]
+            if place := next((line for line in said if line.startswith("File ")), ""):
+                return f" in {place}"
+            time.sleep(_LOOK)
+        return ""
+
+    def _tails(self) -> str:
+        return "".join(f"; {name}{self._tail(name)}" for name in self._children)
+
+    def stop(self) -> None:
+        """End every process: in order if it listens, by SIGKILL if it does not."""
+        for number in (signal.SIGCONT, signal.SIGTERM):
+            for child in self._children.values():
+                if child.poll() is None:
+                    with contextlib.suppress(ProcessLookupError):
+                        child.send_signal(number)
+        deadline = time.monotonic() + _GRACE
+        for child in self._children.values():
+            try:
+                child.wait(timeout=max(deadline - time.monotonic(), 0.0))
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
+        for thread in self._threads:
+            thread.join()
+        self._stack.close()

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The result of a run."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from lathe_rc import part
+from lathe_rc.analysis.metrology import FormErrors, Lay, Measurement
+from lathe_rc.analysis.tolerance import Verdict
+from lathe_rc.cell.durations import Lateness
+from lathe_rc.cell.recording import Recording
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stages.tool import ToolParameters
+from lathe_rc.drawing import html
+from lathe_rc.errors import InputError
+from lathe_rc.event_log import LogEntry, entries
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+Mode = Literal["offline", "composed", "processes"]
+
+
+@dataclass(frozen=True, repr=False)
+class Result:
+    """The result of a run.
+
+    Attributes:
+        scenario: what ran.
+        mode: the host.
+        samples: length of the run.
+        wall_s: from block 0 to the last block computed and recorded by every member [s].
+        bag: where it is recorded; None if it was not to be kept, or in snapshots alone.
+        snapshots: bags of parts of the run, see `lathe_rc.bag.writing.snapshots`.
+        recording: all signals.
+        refused: messages from outside the cell that the nodes refused, by sender.
+        not_reached: events that the run was too short for, by node.
+        unchecked: what the check before the start could not see, since laws or drives of others do not tell it.
+        lateness: of the blocks; None if there was no pace to keep, as offline or with a ``speed_factor`` of 0.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from lathe_rc import harness, resources
+        >>> from lathe_rc.cell import scenario
+        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=20"])
+        >>> result = harness.run(piston)
+        >>> result
+        <Result of piston: offline, 20 revolutions, form error 150.8 to 0.5639 µm RMS, no bag>
+        >>> print(f"at most {result.errors.largest[-1] * 1e6:.3f} µm in the last revolution")
+        at most 0.992 µm in the last revolution
+        >>> result.digest["/tool"] == result.recording.digests()["/tool"]
+        True
+        >>> error = result.frame("/tool")["error"]  # [m], of each sample
+        >>> result.plot().savefig("piston.png")
+    """
+
+    scenario: Scenario
+    mode: str
+    samples: int
+    wall_s: float
+    bag: Path | None
+    snapshots: tuple[Path, ...]
+    recording: Recording
+    refused: Mapping[str, int] = field(default_factory=dict)
+    not_reached: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    unchecked: Sequence[str] = ()
+    lateness: Lateness | None = None
+
+    def __repr__(self) -> str:
+        """The scenario and the result, in a line."""
+        bag = f"bag {self.bag}" if self.bag else "no bag"
+        return f"<Result of {self.scenario.name}: {', '.join([self.mode, *self.errors.told(), bag])}>"
+
+    def _repr_html_(self) -> str:
+        """The same as a table with the form error by revolution, for notebooks."""
+        count, *errors = self.recording.errors.told()
+        rows = [("scenario", self.scenario.name), ("host", self.mode)]
+        rows += [("length", f"{self.simulated_s:.4g} s, {count}")]
+        rows += [("form error", text.removeprefix("form error ")) for text in errors]
+        rows += [("bag", str(self.bag or "none"))]
+        return html.table((), rows) + self.recording.errors_picture()
+
+    def frame(self, topic: str) -> Any:
+        """A topic as a table: a row a sample, or a message; see `lathe_rc.cell.recording.Recording.frame`."""
+        return self.recording.frame(topic)
+
+    def plot(self, title: str | None = None) -> "Figure":
+        """Desired form, form error over angle, form error by revolution; see `lathe_rc.drawing.form.draw`.
+
+        Args:
+            title: of the figure; None: the scenario's name.
+        """
+        return self.recording.plot(self.scenario.name if title is None else title)
+
+    @property
+    def blocks(self) -> int:
+        """Blocks that the spindle sent."""
+        return -(-self.samples // self.scenario.shared.block_size)
+
+    @property
+    def dropped(self) -> int:
+        """Blocks that some member lost: none, since a run that loses any ends in a LossyRunError."""
+        return 0
+
+    @property
+    def simulated_s(self) -> float:
+        """Simulated time [s]."""
+        return self.samples * self.scenario.shared.step
+
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated over wall time."""
+        return self.simulated_s / self.wall_s
+
+    @property
+    def errors(self) -> FormErrors:
+        """Form error by revolution; of no revolution if the scenario has no tool."""
+        return self.recording.errors
+
+    @cached_property
+    def part(self) -> Measurement:
+        """The part as the workshop measures it; see `lathe_rc.part`."""
+        return part.measured(self.recording)
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Whether the part is in tolerance; None if the scenario's tool has no ``tolerance``."""
+        return part.verdict(self.scenario, self.recording)
+
+    @cached_property
+    def surface(self) -> Lay | str | None:
+        """The surface along the part, or why there is none; None: the scenario has no tool with a `nose_radius`."""
+        tools = [table for table in self.scenario.nodes.values() if isinstance(table, ToolParameters)]
+        radius = next((table.nose_radius for table in tools if table.nose_radius), 0.0)
+        if not radius or not self.errors.rms.size:
+            return None
+        try:
+            return part.surface(self.recording, self.part, radius)
+        except InputError as error:
+            return str(error)
+
+    @cached_property
+    def digest(self) -> dict[str, str]:
+        """Digest of each signal topic."""
+        return self.recording.digests()
+
+    @cached_property
+    def event_log(self) -> list[LogEntry]:
+        """Events, alarms and reactions, in order."""
+        return entries(self.recording)
+
+    def summary(self) -> dict[str, object]:
+        """The output of ``lathe run --json``."""
+        errors, step, verdict = self.errors, self.scenario.shared.step, self.verdict
+
+        def of(revolution: int) -> dict[str, Any] | None:
+            return part.numbers(self.part, revolution) if errors.rms.size else None
+
+        return {
+            "scenario": self.scenario.name,
+            "mode": self.mode,
+            "simulated_s": self.simulated_s,
+            "wall_s": self.wall_s,
+            "real_time_factor": self.real_time_factor,
+            "revolutions": int(errors.rms.size),
+            "blocks": self.blocks,
+            "dropped": self.dropped,
+            "lateness_s": asdict(self.lateness) if self.lateness else None,
+            "refused": dict(self.refused),
+            "events": [
+                {"sample": found.sample, "time": found.sample * step, "topic": found.topic, "text": found.text}
+                for found in self.event_log
+            ],
+            "not_reached": {node: list(events) for node, events in self.not_reached.items()},
+            "unchecked": list(self.unchecked),
+            "error_um": {
+                "first": of(0),
+                "last": of(-1),
+                "per_revolution_rms": (errors.rms * 1e6).tolist(),
+                "per_revolution_peak_to_valley": (errors.peak_to_valley * 1e6).tolist(),
+                "per_revolution_ront": (self.part.roundness.peak_to_valley * 1e6).tolist() if errors.rms.size else [],
+            },
+            "tolerance_um": verdict.summary() if verdict else None,
+            "along_um": part.along(self.surface) if isinstance(self.surface, Lay) else self.surface,
+            "bag": str(self.bag) if self.bag else None,
+            "snapshots": [str(path) for path in self.snapshots],
+            "digest": self.digest,
+        }

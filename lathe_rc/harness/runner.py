@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One run, in any host, from the checks to the bag."""
+
+import contextlib
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lathe_rc import messages, starting
+from lathe_rc.bag import reader
+from lathe_rc.bag.check import write_digests
+from lathe_rc.bag.repairing import recover
+from lathe_rc.bag.writing.record import OfflineRecorder, begin, begin_snapshots, recorder_of
+from lathe_rc.bag.writing.writer import refuse_existing
+from lathe_rc.cell.ahead import compile_ahead
+from lathe_rc.cell.collect import Collector, Finite, check_room
+from lathe_rc.cell.durations import Lateness
+from lathe_rc.cell.engine import Engine, Sink
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.messages import Signals
+from lathe_rc.namespace import checked
+from lathe_rc.starting import Start
+
+if TYPE_CHECKING:
+    pass
+
+from lathe_rc.harness.events import Event, ignore
+from lathe_rc.harness.processes import Processes, with_recorder
+from lathe_rc.harness.result import Mode, Result
+
+
+def run(
+    scenario: Scenario,
+    *,
+    mode: Mode = "offline",
+    groups: Sequence[Sequence[str]] | None = None,
+    bag: Path | None = None,
+    watch: Callable[[Event], None] = ignore,
+    domain: int | None = None,
+    namespace: str = "/",
+    start: Start = "fork",
+) -> Result:
+    """Run a scenario to its end.
+
+    Args:
+        scenario: what to run; its spindle must have a number of revolutions.
+        mode: ``offline``: a loop in this process; ``composed``: all nodes in one process; ``processes``: each node
+            a process.
+        groups: nodes that share a process, for ``processes``, the others have their own; None: as the scenario says.
+        bag: folder to record to; None: nothing is kept. Where the recorder's ``mode`` is ``snapshot``, their folder
+            is named after it, and the whole run is kept until its end alone.
+        watch: called with every event, from the thread that called `run`. The first is ``checked``, with the
+            run's samples and step [s]: from then on nothing is refused.
+        domain: ROS domain; None: a free one.
+        namespace: ROS namespace of the cell: two cells with one each can share a domain.
+        start: ``fork``: processes are copies of one that has imported what they need; ``spawn``: interpreters of
+            their own.
+
+    Raises:
+        InputError: the scenario cannot work, the run does not fit into memory, or the bag's folder exists or has no
+            folder to be made in.
+        LatheError: a node failed or was killed; the bag, if one was asked for, is readable.
+        LossyRunError: a free-running cell lost blocks.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from lathe_rc import harness, resources
+        >>> from lathe_rc.cell import scenario
+        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=3"])
+        >>> harness.run(piston, bag=Path("piston_bag"))
+        <Result of piston: offline, 3 revolutions, form error 150.8 to 1.166 µm RMS, bag piston_bag>
+        >>> harness.run(piston, bag=Path("piston_bag"))
+        Traceback (most recent call last):
+        lathe_rc.errors.InputError: piston_bag exists; a bag is never overwritten...
+    """
+    if mode != "offline" and start == "fork":
+        starting.server()  # it imports while the cell is checked
+    cell = Cell(scenario.nodes)
+    cell.check()
+    check_room(cell)
+    for what in cell.unchecked:
+        watch({"event": "unchecked", "node": cell.master.name, "message": what})
+    if bag is not None:
+        refuse_existing(bag)
+    result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace), start)
+    result = replace(result, unchecked=cell.unchecked)
+    if result.bag is not None:
+        write_digests(result.bag, result.digest)
+    return result
+
+
+def _run(
+    scenario: Scenario,
+    cell: Cell,
+    mode: Mode,
+    groups: Sequence[Sequence[str]] | None,
+    bag: Path | None,
+    watch: Callable[[Event], None],
+    domain: int | None,
+    namespace: str,
+    start: Start,
+) -> Result:
+    samples = cell.samples if mode == "offline" else cell.expected_samples
+    watch({"event": "checked", "node": cell.master.name, "samples": samples, "step": scenario.shared.step})
+    for left in compile_ahead(cell.stages.values()):
+        watch({"event": "compiling", "node": left[0], "nodes": left})
+    if mode == "offline":
+        return _offline(scenario, cell, bag, watch)
+    if start == "fork":
+        nodes = {name: (scenario.kind(name), table.model_dump()) for name, table in scenario.nodes.items()}
+        starting.server().preload(nodes)
+    with contextlib.ExitStack() as stack:
+        table = recorder_of(scenario)[1]
+        folder = table.snapshots_of(bag) if bag is not None and table.mode != "continuous" else None
+        place = kept = _whole(scenario, bag)
+        if place is None:
+            place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-"))) / "bag"
+        complete = with_recorder(scenario, place, keep=bag is not None, snapshots=folder)
+        split = [list(complete.nodes)] if mode == "composed" else complete.processes(groups)
+        processes = stack.enter_context(Processes(complete, split, domain=domain, namespace=namespace, start=start))
+        try:
+            events = processes.wait_for_end(watch)
+        except BaseException:
+            processes.stop()
+            for path in ([kept] if kept else []) + _bags_in(folder):
+                recover.mend(path)
+            raise
+        recording = reader.read(place)
+        return Result(
+            scenario=scenario,
+            mode="grouped" if mode == "processes" and len(split) < len(complete.nodes) else mode,
+            samples=cell.master.samples or recording.of_type(messages.ENCODER)["angle"].size,
+            wall_s=(events["complete"]["monotonic_ns"] - events["block0"]["monotonic_ns"]) * 1e-9,
+            bag=kept,
+            snapshots=tuple(_bags_in(folder)),
+            recording=recording,
+            refused=processes.refused,
+            not_reached=processes.not_reached,
+            lateness=_lateness(events),
+        )
+
+
+def _lateness(events: Mapping[str, Event]) -> Lateness | None:
+    """The pace, as the time master reports it."""
+    if "pace" not in events:
+        return None
+    told = events["pace"]
+    within = {int(percent): seconds for percent, seconds in told["within"].items()}  # JSON has no other keys than texts
+    return Lateness(told["blocks"], told["late"], told["worst"], within, told["slipped"])
+
+
+def _whole(scenario: Scenario, bag: Path | None) -> Path | None:
+    """The bag that keeps the whole run, if one does."""
+    return None if recorder_of(scenario)[1].mode == "snapshot" else bag
+
+
+def _bags_in(folder: Path | None) -> list[Path]:
+    """The snapshots in a folder, in the order of their triggers."""
+    return sorted(folder.iterdir()) if folder is not None and folder.is_dir() else []
+
+
+class _Watcher:
+    """A sink that turns an offline run into the events of a cell of nodes."""
+
+    def __init__(self, watch: Callable[[Event], None]) -> None:
+        self._watch = watch
+
+    def chunk(
+        self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, Sequence[Sparse]]
+    ) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        for topic, found in sparse.items():
+            for message in found:
+                if message.type == messages.LEARNING:
+                    self._watch({"event": "cycle", "node": topic, "sample": message.index, **message.values})
+        self._watch({"event": "progress", "node": "", "samples": first + samples})
+
+
+def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[Event], None]) -> Result:
+    engine = Engine(cell)
+    collector = Collector(cell, engine.samples)
+    sinks: list[Sink] = [Finite(cell), collector, _Watcher(watch)]
+    recorder = snapshots = None
+    if bag is not None:
+        snapshots = begin_snapshots(bag, scenario, cell)
+        recorder = OfflineRecorder(cell, engine.samples, begin(bag, scenario, snapshots), snapshots)
+        sinks.append(recorder)
+    start = time.monotonic()
+    try:
+        watch({"event": "block0", "node": cell.master.name})
+        engine.run(sinks)
+    finally:
+        if recorder:
+            recorder.close()
+    wall = time.monotonic() - start
+    kept = _whole(scenario, bag)
+    found = tuple(_bags_in(snapshots.folder)) if snapshots else ()
+    waiting = {name: stage.waiting for name, stage in cell.stages.items() if stage.waiting}
+    for name, events in waiting.items():
+        watch({"event": "not_reached", "node": name, "events": events})
+    recording = collector.recording()
+    return Result(scenario, "offline", engine.samples, wall, kept, found, recording, not_reached=waiting)

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages that do not belong to the cell: refused, counted and named, while the cell goes on."""
+
+from collections.abc import Callable
+
+from lathe_rc.errors import LatheError
+
+_MOST = 32  # senders that are counted by name
+_LONGEST = 256  # characters of a name that is kept
+
+
+class ForeignMessage(LatheError):  # noqa: N818 - the message, not what went wrong
+    """A message that does not belong; what was refused, and why.
+
+    Args:
+        topic: fully qualified.
+        source: who sent it, as it says; empty if it does not.
+        run_id: run that it says to be of.
+        why: what was expected.
+    """
+
+    def __init__(self, topic: str, source: str, run_id: str, why: str) -> None:
+        self.sender = f"{source[:_LONGEST] or 'an unknown sender'} of run {run_id[:_LONGEST]!r} on {topic}"
+        super().__init__(f"{topic}: message of run {run_id[:_LONGEST]!r} from {source[:_LONGEST] or '?'}; {why}")
+        self.topic = topic
+
+
+class RefusedMessages:
+    """Counts what a node has refused.
+
+    Args:
+        told: called with the first message of each sender, up to a number of senders.
+
+    Attributes:
+        senders: messages by sender; those of too many senders together.
+        topics: on which any have come.
+    """
+
+    def __init__(self, told: Callable[[ForeignMessage], None]) -> None:
+        self._told = told
+        self.senders: dict[str, int] = {}
+        self.topics: set[str] = set()
+
+    def refuse(self, message: ForeignMessage) -> None:
+        """Count a message."""
+        self.topics.add(message.topic)
+        new = message.sender not in self.senders
+        sender = "others" if new and len(self.senders) >= _MOST else message.sender
+        self.senders[sender] = self.senders.get(sender, 0) + 1
+        if new and sender != "others":
+            self._told(message)
+
+    def __str__(self) -> str:
+        """How many of whom."""
+        return ", ".join(f"{count} from {sender}" for sender, count in self.senders.items()) or "none"

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shared memory that killed processes have left behind.
+
+Fast DDS keeps the queue at which a process listens in /dev/shm/fastrtps_portN; N follows from the ROS domain, and who
+comes next uses the file again. A process that is killed while it uses the queue leaves it broken: messages to the next
+one get lost, and its cell stands still before the first block. What a process sends is in its segment,
+/dev/shm/fastrtps_ and 16 digits, 0.5 MB; those of the killed would fill the memory (of a container, often 64 MB). So
+what nobody uses is removed before a node starts.
+"""
+
+import fcntl
+import os
+import re
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+FOLDER = Path("/dev/shm")  # noqa: S108 - where POSIX shared memory is on Linux
+_PORT = re.compile(r"fast(rtps|dds)_port\d{1,5}")
+_SEGMENT = re.compile(r"fast(rtps|dds)_[0-9a-f]{16}")
+_LOCKS = ("_el", "_sl")  # of a process that listens alone, and of those that listen together
+
+
+def sweep(folder: Path = FOLDER) -> list[str]:
+    """Remove the ports and segments that this user's processes have left; their names.
+
+    A port is in use as long as one of its lock files is locked or a process has it in its memory; a segment as long as
+    its lock file is, which its process locks first. Sweeps wait for one another: a port that another sweep holds would
+    be taken for one at which somebody listens, and stay.
+    """
+    if not folder.is_dir():
+        return []
+    with _alone(folder):
+        ours = [file for file in sorted(folder.iterdir()) if _is_ours(file)]
+        ports = [file for file in ours if _PORT.fullmatch(file.name) and _remove_port(file)]
+        segments = [file for file in ours if _SEGMENT.fullmatch(file.name) and _remove_segment(file)]
+        return [file.name for file in (*ports, *segments)]
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(opened, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(opened)
+
+
+def _is_ours(file: Path) -> bool:
+    try:
+        return file.stat().st_uid == os.geteuid()
+    except FileNotFoundError:  # somebody else has removed it
+        return False
+
+
+def _remove_port(port: Path) -> bool:
+    """Remove a port if nobody uses it; whether it has."""
+    alone, shared = (port.with_name(port.name + end) for end in _LOCKS)
+    made = not alone.exists()
+    locks = [*([shared] if shared.exists() else []), alone]
+    with ExitStack() as held:
+        try:
+            for lock in locks:
+                stream = held.enter_context(lock.open("ab" if lock is alone else "rb"))
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, FileNotFoundError):  # somebody listens, or has just removed it
+            return False
+        # As long as the locks are held, no process can begin to listen; one that had begun before has it in memory.
+        free = not _is_mapped(port)
+        gone = [port, *locks] if free else []
+        if made and not free:
+            gone = [alone]  # DDS takes a lock file that nobody holds for that of a dead process
+        for file in gone:
+            file.unlink(missing_ok=True)  # DDS removes some, too
+        return free
+
+
+def _remove_segment(segment: Path) -> bool:
+    """Remove a segment if its process has ended; whether it has. A process that still reads in it has it in memory."""
+    lock = segment.with_name(segment.name + _LOCKS[0])
+    try:
+        with lock.open("rb") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            segment.unlink(missing_ok=True)
+            lock.unlink(missing_ok=True)  # DDS removes both, too
+    except (BlockingIOError, FileNotFoundError):  # it lives, or has just removed them
+        return False
+    return True
+
+
+def _is_mapped(file: Path) -> bool:
+    """Whether a process has a file in its memory."""
+    for maps in Path("/proc").glob("[0-9]*/maps"):
+        try:
+            if str(file) in maps.read_text(encoding="utf-8", errors="replace").split():
+                return True
+        except (FileNotFoundError, ProcessLookupError, PermissionError):
+            continue  # it has ended; or it is another user's, who cannot use this user's ports
+    return False

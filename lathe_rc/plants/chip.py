@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The chip of a sample, the force that it makes, and what that does to the edge: the cut for kernels.
+
+The equations are those of `lathe_rc.plants.cutting`. Here they stand sample by sample, so that what moves the edge can
+be solved together with the chip, see `lathe_rc.plants.loaded`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import LatheError
+from lathe_rc.jit import inlined
+from lathe_rc.plants.cut_surface import SurfaceTable, goes_on, read, remember
+from lathe_rc.plants.cutting_force import cutting_stiffness
+from lathe_rc.plants.flank import flank_damping
+from lathe_rc.plants.workpiece import hardness, missing
+from lathe_rc.signals.interpolation import linear
+from lathe_rc.transfer import System, step
+
+Array = npt.NDArray[np.float64]
+
+_TURN = 2.0 * np.pi
+
+WEAR, _EDGE = 0, 1  #: places in the state
+DONE, _STANDS, _TURNS_BACK, DRAWN_IN = 0, 1, 2, 3  #: why a kernel stopped
+APART, BACKWARDS = 0, 1  #: places in the counts
+
+
+class Process(NamedTuple):
+    """Constants of a `lathe_rc.plants.cutting.CuttingProcess` for its kernel.
+
+    Attributes:
+        step: sampling step [s].
+        depth: [m].
+        overlap: µ.
+        sign: σ.
+        kc1, mc, wear_factor: see `lathe_rc.plants.cutting_force.SpecificForce`.
+        per_metre, per_second, radius: of the wear.
+        lag, mode: of F and w.
+        lag_now, mode_now: what a unit of their input changes in their output of the same sample.
+        gaps: shape (m, 2).
+        spots: shape (m, 5).
+        heights, compliances: shape (m,).
+        grid: points in a revolution.
+        pressure, width, land: see `lathe_rc.plants.flank.Flank`.
+    """
+
+    step: float
+    depth: float
+    overlap: float
+    sign: float
+    kc1: float
+    mc: float
+    wear_factor: float
+    per_metre: float
+    per_second: float
+    radius: float
+    lag: System
+    lag_now: float
+    mode: System
+    mode_now: float
+    gaps: Array
+    spots: Array
+    heights: Array
+    compliances: Array
+    grid: int
+    pressure: float
+    width: float
+    land: float
+
+
+class CutTable(NamedTuple):
+    """A `lathe_rc.plants.cutting.CuttingProcess` for its kernel.
+
+    Attributes:
+        process: its constants.
+        lag_state, mode_state: of F and w.
+        state: VB, and where the edge was; NaN before the first sample.
+        surface: what it left.
+        counts: see `CuttingProcess.apart` and `CuttingProcess.backwards`.
+    """
+
+    process: Process
+    lag_state: Array
+    mode_state: Array
+    state: Array
+    surface: SurfaceTable
+    counts: npt.NDArray[np.int64]
+
+
+@inlined
+def _free(system: System, state: Array) -> float:
+    """The next output if the input were 0; the state stays."""
+    order = system.now.size
+    value = 0.0
+    for row in range(order):
+        total = system.before[row] * state[order]
+        for column in range(order):
+            total += system.transition[row, column] * state[column]
+        value += system.output[row] * total
+    return value
+
+
+@inlined
+def pressed_by(process: Process, speed: float, wear: float) -> float:
+    """What the flank's force takes for each metre that the edge moves out of the part in a sample [N/m], times σ."""
+    if process.pressure == 0.0:
+        return 0.0
+    damping = flank_damping(process.pressure, process.width, process.land + wear, process.radius * speed)
+    return float(process.sign * damping / process.step)
+
+
+@inlined
+def meet(
+    cut: CutTable, place: float, speed: float, height: float, angle: float, feed_velocity: float
+) -> tuple[int, float, float, float]:
+    """What the edge meets at ``place`` [grid point]: why it cannot go on, feed, K, and σ·c; nothing changes."""
+    process, state = cut.process, cut.state
+    if not speed > 0.0:
+        return _STANDS, 0.0, 0.0, 0.0
+    if process.overlap > 0.0 and not goes_on(cut.surface.last, place, process.grid):
+        return _TURNS_BACK, 0.0, 0.0, 0.0
+    feed = max(feed_velocity * _TURN / speed, 0.0)
+    stiffness = cutting_stiffness(process.kc1, process.mc, process.wear_factor, feed, state[WEAR])
+    stiffness *= hardness(process.spots, angle, height)
+    return DONE, feed, stiffness, process.sign * linear(process.heights, process.compliances, height)
+
+
+@inlined
+def held(cut: CutTable) -> float:
+    """Force [N] that a sample has without a chip: what the lag keeps."""
+    return _free(cut.process.lag, cut.lag_state)
+
+
+@inlined
+def _moved(cut: CutTable, base: float) -> float:
+    """How far the edge is from where it was a sample before, as far as the tool is not bent [m]."""
+    before = cut.state[_EDGE]
+    return 0.0 if np.isnan(before) else base - before
+
+
+@inlined
+def chip_of(
+    cut: CutTable,
+    place: float,
+    angle: float,
+    cross_position: float,
+    displacement: float,
+    allowance: float,
+    stiffness: float,
+    compliance: float,
+    give: float,
+    pressed: float,
+) -> float:
+    """Depth of cut [m] of a sample, negative where the edge is clear of the part; NaN: it is drawn in without end.
+
+    ``displacement`` of the tool drives is that with the force `held`, to which they give way by ``give`` [m/N] of what
+    the chip adds to it. ``pressed``: see `pressed_by`; where it is not 0, ``give`` is.
+    """
+    process, lag_now = cut.process, cut.process.lag_now
+    chip = process.depth + allowance - cross_position - displacement
+    if process.overlap > 0.0:
+        chip += process.overlap * read(cut.surface.ring, place - process.grid)
+    follows = 1.0 + process.mode_now * pressed * compliance
+    bend = (process.mode_now * lag_now * stiffness * compliance + lag_now * stiffness * give) / follows
+    if not 1.0 + bend > 0.0:
+        return np.nan
+    lagging = held(cut) - pressed * _moved(cut, cross_position + displacement)
+    chip -= compliance * (_free(process.mode, cut.mode_state) + process.mode_now * lagging) / follows
+    chip /= 1.0 + bend
+    return 0.0 if missing(process.gaps, angle) else float(chip)
+
+
+@inlined
+def press(
+    cut: CutTable, chip: float, stiffness: float, compliance: float, speed: float, base: float, pressed: float
+) -> tuple[float, float]:
+    """Step force [N] and deflection [m] on by a sample with a chip of 0 or more; the tool wears.
+
+    ``base``: place of the edge but for its deflection [m]; ``pressed``: see `pressed_by`.
+    """
+    process, state = cut.process, cut.state
+    free = _free(process.mode, cut.mode_state)
+    force = step(process.lag, cut.lag_state, stiffness * chip)
+    if chip > 0.0 and pressed != 0.0:
+        follows = 1.0 + process.mode_now * pressed * compliance
+        force -= pressed * (_moved(cut, base) + compliance * (free + process.mode_now * force)) / follows
+    deflection = compliance * step(process.mode, cut.mode_state, force)
+    if chip > 0.0:
+        path = process.per_metre * process.radius * speed
+        state[WEAR] += (path + process.per_second) * process.step
+    return force, deflection
+
+
+@inlined
+def leave(cut: CutTable, place: float, chip: float, edge: float) -> None:
+    """Remember where the edge [m] is, and where it has been if that is met again."""
+    if cut.process.overlap > 0.0:
+        remember(cut.surface.ring, cut.surface.last, place, edge if chip > 0.0 else 0.0)
+    cut.state[_EDGE] = edge
+
+
+def failure(reason: int, angle: float, speed: float, feed: float) -> LatheError:
+    """Why a cut cannot go on at an angle [rad], a speed [rad/s] and a feed [m/rev]."""
+    if reason == _STANDS:
+        return LatheError(
+            f"the spindle's speed is {speed:.6g} rad/s in the cut; allowed: above 0 (reduce its deviation)"
+        )
+    if reason == _TURNS_BACK:
+        return LatheError(
+            f"the spindle turns back or jumps to {angle:.6g} rad; regeneration needs an angle that rises by less than "
+            "a revolution a sample"
+        )
+    return LatheError(
+        f"the force draws the edge into the part without end at a feed of {feed:.4g} m/rev; reduce the feed, the "
+        "compliance or the sampling step"
+    )

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The current loop of a voice coil, sampled with the step of the cell: see `lathe_rc.plants.loaded`.
+
+    U = ωc·(L·(i* - i) + R·∫(i* - i)dt)
+
+so that i/i* is about 1/(1 + p/ωc). i* may be limited in size and slope, U in size; while U is cut off the integral
+stands.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.jit import kernel
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Coil:
+    """The current loop of a voice coil.
+
+    Attributes:
+        resistance: R [Ω].
+        inductance: L [H].
+        bandwidth: ωc of its loop [rad/s].
+        back_emf: whether the motion induces a voltage.
+        current_limit, voltage_limit: of i* and U [A, V]; inf for none.
+        slew_rate: largest slope of i* [A/s]; inf for none.
+    """
+
+    resistance: float
+    inductance: float
+    bandwidth: float
+    back_emf: bool = True
+    current_limit: float = np.inf
+    voltage_limit: float = np.inf
+    slew_rate: float = np.inf
+
+
+class CoilTable(NamedTuple):
+    """A `Coil` for kernels; without one the position loop's force is there at once.
+
+    Attributes:
+        on: whether there is one.
+        proportional, integral: of the current loop [V/A, V/(A·s)].
+        current_limit, voltage_limit: [A, V].
+        slew: largest change of i* in a sample [A].
+        step: [s].
+        state: integral of i* - i [A·s], and i* [A].
+        limited: of each sample whether something was cut off; sample n stands at n modulo the size.
+    """
+
+    on: bool
+    proportional: float
+    integral: float
+    current_limit: float
+    voltage_limit: float
+    slew: float
+    step: float
+    state: Array
+    limited: npt.NDArray[np.uint8]
+
+
+def coil_table(coil: Coil | None, step: float, kept: int) -> CoilTable:
+    """A coil at rest.
+
+    Args:
+        coil: None: there is none.
+        step: sampling step [s].
+        kept: samples of which it is kept whether something was cut off, a power of two.
+    """
+    return CoilTable(
+        on=coil is not None,
+        proportional=coil.bandwidth * coil.inductance if coil else 0.0,
+        integral=coil.bandwidth * coil.resistance if coil else 0.0,
+        current_limit=coil.current_limit if coil else np.inf,
+        voltage_limit=coil.voltage_limit if coil else np.inf,
+        slew=coil.slew_rate * step if coil else np.inf,
+        step=step,
+        state=np.zeros(2),
+        limited=np.zeros(kept, np.uint8),
+    )
+
+
+@kernel
+def applied(coil: CoilTable, n: int, asked: float, current: float) -> float:
+    """What the loop applies until sample ``n`` [V], from the current and the one asked for [A] of the sample before."""
+    demand = min(max(asked, coil.state[1] - coil.slew), coil.state[1] + coil.slew)
+    demand = min(max(demand, -coil.current_limit), coil.current_limit)
+    error = demand - current
+    integral = coil.state[0] + error * coil.step
+    given = coil.proportional * error + coil.integral * integral
+    voltage = min(max(given, -coil.voltage_limit), coil.voltage_limit)
+    if voltage == given:
+        coil.state[0] = integral
+    coil.state[1] = demand
+    coil.limited[n & (coil.limited.size - 1)] = demand != asked or voltage != given
+    return float(voltage)

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Linear models of a feed drive: the motor's position over the command.
+
+fourth_order   K/(p⁴ + a4·p³ + a3·p² + a2·p + a1)                (paper 002, eq. 1)
+dc_screw       k·(1 + Tz·p)/(p·(1 + T_1·p)·(1 + T_2·p)·…)        (paper 004: W2; the screw of W1)
+sampled        K/(p·(1 + T1·p)) behind a zero-order hold         (paper 003, eq. 2)
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from lathe_rc.errors import InputError
+from lathe_rc.transfer import TransferFunction
+
+Array = npt.NDArray[np.float64]
+
+APPROXIMATE_LAGS = (0.17, 0.22)  #: [s] of W1, 11.79/((0.17p+1)(0.22p+1)) (paper 004)
+FULL_LAGS = (0.11304, 0.2679, 0.01659, 0.01659)  #: [s] of the W1 that meets the step data printed in paper 004
+
+
+def fourth_order(
+    gain: float = 19.0, a1: float = 21.5, a2: float = 48.0, a3: float = 46.9, a4: float = 10.2
+) -> TransferFunction:
+    """K/(p⁴ + a4·p³ + a3·p² + a2·p + a1); by default the nominal drive of paper 002.
+
+    The state matrix of eq. 3 has these coefficients with the opposite sign of what is printed.
+    """
+    return TransferFunction((gain,), (1.0, a4, a3, a2, a1))
+
+
+def dc_screw(velocity_gain: float, lags: Sequence[float], zero: float = 0.0) -> TransferFunction:
+    """Motor and screw, k·(1 + Tz·p)/(p·(1 + T_1·p)·…).
+
+    The zero makes room for a lag that another part has: with that of the cutting process, a drive of the lags of W1
+    gives W1 from the command to the force.
+
+    Args:
+        velocity_gain: k [m/s per unit of the command].
+        lags: T_i [s], at least one, and at least two with a zero.
+        zero: Tz [s]; 0 for none.
+
+    Raises:
+        InputError: a lag that is not positive.
+    """
+    if not all(lag > 0.0 for lag in lags):
+        raise InputError(f"lags of the feed drive = {list(lags)} s; allowed: above 0 (leave out what is not there)")
+    bottom = np.array([1.0, 0.0])
+    for lag in lags:
+        bottom = np.polymul(bottom, [lag, 1.0])
+    return TransferFunction((velocity_gain * zero, velocity_gain), tuple(bottom))
+
+
+def sampled(gain: float = 6.25, lag: float = 0.08) -> TransferFunction:
+    """K/(p·(1 + T1·p)), by default the drive of paper 003; its hold is the ``divisor`` of the `FeedDrive`.
+
+    Args:
+        gain: K [1/s], with the command in the unit of the position.
+        lag: T1 [s].
+    """
+    return dc_screw(gain, (lag,))
+
+
+def realise(model: TransferFunction) -> tuple[Array, Array]:
+    """Matrices a and b of a model, with position and speed as first states.
+
+    The others are the further derivatives, each less what the command adds to it at once (the observability form);
+    a zero that cancels a lag is no obstacle.
+    """
+    top, bottom = (np.trim_zeros(np.array(part), "f") for part in (model.numerator, model.denominator))
+    order = bottom.size - 1
+    if bottom.size - top.size < 2:
+        raise InputError(
+            f"feed drive {model} of degrees {top.size - 1} over {order}; allowed: a numerator lower by two or more, "
+            "since a speed cannot jump (add a lag, or leave out the zero)"
+        )
+    a = np.diag(np.ones(order - 1), 1)
+    a[-1] = -bottom[:0:-1] / bottom[0]
+    impulse = np.eye(1, order + 1)[0]
+    markov = scipy.signal.lfilter(np.concatenate((np.zeros(bottom.size - top.size), top)), bottom, impulse)
+    return a, np.asarray(markov[1:])
+
+
+def settles(model: TransferFunction) -> tuple[float, bool]:
+    """What a command of 1 asks for, 0 if neither a position nor a speed, and whether it is a speed."""
+    integrates = model.denominator[-1] == 0.0
+    divisor = model.denominator[-2 if integrates else -1]
+    return (abs(model.numerator[-1] / divisor) if divisor else 0.0), integrates

@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motion of tool drives under the cutting force, sample by sample: drives and chip solved together, for kernels.
+
+The equations are those of `lathe_rc.plants.loaded`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import LatheError
+from lathe_rc.jit import inlined, kernel
+from lathe_rc.plants.chip import (
+    APART,
+    BACKWARDS,
+    DONE,
+    DRAWN_IN,
+    WEAR,
+    CutTable,
+    chip_of,
+    held,
+    leave,
+    meet,
+    press,
+)
+from lathe_rc.plants.chip import failure as failure_of_cut
+from lathe_rc.plants.coil import CoilTable, applied
+from lathe_rc.plants.end_stops import between_stops
+from lathe_rc.plants.piezo import VOLTAGE, StackTable, extend
+from lathe_rc.signals.noise import quantise
+
+Array = npt.NDArray[np.float64]
+
+_ROUNDS = 32  # at most, to find the carriage's position and the extension of the same sample
+_TURN = 2.0 * np.pi
+_TORN_OFF = DRAWN_IN + 1  # why the kernel stopped, beside the reasons of the cut
+STOPPED, SATURATED = 0, 1  #: what is counted
+
+
+class LoadedTable(NamedTuple):
+    """A `lathe_rc.plants.loaded.LoadedDrive` for kernels.
+
+    Attributes:
+        series: whether a piezo rides on the carriage.
+        transition: of positions, velocities and, with a current loop, the current, shape (m, m).
+        coarse: weights of the command, or of the voltage, shape (m, 3).
+        fine, load: weights of the extension e and of the radial force, shape (m, 3).
+        tool: place of the tool's position.
+        delay, part: of the command [sample].
+        spring, damper, force_per_current: of the position loop.
+        carriage_stroke: [m].
+        stack, memory, full_voltage: of the piezo.
+        feedback, resolution: see `lathe_rc.plants.series.SeriesTable`.
+        stiff, loss: ω2², 2ζ2ω2.
+        tension: largest q before the stack is torn off its preload [m/s²]; inf for any.
+        radial: ρ.
+        coil: its current loop.
+        state: shape (m,).
+        before: e [m] and radial force [N] of the last sample.
+        reading: of the carriage's sensor in the last sample [m], shape (1,).
+        line: a ring of past commands: sample n stands at n modulo its length.
+        counts: samples at an end stop, and in which the piezo saturated.
+    """
+
+    series: bool
+    transition: Array
+    coarse: Array
+    fine: Array
+    load: Array
+    tool: int
+    delay: int
+    part: float
+    spring: float
+    damper: float
+    force_per_current: float
+    carriage_stroke: float
+    stack: StackTable
+    memory: Array
+    full_voltage: float
+    feedback: bool
+    resolution: float
+    stiff: float
+    loss: float
+    tension: float
+    radial: float
+    coil: CoilTable
+    state: Array
+    before: Array
+    reading: Array
+    line: Array
+    counts: npt.NDArray[np.int64]
+
+
+@inlined
+def _begin(drive: LoadedTable, n: int, command: float, free: Array) -> float:
+    """Fill what the drives do without the extension and the force of sample ``n``; returns the delayed command [m]."""
+    line, transition, coarse = drive.line, drive.transition, drive.coarse
+    size, delay, part = line.size, drive.delay, drive.part
+    line[n % size] = command
+    u0, u1, u2 = line[(n - delay) % size], line[(n - delay - 1) % size], line[(n - delay - 2) % size]
+    d0, d1, d2 = u0, u1, u2
+    if drive.coil.on:
+        wanted, state = (1.0 - part) * u1 + part * u2, drive.state
+        asked = (drive.spring * (wanted - state[0]) - drive.damper * state[1]) * drive.force_per_current
+        d0, d1, d2 = applied(drive.coil, n, asked, state[state.size - 1]), 0.0, 0.0
+    for i in range(free.size):
+        # In the order of the drives that feel no force, for the same bits.
+        free[i] = 0.0
+        if drive.series:
+            free[i] = coarse[i, 0] * d0 + coarse[i, 1] * d1 + coarse[i, 2] * d2 + drive.fine[i, 1] * drive.before[0]
+        for j in range(free.size):
+            free[i] += transition[i, j] * drive.state[j]
+        if not drive.series:
+            free[i] = free[i] + coarse[i, 0] * d0 + coarse[i, 1] * d1 + coarse[i, 2] * d2
+        free[i] += drive.load[i, 1] * drive.before[1]
+    return float((1.0 - part) * u0 + part * u1)
+
+
+@inlined
+def _carriage(drive: LoadedTable, free: Array, e: float, pushes: float) -> float:
+    """Position of the carriage [m] with an extension and a radial force, between its end stops."""
+    stroke = drive.carriage_stroke
+    return float(min(max(free[0] + drive.fine[0, 0] * e + drive.load[0, 0] * pushes, -stroke), stroke))
+
+
+@inlined
+def _chip(
+    drive: LoadedTable, cut: CutTable, free: Array, e: float, here: tuple[float, ...], stiffness: float, c: float
+) -> float:
+    """Depth of cut with an extension, see `chip_of`; ``here``: place, angle, cross position, met form, allowance."""
+    place, angle, cross_position, met, allowance = here
+    kept, tool = drive.radial * held(cut), drive.tool
+    displacement = free[tool] + drive.fine[tool, 0] * e + drive.load[tool, 0] * kept
+    if drive.series:  # in the rounding of two states that are added
+        x1 = _carriage(drive, free, e, kept)
+        displacement = x1 + (displacement - x1)
+    give = drive.radial * drive.load[tool, 0]
+    chip = chip_of(cut, place, angle, cross_position, displacement - met, allowance, stiffness, c, give, 0.0)
+    if not drive.series:
+        x1 = free[0] + drive.load[0, 0] * (kept + drive.radial * cut.process.lag_now * stiffness * max(chip, 0.0))
+        if abs(x1) > drive.carriage_stroke:  # an end stop holds it, and it does not give way
+            x1 = drive.carriage_stroke if x1 > 0.0 else -drive.carriage_stroke
+            chip = chip_of(cut, place, angle, cross_position, x1 - met, allowance, stiffness, c, 0.0, 0.0)
+    return chip
+
+
+@inlined
+def _solve(
+    drive: LoadedTable,
+    cut: CutTable,
+    free: Array,
+    trial: Array,
+    set_point: float,
+    noise: float,
+    here: tuple[float, ...],
+    stiffness: float,
+    c: float,
+) -> tuple[float, float]:
+    """Extension [m] and depth of cut [m] of a sample; with feedback they are found by iteration.
+
+    The extension then needs the carriage's position of this sample and moves it by a thousandth of itself.
+    """
+    memory, e, cuts = drive.memory, 0.0, False
+    if not drive.feedback:
+        if drive.series:
+            e, cuts = extend(drive.stack, memory, set_point)
+            drive.counts[SATURATED] += cuts
+        return e, _chip(drive, cut, free, e, here, stiffness, c)
+    chip, x1 = 0.0, _carriage(drive, free, drive.before[0], 0.0)
+    for _ in range(_ROUNDS):
+        guess = x1
+        drive.reading[0] = quantise(guess + noise, drive.resolution)
+        trial[:] = memory
+        e, cuts = extend(drive.stack, trial, set_point - drive.reading[0])
+        chip = _chip(drive, cut, free, e, here, stiffness, c)
+        force = held(cut) + cut.process.lag_now * stiffness * max(chip, 0.0)
+        x1 = _carriage(drive, free, e, drive.radial * force)
+        if x1 == guess:
+            break
+    memory[:] = trial
+    drive.counts[SATURATED] += cuts
+    return e, chip
+
+
+@inlined
+def _settle(drive: LoadedTable, free: Array, e: float, pushes: float, noise: float) -> None:
+    """Where the drives are at the end of the sample, with its extension and its radial force."""
+    state = drive.state
+    for i in range(free.size):
+        state[i] = free[i] + drive.fine[i, 0] * e + drive.load[i, 0] * pushes
+    drive.before[0], drive.before[1] = e, pushes
+    state[0], state[1], stops = between_stops(state[0], state[1], drive.carriage_stroke)  # the tool swings on
+    drive.counts[STOPPED] += stops
+    if not drive.feedback:
+        drive.reading[0] = quantise(state[0] + noise, drive.resolution)
+
+
+@kernel
+def advance_loaded(
+    drive: LoadedTable,
+    cut: CutTable,
+    first: int,
+    command: Array,
+    set_point: Array,
+    noise: Array,
+    met: Array,
+    angle: Array,
+    speed: Array,
+    height: Array,
+    cross_position: Array,
+    feed_velocity: Array,
+    allowance: Array,
+    carriage: Array,
+    carriage_velocity: Array,
+    current: Array,
+    measured: Array,
+    extension: Array,
+    extension_velocity: Array,
+    voltage: Array,
+    force: Array,
+    deflection: Array,
+    depth_of_cut: Array,
+    feed: Array,
+    wear: Array,
+) -> tuple[int, int]:
+    """Step drives and cut through a block, see `LoadedDrive.block`; returns the sample where it stopped and why."""
+    state, per_radian = drive.state, cut.process.grid / _TURN
+    free, trial = np.empty(state.size), np.empty(drive.memory.size)
+    for k in range(command.size):
+        place = angle[k] * per_radian
+        reason, feed[k], stiffness, c = meet(cut, place, speed[k], height[k], angle[k], feed_velocity[k])
+        if reason != DONE:
+            return k, reason
+        wear[k] = cut.state[WEAR]
+        delayed = _begin(drive, first + k, command[k], free)
+        here = (place, angle[k], cross_position[k], met[k], allowance[k])
+        e, chip = _solve(drive, cut, free, trial, set_point[k], noise[k], here, stiffness, c)
+        if np.isnan(chip):
+            return k, DRAWN_IN
+        cut.counts[BACKWARDS] += feed_velocity[k] < 0.0
+        cut.counts[APART] += chip < 0.0
+        depth_of_cut[k] = chip = max(chip, 0.0)
+        force[k], deflection[k] = press(cut, chip, stiffness, c, speed[k], 0.0, 0.0)
+        _settle(drive, free, e, drive.radial * force[k], noise[k])
+        carriage[k], carriage_velocity[k], measured[k] = state[0], state[1], drive.reading[0]
+        current[k] = (drive.spring * (delayed - state[0]) - drive.damper * state[1]) * drive.force_per_current
+        if drive.coil.on:
+            current[k] = state[state.size - 1]
+        moved = state[0]
+        if drive.series:
+            extension[k], extension_velocity[k] = state[2] - state[0], state[3] - state[1]
+            voltage[k], moved = drive.memory[VOLTAGE] * drive.full_voltage, state[0] + extension[k]
+            if drive.stiff * (e - extension[k]) - drive.loss * extension_velocity[k] > drive.tension:
+                return k, _TORN_OFF
+        leave(cut, place, chip, cross_position[k] + (moved - met[k]) + deflection[k])
+    return command.size, DONE
+
+
+def failure(reason: int, angle: float, speed: float, feed: float) -> LatheError:
+    """Why drives and cut cannot go on, see `lathe_rc.plants.chip.failure`."""
+    if reason == _TORN_OFF:
+        return LatheError(
+            f"the tool's acceleration tears the stack off its preload at {angle:.6g} rad; allowed: more preload, or a "
+            "gentler command"
+        )
+    return failure_of_cut(reason, angle, speed, feed)

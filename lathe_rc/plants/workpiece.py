@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the part does to the cut: where it has no material, where it is harder, how it gives way along it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import inlined
+
+Array = npt.NDArray[np.float64]
+
+_TURN = 2.0 * np.pi
+
+
+@dataclass(frozen=True)
+class HardSpot:
+    """A place in the part where the force is another.
+
+    Attributes:
+        start, width: angular window [rad].
+        bottom, top: its heights along the part [m].
+        factor: of the force.
+    """
+
+    start: float
+    width: float
+    bottom: float
+    top: float
+    factor: float
+
+    def __post_init__(self) -> None:
+        _check_window("hard spot", self.start, self.width)
+        if not self.bottom < self.top:
+            raise InputError(f"hard spot from {self.bottom:g} to {self.top:g} m; allowed: a top above the bottom")
+        if not 0.0 <= self.factor < np.inf:
+            raise InputError(f"hard spot: factor {self.factor:g}; allowed: 0 or more")
+
+    @property
+    def row(self) -> tuple[float, ...]:
+        """As the kernel has it."""
+        return self.start, self.width, self.bottom, self.top, self.factor
+
+
+def _check_window(what: str, start: float, width: float) -> None:
+    if not (np.isfinite(start) and 0.0 < width < _TURN):
+        raise InputError(
+            f"{what}: window at {start:g} rad of {width:g} rad; allowed: a width above 0 and below a revolution"
+        )
+
+
+@dataclass(frozen=True)
+class Part:
+    """What the part does to the cut.
+
+    Attributes:
+        radius: at which the cutting path is reckoned [m].
+        gaps: angular windows without material (keyways): start and width of each [rad].
+        hard_spots: where spots overlap their factors multiply.
+        heights, compliances: c along the part [m, m/N], instead of that of the elasticity, linear between heights and
+            the same beyond the ends; ``None`` where it does not change. See `lathe_rc.analysis.shaft`.
+
+    Raises:
+        InputError: a window or table that is none.
+    """
+
+    radius: float = 0.05
+    gaps: Sequence[tuple[float, float]] = ()
+    hard_spots: Sequence[HardSpot] = ()
+    heights: Array | None = None
+    compliances: Array | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.radius < np.inf:
+            raise InputError(f"part: radius {self.radius:g} m; allowed: above 0")
+        for start, width in self.gaps:
+            _check_window("keyway", start, width)
+        if (self.heights is None) != (self.compliances is None):
+            raise InputError("part: heights without compliances or the other way round; give both or none")
+        if self.heights is not None and self.compliances is not None:
+            if self.heights.size != self.compliances.size or not self.heights.size:
+                raise InputError(
+                    f"part: {self.heights.size} heights and {self.compliances.size} compliances; give as many of each"
+                )
+            if np.any(np.diff(self.heights) <= 0.0) or np.any(self.compliances < 0.0):
+                raise InputError("part: heights have to rise, compliances must not be negative; sort or correct them")
+
+
+@inlined
+def _within(angle: float, start: float, width: float) -> bool:
+    """Whether an angle lies in a window [rad]; windows may lie across the zero."""
+    since = (angle - start) / _TURN
+    return bool((since - np.floor(since)) * _TURN < width)
+
+
+@inlined
+def missing(gaps: Array, angle: float) -> bool:
+    """Whether there is no material at an angle [rad]."""
+    found = False
+    for i in range(gaps.shape[0]):
+        found |= _within(angle, gaps[i, 0], gaps[i, 1])
+    return found
+
+
+@inlined
+def hardness(spots: Array, angle: float, height: float) -> float:
+    """Factor of the force at an angle [rad] and a height [m], see `HardSpot.row`."""
+    factor = 1.0
+    for i in range(spots.shape[0]):
+        if spots[i, 2] <= height <= spots[i, 3] and _within(angle, spots[i, 0], spots[i, 1]):
+            factor *= spots[i, 4]
+    return factor

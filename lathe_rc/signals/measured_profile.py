@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A part profile from measured points, and the CSV file that it is read from."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from lathe_rc.errors import InputError
+from lathe_rc.signals.table import parse_table, read_text
+
+Array = npt.NDArray[np.float64]
+
+_TURN = 2.0 * np.pi
+_HEADERS = (("angle_deg", "radius_um"), ("angle_deg", "height_mm", "radius_um"))
+_FLATTEST = 0.01  # [µm] peak to valley of a form: nobody turns less
+_FARTHEST = 10_000.0  # [µm] that all of a form may be away from the middle
+_TURN_OF_RADIANS = 6.3  # [°] a column that spans no more is in another unit
+_CLOSEST = 1e-6  # [°, mm] between two points: closer ones are a slip, and their slope overflows
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A profile from points: a periodic cubic spline through each row, linear between rows.
+
+    Args:
+        angle: increasing angles [rad] in [0, 2π), shape (n,).
+        heights: increasing positions [m], shape (m,).
+        radius: deviations [m], shape (m, n).
+    """
+
+    angle: Array
+    heights: Array
+    radius: Array
+
+    def deviation(self, angle: Array, height: float) -> Array:
+        """See `lathe_rc.signals.profile.Profile`."""
+        rows = [np.interp(height, self.heights, column) for column in self.radius.T]
+        closed = np.append(rows, rows[0])
+        spline = scipy.interpolate.CubicSpline(np.append(self.angle, self.angle[0] + _TURN), closed, bc_type="periodic")
+        return np.asarray(spline(self.angle[0] + np.mod(angle - self.angle[0], _TURN)))
+
+
+def _check_distances(path: Path, what: str, unit: str, places: Array) -> None:
+    near = np.flatnonzero(np.diff(places) < _CLOSEST)
+    if near.size:
+        a, b = places[near[0]], places[near[0] + 1]
+        raise InputError(
+            f"{path}: {what} {a:.10g} and {b:.10g}{unit} are too close; allowed: {_CLOSEST:g}{unit} apart or more"
+        )
+
+
+def _check_units(path: Path, angle_deg: Array, radius_um: Array) -> None:
+    """Refuse columns that are most likely in another unit than their names say."""
+    low, high = angle_deg[0], angle_deg[-1]
+    if high - low <= _TURN_OF_RADIANS:
+        unit = "radians" if high > 1.0 else "revolutions"
+        raise InputError(
+            f"{path}: angle_deg spans {low:.4g} to {high:.4g}, which looks like {unit}; allowed: degrees all round, 0 "
+            "up to 360"
+        )
+    height = float(np.ptp(radius_um))
+    if 0.0 < height < _FLATTEST:
+        raise InputError(
+            f"{path}: radius_um is {height:.3g} µm from peak to valley, which looks like metres or millimetres; "
+            f"allowed: micrometres, 0 or {_FLATTEST:g} and above"
+        )
+    nearest = float(np.abs(radius_um).min())
+    if nearest > _FARTHEST:
+        raise InputError(
+            f"{path}: radius_um is {nearest:.4g} µm or more everywhere, which looks like radii, or nanometres; "
+            f"allowed: deviations from the mean radius in micrometres, up to {_FARTHEST:g}"
+        )
+
+
+def read_csv(path: Path) -> Measured:
+    """Read a profile from a CSV file.
+
+    Columns ``angle_deg`` [°], optionally ``height_mm`` [mm], ``radius_um`` (radius deviation) [µm], in any
+    order of rows. Every height must have the same angles.
+
+    Raises:
+        InputError: the file is missing, malformed, in other units, holds a number that is not finite, or repeats an
+            angle.
+    """
+    return _measured(read_text(path, "profile"), path)
+
+
+@lru_cache(maxsize=8)
+def _measured(text: str, path: Path) -> Measured:
+    """The profile in a text: to make it takes longer than some cells run, and nobody changes it."""
+    header, rows = parse_table(text, path, _HEADERS)
+    if not rows.size:
+        raise InputError(f"{path}: no points; give at least three angles")
+    if len(header) == 2:
+        rows = np.insert(rows, 1, 0.0, axis=1)
+    angle_deg, heights_mm = np.unique(rows[:, 0]), np.unique(rows[:, 1])
+    if angle_deg[0] < 0.0 or angle_deg[-1] >= 360.0:
+        wrong = angle_deg[0] if angle_deg[0] < 0.0 else angle_deg[-1]
+        raise InputError(f"{path}: angle {wrong:g}°; allowed: 0 up to but not including 360")
+    if angle_deg.size < 3:
+        raise InputError(f"{path}: {angle_deg.size} different angles; allowed: 3 or more")
+    _check_units(path, angle_deg, rows[:, 2])
+    _check_distances(path, "angles", "°", np.append(angle_deg, angle_deg[0] + 360.0))
+    _check_distances(path, "heights", " mm", heights_mm)
+    radius = np.full((heights_mm.size, angle_deg.size), np.nan)
+    at = np.searchsorted(heights_mm, rows[:, 1]), np.searchsorted(angle_deg, rows[:, 0])
+    cells, counts = np.unique(np.stack(at), axis=1, return_counts=True)
+    if np.any(counts > 1):
+        height, angle = cells[:, np.argmax(counts > 1)]
+        raise InputError(
+            f"{path}: angle {angle_deg[angle]:g}° at height {heights_mm[height]:g} mm appears more than once; keep one"
+        )
+    radius[at] = rows[:, 2] * 1e-6
+    if np.any(np.isnan(radius)):
+        height, angle = np.argwhere(np.isnan(radius))[0]
+        raise InputError(
+            f"{path}: no point at angle {angle_deg[angle]:g}°, height {heights_mm[height]:g} mm; "
+            "every height needs the same angles"
+        )
+    return Measured(np.deg2rad(angle_deg), heights_mm * 1e-3, radius)

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A part profile as the cell runs it: a table, and what it asks of a drive.
+
+The table is a periodic cubic spline in the angle with linear interpolation along the part, which also gives the
+derivatives for the feasibility check.
+"""
+
+import pickle
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from lathe_rc.jit import inlined, kernel
+from lathe_rc.signals.profile import Profile
+
+Array = npt.NDArray[np.float64]
+
+_TURN = 2.0 * np.pi
+
+
+@kernel
+def height_along(feed: float, start: float, part: int, angle: Array, height: Array) -> None:
+    """Fill the place along the part [m] at a spindle angle [rad], shape (n,).
+
+    Args:
+        feed: [m/rev].
+        start: where the part begins [m].
+        part: revolutions after which the next part begins; 0 for one endless part.
+        angle: see above.
+        height: see above.
+    """
+    for k in range(angle.size):
+        turns = angle[k] / _TURN
+        if part > 0:
+            turns -= part * np.floor(turns / part)
+        height[k] = start + feed * turns
+
+
+@inlined
+def _cubic(row: Array, place: float) -> float:
+    """A row of a table, shape (n, 4), at ``place`` [interval]; n is a power of two."""
+    whole = np.floor(place)
+    j = np.uint64(np.int64(whole)) & np.uint64(row.shape[0] - 1)
+    u = place - whole
+    return float(((row[j, 0] * u + row[j, 1]) * u + row[j, 2]) * u + row[j, 3])
+
+
+@inlined
+def _cubic_derivatives(c: Array, u: float) -> tuple[float, float, float]:
+    """A cubic, highest power first, and its first two derivatives at ``u``."""
+    return (
+        ((c[0] * u + c[1]) * u + c[2]) * u + c[3],
+        (3.0 * c[0] * u + 2.0 * c[1]) * u + c[2],
+        6.0 * c[0] * u + 2.0 * c[1],
+    )
+
+
+@kernel
+def deviation_along(heights: Array, table: Array, angle: Array, height: Array, deviation: Array) -> None:
+    """Fill the radius deviation [m] at angles [rad] and heights [m], shape (n,), from a `ProfileTable`.
+
+    Cubic in the angle, linear in the height, and beyond the ends of the part as at its ends.
+    """
+    per_radian = table.shape[1] / _TURN
+    last = heights.size - 1
+    row = start = 0
+    while start < angle.size:
+        # Neighbours are mostly between the same two rows: take them together.
+        while row > 0 and not height[start] >= heights[row]:
+            row -= 1
+        while row < last and height[start] >= heights[row + 1]:
+            row += 1
+        stop = start + 1
+        while (
+            stop < angle.size
+            and (row == 0 or height[stop] >= heights[row])
+            and (row == last or height[stop] < heights[row + 1])
+        ):
+            stop += 1
+        below = table[row]
+        if row == last:
+            for k in range(start, stop):
+                deviation[k] = _cubic(below, angle[k] * per_radian)
+        else:
+            above, low, high = table[row + 1], heights[row], heights[row + 1]
+            for k in range(start, stop):
+                place = angle[k] * per_radian
+                v = (height[k] - low) / (high - low)
+                value = _cubic(below, place)
+                deviation[k] = value + v * (_cubic(above, place) - value) if v > 0.0 else value
+        start = stop
+
+
+@kernel
+def derivatives_at(
+    heights: Array, table: Array, feed: float, start: float, part: int, angle: float
+) -> tuple[float, float, float]:
+    """Radius deviation [m] at an angle [rad], and its first two derivatives over the angle along the tool's path.
+
+    Args:
+        heights: see `deviation_along`.
+        table: see `deviation_along`.
+        feed: see `height_along`.
+        start: see `height_along`.
+        part: see `height_along`.
+        angle: [rad].
+
+    Returns:
+        r [m], dr/dφ [m/rad], d²r/dφ² [m/rad²]. The slope along the part counts in the first derivative.
+    """
+    turns = angle / _TURN
+    if part > 0:
+        turns -= part * np.floor(turns / part)
+    height = start + feed * turns
+    row, last = 0, heights.size - 1
+    while row < last and height >= heights[row + 1]:
+        row += 1
+    per_radian = table.shape[1] / _TURN
+    place = angle * per_radian
+    whole = np.floor(place)
+    j, u = np.int64(whole) & (table.shape[1] - 1), place - whole
+    value, slope, bow = _cubic_derivatives(table[row, j], u)
+    if row < last and height > heights[row]:
+        apart = heights[row + 1] - heights[row]
+        v = (height - heights[row]) / apart
+        above, steeper, rounder = _cubic_derivatives(table[row + 1, j], u)
+        along = (above - value) / apart * feed / _TURN
+        value += v * (above - value)
+        slope += v * (steeper - slope)
+        bow += v * (rounder - bow)
+        return value, slope * per_radian + along, bow * per_radian**2
+    return value, slope * per_radian, bow * per_radian**2
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What a profile asks of a drive at its worst place."""
+
+    stroke: float  #: largest displacement from the middle [m]
+    velocity: float  #: [m/s]
+    acceleration: float  #: [m/s²]
+
+
+class _ByContent:
+    """A profile that is equal to others of the same content.
+
+    Args:
+        profile: what it stands for.
+    """
+
+    def __init__(self, profile: Profile) -> None:
+        self.profile = profile
+        self._content = pickle.dumps(profile)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ByContent) and self._content == other._content
+
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+
+@lru_cache(maxsize=8)
+def _table(profile: _ByContent) -> "ProfileTable":
+    return ProfileTable(profile.profile)
+
+
+def tabulated(profile: Profile) -> "ProfileTable":
+    """The table of a profile; equal profiles share one, which nobody changes: to make it takes 20 ms and more."""
+    return _table(_ByContent(profile))
+
+
+class ProfileTable:
+    """A profile as the cell runs it.
+
+    Args:
+        profile: the form.
+        points: intervals of the periodic cubic spline per revolution, a power of two.
+
+    Attributes:
+        heights: [m], shape (m,).
+        table: polynomial coefficients of each interval, highest power first, shape (m, points, 4).
+    """
+
+    def __init__(self, profile: Profile, points: int = 4096) -> None:
+        angle = np.linspace(0.0, _TURN, points + 1)
+        self.heights = np.ascontiguousarray(profile.heights)
+        self.table = np.empty((self.heights.size, points, 4))
+        for row, height in zip(self.table, self.heights, strict=True):
+            values = profile.deviation(angle, float(height))
+            values[-1] = values[0]
+            spline = scipy.interpolate.CubicSpline(np.arange(points + 1.0), values, bc_type="periodic")
+            row[:] = spline.c.T
+
+    def demand(self, speed: float, acceleration: float, feed: float) -> Demand:
+        """What the profile asks at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], ``feed`` in m/rev."""
+        return _demand(self, speed, acceleration, feed)
+
+
+@lru_cache(maxsize=8)
+def _demand(form: ProfileTable, speed: float, acceleration: float, feed: float) -> Demand:
+    per_radian = form.table.shape[1] / _TURN
+    value, slope = form.table[..., 3], form.table[..., 2] * per_radian
+    curvature = 2.0 * form.table[..., 1] * per_radian**2
+    along = np.zeros_like(value)
+    if form.heights.size > 1:
+        steepest = np.abs(np.diff(value, axis=0) / np.diff(form.heights)[:, None])
+        along[:-1] = steepest
+        along[1:] = np.maximum(along[1:], steepest)
+    return Demand(
+        stroke=float(np.abs(value).max()),
+        velocity=float(speed * (np.abs(slope) + along * feed / _TURN).max()),
+        acceleration=float((speed**2 * np.abs(curvature) + acceleration * np.abs(slope)).max()),
+    )

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""sdist and wheel hold the package and its data, and work in an environment that has nothing else."""
+
+import os
+import shutil
+import subprocess
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import installer
+import workplace
+from lathe_rc import __version__
+
+pytestmark = pytest.mark.system
+
+UV = workplace.PYTHON.with_name("uv")
+LOCK = workplace.REQUIREMENTS / "python.lock"
+NOT_COPIED = shutil.ignore_patterns(".git", ".lathe", ".*_cache", ".hypothesis", "bags")
+
+
+def uv(*words: str | Path) -> None:
+    """Run uv with the settings that the user has made for pip."""
+    listed = subprocess.run(
+        [workplace.PYTHON, "-m", "pip", "config", "list"], capture_output=True, text=True, check=True
+    )
+    settings = installer.uv_environment(listed.stdout, os.environ)
+    settings["UV_LINK_MODE"] = "hardlink"  # nothing here is changed, and copies of 500 MB take their time
+    subprocess.run([UV, *words], env=settings, check=True)
+
+
+@pytest.fixture(scope="module")
+def dist(tmp_path_factory) -> Path:
+    """Both sdists, and the wheel that was built from the first, of a copy of this checkout with all its caches."""
+    folder = tmp_path_factory.mktemp("dist")
+    source = folder / "source"
+    shutil.copytree(workplace.ROOT, source, symlinks=True, ignore=NOT_COPIED)
+    uv("build", "--quiet", source, "--out-dir", folder)
+    uv("build", "--quiet", "--sdist", source / "msg_defs", "--out-dir", folder)
+    return folder
+
+
+def files(folder: str) -> set[str]:
+    """Return the files of a folder of the checkout, without caches."""
+    found = (workplace.ROOT / folder).rglob("*")
+    here = {str(path.relative_to(workplace.ROOT)) for path in found if path.is_file()}
+    return {name for name in here if "__pycache__" not in name}
+
+
+MESSAGES = {name for name in files("msg_defs") if name.endswith((".msg", ".srv"))}
+
+
+def test_wheel_holds_the_package_its_data_and_nothing_else(dist):
+    (wheel,) = dist.glob("lathe_rc-*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    data = f"lathe_rc-{__version__}.data/data/share"
+    shared = {"package.xml", *files("config"), *files("launch")}
+    expected = {name for name in files("lathe_rc") if not name.startswith("lathe_rc/msg_defs/")}
+    expected |= {f"lathe_rc/{name}" for name in MESSAGES}
+    expected |= {f"{data}/lathe_rc/{name}" for name in shared}
+    expected |= {f"{data}/ament_index/resource_index/packages/lathe_rc"}
+    assert {name for name in names if f"lathe_rc-{__version__}.dist-info/" not in name} == expected
+
+
+def test_sdists_hold_what_is_built_and_no_tests_and_caches(dist):
+    for name, needed in (
+        ("lathe_rc", {"setup.py", "pyproject.toml", "package.xml", "LICENSE", "CITATION.cff", *files("config")}),
+        ("lathe_rc_msgs", {name.removeprefix("msg_defs/") for name in files("msg_defs")}),
+    ):
+        (path,) = dist.glob(f"{name}-*.tar.gz")
+        with tarfile.open(path) as archive:
+            names = {member.name.partition("/")[2] for member in archive if member.isfile()}
+        assert needed <= names
+        assert [name for name in names if name.startswith(("tests/", ".")) or "cache" in name] == []
+
+
+def environment(dist: Path, place: Path, wanted: str) -> "Installed":
+    uv("venv", "--quiet", "--python", workplace.BASE_PYTHON, place)
+    python = place / "bin" / "python"
+    uv("pip", "install", "--quiet", "--python", python, "--find-links", dist, "--constraint", LOCK, wanted)
+    return Installed(place)
+
+
+class Installed:
+    """An environment with lathe_rc, called as a user calls it, from a folder of the user's own."""
+
+    def __init__(self, place: Path) -> None:
+        self._programs = place / "bin"
+        self.folder = place / "work"
+        self.folder.mkdir()
+
+    def run(self, program: str, *words: str, code: int = 0) -> str:
+        """Return what a program of the environment prints, on both streams."""
+        environ = {"PATH": os.defpath, "HOME": str(self.folder)}
+        done = subprocess.run(
+            [self._programs / program, *words],
+            cwd=self.folder,
+            env=environ,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == code, done.stdout
+        return done.stdout
+
+
+@pytest.fixture(scope="module")
+def alone(dist) -> Installed:
+    """Without ROS and without any extra."""
+    return environment(dist, dist / "alone", "lathe_rc")
+
+
+def test_it_runs_without_ros(alone):
+    assert alone.run("lathe", "--version") == f"lathe, version {__version__}\n"
+    assert "5 revolutions" in alone.run("lathe", "run", "piston", "--revolutions", "5", "--bag", "B")
+    assert alone.run("lathe", "bag", "check", "B").startswith("clean: ")
+    alone.run("lathe", "report", "B", "-o", "report.html")
+    assert (alone.folder / "report.html").stat().st_size > 100_000
+    assert "Usage: " in alone.run("lathe", "study", "--help")
+    alone.run("lathe", "new", "law", "mine")
+    notebook = """
+from pathlib import Path
+from lathe_rc import harness
+from lathe_rc.bag import reader
+print(reader.read(Path("B")).plot())
+"""
+    assert "Figure" in alone.run("python", "-c", notebook)
+
+
+@pytest.mark.parametrize(
+    ("words", "extra"),
+    [
+        (("run", "piston", "--mode", "processes"), "ros"),
+        (("node", "tool"), "ros"),
+        (("sweep", "piston", "--vary", "tool.tolerance=1e-6:2e-6:2", "--out", "S"), "sweep"),
+        (("view", "B"), "view"),
+    ],
+)
+def test_a_command_without_its_extra_says_what_to_install(alone, words, extra):
+    said = alone.run("lathe", *words, code=1)
+    assert said.count("\n") == 1
+    assert f"pip install 'lathe_rc[{extra}]'" in said
+
+
+@pytest.mark.timeout(900)  # most of a minute, of which a machine that does other things makes several
+def test_with_ros_the_messages_are_built_by_the_installation(dist):
+    """One command installs ROS 2 and the messages; then the same cell runs as processes, with the same bits."""
+    ros = environment(dist, dist / "ros", "lathe_rc[ros]")
+    assert "0 lost; 5 revolutions" in ros.run(
+        "lathe", "run", "piston", "--mode", "processes", "--revolutions", "5", "--bag", "B"
+    )
+    assert ros.run("lathe", "bag", "check", "B").startswith("clean: ")

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Publishers that do not belong to a cell, on its topics: refused, counted, named, and the cell goes on."""
+
+import contextlib
+import itertools
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from cells import STEP, block, scenario
+from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, SafetyStatus, ToolBlock
+from mcap.reader import make_reader
+from rclpy.executors import SingleThreadedExecutor
+from rosbags.highlevel import AnyReader
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+
+from lathe_rc import harness, messages
+from lathe_rc.errors import LatheError
+from lathe_rc.nodes.ports import latched_qos
+from lathe_rc.nodes.stage_node import StageNode
+
+
+def uneven(msgtype, source, run_id):
+    made = messages.decode(msgtype, block(msgtype, 0, source, run_id))
+    name = next(iter(messages.sample_fields(msgtype)))
+    setattr(made, name, getattr(made, name)[:1])
+    return messages.encode(msgtype, made)
+
+
+def foreign(msgtype, own):
+    """Blocks that do not belong, on a topic of the node ``own`` in the run 'test'."""
+    return [
+        block(msgtype, 0, "/other", "test"),
+        block(msgtype, 0, own, "elsewhere"),
+        block(msgtype, 64, "/step", "test", step=20_000),
+        block(msgtype, 0, "/long", "test", size=8192),
+        uneven(msgtype, "/uneven", "test"),
+        block(msgtype, 0, "/nan", "test", fill=np.nan),
+        block(msgtype, 2**40, "/jump", "test"),
+        b"\0\1\0\0" + b"\xff" * 1000,
+    ]
+
+
+def joint_state(sample):
+    """One with a time of this run; none is due at the samples that are used here."""
+    sec, nanosec = divmod(messages.START_NS + sample * STEP, 10**9)
+    return JointState(header=Header(stamp=Time(sec=sec, nanosec=nanosec)), position=[1.0])
+
+
+def senders(topic, own):
+    """The names of the refused messages of `foreign`."""
+    sources = ["/other", "/step", "/long", "/uneven", "/nan", "/jump"]
+    return {f"{source} of run 'test' on {topic}" for source in sources} | {
+        f"{own} of run 'elsewhere' on {topic}",
+        f"an unknown sender of run '' on {topic}",
+    }
+
+
+@contextlib.contextmanager
+def all_the_time(sends, pause=0.002):
+    """Publishes the messages of ``sends``, pairs of publisher and message, again and again."""
+    over = threading.Event()
+
+    def work():
+        for publisher, message in itertools.cycle(sends):
+            publisher.publish(message)
+            if over.wait(pause):
+                return
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def diagnostics(bag):
+    """Of each node, the last report in a bag."""
+    with next(bag.glob("*.mcap")).open("rb") as stream:
+        told = [message.data for _, _, message in make_reader(stream).iter_messages(topics=["/diagnostics"])]
+    arrays = [messages.decode("diagnostic_msgs/msg/DiagnosticArray", data) for data in told]
+    return {status.name: status for array in arrays for status in array.status}
+
+
+def test_a_cell_goes_on_among_foreign_messages(ghost, domain, tmp_path):
+    """Foreign messages are refused, counted and named, and the cell gives the bits that it has alone."""
+    cell = scenario(spindle_encoder={"revolutions": 30.0, "speed_factor": 1.0})  # while all is said several times
+    on = {"/encoder": (EncoderBlock, "/spindle_encoder"), "/tool": (ToolBlock, "/tool")}
+    sends = []
+    for topic, (kind, own) in on.items():
+        publisher = ghost.create_publisher(kind, topic, latched_qos(10))
+        sends += [(publisher, message) for message in foreign(f"lathe_rc_msgs/msg/{kind.__name__}", own)]
+    members = ghost.create_publisher(Member, "/members", latched_qos(10))
+    states = ghost.create_publisher(CellState, "/cell_state", latched_qos(10))
+    progress = ghost.create_publisher(Progress, "/progress", latched_qos(10))
+    joints = ghost.create_publisher(JointState, "/electrodynamic_actuator/joint_states", latched_qos(10))
+    sends += [
+        (members, Member(run_id="elsewhere", name="/tool", state=Member.FAILED, message="no")),
+        (members, Member(run_id="test", name="/made_up", publishes=["/a"])),
+        (members, Member(run_id="test", name="/made_up", publishes=["/a"], types=["a/b/c"], sparse=[False])),
+        (members, Member(run_id="test", name="/usurper", members=["/usurper"], parameters="{}")),
+        (members, b"\0\1\0\0" + b"\xff" * 100),
+        (states, CellState(run_id="x", state=CellState.FAILED)),
+        (progress, Progress(run_id="x", name="/tool", blocks=2**40)),
+        (progress, Progress(run_id="test", name="/made_up", blocks=2**40)),
+        *((joints, joint_state(sample)) for sample in range(100, 120_000, 10_000)),
+    ]
+    with all_the_time(sends):
+        result = harness.run(cell, mode="processes", groups=[], domain=domain, bag=tmp_path / "bag")
+    assert result.digest == harness.run(cell).digest
+    expected = set.union(*(senders(topic, own) for topic, (_, own) in on.items()))
+    assert expected <= set(result.refused)
+    others = set(result.refused) - expected
+    assert "/electrodynamic_actuator of run 'test' on /electrodynamic_actuator/joint_states" in others
+    assert {"/tool of run 'elsewhere' on /members", "/made_up of run 'test' on /members"} <= others
+    assert {"an unknown sender of run 'x' on /cell_state", "/tool of run 'x' on /progress"} <= others
+    values = {pair.key: pair.value for pair in diagnostics(tmp_path / "bag")["/learning_controller"].values}
+    assert "from /nan of run 'test' on /tool" in values["refused"]
+    assert "/haunted/ghost" in values["publishers of /tool"]
+
+
+def test_a_cell_begins_in_a_flood_of_announcements(ghost, domain):
+    """A cell begins in a flood that pushes its own announcements out of the readers of nodes that start."""
+    sends = [(ghost.create_publisher(Member, "/members", latched_qos(10)), Member(run_id="elsewhere", name="/x"))]
+    cell = scenario(spindle_encoder={"revolutions": 2.0})
+    with all_the_time(sends, pause=0.0005):
+        result = harness.run(cell, mode="processes", groups=[], domain=domain)
+    assert result.digest == harness.run(cell).digest
+    assert result.refused["/x of run 'elsewhere' on /members"] > 256
+
+
+def test_who_speaks_in_the_name_of_a_member_makes_the_cell_safe_and_all_publishers_are_named(ghost, domain, tmp_path):
+    """A sender in a member's name makes the cell safe, as a member that goes wrong: no node can distinguish them."""
+    cell, sent = scenario(spindle_encoder={"revolutions": 200.0, "speed_factor": 1.0}), []
+    publisher = ghost.create_publisher(ToolBlock, "/tool", latched_qos(10))
+
+    def watch(event):
+        if event["event"] == "cycle" and not sent:
+            sent.append(publisher.publish(block(messages.TOOL, 0, "/tool", "test")))
+
+    twice = r"failed: /tool: /tool goes from sample \d+ to 0: a block came twice; publishers of /tool: /haunted/ghost, "
+    with pytest.raises(LatheError, match=rf"{twice}/tool: safe state from sample \d+ on"):
+        harness.run(cell, mode="processes", groups=[], domain=domain, bag=tmp_path / "bag", watch=watch)
+    with AnyReader([tmp_path / "bag"]) as found:
+        assert sum(1 for _ in found.messages()) > 100
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (block(messages.TOOL, 0, "/tool", "test", step=20_000), "/tool: /tool has a step of 20000 ns; expected 15625"),
+        (block(messages.TOOL, 0, "/tool", "test", size=65), "/tool: /tool sends 65 samples in a block; expected 64"),
+        (uneven(messages.TOOL, "/tool", "test"), r"/tool: /tool sends arrays of \[1, 64\] samples in one block"),
+    ],
+)
+def test_a_member_that_goes_wrong_makes_the_cell_safe(ghost, domain, tmp_path, bad, words):
+    cell, sent = scenario(spindle_encoder={"revolutions": 200.0, "speed_factor": 1.0}), []
+    publisher = ghost.create_publisher(ToolBlock, "/tool", latched_qos(10))
+
+    def watch(event):
+        if event["event"] == "cycle" and not sent:
+            sent.append(publisher.publish(bad))
+
+    with pytest.raises(LatheError, match=words) as caught:
+        harness.run(cell, mode="processes", groups=[], domain=domain, bag=tmp_path / "bag", watch=watch)
+    assert "safe state from sample" in str(caught.value)
+    with AnyReader([tmp_path / "bag"]) as found:
+        assert sum(1 for _ in found.messages()) > 100
+
+
+def test_nobody_listens_for_lost_messages():
+    """A flood loses some, and in rmw_fastrtps 8.4 whoever listens for that may stand still for ever."""
+    events = StageNode.subscription_events(SimpleNamespace(), "/encoder")
+    assert events.incompatible_qos is not None
+    assert events.message_lost is None
+
+
+def test_who_comes_late_learns_the_state_of_the_cell_and_its_members(ghost, domain, tmp_path):
+    watched = {"error_limit": 1e-12, "error_after": 0.0, "error_reaction": "warn"}
+    slow = scenario(spindle_encoder={"revolutions": 1000.0, "speed_factor": 0.1}, supervisor=watched)
+    cell = harness.with_recorder(slow, tmp_path / "bag", keep=True)
+    heard = {}
+    with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
+        processes.wait_for("progress")
+        ghost.create_subscription(CellState, "/cell_state", lambda told: heard.update(state=told), latched_qos(1))
+        ghost.create_subscription(Member, "/members", lambda told: heard.update({told.name: told}), latched_qos(256))
+        ghost.create_subscription(SafetyStatus, "/safety/status", lambda told: heard.update(alarm=told), latched_qos(1))
+        executor = SingleThreadedExecutor()
+        executor.add_node(ghost)
+        while len(heard) < 2 + len(cell.nodes):
+            executor.spin_once(timeout_sec=1.0)
+        executor.shutdown()
+    assert (heard["state"].run_id, heard["state"].state) == ("test", CellState.RUNNING)
+    assert (heard["alarm"].source, heard["alarm"].monitor, heard["alarm"].subject) == ("/supervisor", "error", "tool")
+    assert {name for name in heard if name not in ("state", "alarm")} == {f"/{name}" for name in cell.nodes}
+    assert all(heard[f"/{name}"].state == Member.READY for name in cell.nodes)
