@@ -30,14 +30,14 @@ def test_composed_nodes_give_the_digests_of_the_offline_run(name):
 
 def form(name):
     """Kind, topics and compiled step of each node of a scenario, in any order."""
-    cell = Cell(scenario.load(BY_NAME[name]).nodes)
+    loaded = scenario.load(BY_NAME[name])
     return Counter(
         (
-            cell.nodes[node].stage or node,
+            loaded.kind(node),
             *(tuple(port.topic for port in ports) for ports in (stage.inputs, stage.outputs)),
             stage.native().name if stage.is_compiled else "",
         )
-        for node, stage in cell.stages.items()
+        for node, stage in Cell(loaded.nodes).stages.items()
     )
 
 

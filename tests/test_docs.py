@@ -4,14 +4,15 @@
 import ast
 import functools
 import importlib.util
+import pkgutil
 import re
-import runpy
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import pages
 import pytest
 from click.testing import CliRunner
 
@@ -22,16 +23,16 @@ from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.commands.run import run
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import PACKAGE, store
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
+WITH_PYTHON = [page for page in PAGES if "```python\n" in page.read_text(encoding="utf-8")]
 SCENARIOS = sorted((ROOT / "config").glob("*.yaml"))
 FIVE = {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder"}
 LAUNCH = ROOT / "launch" / "cell.launch.py"
 
 _LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
-_BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _RUN = re.compile(r"^\$ \./lathe (run .*)$", re.MULTILINE)
 _TEST = re.compile(r"`((?:(?:system/)?test_\w+\.py::(?:\w+::)?)?test_[a-z0-9_]+)`")
 _CODE = re.compile(r"```.*?```|`[^`]*`|<!--.*?-->", re.DOTALL)
@@ -150,6 +151,38 @@ def test_every_test_that_a_page_names_exists(page: Path) -> None:
     assert [f"{name(page)}:{number}: no test {test}" for number, test in sorted(named) if test not in known] == []
 
 
+def exists(name: str) -> bool:
+    """Whether a node, NODE.PARAM, Message.field or dotted name of the package exists."""
+    first, _, rest = name.partition(".")
+    if first in TABLES:
+        return not rest or rest in TABLES[first].rows()
+    if first == "lathe_rc":
+        try:
+            pkgutil.resolve_name(name)
+        except (ImportError, AttributeError):
+            return False
+        return True
+    fields = store().fielddefs.get(f"{PACKAGE}/msg/{first}", (None, []))[1]
+    return rest in {field for field, _ in fields}
+
+
+def test_every_name_in_the_table_of_terms_exists() -> None:
+    page = (ROOT / "docs" / "terms.md").read_text(encoding="utf-8")
+    rows = [row.split("|")[1:-1] for row in page.splitlines() if row.startswith("| ")]
+    assert {len(row) for row in rows} == {4}, "a | in a cell has to be written \\lvert"
+    names = [found for row in rows[1:] for found in re.findall(r"`([^`]+)`", row[-1])]
+    assert len(names) > 100
+    assert [found for found in names if not exists(found)] == []
+
+
+def test_every_check_of_the_model_is_a_test_of_that_file() -> None:
+    page = (ROOT / "docs" / "model.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`(test_\w+\.py)(?:::(test_\w+))?`", page))
+    there = {file: (ROOT / "tests" / file).read_text(encoding="utf-8") for file, _ in named}
+    assert len(named) > 50
+    assert [f"{file}::{test}" for file, test in sorted(named) if f"def {test}(" not in there[file]] == []
+
+
 @pytest.mark.parametrize("page", ["cell", "safety"])
 def test_every_promise_names_a_test(page: str) -> None:
     """By its file and name, or it is one of another page whose promises are checked in the same way."""
@@ -196,11 +229,9 @@ class TestPages:
 
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=name)
 def test_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The Python of a page runs, all its examples one after the other, as one program."""
+    """The Python of a page runs, all its examples one after the other, and prints what the page shows."""
     monkeypatch.chdir(tmp_path)
-    program = tmp_path / "page.py"
-    program.write_text("\n".join(_BLOCK.findall(page.read_text(encoding="utf-8"))), encoding="utf-8")
-    runpy.run_path(str(program))
+    pages.run_python(page, tmp_path)
 
 
 @pytest.mark.parametrize("path", SCENARIOS, ids=name)

@@ -460,12 +460,14 @@ def test_run_environment_adds_to_the_users_own():
         "EDITOR": "vi",
         "GUARD": "1",
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "FASTRTPS_DEFAULT_PROFILES_FILE": str(environment.DDS),
     }
+    assert environment.DDS.is_file()
 
 
-def test_users_discovery_range_stays():
-    result = environment.run_environment(environment.changes({}), {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"})
-    assert result["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SUBNET"
+def test_users_settings_of_dds_stay():
+    own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "FASTRTPS_DEFAULT_PROFILES_FILE": "/mine.xml"}
+    assert environment.run_environment(environment.changes({}), own) == own
 
 
 @pytest.mark.parametrize("shell", ["sh", "bash"])

@@ -25,7 +25,7 @@ from lathe_rc.cell.stages.profile import ProfileStage
 from lathe_rc.cell.stages.supervisor import Supervisor
 from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.stages.tool import Tool
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, UnpublishedError
 from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.tip_path import steepest_fall
 
@@ -142,7 +142,7 @@ def _source(dense: Mapping[str, Source], node: str, topic: str, port: Input) -> 
     """Who publishes what a node reads."""
     source = dense.get(topic)
     if source is None:
-        raise InputError(
+        raise UnpublishedError(
             f"{node} reads {topic}, which no node of the scenario publishes; allowed: a node that does, or another "
             f"topic by {node}.remap"
         )
