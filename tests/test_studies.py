@@ -82,7 +82,7 @@ def study(*arguments, sets=()):
 
 @functools.cache
 def quick(name):
-    """What a study finds with its quick settings, and how much of its loop it has told."""
+    """The result of a study with its quick settings, and how much of its loop it has told."""
     seen = []
 
     def track(items):

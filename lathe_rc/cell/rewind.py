@@ -36,7 +36,7 @@ class UnknownPartError(Exception):
 
 
 class Start:
-    """What a stage is before its run.
+    """The state of a stage before its run.
 
     Args:
         stage: which has not run.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What takes long by its nature: the largest cells with a process a node, an installation by pip, compiling."""
+"""Tests that take long by their nature: the largest cells with a process a node, an installation by pip, compiling."""
 
 import json
 import os
