@@ -54,7 +54,7 @@ class Unknown:
 
 
 class Ports(NamedTuple):
-    """The ports of a stage towards the others; topics are relative names after remapping.
+    """The ports of a stage; topics are relative names after remapping.
 
     Attributes:
         node: its name.
@@ -84,7 +84,7 @@ def _ports(stage: Stage) -> Ports:
 
 @dataclass(frozen=True, eq=False)
 class Wiring:
-    """Publisher of each topic and order of computing; one for all cells whose ports are alike.
+    """Publishers and order of the stages; the same one for all cells whose ports are alike.
 
     Attributes:
         dense, sparse: see `Cell`.
@@ -112,7 +112,7 @@ def _wire(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> Wiring:
 
 
 def _sources(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> tuple[dict[str, Source], dict[str, Source]]:
-    """Publishers of the dense and the sparse topics."""
+    """The publishers of dense and sparse topics."""
     dense: dict[str, Source] = {}
     sparse: dict[str, Source] = {}
 
