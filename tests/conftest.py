@@ -31,7 +31,7 @@ os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(dds.__file__).w
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
-    """The tests stay until the end: the collector of garbage need not walk through them, now or later."""
+    """The collected tests stay to the end: freeze them, so that the garbage collector skips them."""
     gc.disable()
     try:
         return (yield)

@@ -80,7 +80,7 @@ KINDS = {
 
 @cache
 def alone(kind):
-    """What a cell gives in a process of its own: its digests, or why it failed."""
+    """The digests of a run of the cell alone, or why it failed."""
     try:
         return dict(harness.run(load("piston", 3).varied(KINDS[kind])).digest)
     except LatheError as error:

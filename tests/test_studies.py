@@ -82,7 +82,7 @@ def study(*arguments, sets=()):
 
 @functools.cache
 def quick(name):
-    """The result of a study with its quick settings, and the number of items of its loop that it has told."""
+    """The result of a study with its quick settings, and how much of its loop it has told."""
     seen = []
 
     def track(items):

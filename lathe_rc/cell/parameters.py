@@ -175,7 +175,7 @@ class Table(BaseModel):
 
 @cache
 def _check(table: type[Table], name: str) -> Callable[[object], Any]:
-    """What a table makes of a value of a parameter; raises ValidationError."""
+    """The check of a parameter's values, which returns the table's value; it raises ValidationError."""
     field = table.model_fields[name]
     parts = (field.annotation, *field.metadata)
     kind = cast("Any", Annotated)[parts] if field.metadata else field.annotation

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stages that run again: everything that a run may change of a stage is set back to what it was before.
+"""Stages that run again: all that a run may change of a stage is set back to its start.
 
 A cell of a batch differs from the one before in a few tables. To make the other stages anew takes longer than to copy
 what their runs have changed, and their memories stay where the caches have them.
@@ -36,7 +36,7 @@ class UnknownPartError(Exception):
 
 
 class Start:
-    """What a stage is before its run.
+    """The state of a stage before its run.
 
     Args:
         stage: which has not run.
@@ -122,7 +122,7 @@ def _refill(part: Any, content: Any) -> None:
 
 
 class Stock:
-    """The newest stage of each name, and what it is before its run; for cells that run one after the other."""
+    """The newest stage of each name, and its start; for cells that run one after the other."""
 
     def __init__(self) -> None:
         self._stages: dict[str, Stage] = {}

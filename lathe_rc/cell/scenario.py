@@ -202,7 +202,7 @@ class Scenario:
         return cast("Value", found if element is None else found[element])
 
     def named(self) -> "Scenario":
-        """The same cell, whose variations keep its run id; they need not be told apart by that."""
+        """The same cell, whose variations keep its run id."""
         return self.varied({"run_id": f"{self.shared.run_id} varied"})
 
     def with_models_given(self) -> "Scenario":

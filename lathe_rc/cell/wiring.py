@@ -54,7 +54,7 @@ class Unknown:
 
 
 class Ports(NamedTuple):
-    """What a stage has to do with the others; topics are relative names after remapping.
+    """The ports of a stage; topics are relative names after remapping.
 
     Attributes:
         node: its name.
@@ -84,7 +84,7 @@ def _ports(stage: Stage) -> Ports:
 
 @dataclass(frozen=True, eq=False)
 class Wiring:
-    """Who publishes what, and who computes before whom; the same one for all cells whose ports are alike.
+    """Publishers and order of the stages; the same one for all cells whose ports are alike.
 
     Attributes:
         dense, sparse: see `Cell`.
@@ -112,7 +112,7 @@ def _wire(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> Wiring:
 
 
 def _sources(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> tuple[dict[str, Source], dict[str, Source]]:
-    """Who publishes the dense and the sparse topics."""
+    """The publishers of dense and sparse topics."""
     dense: dict[str, Source] = {}
     sparse: dict[str, Source] = {}
 
@@ -139,7 +139,7 @@ def _wire_alike(stages: tuple[Ports, ...]) -> Wiring:
 
 
 def _source(dense: Mapping[str, Source], node: str, topic: str, port: Input) -> Source:
-    """Who publishes what a node reads."""
+    """The publisher of a topic that a node reads."""
     source = dense.get(topic)
     if source is None:
         raise UnpublishedError(
