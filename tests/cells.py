@@ -67,6 +67,23 @@ def told_until_all_have_ended(processes: harness.Processes) -> list[harness.Even
     return told
 
 
+class Seen:
+    """The events of a cell from its start on: what a busy machine tells early, or in another order, counts as well."""
+
+    def __init__(self, processes):
+        self._processes, self._events = processes, []
+
+    def wait_for(self, kind, **values):
+        wanted = {"event": kind, **values}.items()
+        if any(wanted <= event.items() for event in self._events):
+            return
+        for event in self._processes.events(60.0):
+            self._events.append(event)
+            if wanted <= event.items():
+                return
+            self._processes._raise_failure(event)
+
+
 @contextlib.contextmanager
 def held(cell: Scenario, domain: int) -> Iterator[tuple[harness.Processes, Callable[[], None]]]:
     """The processes of a cell that does not begin, since its recorder is missing, and what starts that.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import rclpy
-from cells import held
+from cells import Seen, held
 from lathe_rc_msgs.srv import Schedule
 from rosbags.highlevel import AnyReader
 
@@ -61,23 +61,6 @@ def test_pace_changes_no_bit(offline):
 @pytest.mark.parametrize("window", [1, 500])
 def test_window_changes_no_bit(offline, window):
     assert harness.run(piston(f"window={window}"), mode="composed").digest == offline
-
-
-class Seen:
-    """The events of a cell from its start on: what a busy machine tells early, or in another order, counts as well."""
-
-    def __init__(self, processes):
-        self._processes, self._events = processes, []
-
-    def wait_for(self, kind, **values):
-        wanted = {"event": kind, **values}.items()
-        if any(wanted <= event.items() for event in self._events):
-            return
-        for event in self._processes.events(60.0):
-            self._events.append(event)
-            if wanted <= event.items():
-                return
-            self._processes._raise_failure(event)
 
 
 # The largest window is longer than the run: nobody waits, and still the stopped one is named before the end.

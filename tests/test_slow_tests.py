@@ -106,7 +106,7 @@ def test_the_coverage_is_that_of_the_last_measurement_or_what_the_page_says(file
     totals = {"percent_covered": 87.65, "num_statements": 2000, "num_branches": 700}
     (folder / slow_tests.FIGURES).write_text(json.dumps({"totals": totals}), encoding="utf-8")
     said = slow_tests.coverage()
-    assert "take 87.7 % of the 2000 statements and 700 branches" in said
+    assert "87.7 % of 2000 statements and 700 branches" in said
     page.write_text(slow_tests.written(slow_tests.took(files), slow_tests.told()), encoding="utf-8")
     (folder / slow_tests.FIGURES).unlink()
     assert slow_tests.coverage() == said

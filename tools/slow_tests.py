@@ -27,8 +27,7 @@ SLOWEST = 60  #: tests in the table
 _FILE = re.compile(r"^\| \*\*(test_\w+)\*\* \| ([\d.]+) % \|", re.MULTILINE)
 _ROW = re.compile(r"^\| (?:(\w+)\.)?`(test_\w+)` \| [\d.]+ % \| \d+ \| [a-z, ]*\| (.*) \|$", re.MULTILINE)
 _COVERAGE = (
-    "Coverage: the tests take {:.1f} % of the {} statements and {} branches of lathe_rc, counted in all processes that "
-    "they start (`./lathe test --coverage`); kernels do not count, since Numba compiles them."
+    "Coverage: {:.1f} % of {} statements and {} branches of lathe_rc, child processes counted, compiled kernels not."
 )
 _UNKNOWN = "Coverage: not measured; `./lathe test --coverage` does it."
 _HOSTS = ("offline", "composed", "processes")
