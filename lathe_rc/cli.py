@@ -93,7 +93,7 @@ class Group(click.Group):
     commands=[_Command(name, short_help=summary) for name, summary in COMMANDS.items()],
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="./lathe of a checkout also has: setup; test (linters and tests; --system: those that need privileges); "
-    "bench (how fast it is here); python SCRIPT ... (in its environment).",
+    "docs (the documentation as a site); bench (how fast it is here); python SCRIPT (in its environment).",
 )
 @click.version_option(__version__)
 def main() -> None:

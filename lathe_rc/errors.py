@@ -16,6 +16,10 @@ class InputError(LatheError):
     exit_code: ClassVar[int] = 2
 
 
+class UnpublishedError(InputError):
+    """A topic is read that no node of the scenario publishes."""
+
+
 class DivergedError(LatheError):
     """A run grew beyond what it may: beyond all numbers, or beyond a law's ``stop_ratio``."""
 

@@ -202,7 +202,7 @@ def _offered(group: str) -> Mapping[str, importlib.metadata.EntryPoint]:
 
 
 def in_words(names: Iterable[str]) -> str:
-    """What may be given where ``names`` are known, and classes of others."""
+    """The allowed names where ``names`` are known, and classes of others."""
     listed = ", ".join(names)
     return f"{listed}, or PACKAGE.MODULE:CLASS" if listed else "PACKAGE.MODULE:CLASS"
 

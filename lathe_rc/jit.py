@@ -26,7 +26,6 @@ _KERNELS = (
     "bag/resimulation/bag_spindle.py",
     "bag/reading/chunk_messages.py",
     "safety/*.py",
-    "cell/collect.py",
     "cell/native.py",
     "cell/program.py",
     "cell/stages/*.py",

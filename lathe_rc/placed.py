@@ -10,6 +10,9 @@ Of a NamedTuple that is `sized` the shapes of the arrays are part of the type: t
 matrices of two or six rows. That is for few and small arrays, since each shape is compiled by itself.
 """
 
+import ctypes
+import itertools
+import struct
 from collections.abc import Iterator
 from functools import cache
 from typing import Any, TypeVar
@@ -60,7 +63,9 @@ class Placed(types.Type):
 
 def placed(value: tuple[Any, ...]) -> Placed:
     """The type of a NamedTuple of arrays of float64, int64 or uint8, constants, and NamedTuples of those."""
-    return _placed(*_sort(value))
+    sorts: list[Any] = []
+    _spread(value, sorts, [])
+    return _layout(tuple(sorts)).kind
 
 
 def unfit(value: object, name: str = "") -> str:
@@ -84,30 +89,65 @@ def unfit(value: object, name: str = "") -> str:
     return f"{name or 'the memory'} is a {type(value).__name__}; allowed: arrays, int, float, bool and NamedTuples"
 
 
-def _sort(part: Any) -> Any:
-    """The key of a member's type: types of NamedTuples are made once for all that are alike."""
-    if isinstance(part, tuple):
-        shapes = [each.shape for each in part if isinstance(each, np.ndarray)]
-        return type(part), tuple(map(_sort, part)), tuple(shapes) if type(part) in _SIZED else ()
-    return (part.dtype, part.ndim) if isinstance(part, np.ndarray) else type(part)
+def _spread(value: tuple[Any, ...], sorts: list[Any], leaves: list[Any]) -> None:
+    """Collect what the layout of a NamedTuple depends on, and its arrays and constants, in order."""
+    kind = type(value)
+    sorts.append(kind)
+    known = kind in _SIZED
+    for part in value:
+        if isinstance(part, np.ndarray):
+            sorts += (part.dtype, part.shape if known else part.ndim)
+            leaves.append(part)
+        elif isinstance(part, tuple):
+            _spread(part, sorts, leaves)
+        else:
+            sorts.append(type(part))
+            leaves.append(part)
+
+
+class _Layout:
+    """How all NamedTuples of a type are laid out.
+
+    Attributes:
+        kind: the type.
+        words: writes the words of all arrays and constants.
+    """
+
+    def __init__(self, sorts: tuple[Any, ...]) -> None:
+        formats: list[str] = []
+        self.kind = _placed(iter(sorts), formats)
+        self.words = struct.Struct("=" + "".join(formats))
 
 
 @cache
-def _placed(kind: Any, sorts: tuple[Any, ...], known: tuple[tuple[int, ...], ...]) -> Placed:
+def _layout(sorts: tuple[Any, ...]) -> _Layout:
+    """Of what `_spread` has collected; made once for all that are alike."""
+    return _Layout(sorts)
+
+
+def _placed(sorts: Iterator[Any], formats: list[str]) -> Placed:
+    """The type of the NamedTuple that comes next; ``formats`` gets those of its words."""
+    kind = next(sorts)
     members: dict[str, tuple[types.Type, int]] = {}
     shapes: dict[str, tuple[int, ...]] = {}
     place = 0
-    for name, sort in zip(kind._fields, sorts, strict=True):
+    for name in kind._fields:
+        sort = next(sorts)
         member: types.Type
-        if not isinstance(sort, tuple):
-            member = types.float64 if issubclass(sort, float) else types.int64
-            member = types.boolean if sort in (bool, np.bool_) else member
-        elif isinstance(sort[0], np.dtype):
-            member = types.Array(_KINDS[sort[0]], sort[1], "C")
-            if known:
-                shapes[name] = known[len(shapes)]
+        if isinstance(sort, np.dtype):
+            shape = next(sorts)
+            if kind in _SIZED:
+                shapes[name] = shape
+            member = types.Array(_KINDS[sort], len(shape) if kind in _SIZED else shape, "C")
+            formats.append(f"{1 + member.ndim}q")
+        elif issubclass(sort, tuple):
+            member = _placed(itertools.chain((sort,), sorts), formats)
+        elif sort in (bool, np.bool_):
+            member = types.boolean
+            formats.append("?7x")
         else:
-            member = _placed(*sort)
+            member = types.float64 if issubclass(sort, float) else types.int64
+            formats.append("d" if member == types.float64 else "q")
         members[name] = member, place
         place += _words_of(member)
     return Placed(f"{kind.__module__}.{kind.__qualname__}", members, shapes, place)
@@ -131,19 +171,21 @@ class Words:
     """
 
     def __init__(self, value: tuple[Any, ...]) -> None:
-        self.kind = placed(value)
-        self.words = np.zeros(max(self.kind.size, 1), np.int64)
+        sorts, leaves, words = list[Any](), list[Any](), list[Any]()
+        _spread(value, sorts, leaves)
+        layout = _layout(tuple(sorts))
+        for part in leaves:
+            words += _of(part) if isinstance(part, np.ndarray) else (part,)
+        self.kind = layout.kind
+        self.words = np.frombuffer(bytearray(layout.words.pack(*words)) or bytearray(8), np.int64)
         self._floats = self.words.view(np.float64)
-        self._value: tuple[Any, ...] = ()  # keeps the arrays
-        self.update(value)
+        self._value = value  # keeps the arrays
 
     def update(self, value: tuple[Any, ...]) -> None:
         """Lay out anew what has been replaced in the value, which must be of the same type."""
         for place, part in _replaced(self.kind, 0, value, self._value):
             if isinstance(part, np.ndarray):
-                assert part.flags.c_contiguous, "kernels take it for contiguous"
-                self.words[place] = part.ctypes.data
-                self.words[place + 1 : place + 1 + part.ndim] = part.shape
+                self.words[place : place + 1 + part.ndim] = _of(part)
             elif isinstance(part, float):
                 self._floats[place] = part
             else:
@@ -151,14 +193,27 @@ class Words:
         self._value = value
 
 
+def address(array: npt.NDArray[Any]) -> int:
+    """Where a contiguous array begins; NumPy takes ten times as long to say so."""
+    try:
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]  # it is a buffer
+    except (TypeError, ValueError):  # nobody may write to it, or it is empty
+        return array.ctypes.data
+
+
+def _of(array: npt.NDArray[Any]) -> tuple[int, ...]:
+    """The words of an array."""
+    assert array.flags.c_contiguous, "kernels take it for contiguous"
+    return address(array), *array.shape
+
+
 def _replaced(kind: Placed, begin: int, value: tuple[Any, ...], known: tuple[Any, ...]) -> Iterator[tuple[int, Any]]:
-    """Places and values of the members that are not what is known; if nothing is known, of all."""
-    for number, (member, place) in enumerate(kind.members.values()):
-        part, before = value[number], known[number] if known else None
-        if known and part is before:
+    """Places and values of the members that are not what is known."""
+    for (member, place), part, before in zip(kind.members.values(), value, known, strict=True):
+        if part is before:
             continue
         if isinstance(member, Placed):
-            yield from _replaced(member, begin + place, part, before or ())
+            yield from _replaced(member, begin + place, part, before)
         else:
             yield begin + place, part
 

@@ -3,6 +3,7 @@
 
 import contextlib
 import itertools
+import json
 import resource
 import signal
 import subprocess
@@ -135,6 +136,34 @@ def started(*arguments, first=""):
             yield process
         finally:
             process.kill()
+
+
+_ONE_AFTER_THE_OTHER = """
+import json, os, sys, tempfile
+from lathe_rc.cli import main
+told = []
+for words in json.loads(sys.argv[1]):
+    with tempfile.TemporaryFile() as said:
+        os.dup2(said.fileno(), 2)
+        try:
+            main(words)
+        except SystemExit as ended:
+            code = ended.code
+        said.seek(0)
+        told.append((code, said.read().decode()))
+print(json.dumps(told))
+"""
+
+
+def refusals(*commands: Sequence[object], cwd: Path | None = None) -> list[tuple[int, str]]:
+    """Exit code and error stream of commands that end by themselves, one after the other in a process of their own.
+
+    What is left of their ROS nodes would stay in this one, and to start a process for each takes longer than they do.
+    """
+    words = json.dumps([list(map(str, command)) for command in commands])
+    process = [sys.executable, "-c", _ONE_AFTER_THE_OTHER, words]
+    done = subprocess.run(process, stdout=subprocess.PIPE, text=True, check=True, cwd=cwd)
+    return [(code, said) for code, said in json.loads(done.stdout)]
 
 
 def block(msgtype, first, source, run_id, *, step=STEP, size=64, fill=0.0):

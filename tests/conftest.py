@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings that all tests share."""
 
+import gc
 import os
 import signal
 from pathlib import Path
@@ -26,6 +27,17 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Nodes that the tests make have the DDS settings of those of a cell: by default what one missed comes after 3 s.
 os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(dds.__file__).with_name("fastdds.xml")))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """The collected tests stay to the end: freeze them, so that the garbage collector skips them."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_collection_modifyitems(config, items):

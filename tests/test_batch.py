@@ -4,7 +4,7 @@
 import gc
 import itertools
 import weakref
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +59,64 @@ def test_each_cell_has_the_digests_that_it_has_alone(cells):
         assert outcome.scenario is cell
         alone = harness.run(cell).digest
         assert outcome.kept.digests() == {f"/{topic}": alone[f"/{topic}"] for topic in sorted(topics)}
+
+
+#: variations of a piston that leave different things behind them, by what comes of them
+KINDS = {
+    "plain": {},
+    "noise": {"electrodynamic_actuator.noise_rms": 1e-7, "seed": 3},
+    "events": {"learning_controller.events": ["revolution 1: freeze", "revolution 2: clear"]},
+    "limit": {"electrodynamic_actuator.command_stroke": 50e-6},
+    "faults": {"allow_faults": True, "tool.faults": ["revolution 1 to 2: coarse/state.position stuck"]},
+    "other drive": {"electrodynamic_actuator.damping": 0.7},
+    "coarse encoder": {"spindle_encoder.counts_per_revolution": 20_000},
+    "block": {"block_size": 128},
+    "no such lead": {"learning_controller.lead_time": -1.0},
+    "refused": {"learning_controller.lead_time": 3e-3},
+    "not finite": {"electrodynamic_actuator.noise_rms": 1e308},
+    "stopped": {"learning_controller.stop_ratio": 1e-6},
+}
+
+
+@cache
+def alone(kind):
+    """The digests of a run of the cell alone, or why it failed."""
+    try:
+        return dict(harness.run(load("piston", 3).varied(KINDS[kind])).digest)
+    except LatheError as error:
+        return str(error)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.sampled_from(sorted(KINDS.keys() - {"no such lead"})), min_size=3, max_size=8), st.booleans())
+def test_what_ran_before_on_a_bench_leaves_no_trace(kinds, named):
+    """In any order, also after cells that were refused, have diverged or failed, and whether or not stages are kept."""
+    piston = load("piston", 3)
+    piston = piston.named() if named else piston
+    bench = batch.Bench()
+    for kind in kinds:
+        try:
+            cell = bench.cell(piston.varied(KINDS[kind]))
+            cell.check()
+            kept = bench.run(cell, batch.Topics(cell, cell.samples, [*cell.dense, *cell.sparse])).digests()
+        except LatheError as error:
+            kept = str(error)
+        assert kept == alone(kind)
+
+
+@pytest.mark.parametrize("path", sorted(Path("config").glob("*.yaml")), ids=lambda path: path.stem)
+def test_stages_of_all_kinds_are_set_back(path):
+    """A cell that runs again and again on a bench gives the same, though its stages are made once or twice."""
+    bench, told, stages = batch.Bench(), [], []
+    described = scenario.load(path, ["spindle_encoder.revolutions=2"])
+    for _ in range(4):
+        cell = bench.cell(described)
+        cell.check()
+        told.append(bench.run(cell, batch.Topics(cell, cell.samples, [*cell.dense, *cell.sparse])).digests())
+        stages.append(cell.stages)
+    assert told[0] == dict(harness.run(described).digest)
+    assert told[1:] == told[:1] * 3
+    assert all(stages[1][name] is stages[3][name] for name in stages[0]), "they are kept"
 
 
 def test_errors_are_those_of_a_run():

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One law, many hosts: real processes over real DDS give the bits of the offline engine."""
 
-import itertools
 import os
 import signal
 import subprocess
@@ -33,11 +32,11 @@ def offline() -> dict[str, str]:
     return harness.run(piston()).digest
 
 
-# Processes with blocks of 64: below, with what is in their bags.
-HOSTS = set(itertools.product(["offline", "composed", "processes"], [32, 64, 256])) - {("processes", 64)}
+# Blocks of 64: offline in the fixture, composed and in processes below.
+HOSTS = [("offline", 32), ("offline", 256), ("composed", 256), ("processes", 32)]
 
 
-@pytest.mark.parametrize(("mode", "block_size"), sorted(HOSTS))
+@pytest.mark.parametrize(("mode", "block_size"), HOSTS)
 def test_every_host_and_block_size_gives_the_same_bits(offline, mode, block_size):
     assert harness.run(piston(f"block_size={block_size}"), mode=mode).digest == offline
 
@@ -59,26 +58,44 @@ def test_pace_changes_no_bit(offline):
     assert result.real_time_factor <= 1.0
 
 
-@pytest.mark.parametrize("window", [1, 3, 500])
+@pytest.mark.parametrize("window", [1, 500])
 def test_window_changes_no_bit(offline, window):
     assert harness.run(piston(f"window={window}"), mode="composed").digest == offline
 
 
-@pytest.mark.parametrize(("node", "window"), [("tool", 64), ("recorder", 64), ("tool", 4096), ("spindle_encoder", 64)])
-def test_a_stopped_process_changes_no_bit(offline, node, window, tmp_path):
-    # The largest window is longer than the run: nobody waits, and still the stopped one is named before the end.
-    pace = 0.2 if window > 1000 else 0.5
-    stopped = piston(f"spindle_encoder.speed_factor={pace}", f"window={window}")
+class Seen:
+    """The events of a cell from its start on: what a busy machine tells early, or in another order, counts as well."""
+
+    def __init__(self, processes):
+        self._processes, self._events = processes, []
+
+    def wait_for(self, kind, **values):
+        wanted = {"event": kind, **values}.items()
+        if any(wanted <= event.items() for event in self._events):
+            return
+        for event in self._processes.events(60.0):
+            self._events.append(event)
+            if wanted <= event.items():
+                return
+            self._processes._raise_failure(event)
+
+
+# The largest window is longer than the run: nobody waits, and still the stopped one is named before the end.
+@pytest.mark.parametrize(("nodes", "window"), [(["tool", "recorder", "spindle_encoder"], 64), (["tool"], 4096)])
+def test_a_stopped_process_changes_no_bit(offline, nodes, window, tmp_path):
+    stopped = piston("spindle_encoder.speed_factor=0.2", f"window={window}")
     cell = harness.with_recorder(stopped, tmp_path / "bag", keep=True)
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
-        processes.wait_for("cycle")
-        os.kill(processes.pids[node], signal.SIGSTOP)
-        # The spindle names the silent one, and the others the spindle, whomever else a busy machine delays; only then
-        # does it go on.
-        processes.wait_for("stopped", node=node, signal=signal.SIGSTOP)
-        processes.wait_for("stall", member=f"/{node}")
-        os.kill(processes.pids[node], signal.SIGCONT)
-        processes.wait_for("continued", node=node)
+        seen = Seen(processes)
+        seen.wait_for("cycle")
+        for node in nodes:
+            os.kill(processes.pids[node], signal.SIGSTOP)
+            # The spindle names the silent one, and the others the spindle, whomever else a busy machine delays; only
+            # then does it go on.
+            seen.wait_for("stopped", node=node, signal=signal.SIGSTOP)
+            seen.wait_for("stall", member=f"/{node}")
+            os.kill(processes.pids[node], signal.SIGCONT)
+            seen.wait_for("continued", node=node)
         processes.wait_for_end()
     assert reader.read(tmp_path / "bag").digests() == offline
 

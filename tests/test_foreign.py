@@ -112,10 +112,8 @@ BOTH = ["learning_controller", "electrodynamic_actuator"]
 @pytest.mark.parametrize(
     ("foreign", "together"),
     [
-        (["listener"], ["spindle_encoder", *BOTH, "tool", "recorder"]),
-        (["learning_controller"], ["spindle_encoder", "electrodynamic_actuator", "tool"]),
         (["electrodynamic_actuator"], ["tool", "recorder"]),
-        (BOTH, ["spindle_encoder", "tool"]),
+        ([*BOTH, "listener"], ["spindle_encoder", "tool"]),
     ],
 )
 def test_nodes_in_plain_rclpy_take_part_in_a_cell(domain, tmp_path, foreign, together):

@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cache of compiled kernels."""
 
-import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -27,30 +23,6 @@ def test_the_cache_knows_every_file_with_a_kernel():
     with_kernels = {path for path in PACKAGE.rglob("*.py") if uses.search(path.read_text(encoding="utf-8"))}
     assert with_kernels - looked_at == set()
     assert len(with_kernels) > 30
-
-
-AHEAD = """
-import json
-from lathe_rc.cell import ahead
-from lathe_rc.cell.scenario import TABLES
-from lathe_rc.cell.stages import STAGES
-
-def made(name, kind):
-    return STAGES[kind](name, TABLES[kind].read(name, {"stage": kind}))
-
-stages = [made("spindle_encoder", "spindle_encoder"), made("form", "profile"), made("other", "profile")]
-print(json.dumps([list(ahead.compile_ahead(stages)), list(ahead.compile_ahead(stages))]))
-"""
-
-
-def test_steps_are_compiled_once_and_those_that_are_alike_together(tmp_path):
-    """Each process that compiles tells what it has done; a second call finds all on the disk."""
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    run = subprocess.run([sys.executable, "-c", AHEAD], env=environment, capture_output=True, text=True, check=True)
-    first, second = json.loads(run.stdout)
-    assert first[0] == ["spindle_encoder", "form"]
-    assert len(first[1]) == 1
-    assert second == []
 
 
 def test_a_process_that_cannot_compile_is_an_error(monkeypatch):

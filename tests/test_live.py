@@ -309,30 +309,36 @@ def test_a_running_cell_is_shown_as_its_bag(offline, tmp_path):
     assert_allclose(10 ** view.scalars("/learning/coarse/learning")[2] * 1e-6, learned)
 
 
-@pytest.mark.parametrize("until_the_end", [False, True])
-def test_a_bridge_that_is_stuck_delays_no_member(until_the_end, offline, tmp_path):
-    with harness.free_domain() as domain, watching(domain, tmp_path) as bridge:
+def test_a_bridge_that_is_stuck_delays_no_member(offline, tmp_path):
+    """Two of them: one goes on before the run has ended, and one after that."""
+    folders = [tmp_path / "goes_on", tmp_path / "until_the_end"]
+    for folder in folders:
+        folder.mkdir()
+    with contextlib.ExitStack() as stack:
+        domain = stack.enter_context(harness.free_domain())
+        bridges = [stack.enter_context(watching(domain, folder)) for folder in folders]
         with cell(tmp_path, domain, "spindle_encoder.speed_factor=0.5") as (processes, begin):
-            listens(bridge)
+            for bridge in bridges:
+                listens(bridge)
             begin()
             processes.wait_for("cycle", cycle=2.0)
-            bridge.send_signal(signal.SIGSTOP)
+            for bridge in bridges:
+                bridge.send_signal(signal.SIGSTOP)
             processes.wait_for("cycle", cycle=9.0)
-            if not until_the_end:
-                bridge.send_signal(signal.SIGCONT)
+            bridges[0].send_signal(signal.SIGCONT)
             processes.wait_for_end()
-        bridge.send_signal(signal.SIGCONT)
-        bridge.send_signal(signal.SIGINT)
-        run, errors = told(bridge)
+        bridges[1].send_signal(signal.SIGCONT)
+        for bridge in bridges:
+            bridge.send_signal(signal.SIGINT)
+        (goes_on, left_out), (until_the_end, cut) = map(told, bridges)
     recording = reader.read(tmp_path / "bag")
     assert recording.digests() == offline
     samples = recording.of_type(messages.TOOL)["error"] * 1e6
-    time, _, value = View(tmp_path / "live.rrd").scalars("/signals/tool/error")
-    assert_array_equal(value, samples[time // STEP_NS])
-    assert run["revolutions"] < LENGTH
-    if until_the_end:
-        assert not run["complete"]
-        assert "its end was not heard" in errors
-    else:
-        assert run["left_out"] > 0
-        assert "left out, wholly or in part" in errors
+    for folder, run in zip(folders, (goes_on, until_the_end), strict=True):
+        time, _, value = View(folder / "live.rrd").scalars("/signals/tool/error")
+        assert_array_equal(value, samples[time // STEP_NS])
+        assert run["revolutions"] < LENGTH
+    assert not until_the_end["complete"]
+    assert "its end was not heard" in cut
+    assert goes_on["left_out"] > 0
+    assert "left out, wholly or in part" in left_out

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parts of others: Q filters, speed laws, profiles, monitors and studies that stand outside of lathe_rc.
 
-Those of docs/parts.py are what a good one looks like; those that are refused stand here.
+Those of figures/parts.py are what a good one looks like; those that are refused stand here.
 """
 
 import json
@@ -37,7 +37,8 @@ from lathe_rc.signals.part_profile import PartProfile
 from lathe_rc.studies import STUDIES
 
 DOCS = Path(__file__).parents[1] / "docs"
-sys.path.append(str(DOCS))
+FIGURES = DOCS.with_name("figures")
+sys.path.append(str(FIGURES))
 
 import parts  # noqa: E402 - it stands beside the page that explains it
 
@@ -76,8 +77,8 @@ def lathe(*arguments):
 
 
 def test_the_page_shows_the_parts_as_they_are():
-    """The classes on docs/parts.md, and the hash of their source, are those of docs/parts.py."""
-    page, source = (DOCS / "parts.md").read_text(), (DOCS / "parts.py").read_text()
+    """The classes on docs/parts.md, and the hash of their source, are those of figures/parts.py."""
+    page, source = (DOCS / "parts.md").read_text(), (FIGURES / "parts.py").read_text()
     shown = re.findall(r"^```py\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert len(shown) == 4
     assert [part for part in shown if part not in source] == []
@@ -392,11 +393,11 @@ def test_a_monitor_begins_anew_at_a_reset():
 
 @pytest.fixture
 def installed(tmp_path, monkeypatch):
-    """The parts of docs/parts.py as an installed distribution; what makes it one."""
+    """The parts of figures/parts.py as an installed distribution; what makes it one."""
     folder = tmp_path / "site"
     about = folder / "lathe_hann-0.3.dist-info"
     about.mkdir(parents=True)
-    shutil.copy(DOCS / "parts.py", folder / "lathe_hann.py")
+    shutil.copy(FIGURES / "parts.py", folder / "lathe_hann.py")
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: lathe-hann\nVersion: 0.3\n")
     (about / "top_level.txt").write_text("lathe_hann\n")
     (about / "entry_points.txt").write_text(
@@ -432,7 +433,7 @@ def test_studies_of_others_are_listed_with_their_distribution(installed):
     """One that cannot be used says so in its line, and keeps no other away."""
     listed = lathe("study").stdout.splitlines()
     assert [line.split()[0] for line in listed] == [*STUDIES.own, "passed", "broken"]
-    assert listed[-2].endswith("Which waves the Hann filter of docs/parts.py passes (lathe-hann 0.3)")
+    assert listed[-2].endswith("Which waves the Hann filter of figures/parts.py passes (lathe-hann 0.3)")
     assert listed[-1].endswith("study 'broken' of lathe-hann 0.3: lathe_hann has no 'NONE'")
     assert "lathe-hann 0.3" in lathe("study", "--help").stdout
 

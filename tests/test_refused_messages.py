@@ -166,8 +166,9 @@ def test_a_member_that_goes_wrong_makes_the_cell_safe(ghost, domain, tmp_path, b
         if event["event"] == "cycle" and not sent:
             sent.append(publisher.publish(bad))
 
+    groups = [["spindle_encoder", "electrodynamic_actuator", "tool", "recorder"]]
     with pytest.raises(LatheError, match=words) as caught:
-        harness.run(cell, mode="processes", groups=[], domain=domain, bag=tmp_path / "bag", watch=watch)
+        harness.run(cell, mode="processes", groups=groups, domain=domain, bag=tmp_path / "bag", watch=watch)
     assert "safe state from sample" in str(caught.value)
     with AnyReader([tmp_path / "bag"]) as found:
         assert sum(1 for _ in found.messages()) > 100

@@ -10,7 +10,7 @@ import threading
 import pytest
 import rclpy
 import yaml
-from cells import scenario, started
+from cells import refusals, scenario, started
 from geometry_msgs.msg import Point
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -32,7 +32,7 @@ def test_a_replayed_cell_is_recorded_as_the_same_bag(domain, tmp_path):
     form = tmp_path / "form.csv"
     form.write_text("angle_deg,radius_um\n0,0\n120,30\n240,-10\n")
     loaded = scenario(spindle_encoder={"revolutions": 8.0}, tool={"profile": "csv", "profile_file": str(form)})
-    harness.run(loaded, mode="processes", bag=first)
+    harness.run(loaded, mode="composed", bag=first)
     with started("node", "recorder", "--ros-args", "-p", f"bag:={again}", "-p", "run_id:=test") as recorder:
         replayed = subprocess.run(
             [sys.executable, "-m", "lathe_rc", "replay", first, "--rate", "0", "--as-cell"],
@@ -172,39 +172,51 @@ def test_a_part_of_some_topics(strange, listener):
     assert set(listener.heard["/b"]) == {float(n) for n in range(501, 600, 2)}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--topics", "/c"], "replayer.topics: /c is not in the bag; allowed: /a, /b"),
-        (["--topics", "/clock"], "replayer.topics: /clock is not in the bag; allowed: /a, /b"),
-        (["--start", "2"], "replayer.start = 2 s, end = 0 s: nothing to send; allowed: a start up to 1.499 s"),
-        (["--start", "1", "--end", "1"], "replayer.start = 1 s, end = 1 s: nothing to send"),
-        (["--as-cell"], "the bag holds no scenario"),
-        (["--as-cell", "--loop"], "a cell is replayed whole and once"),
-        (["--rate", "-1"], "-1"),
-    ],
-)
-def test_what_cannot_be_replayed_is_refused(strange, domain, arguments, said):
-    ended = refused(strange, *arguments, ROS_LOG_DIR=str(strange))
-    assert ended.returncode == 2
-    assert said in ended.stderr
-    assert "Traceback" not in ended.stderr
+REFUSED = {
+    "no such topic": (["--topics", "/c"], "replayer.topics: /c is not in the bag; allowed: /a, /b"),
+    "its own clock": (["--topics", "/clock"], "replayer.topics: /clock is not in the bag; allowed: /a, /b"),
+    "late start": (
+        ["--start", "2"], "replayer.start = 2 s, end = 0 s: nothing to send; allowed: a start up to 1.499 s"
+    ),
+    "empty part": (["--start", "1", "--end", "1"], "replayer.start = 1 s, end = 1 s: nothing to send"),
+    "no cell": (["--as-cell"], "the bag holds no scenario"),
+    "cell in a loop": (["--as-cell", "--loop"], "a cell is replayed whole and once"),
+    "backwards": (["--rate", "-1"], "-1"),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("log_ns", "data", "arguments", "said"),
-    [
+@pytest.fixture(scope="module")
+def told(strange):
+    """Exit code and words of each command that is refused."""
+    with harness.free_domain() as number, pytest.MonkeyPatch.context() as environment:
+        environment.setenv("ROS_DOMAIN_ID", str(number))
+        environment.setenv("ROS_LOG_DIR", str(strange.parent))
+        ended = refusals(*(["replay", strange, *arguments] for arguments, _ in REFUSED.values()))
+    return dict(zip(REFUSED, ended, strict=True))
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_replayed_is_refused(told, name):
+    code, said = told[name]
+    assert code == 2
+    assert REFUSED[name][1] in said
+    assert "Traceback" not in said
+
+
+def test_what_cannot_be_sent_is_refused(domain, tmp_path):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    cases = [
         (2**31 * 10**9, bytes(12), [], "log times up to 2147483648000000000 ns; /clock ends in 2038"),
         (1, bytes(12), ["--topics", "/clock"], "/clock is the replayer's own and tells the log times of the bag"),
         (1, b"junk" * 1000, [], "/other: message 1 that is sent is none of its type"),
-    ],
-)
-def test_what_cannot_be_sent_is_refused(domain, tmp_path, log_ns, data, arguments, said):
-    store = get_typestore(Stores.ROS2_JAZZY)
-    with RosbagWriter(tmp_path / "bag", version=9) as writer:
-        for topic in ("/clock", "/other"):
-            writer.write(writer.add_connection(topic, "rosgraph_msgs/msg/Clock", typestore=store), log_ns, data)
-    ended = refused(tmp_path / "bag", "--rate", "0", *arguments)
-    assert ended.returncode == 2
-    assert said in ended.stderr
-    assert "Traceback" not in ended.stderr
+    ]
+    commands = []
+    for number, (log_ns, data, arguments, _) in enumerate(cases):
+        commands.append(["replay", tmp_path / str(number), "--rate", "0", *arguments])
+        with RosbagWriter(tmp_path / str(number), version=9) as writer:
+            for topic in ("/clock", "/other"):
+                writer.write(writer.add_connection(topic, "rosgraph_msgs/msg/Clock", typestore=store), log_ns, data)
+    for (code, told), (_, _, _, said) in zip(refusals(*commands), cases, strict=True):
+        assert code == 2, told
+        assert said in told
+        assert "Traceback" not in told

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 import rclpy
-from cells import scenario, started
+from cells import refusals, scenario, started
 from rclpy.qos import QoSProfile
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader, StoragePlugin
@@ -114,7 +114,7 @@ def test_a_bag_of_others_is_recorded_again_as_it_was(foreign, domain, tmp_path):
 
 def test_a_bag_of_the_cell_is_recorded_again_as_it_was(domain, tmp_path):
     first, again = tmp_path / "first", tmp_path / "again"
-    harness.run(scenario(spindle_encoder={"revolutions": 6.0}), mode="processes", bag=first)
+    harness.run(scenario(spindle_encoder={"revolutions": 6.0}), mode="composed", bag=first)
     with started("record", again, "--sim-time", "--once") as recording:
         replay(first)
         said, _ = recording.communicate()
@@ -216,24 +216,19 @@ def test_simulated_time_that_nobody_tells_is_no_success(node, tmp_path):
     assert "/clock told no time: 1 messages are not recorded" in said
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
+def test_what_cannot_be_recorded_is_refused(domain, tmp_path):
+    (tmp_path / "here").mkdir()
+    cases = [
         (["here"], "here exists; a bag is never overwritten"),
         (["new", "--topics", "/a", "--all"], "topic_recorder.all: /a are named; give one or the other"),
         (["new", "--sim-time", "--topics", "/clock"], "/clock tells the log times"),
         (["new", "--hold", "0"], "0"),
-    ],
-)
-def test_what_cannot_be_recorded_is_refused(domain, tmp_path, arguments, said):
-    (tmp_path / "here").mkdir()
-    ended = subprocess.run(
-        [sys.executable, "-m", "lathe_rc", "record", *arguments],
-        capture_output=True, text=True, check=False, cwd=tmp_path,
-    )  # fmt: skip
-    assert ended.returncode == 2
-    assert said in ended.stderr
-    assert "Traceback" not in ended.stderr
+    ]
+    told = refusals(*(["record", *arguments] for arguments, _ in cases), cwd=tmp_path)
+    for (code, words), (arguments, said) in zip(told, cases, strict=True):
+        assert code == 2, arguments
+        assert said in words
+        assert "Traceback" not in words
     assert not (tmp_path / "new").exists()
 
 

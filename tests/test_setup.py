@@ -299,7 +299,8 @@ def test_the_viewer_stays_away_from_a_sourced_ros():
 @pytest.mark.parametrize(
     ("arguments", "groups"),
     [
-        (["test", "-k", "view"], ["sweep", "test", "view"]),
+        (["test", "-k", "view"], ["docs", "sweep", "test", "view"]),
+        (["docs", "--build"], ["docs"]),
         (["sweep", "piston"], ["sweep"]),
         (["tune", "piston"], ["sweep"]),
         (["view", "bag"], ["view"]),
@@ -313,9 +314,8 @@ def test_a_command_says_what_it_needs(arguments, groups):
 
 
 def test_setup_of_an_unknown_group_is_refused(copy):
-    assert_refused(
-        lathe(copy, "setup", "viewer"), copy, "setup viewer; allowed: notebook, sweep, test, view, or nothing more"
-    )
+    allowed = "docs, notebook, sweep, test, view, or nothing more"
+    assert_refused(lathe(copy, "setup", "viewer"), copy, f"setup viewer; allowed: {allowed}")
 
 
 def test_what_is_set_for_pip_holds_for_uv_and_the_environment_comes_first():
@@ -460,12 +460,14 @@ def test_run_environment_adds_to_the_users_own():
         "EDITOR": "vi",
         "GUARD": "1",
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "FASTRTPS_DEFAULT_PROFILES_FILE": str(environment.DDS),
     }
+    assert environment.DDS.is_file()
 
 
-def test_users_discovery_range_stays():
-    result = environment.run_environment(environment.changes({}), {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"})
-    assert result["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SUBNET"
+def test_users_settings_of_dds_stay():
+    own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "FASTRTPS_DEFAULT_PROFILES_FILE": "/mine.xml"}
+    assert environment.run_environment(environment.changes({}), own) == own
 
 
 @pytest.mark.parametrize("shell", ["sh", "bash"])

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of the slow tests says what the tests say, and is made of what they took."""
 
+import json
+
 import pytest
 
 import slow_tests
@@ -93,6 +95,21 @@ def test_the_slowest_come_first_by_file_and_what_is_wrong_is_named(files):
         "test_is_held says: The force is held.",
         "no test test_one in tests/test_a.py",
     ]
+
+
+def test_the_coverage_is_that_of_the_last_measurement_or_what_the_page_says(files, monkeypatch):
+    folder, page = files.parent / "coverage", files.with_name("tests.md")
+    monkeypatch.setattr(slow_tests, "COVERAGE", folder)
+    monkeypatch.setattr(slow_tests, "PAGE", page)
+    assert slow_tests.coverage().startswith("Coverage: not measured")
+    folder.mkdir()
+    totals = {"percent_covered": 87.65, "num_statements": 2000, "num_branches": 700}
+    (folder / slow_tests.FIGURES).write_text(json.dumps({"totals": totals}), encoding="utf-8")
+    said = slow_tests.coverage()
+    assert "take 87.7 % of the 2000 statements and 700 branches" in said
+    page.write_text(slow_tests.written(slow_tests.took(files), slow_tests.told()), encoding="utf-8")
+    (folder / slow_tests.FIGURES).unlink()
+    assert slow_tests.coverage() == said
 
 
 def test_a_report_of_some_files_makes_no_page(files):

@@ -16,7 +16,7 @@ from steps import exclusive
 from workplace import PYTHON, ROOT, VENV, RefusalError, StepError, say
 
 COMPLETES = "_LATHE_COMPLETE"  #: in the environment: a shell asks what may follow
-OWN = ("setup", "test", "python")  #: commands of ./lathe alone
+OWN = ("docs", "setup", "test", "python")  #: commands of ./lathe alone
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -64,7 +64,7 @@ def needed(arguments: Sequence[str]) -> Sequence[str]:
                 raise RefusalError(f"setup {name}; allowed: {', '.join(GROUPS)}, or nothing more")
         return arguments[1:]
     sweeps = {name: ["sweep"] for name in ("bench", "sweep", "tune")}
-    wanted = {**sweeps, "test": ["sweep", "test", "view"], "view": ["view"]}
+    wanted = {**sweeps, "docs": ["docs"], "test": ["docs", "sweep", "test", "view"], "view": ["view"]}
     return wanted.get(next(iter(arguments), ""), [])
 
 
@@ -81,8 +81,9 @@ def set_up(ros: SourcedRos | None, groups: Sequence[str]) -> Changes:
 
 def command(arguments: Sequence[str]) -> list[str]:
     """Return what the Python of the environment is to run."""
-    if arguments[:1] == ["test"]:
-        return [str(ROOT / "tools" / "check.py"), *arguments[1:]]
+    for name, script in {"docs": "docs.py", "test": "check.py"}.items():
+        if arguments[:1] == [name]:
+            return [str(ROOT / "tools" / script), *arguments[1:]]
     if arguments[:1] == ["bench"]:
         return ["-m", "benchmarks", *arguments]
     if arguments[:1] == ["python"]:

@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """./lathe test: the linters, then the tests, all of them, whatever the others find.
 
---lint: the linters alone; --system: the tests that need packages or privileges of the machine; --table: no tests, but
-docs/tests.md from the report of the last.
+--lint: the linters alone; --system: the tests that need packages or privileges of the machine; --coverage: also which
+branches of lathe_rc the tests take; --table: no tests, but docs/tests.md from the report of the last.
 """
 
+import contextlib
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 
 import pytest
+from coverage import Coverage
 
 import slow_tests
 import system
@@ -28,11 +31,12 @@ LINTERS = {
     "prose": [sys.executable, str(ROOT / "tools" / "prose.py")],
     "imports": ["lint-imports", "--no-logo", "--no-cache"],
 }
+SITE = [sys.executable, str(ROOT / "tools" / "docs.py"), "--check"]
 # What would be compiled in the middle of the tests, by several of them at once; the linters leave cores for it.
 KERNELS = [sys.executable, str(ROOT / "tools" / "kernels.py")]
-# Tests wait for processes more than they compute, so two files run at once; what a file's tests share is made once.
-# Which files come first says tests/conftest.py.
-AT_ONCE = ["--numprocesses=2", "--dist=loadfile", "--no-loadscope-reorder"]
+# Tests wait for processes now and then, so three files run at once on two cores; what a file's tests share is made
+# once. Which files come first says tests/conftest.py.
+AT_ONCE = ["--numprocesses=3", "--dist=loadfile", "--no-loadscope-reorder"]
 REPORTED = [f"--junitxml={slow_tests.REPORT}"]
 LOCKED_NUMPY = re.compile(r"^numpy==(\S+) ; python_full_version >=", re.MULTILINE)
 
@@ -64,6 +68,23 @@ def lint(name: str, command: Sequence[str]) -> bool:
     return passed
 
 
+@contextlib.contextmanager
+def covered() -> Iterator[None]:
+    """Measure which branches of lathe_rc all processes take meanwhile, and keep the figure for docs/tests.md."""
+    shutil.rmtree(slow_tests.COVERAGE, ignore_errors=True)
+    slow_tests.COVERAGE.mkdir()
+    measure = Coverage(str(slow_tests.COVERAGE / "data"), config_file=str(ROOT / "pyproject.toml"))
+    measure.start()
+    try:
+        yield
+    finally:
+        measure.stop()
+        measure.save()
+        measure.combine()
+        measure.json_report(outfile=str(slow_tests.COVERAGE / slow_tests.FIGURES))
+        print(slow_tests.coverage(), flush=True)
+
+
 def locked_numpy() -> str:
     """Return the version of NumPy in the lock file, which is one from Python 3.11 on."""
     found = LOCKED_NUMPY.search((REQUIREMENTS / "python.lock").read_text(encoding="utf-8"))
@@ -83,21 +104,25 @@ def main(arguments: list[str]) -> int:
         return int(pytest.main(["-m", "system", "tests/system", *arguments]))
     if "--table" in arguments:
         return slow_tests.main()
+    if measure := "--coverage" in arguments:
+        arguments.remove("--coverage")
     linters, verdicts = dict(LINTERS), list[str]()
     if (here := version("numpy")) != (locked := locked_numpy()):
         del linters["mypy"]
         verdicts.append(f"not run: mypy, because its verdict is for the types of NumPy {locked}, not {here}")
-    with ThreadPoolExecutor(1) as beside:
-        compiled = beside.submit(lint, "kernels", KERNELS) if not arguments else None
+    with ThreadPoolExecutor(2) as pool:
+        beside = {"docs": pool.submit(lint, "docs", SITE)}
+        if not arguments:
+            beside["kernels"] = pool.submit(lint, "kernels", KERNELS)
         failed = [name for name, command in linters.items() if not lint(name, command)]
-    if compiled is not None and not compiled.result():
-        failed.append("kernels")
+    failed += [name for name, passed in beside.items() if not passed.result()]
     if "--lint" in arguments:
         print(*verdicts, sep="\n", end="\n" if verdicts else "")
         return int(bool(failed))
     verdicts += [f"{name} FAILED: see above" for name in failed]
     verdicts.append("not run: the tests that need system packages or privileges (./lathe test --system)")
-    code = pytest.main(["-m", "not system", *AT_ONCE, *REPORTED, *arguments], plugins=[Verdicts(verdicts)])
+    with covered() if measure else contextlib.nullcontext():
+        code = pytest.main(["-m", "not system", *AT_ONCE, *REPORTED, *arguments], plugins=[Verdicts(verdicts)])
     return int(code) or int(bool(failed))
 
 

@@ -10,6 +10,9 @@ import ros_wheels
 from ros import SourcedRos, site_packages, split, split_own
 from workplace import ROOT, VENV
 
+# Where Fast DDS is told how fast it is to ask for what it has missed.
+PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+DDS = ROOT / "lathe_rc" / "nodes" / "fastdds.xml"
 # What a shell sets for itself.
 SHELL_OWN = frozenset({"_", "OLDPWD", "PWD", "SHLVL"})
 
@@ -69,8 +72,8 @@ def apply(wanted: Changes, environ: Mapping[str, str]) -> dict[str, str]:
 
 
 def run_environment(wanted: Changes, environ: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment in which to run lathe_rc."""
-    return apply(wanted, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", **environ})
+    """Return the environment in which to run lathe_rc, and nodes in plain rclpy beside it."""
+    return apply(wanted, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", PROFILES: str(DDS), **environ})
 
 
 def shell_lines(wanted: Changes) -> str:

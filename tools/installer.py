@@ -2,10 +2,11 @@
 """Installing packages with uv, which reads settings of its own: those that the user has made for pip hold here, too."""
 
 import ast
+import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from workplace import PYTHON, REQUIREMENTS
+from workplace import NODE, PYTHON, REQUIREMENTS
 
 # Settings of pip, and the environment variables of uv that say the same.
 _SETTINGS = {
@@ -34,6 +35,17 @@ def uv(lists: Iterable[str], locks: Iterable[str]) -> list[str | Path]:
     files = [word for name in lists for word in ("-r", REQUIREMENTS / name)]
     constraints = [word for name in locks for word in ("-c", REQUIREMENTS / name)]
     return [PYTHON.with_name("uv"), "pip", "install", "--compile-bytecode", "--python", PYTHON, *files, *constraints]
+
+
+def npm() -> list[str | Path]:
+    """Return a command line that installs what requirements/package.json lists, as its lock says.
+
+    npm wants its two files where it installs.
+    """
+    NODE.mkdir(exist_ok=True)
+    for name in ("package.json", "package-lock.json"):
+        shutil.copy(REQUIREMENTS / name, NODE)
+    return [PYTHON.with_name("npm"), "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--prefix", NODE]
 
 
 def uv_environment(pip_config: str, environ: Mapping[str, str]) -> dict[str, str]:

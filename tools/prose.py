@@ -75,7 +75,7 @@ def found(path: Path, refused: list[Rule]) -> Iterator[str]:
                 continue
             for match in rule.pattern.finditer(text):
                 number = line + text.count("\n", 0, match.start())
-                words = " ".join(match[0].split())
+                words = " ".join(match[0].split())[:40]
                 yield f"{place}:{number}: {words!r}: {rule.why}; not {rule.before!r}, but {rule.after!r}"
 
 

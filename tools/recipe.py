@@ -37,14 +37,17 @@ class Group(NamedTuple):
         list: file in requirements/ that names them.
         usual: how long they take to install, and how much they take, for the terminal.
         sourced: whether they go with a ROS 2 that is sourced.
+        npm: whether they bring npm, which installs what requirements/package.json lists.
     """
 
     list: str
     usual: str
     sourced: bool
+    npm: bool = False
 
 
 GROUPS = {
+    "docs": Group("docs.in", "5 s, 250 MB", sourced=True, npm=True),
     "notebook": Group("notebook.in", "10 s, 300 MB", sourced=True),
     "sweep": Group("sweep.in", "5 s, 70 MB", sourced=True),
     "test": Group("test.in", "5 s, 300 MB", sourced=True),
@@ -143,6 +146,8 @@ class Recipe:
     def _install_group(self, name: str, lock: int) -> None:
         with Step(f"packages: {name}", GROUPS[name].usual, CHECK_NETWORK, lock) as step:
             self._install(step, GROUPS[name].list)
+            if GROUPS[name].npm:
+                step.run(*installer.npm(), environ=build_environment(self._ros))
 
     def _install(self, step: Step, *lists: str) -> None:
         """Install what files in requirements/ list: beside a sourced ROS 2 with pip, which knows its packages."""

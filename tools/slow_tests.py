@@ -6,6 +6,7 @@ else the test's name. What a test starts is read off its source and that of the 
 """
 
 import ast
+import json
 import re
 import sys
 from collections import defaultdict
@@ -17,12 +18,19 @@ from xml.etree import ElementTree as ET
 from workplace import HOME, ROOT, RefusalError, say
 
 REPORT = HOME / "test-report.xml"  #: of the last ./lathe test, as JUnit has it
+COVERAGE = HOME / "coverage"  #: of the last ./lathe test --coverage
+FIGURES = "figures.json"  #: in that folder
 PAGE = ROOT / "docs" / "tests.md"
 TESTS = ROOT / "tests"
 SLOWEST = 60  #: tests in the table
 
 _FILE = re.compile(r"^\| \*\*(test_\w+)\*\* \| ([\d.]+) % \|", re.MULTILINE)
 _ROW = re.compile(r"^\| (?:(\w+)\.)?`(test_\w+)` \| [\d.]+ % \| \d+ \| [a-z, ]*\| (.*) \|$", re.MULTILINE)
+_COVERAGE = (
+    "Coverage: the tests take {:.1f} % of the {} statements and {} branches of lathe_rc, counted in all processes that "
+    "they start (`./lathe test --coverage`); kernels do not count, since Numba compiles them."
+)
+_UNKNOWN = "Coverage: not measured; `./lathe test --coverage` does it."
 _HOSTS = ("offline", "composed", "processes")
 _PROCESSES = {"Processes", "starting", "held"}
 _PROGRAMS = {"Popen", "subprocess", "started"}
@@ -36,6 +44,8 @@ differ, so it is the share that counts. The cases of a test are added up; what s
 of them. A promise is the first line of the test's docstring, or else its name, and what a test starts is read off its
 source: change them there. tests/test_slow_tests.py checks that the page says what the tests say. `./lathe test` starts
 with the files that take longest.
+
+{coverage}
 
 | test | share | cases | starts | promise |
 | --- | --- | --- | --- | --- |
@@ -169,6 +179,15 @@ def shares() -> dict[str, float]:
     return {file: float(share) for file, share in _FILE.findall(page)}
 
 
+def coverage() -> str:
+    """Return what the last ./lathe test --coverage found, in a sentence; what the page says if there was none here."""
+    if (COVERAGE / FIGURES).exists():
+        total = json.loads((COVERAGE / FIGURES).read_text(encoding="utf-8"))["totals"]
+        return _COVERAGE.format(total["percent_covered"], total["num_statements"], total["num_branches"])
+    page = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
+    return next((line for line in page.splitlines() if line.startswith(_COVERAGE[:12])), _UNKNOWN)
+
+
 # ---- the page
 
 
@@ -188,7 +207,7 @@ def written(costs: Mapping[Name, Cost], said: Mapping[Name, Told]) -> str:
                 share, promise = 100 * cost.seconds / whole, test.promise.replace("|", r"\|")
                 lines.append(f"| {owner}`{name.test}` | {share:.1f} % | {cost.cases} | {test.starts} | {promise} |")
     tests = sum(cost.cases for cost in costs.values())
-    return _HEAD.format(slowest=len(known), tests=tests, seconds=whole) + "\n".join(lines) + "\n"
+    return _HEAD.format(slowest=len(known), tests=tests, seconds=whole, coverage=coverage()) + "\n".join(lines) + "\n"
 
 
 def wrong(page: str, said: Mapping[Name, Told]) -> list[str]:

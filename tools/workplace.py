@@ -8,6 +8,7 @@ ROOT = Path(__file__).resolve().parent.parent
 HOME = ROOT / ".lathe"
 VENV = HOME / "venv"
 PYTHON = VENV / "bin" / "python"
+NODE = VENV / "npm"
 BUILD = HOME / "build"
 INSTALL = HOME / "install"
 LOG = HOME / "log"

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many cells at once: each with its own memory, all through the same compiled program, on all cores.
+"""Many cells at once, all through the same compiled program, on all cores.
 
     piston = scenario.load(Path("config/piston.yaml"))
     cells = (piston.varied({"learning_controller.learning_gain": gain}) for gain in (0.25, 0.5, 1.0))
     for outcome in run(cells, Errors):
         print(outcome.kept.rms[-1])
 
-A cell gets the bits that it gets alone. Nothing is kept of its signals but what is asked for, and cells are made when
-their turn comes, so that the memory that a batch takes does not depend on how many they are.
+A cell gets the bits that it gets alone, though it shares with the one before what does not differ: see `Bench`. Nothing
+is kept of its signals but what is asked for, and cells are made when their turn comes, so that the memory that a batch
+takes does not depend on how many they are.
 """
 
 import os
@@ -21,9 +22,10 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.analysis.metrology import FormErrors, form_errors
-from lathe_rc.cell.collect import Collector, Finite
+from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.recording import Recording
+from lathe_rc.cell.rewind import Stock
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
@@ -36,7 +38,7 @@ _AHEAD = 2  # cells that are made for each thread before the first of them has b
 
 
 class Keeper(Sink, Protocol[K_co]):
-    """A sink that keeps of a run what is asked for."""
+    """A sink that keeps of a run what is asked for; the cell's stages run again in the next one."""
 
     @property
     def heard(self) -> Collection[str]:
@@ -95,10 +97,10 @@ def run(scenarios: Iterable[Scenario], keep: Make[K_co], *, threads: int | None 
     """
     count = threads or os.cpu_count() or 1
     waiting: deque[Future[Outcome[K_co]]] = deque()
-    pool = ThreadPoolExecutor(count)
+    pool, idle = ThreadPoolExecutor(count), deque(Bench() for _ in range(count))
     try:
         for number, scenario in enumerate(scenarios):
-            waiting.append(pool.submit(_outcome, scenario, keep))
+            waiting.append(pool.submit(_outcome, scenario, keep, idle))
             # The first compiles what the others use.
             if number == 0 or len(waiting) > _AHEAD * count:
                 yield waiting.popleft().result()
@@ -108,15 +110,43 @@ def run(scenarios: Iterable[Scenario], keep: Make[K_co], *, threads: int | None 
         pool.shutdown(cancel_futures=True)
 
 
-def _outcome(scenario: Scenario, keep: Make[K_co]) -> Outcome[K_co]:
+class Bench:
+    """Runs cells one after the other. Those that are alike share what does not differ: engine, and stages."""
+
+    def __init__(self) -> None:
+        self._stock = Stock()
+        self._engine: Engine | None = None
+
+    def cell(self, scenario: Scenario) -> Cell:
+        """The cell of a scenario; it is good until the next one is asked for.
+
+        Raises:
+            InputError: see `Cell`.
+        """
+        return Cell(scenario.nodes, stage=self._stock.take)
+
+    def run(self, cell: Cell, keeper: Keeper[K_co]) -> K_co:
+        """Run a cell that has passed its check to its end.
+
+        Raises:
+            LatheError: it cannot go on.
+        """
+        if self._engine is None or not self._engine.begin(cell, keeper.heard):
+            self._engine = Engine(cell, keeper.heard)
+        self._engine.run([keeper])
+        return keeper.kept()
+
+
+def _outcome(scenario: Scenario, keep: Make[K_co], idle: deque[Bench]) -> Outcome[K_co]:
+    bench = idle.pop()
     try:
-        cell = Cell(scenario.nodes)
+        cell = bench.cell(scenario)
         cell.check()
-        keeper = keep(cell, cell.samples)
-        Engine(cell, keeper.heard).run([Finite(cell), keeper])
+        return Outcome(scenario, bench.run(cell, keep(cell, cell.samples)))
     except LatheError as error:
         return Outcome(scenario, None, error)
-    return Outcome(scenario, keeper.kept())
+    finally:
+        idle.append(bench)
 
 
 class Errors:

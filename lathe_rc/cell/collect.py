@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checking the signals of an offline run, and keeping them in memory."""
+"""Keeping the signals of an offline run in memory."""
 
 import contextlib
 import os
@@ -9,50 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.block import NotFiniteError, check_finite
 from lathe_rc.cell.framing import Framer
 from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import DivergedError, InputError
-from lathe_rc.jit import kernel
-from lathe_rc.messages import Samples, Signals
+from lathe_rc.errors import InputError
+from lathe_rc.messages import Signals
 from lathe_rc.names import instead
-
-
-@kernel
-def _not_finite(samples: Samples) -> int:
-    """How many samples are NaN or infinite."""
-    count = 0
-    for k in range(samples.size):
-        count += not abs(samples[k]) < np.inf
-    return count
-
-
-class Finite:
-    """Ends a run with numbers that are not finite, as nodes end theirs; a sink of the engine, the first."""
-
-    def __init__(self, cell: Cell) -> None:
-        self._sources = {topic: f"/{source.node}" for topic, source in cell.dense.items()}
-
-    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`.
-
-        Raises:
-            DivergedError: a sample is NaN or infinite; names the first.
-        """
-        if not any(
-            array.dtype == np.float64 and _not_finite(array) for signals in dense.values() for array in signals.values()
-        ):
-            return
-        found: list[tuple[int, int, str]] = []
-        for topic, signals in dense.items():
-            for name, array in signals.items():
-                try:
-                    check_finite(self._sources[topic], name, array, first)
-                except NotFiniteError as error:
-                    found.append((error.index, len(found), f"/{topic}: {error}"))
-        raise DivergedError(min(found)[2])
 
 
 def _free_memory() -> int:

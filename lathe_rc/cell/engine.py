@@ -3,15 +3,17 @@
 
 import gc
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Protocol
+from typing import NoReturn, Protocol
 
 import numpy as np
 
+from lathe_rc.cell.block import NotFiniteError, check_finite
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.program import Program, Tapes, chunk_of, wired
 from lathe_rc.cell.stage import Sparse, compile_kernels
 from lathe_rc.cell.track import longest_delays
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import DivergedError
 from lathe_rc.messages import MAX_BLOCK, Signals
 
 
@@ -37,26 +39,45 @@ class Engine:
     """
 
     def __init__(self, cell: Cell, heard: Collection[str] | None = None) -> None:
-        self.samples = cell.samples
-        self._stages = list(cell.stages.values())
-        if heard is not None:
-            for stage in self._stages:
-                stage.unheard = {topic for topic in stage.sparse_topics if remapped(stage.shared, topic) not in heard}
         chunk = chunk_of(cell.master.shared.block_size, [cell.shortest_feedback or 0])
         self._piece = MAX_BLOCK // chunk * chunk
         topics = {topic: (source.type, longest_delays(cell.inputs(topic))) for topic, source in cell.dense.items()}
         self._tapes = Tapes(topics, self._piece)
+        self._take(cell, heard)
+        wires = [wired(stage) for stage in self._stages]
+        self._topics = [each.outputs for each in wires]
+        self._program = Program(wires, self._tapes, chunk)
+
+    def _take(self, cell: Cell, heard: Collection[str] | None) -> None:
+        """Have the stages of a cell ready."""
+        self.samples = cell.samples
+        self._wiring, self._block = cell.wiring, cell.master.shared.block_size
+        self._stages = list(cell.stages.values())
         for stage in self._stages:
+            unheard = () if heard is None else stage.sparse_topics
+            stage.unheard = {topic for topic in unheard if remapped(stage.shared, topic) not in (heard or ())}
             compile_kernels(stage)
-        self._wired = [wired(stage) for stage in self._stages]
-        self._program = Program(self._wired, self._tapes, chunk)
+
+    def begin(self, cell: Cell, heard: Collection[str] | None = None) -> bool:
+        """Begin anew with another cell; whether that can be: it must be wired as the one before, and checked too."""
+        if cell.wiring is not self._wiring or cell.master.shared.block_size != self._block:
+            return False
+        self._take(cell, heard)
+        self._tapes.rewind()
+        self._program.begin(self._stages)
+        return True
 
     def run(self, sinks: Iterable[Sink]) -> None:
-        """Run to the end."""
+        """Run to the end.
+
+        Raises:
+            DivergedError: a sample that sinks would take is NaN or infinite; names the first.
+            LatheError: a stage cannot go on.
+        """
         # Freeze existing objects so that the garbage collector skips them.
         gc.freeze()
         try:
-            # What is not finite is named by a sink, see `lathe_rc.cell.collect.Finite`; NumPy need not warn of it too.
+            # What is not finite is named here; NumPy need not warn of it too.
             with np.errstate(over="ignore", invalid="ignore"):
                 for _ in self.steps(list(sinks)):
                     pass
@@ -64,14 +85,29 @@ class Engine:
             gc.unfreeze()
 
     def steps(self, sinks: Sequence[Sink]) -> Iterator[int]:
-        """Run piece by piece; the sample index after each."""
+        """Run piece by piece; the sample index after each. Raises as `run`."""
         for first in range(0, self.samples, self._piece):
             self._tapes.advance(first)
+            broken = False
             try:
-                self._program.run(min(first + self._piece, self.samples))
+                broken = self._program.run(min(first + self._piece, self.samples), finite=bool(sinks))
             finally:
-                self._hand_over(first, self._program.reached, sinks)
+                if not broken:
+                    self._hand_over(first, self._program.reached, sinks)
+            if broken:
+                self._break_off(first)
             yield self._program.reached
+
+    def _break_off(self, first: int) -> NoReturn:
+        """Name the first sample of the piece that is not finite, as nodes do."""
+        found: list[tuple[int, int, str]] = []
+        for topic, source in self._wiring.dense.items():
+            for name, array in self._tapes.view(topic, first, self._program.reached - first).items():
+                try:
+                    check_finite(f"/{source.node}", name, array, first)
+                except NotFiniteError as error:
+                    found.append((error.index, len(found), f"/{topic}: {error}"))
+        raise DivergedError(min(found)[2])
 
     def _hand_over(self, first: int, end: int, sinks: Sequence[Sink]) -> None:
         """Give a piece to the sinks."""
@@ -79,7 +115,7 @@ class Engine:
             return
         dense: dict[str, Signals] = {}
         sparse: dict[str, list[Sparse]] = {}
-        for number, (stage, _, topics) in enumerate(self._wired):
+        for number, (stage, topics) in enumerate(zip(self._stages, self._topics, strict=True)):
             outputs = [self._tapes.view(topic, first, end - first) for topic in topics]
             dense.update(zip(topics, outputs, strict=True))
             # Where a stage has failed, those before it have gone on.

@@ -79,7 +79,6 @@ class Native:
         inputs, outputs: element types of the arrays of all fields of all ports.
 
     Attributes:
-        name: of the module that it stands in.
         words: of the memory, see `Words`.
     """
 
@@ -92,21 +91,22 @@ class Native:
     ) -> None:
         self._words = Words(memory)
         self.words = self._words.words
-        self._text = _text(step, self._words.kind, inputs, outputs)
-        self.name = f"step_{hashlib.sha256(self._text.encode()).hexdigest()[:16]}"
+        self._entry = _entry(step, self._words.kind, tuple(inputs), tuple(outputs))
         self._reached, self._fields = np.zeros(1, np.int64), np.zeros(len(inputs) + len(outputs), np.int64)
 
-    @cached_property
+    @property
+    def name(self) -> str:
+        """Of the module that it stands in."""
+        return self._entry.name
+
+    @property
     def address(self) -> int:
         """Of the function, which is compiled if it never was.
 
         Raises:
             InputError: it cannot be compiled.
         """
-        try:
-            return int(_module(self.name, self._text, self._words.kind).enter.address)
-        except NumbaError as error:
-            raise InputError(_cause(str(error))) from error
+        return self._entry.address
 
     def update(self, memory: tuple[Any, ...]) -> None:
         """See `Words`."""
@@ -143,6 +143,27 @@ def _call(
 
 
 # ---- the module ----------------------------------------------------------------------------------------------------
+
+
+class Entry:
+    """The function of addresses for a kind of step, memory and ports; see `Native`."""
+
+    def __init__(
+        self, step: Step, memory: Placed, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]
+    ) -> None:
+        self._memory, self._text = memory, _text(step, memory, inputs, outputs)
+        self.name = f"step_{hashlib.sha256(self._text.encode()).hexdigest()[:16]}"
+
+    @cached_property
+    def address(self) -> int:
+        """See `Native`."""
+        try:
+            return int(_module(self.name, self._text, self._memory).enter.address)
+        except NumbaError as error:
+            raise InputError(_cause(str(error))) from error
+
+
+_entry = cache(Entry)  # made once for all that are alike
 
 
 def _text(step: Step, memory: Placed, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]) -> str:

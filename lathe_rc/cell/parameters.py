@@ -6,14 +6,14 @@ ROS descriptors, validation, help and the documentation are made from these tabl
 
 import copy
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from lathe_rc.errors import InputError, shown
@@ -157,6 +157,31 @@ class Table(BaseModel):
                 raise InputError(f"{node}.{name}: {why}") from None
             given = f"{values.get(name, cls.model_fields[name].default)!r:.200}"
             raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
+
+    def changed(self: T, node: str, values: Mapping[str, object]) -> T:
+        """The same table with other values; raises as `read`."""
+        kind = type(self)
+        checks = kind.__pydantic_decorators__  # those of others' tables may look at all values at once
+        if not (checks.field_validators or checks.model_validators):
+            try:
+                found = self.model_copy(update={name: _check(kind, name)(value) for name, value in values.items()})
+                found.model_post_init(None)
+            except (KeyError, InputError, ValidationError):
+                pass  # all of it is read again, and says what is wrong
+            else:
+                return found
+        return kind.read(node, {**self.model_dump(exclude_unset=True), **values})
+
+
+@cache
+def _check(table: type[Table], name: str) -> Callable[[object], Any]:
+    """The check of a parameter's values, which returns the table's value; it raises ValidationError."""
+    field = table.model_fields[name]
+    parts = (field.annotation, *field.metadata)
+    kind = cast("Any", Annotated)[parts] if field.metadata else field.annotation
+    config = ConfigDict(strict=True, allow_inf_nan=False)
+    found: TypeAdapter[Any] = TypeAdapter(kind, config=config)
+    return found.validate_python
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
-from lathe_rc.placed import call, floats
+from lathe_rc.placed import address, call, floats
 
 _CHUNK = 1024  # samples that a stage computes in one go, at most: what stages hand on stays in the cache
 
@@ -60,6 +60,15 @@ class Tapes:
                 array[kept] = array[kept.start + shift : kept.stop + shift].copy()
         self.begin = first
 
+    def rewind(self) -> None:
+        """Begin again before sample 0."""
+        for array in self.arrays.values():
+            array.fill(0)
+        self.begin = 0
+
+
+NOT_FINITE = -3  #: why a program has stopped: a number is not finite
+_NOBODY = np.empty(0, np.int64)
 
 # Columns of the plan of the stages: address of the step or 0, address of its memory, its first field, the field with
 # the spindle angle or -1, the sample from which on it needs Python.
@@ -67,7 +76,9 @@ _STEP, _WORDS, _FIELD, _ANGLE, _DUE = range(5)
 
 
 @kernel
-def _run(plan: Integers, turn: Samples, fields: Integers, where: Integers, base: int, end: int, chunk: int) -> int:
+def _run(
+    plan: Integers, turn: Samples, fields: Integers, where: Integers, base: int, end: int, chunk: int, told: Integers
+) -> int:
     """Compute from `where` (block, stage, sample in the block) up to sample ``end``; see `Program`.
 
     Args:
@@ -79,9 +90,10 @@ def _run(plan: Integers, turn: Samples, fields: Integers, where: Integers, base:
         base: place of sample 0 on the tape.
         end: see above.
         chunk: samples that a stage computes in one go.
+        told: numbers of the fields that have to be finite.
 
     Returns:
-        Why it stopped: `DONE` at the end.
+        Why it stopped: `DONE` at the end, `NOT_FINITE` after the chunk in which a number is not.
     """
     first, stage, start = where[0], where[1], where[2]
     origin, size, at = fields[0], fields[1], fields[2]
@@ -108,8 +120,20 @@ def _run(plan: Integers, turn: Samples, fields: Integers, where: Integers, base:
             start = 0
         stage = 0
         first += n
-    where[0], where[1], where[2] = first, 0, 0
+        where[0], where[1], where[2] = first, 0, 0
+        for field in told:
+            if not _finite(floats(at.ctypes.data, field, n)):
+                return NOT_FINITE
     return DONE
+
+
+@kernel
+def _finite(samples: Samples) -> bool:
+    """Whether no sample is NaN or infinite."""
+    count = 0
+    for k in range(samples.size):
+        count += not abs(samples[k]) < np.inf
+    return count == 0
 
 
 @kernel
@@ -165,11 +189,12 @@ class Program:
     """
 
     def __init__(self, stages: Sequence[Wired], tapes: Tapes, chunk: int) -> None:
-        self._wired, self._stages, self._tapes, self._chunk = stages, [each.stage for each in stages], tapes, chunk
-        self.number, self.ends = 0, [0] * len(stages)
-        self._turn = np.empty(len(self._stages))
-        self._plan = np.zeros((len(self._stages) + 1, 5), np.int64)
+        self._tapes, self._chunk = tapes, chunk
+        self._inputs, self._outputs = [each.inputs for each in stages], [each.outputs for each in stages]
+        self._turn = np.empty(len(stages))
+        self._plan = np.zeros((len(stages) + 1, 5), np.int64)
         fields: list[tuple[int, int, int]] = []
+        told: list[int] = []
         for row, (stage, inputs, outputs) in zip(self._plan, stages, strict=False):
             row[_FIELD], row[_ANGLE], angle = len(fields), -1, stage.angle_input
             for place, port in enumerate(stage.inputs[: stage.own_inputs]):
@@ -177,39 +202,57 @@ class Program:
                     row[_ANGLE] = len(fields) + port.fields.index("angle")
                 fields += [self._field(*inputs[place], name) for name in port.fields]
             for tape, output in zip(outputs, stage.outputs, strict=True):
-                fields += [self._field(tape, 0, name) for name in messages.sample_fields(output.type)]
+                for name, dtype in messages.sample_fields(output.type).items():
+                    told += [len(fields)] if dtype == np.float64 else []
+                    fields.append(self._field(tape, 0, name))
             if angle is not None and angle >= stage.own_inputs:
                 row[_ANGLE] = len(fields)
                 fields.append(self._field(*inputs[angle], "angle"))
         self._plan[-1, _FIELD] = len(fields)
         self._fields = np.ascontiguousarray(np.array(fields, np.int64).T)
+        self._told_of = np.array(told, np.int64)
         self._where = np.zeros(3, np.int64)
-        self._told = [0] * len(self._stages)
-        self._sparse: list[list[Sparse]] = [[] for _ in self._stages]
-        for number in range(len(self._stages)):
+        self.begin([each.stage for each in stages])
+
+    def begin(self, stages: Sequence[Stage]) -> None:
+        """Begin at sample 0 with stages whose ports are those of the stages that it was made of."""
+        self._stages = stages
+        self.number, self.ends = 0, [0] * len(stages)
+        self._where[:] = 0
+        self._told = [0] * len(stages)
+        self._sparse: list[list[Sparse]] = [[] for _ in stages]
+        for number in range(len(stages)):
             self._load(number)
 
     def _field(self, tape: str, delay: int, name: str) -> tuple[int, int, int]:
         array = self._tapes.arrays[tape, name]
-        return array.ctypes.data - delay * array.itemsize, array.itemsize, 0
+        return address(array) - delay * array.itemsize, array.itemsize, 0
 
     def _load(self, number: int) -> None:
         """Take what a stage has in its memory now, and when it wants Python next."""
         stage, row = self._stages[number], self._plan[number]
+        row[_STEP] = row[_WORDS] = 0
         if stage.is_compiled:
             native = stage.native()
-            row[_STEP], row[_WORDS] = native.address, native.words.ctypes.data
+            row[_STEP], row[_WORDS] = native.address, address(native.words)
         row[_DUE], self._turn[number] = stage.due
 
-    def run(self, end: int) -> None:
+    def run(self, end: int, *, finite: bool = False) -> bool:
         """Compute up to sample ``end``, which must lie within the piece of the tapes.
+
+        Args:
+            end: see above.
+            finite: stop after the chunk in which something is computed that is not.
+
+        Returns:
+            Whether it has stopped there.
 
         Raises:
             LatheError: a stage cannot go on; names it. What was computed before is on the tapes, see `reached`.
         """
         self.number = 0
         try:
-            self._compute(end)
+            return self._compute(end, self._told_of if finite else _NOBODY)
         finally:
             first = self.reached
             ahead = min(first + self._chunk, end)
@@ -217,17 +260,21 @@ class Program:
             for number, reached in enumerate(self.ends):
                 self._tell(number, reached)
 
-    def _compute(self, end: int) -> None:
+    def _compute(self, end: int, told: Integers) -> bool:
         for number, stage in enumerate(self._stages):
             self.number = number
             with stage.named():
                 stage.prepare(self.reached, end - self.reached)
             self._plan[number, _DUE], self._turn[number] = stage.due
         base = self._tapes.history - self._tapes.begin
-        while (reason := _run(self._plan, self._turn, self._fields, self._where, base, end, self._chunk)) != DONE:
+        plan, turn, fields, where = self._plan, self._turn, self._fields, self._where
+        while (reason := _run(plan, turn, fields, where, base, end, self._chunk, told)) != DONE:
+            if reason == NOT_FINITE:
+                return True
             first, self.number, reached = self._where.tolist()
             self._serve(reason, first, self.number, reached, min(self._chunk, end - first))
             self._load(self.number)
+        return False
 
     @property
     def reached(self) -> int:
@@ -237,8 +284,8 @@ class Program:
     def _serve(self, reason: int, first: int, number: int, reached: int, samples: int) -> None:
         """Do in Python what a stage needs."""
         stage, tapes = self._stages[number], self._tapes
-        inputs = [tapes.view(tape, first, samples, delay) for tape, delay in self._wired[number].inputs]
-        outputs = [tapes.view(tape, first, samples) for tape in self._wired[number].outputs]
+        inputs = [tapes.view(tape, first, samples, delay) for tape, delay in self._inputs[number]]
+        outputs = [tapes.view(tape, first, samples) for tape in self._outputs[number]]
         with stage.named():
             if reason == BROKEN:
                 raise broken()

@@ -105,7 +105,7 @@ class Scenario:
     Attributes:
         name: the file's name without its ending.
         nodes: the table of each node by its name, in the order of the file.
-        fingerprints: of the tables; what the run id is made of.
+        fingerprints: of the tables, as far as they are known; what the run id is made of.
     """
 
     name: str
@@ -170,7 +170,8 @@ class Scenario:
     @property
     def identity(self) -> str:
         """A hash of all that changes a run: its nodes and their parameters, and what the files hold that they name."""
-        return _hash(self.fingerprints)
+        missing = {node: table for node, table in self.nodes.items() if node not in self.fingerprints}
+        return _hash({**self.fingerprints, **{node: _fingerprint(table) for node, table in missing.items()}})
 
     def parameter(self, target: str) -> Row:
         """The row of a parameter in its node's table.
@@ -199,6 +200,10 @@ class Scenario:
         node, _, name = whole.rpartition(".")
         found = getattr(self.nodes[node] if node else self.shared, name)
         return cast("Value", found if element is None else found[element])
+
+    def named(self) -> "Scenario":
+        """The same cell, whose variations keep its run id."""
+        return self.varied({"run_id": f"{self.shared.run_id} varied"})
 
     def with_models_given(self) -> "Scenario":
         """The same cell, whose controllers keep their models of the drives when the drives are varied."""
@@ -242,13 +247,14 @@ class Scenario:
         tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
         given = "run_id" in values or self.shared.run_id != _identity(fingerprints)
         for node, changed in changes.items():
-            before = self.nodes[node].model_dump(exclude_unset=True)
-            tables[node] = TABLES[self.kind(node)].read(node, {**before, **changed})
+            tables[node] = self.nodes[node].changed(node, changed)
         tables = models.resolved(tables)
-        fingerprints |= {node: _fingerprint(table) for node, table in tables.items() if table is not self.nodes[node]}
-        if not given:
-            tables = {node: table.model_copy(update={"run_id": ""}) for node, table in tables.items()}
-        return _agreed(self.name, tables, fingerprints)
+        other = {node: table for node, table in tables.items() if table is not self.nodes[node]}
+        if given and (run_id := next(iter(tables.values())).run_id):
+            known = {node: told for node, told in fingerprints.items() if node not in other}
+            return _agreed(self.name, tables, known, run_id)
+        fingerprints |= {node: _fingerprint(table) for node, table in other.items()}
+        return _agreed(self.name, tables, fingerprints, _identity(fingerprints))
 
     def to_yaml(self, *, given: bool = False) -> str:
         """The complete parameter file; empty lists are left out, since rcl cannot read them.
@@ -360,8 +366,8 @@ def _hash(fingerprints: Mapping[str, str]) -> str:
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
-def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mapping[str, str]) -> Scenario:
-    """The scenario of some tables, with its run id.
+def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mapping[str, str], run_id: str) -> Scenario:
+    """The scenario of some tables, with a run id.
 
     Raises:
         InputError: the nodes do not agree on what they share.
@@ -374,8 +380,10 @@ def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mappi
                     f"{node}.{key} = {getattr(table, key)}: other nodes have {getattr(agreed, key)}; "
                     f"set it under {_EVERYONE}"
                 )
-    identity = agreed.run_id or _identity(fingerprints)
-    named = {node: table.model_copy(update={"run_id": identity}) for node, table in tables.items()}
+    named = {
+        node: table if table.run_id == run_id else table.model_copy(update={"run_id": run_id})
+        for node, table in tables.items()
+    }
     return Scenario(name, named, fingerprints)
 
 
@@ -425,4 +433,5 @@ def load(path: Path, overrides: Iterable[str] = (), *, complete: bool = False) -
                 raise InputError(f"{given}: {_EVERYONE} says {shared[key]}; keep one ({key}=... sets all nodes)")
         tables[name] = TABLES[kind_of(name, values.get("stage"))].read(name, {**shared, **values})
     tables = tables if complete else models.resolved(tables)
-    return _agreed(path.stem, tables, {name: _fingerprint(table) for name, table in tables.items()})
+    fingerprints = {name: _fingerprint(table) for name, table in tables.items()}
+    return _agreed(path.stem, tables, fingerprints, next(iter(tables.values())).run_id or _identity(fingerprints))

@@ -5,16 +5,18 @@ Longer than 400 lines: each check looks at the same wired cell, and a cell is re
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from graphlib import CycleError, TopologicalSorter
+from typing import NamedTuple
 
 import numpy as np
 
 from lathe_rc.analysis.learning import Response
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import kind_of
-from lathe_rc.cell.stage import Input, Stage
+from lathe_rc.cell.stage import Input, Output, Stage
 from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.learner import Learner
@@ -23,7 +25,7 @@ from lathe_rc.cell.stages.profile import ProfileStage
 from lathe_rc.cell.stages.supervisor import Supervisor
 from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.stages.tool import Tool
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, UnpublishedError
 from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.tip_path import steepest_fall
 
@@ -51,12 +53,116 @@ class Unknown:
     reads: frozenset[str]
 
 
+class Ports(NamedTuple):
+    """The ports of a stage; topics are relative names after remapping.
+
+    Attributes:
+        node: its name.
+        inputs: that it reads, with their topics.
+        own: how many of them its step gets.
+        outputs: that it publishes, the same way.
+        sparse: topics and types of messages at chosen samples.
+    """
+
+    node: str
+    inputs: tuple[tuple[str, Input], ...]
+    own: int
+    outputs: tuple[tuple[str, Output], ...]
+    sparse: tuple[tuple[str, str], ...]
+
+
+def _ports(stage: Stage) -> Ports:
+    table = stage.shared
+    return Ports(
+        stage.name,
+        tuple((remapped(table, port.topic), port) for port in stage.inputs),
+        stage.own_inputs,
+        tuple((remapped(table, port.topic), port) for port in stage.outputs),
+        tuple((remapped(table, topic), msgtype) for topic, msgtype in stage.sparse_topics.items()),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Wiring:
+    """Publishers and order of the stages; the same one for all cells whose ports are alike.
+
+    Attributes:
+        dense, sparse: see `Cell`.
+        order: of the stages.
+    """
+
+    dense: Mapping[str, Source]
+    sparse: Mapping[str, Source]
+    order: Sequence[str]
+
+
+def _wire(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> Wiring:
+    """Wire some stages and members; raises as `Cell` does."""
+    dense, sparse = _sources(stages, unknown)
+    order: TopologicalSorter[str] = TopologicalSorter({stage.node: () for stage in stages})
+    for stage in stages:
+        for topic, port in stage.inputs:
+            source = _source(dense, stage.node, topic, port)
+            if port.delay == 0 and source.node not in unknown:
+                order.add(stage.node, source.node)
+    try:
+        return Wiring(dense, sparse, tuple(order.static_order()))
+    except CycleError as error:
+        raise InputError(f"{' -> '.join(error.args[1])}: a loop without a feedback delay cannot start") from None
+
+
+def _sources(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> tuple[dict[str, Source], dict[str, Source]]:
+    """The publishers of dense and sparse topics."""
+    dense: dict[str, Source] = {}
+    sparse: dict[str, Source] = {}
+
+    def add(topics: dict[str, Source], topic: str, source: Source) -> None:
+        if other := dense.get(topic) or sparse.get(topic):
+            raise InputError(f"{topic} is published by {other.node} and {source.node}; remap one of them")
+        topics[topic] = source
+
+    for stage in stages:
+        for topic, output in stage.outputs:
+            add(dense, topic, Source(stage.node, output.type))
+        for topic, msgtype in stage.sparse:
+            add(sparse, topic, Source(stage.node, msgtype))
+    for name, member in unknown.items():
+        for topics, published in ((dense, member.dense), (sparse, member.sparse)):
+            for topic, msgtype in published.items():
+                add(topics, topic, Source(name, msgtype))
+    return dense, sparse
+
+
+@lru_cache
+def _wire_alike(stages: tuple[Ports, ...]) -> Wiring:
+    return _wire(stages, {})
+
+
+def _source(dense: Mapping[str, Source], node: str, topic: str, port: Input) -> Source:
+    """The publisher of a topic that a node reads."""
+    source = dense.get(topic)
+    if source is None:
+        raise UnpublishedError(
+            f"{node} reads {topic}, which no node of the scenario publishes; allowed: a node that does, or another "
+            f"topic by {node}.remap"
+        )
+    if source.type != port.type:
+        raise InputError(f"{node} reads {topic} as {port.type}, but {source.node} publishes {source.type}")
+    return source
+
+
+def new_stage(name: str, table: NodeParameters) -> Stage:
+    """The stage of a node."""
+    return STAGES[kind_of(name, table.stage)](name, table)
+
+
 class Cell:
     """All stages of a scenario, wired.
 
     Args:
         nodes: table of each node by name; nodes that are no stages are left out.
         unknown: members that nobody here knows more of than their topics, by name.
+        stage: gives the stage of a name and table.
 
     Attributes:
         unknown: see above.
@@ -65,6 +171,7 @@ class Cell:
         factors: largest factor of a cycle over all frequencies, sup|Q - γZ| of repetitive control, by learning node;
             below 1 the error of each cycle is smaller than that of the one before. `check` finds it.
         stages: by node name, in the order of the forward edges.
+        wiring: see `Wiring`.
         dense: publisher of each topic that carries a block a block, by relative topic.
         sparse: the same for topics that carry messages at chosen samples.
 
@@ -72,61 +179,20 @@ class Cell:
         InputError: a topic without or with two publishers, types that do not match, a loop without a delay.
     """
 
-    def __init__(self, nodes: Mapping[str, NodeParameters], unknown: Mapping[str, Unknown] | None = None) -> None:
+    def __init__(
+        self,
+        nodes: Mapping[str, NodeParameters],
+        unknown: Mapping[str, Unknown] | None = None,
+        *,
+        stage: Callable[[str, NodeParameters], Stage] = new_stage,
+    ) -> None:
         self.unknown, self.unchecked = unknown or {}, list[str]()
         self.factors: dict[str, float] = {}
-        made: dict[str, Stage] = {}
-        for name, table in nodes.items():
-            kind = kind_of(name, table.stage)
-            if kind in STAGES:
-                made[name] = STAGES[kind](name, table)
-        self.dense: dict[str, Source] = {}
-        self.sparse: dict[str, Source] = {}
-        for name, stage in made.items():
-            for output in stage.outputs:
-                self._add(self.dense, remapped(stage.shared, output.topic), Source(name, output.type))
-            for topic, msgtype in stage.sparse_topics.items():
-                self._add(self.sparse, remapped(stage.shared, topic), Source(name, msgtype))
-        self._add_unknown()
-        order: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(made, ()))
-        for name, stage in made.items():
-            for port in stage.inputs:
-                source = self.source(stage, port)
-                if port.delay == 0 and source.node in made:
-                    order.add(name, source.node)
-        try:
-            self.stages = {name: made[name] for name in order.static_order()}
-        except CycleError as error:
-            raise InputError(f"{' -> '.join(error.args[1])}: a loop without a feedback delay cannot start") from None
-
-    def _add_unknown(self) -> None:
-        for name, member in self.unknown.items():
-            for topics, published in ((self.dense, member.dense), (self.sparse, member.sparse)):
-                for topic, msgtype in published.items():
-                    self._add(topics, topic, Source(name, msgtype))
-
-    def _add(self, topics: dict[str, Source], topic: str, source: Source) -> None:
-        other = self.dense.get(topic) or self.sparse.get(topic)
-        if other:
-            raise InputError(f"{topic} is published by {other.node} and {source.node}; remap one of them")
-        topics[topic] = source
-
-    def source(self, stage: Stage, port: Input) -> Source:
-        """The publishers of a stage's inputs.
-
-        Raises:
-            InputError: nobody, or as another type.
-        """
-        topic = remapped(stage.shared, port.topic)
-        source = self.dense.get(topic)
-        if source is None:
-            raise InputError(
-                f"{stage.name} reads {topic}, which no node of the scenario publishes; allowed: a node that does, or "
-                f"another topic by {stage.name}.remap"
-            )
-        if source.type != port.type:
-            raise InputError(f"{stage.name} reads {topic} as {port.type}, but {source.node} publishes {source.type}")
-        return source
+        made = {name: stage(name, table) for name, table in nodes.items() if kind_of(name, table.stage) in STAGES}
+        ports = tuple(map(_ports, made.values()))
+        self.wiring = _wire(ports, self.unknown) if self.unknown else _wire_alike(ports)
+        self.dense, self.sparse = self.wiring.dense, self.wiring.sparse
+        self.stages = {name: made[name] for name in self.wiring.order}
 
     def _publisher(self, topic: str, question: str) -> Stage | None:
         """The stage that publishes a topic; None if nobody here knows it: then the question stays open."""
@@ -138,7 +204,12 @@ class Cell:
     def _leave_open(self, question: str, name: str) -> None:
         self.unchecked.append(f"the parameters of {name} are not known here: {question}")
 
-    @property
+    def replace(self, stage: Stage) -> None:
+        """Put a stage in the place of the one of its name, whose ports it has."""
+        self.stages[stage.name] = stage
+        self.__dict__.pop("master", None)
+
+    @cached_property
     def master(self) -> TimeMaster:
         """The time master.
 

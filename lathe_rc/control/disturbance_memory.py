@@ -30,7 +30,7 @@ _SETTLED = 8  # revolutions that are learned before the change with the speed is
 
 
 class MemoryTable(NamedTuple):
-    """What is known of the disturbance over the angle.
+    """The model of the disturbance over the angle.
 
     Attributes:
         nominal: speed Ω0 [rad/s].
@@ -105,7 +105,7 @@ def forget_all(m: MemoryTable) -> None:
 
 @kernel
 def expected(m: MemoryTable, angle: float, speed: float) -> float:
-    """What the memory expects at an angle [rad] and a speed [rad/s], in metres of the command."""
+    """The memory's prediction at an angle [rad] and a speed [rad/s], in metres of the command."""
     if not m.learns:
         return 0.0
     place = angle * (m.value.size / _TURN)

@@ -21,7 +21,7 @@ _UNSURE = (0.3, 0.4)  # standard deviations of a1 and a2 as they are given, rela
 
 
 class FitTable(NamedTuple):
-    """What measurements say of the drive.
+    """The measurements of the drive.
 
     Attributes:
         given: a1 [s] and a2 [s²] as they are told, shape (2,).

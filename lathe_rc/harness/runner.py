@@ -16,7 +16,7 @@ from lathe_rc.bag.repairing import recover
 from lathe_rc.bag.writing.record import OfflineRecorder, begin, begin_snapshots, recorder_of
 from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.cell.ahead import compile_ahead
-from lathe_rc.cell.collect import Collector, Finite, check_room
+from lathe_rc.cell.collect import Collector, check_room
 from lathe_rc.cell.durations import Lateness
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.scenario import Scenario
@@ -184,7 +184,7 @@ class _Watcher:
 def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[Event], None]) -> Result:
     engine = Engine(cell)
     collector = Collector(cell, engine.samples)
-    sinks: list[Sink] = [Finite(cell), collector, _Watcher(watch)]
+    sinks: list[Sink] = [collector, _Watcher(watch)]
     recorder = snapshots = None
     if bag is not None:
         snapshots = begin_snapshots(bag, scenario, cell)

@@ -9,6 +9,7 @@ and tracks hold what it would find there. So when anything goes wrong the chain 
 
 from collections.abc import Mapping, Sequence
 
+from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.program import Program, Tapes, Wired, chunk_of
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
@@ -131,7 +132,7 @@ def _groups(cell: Cell, here: Mapping[str, object]) -> list[list[str]]:
     groups: list[list[str]] = [[]]
     beyond: set[str] = set()  # stages elsewhere that compute after some of the group at hand
     for name, stage in cell.stages.items():
-        reads = {cell.source(stage, port).node for port in stage.inputs if not port.delay}
+        reads = {cell.dense[remapped(stage.shared, port.topic)].node for port in stage.inputs if not port.delay}
         if name in here:
             if reads & (beyond | cell.unknown.keys()):
                 groups.append([])

@@ -11,7 +11,7 @@ from lathe_rc.nodes.restart import Restartable
 
 
 class Chain(Protocol):
-    """What a node computes together with, see `lathe_rc.nodes.chain.Chain`."""
+    """The stages that a node computes together with, see `lathe_rc.nodes.chain.Chain`."""
 
     def advance(self) -> None:
         """Compute what the inputs from outside allow; the first of the nodes says how far."""

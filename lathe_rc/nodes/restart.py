@@ -53,7 +53,7 @@ class Restartable(StageTopics):
             super().members_changed()
 
     def matched(self) -> bool:
-        """See `CellNode`; who may join in mid-run must know whether the cell is running."""
+        """See `CellNode`; a node that may join in mid-run must know whether the cell is running."""
         return (self._cell is not None or not self._restart_file) and super().matched()
 
     def begin(self, *, joins: bool) -> None:

@@ -105,7 +105,7 @@ def _free(system: System, state: Array) -> float:
 
 @inlined
 def pressed_by(process: Process, speed: float, wear: float) -> float:
-    """What the flank's force takes for each metre that the edge moves out of the part in a sample [N/m], times σ."""
+    """The loss of the flank's force for each metre that the edge moves out of the part in a sample [N/m], times σ."""
     if process.pressure == 0.0:
         return 0.0
     damping = flank_damping(process.pressure, process.width, process.land + wear, process.radius * speed)
@@ -116,7 +116,7 @@ def pressed_by(process: Process, speed: float, wear: float) -> float:
 def meet(
     cut: CutTable, place: float, speed: float, height: float, angle: float, feed_velocity: float
 ) -> tuple[int, float, float, float]:
-    """What the edge meets at ``place`` [grid point]: why it cannot go on, feed, K, and σ·c; nothing changes."""
+    """The cut at ``place`` [grid point]: the reason to stop, feed, K, and σ·c; nothing changes."""
     process, state = cut.process, cut.state
     if not speed > 0.0:
         return _STANDS, 0.0, 0.0, 0.0

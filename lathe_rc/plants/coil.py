@@ -87,7 +87,7 @@ def coil_table(coil: Coil | None, step: float, kept: int) -> CoilTable:
 
 @kernel
 def applied(coil: CoilTable, n: int, asked: float, current: float) -> float:
-    """What the loop applies until sample ``n`` [V], from the current and the one asked for [A] of the sample before."""
+    """The voltage of the loop until sample ``n`` [V], from measured and set current [A] of the sample before."""
     demand = min(max(asked, coil.state[1] - coil.slew), coil.state[1] + coil.slew)
     demand = min(max(demand, -coil.current_limit), coil.current_limit)
     error = demand - current

@@ -84,7 +84,7 @@ def realise(model: TransferFunction) -> tuple[Array, Array]:
 
 
 def settles(model: TransferFunction) -> tuple[float, bool]:
-    """What a command of 1 asks for, 0 if neither a position nor a speed, and whether it is a speed."""
+    """The motion that a command of 1 asks for, 0 if neither a position nor a speed, and whether it is a speed."""
     integrates = model.denominator[-1] == 0.0
     divisor = model.denominator[-2 if integrates else -1]
     return (abs(model.numerator[-1] / divisor) if divisor else 0.0), integrates

@@ -239,12 +239,14 @@ def check_thresholds(thresholds: Array) -> None:
     Raises:
         InputError: they are not.
     """
-    if not np.all(np.diff(thresholds, prepend=0.0) > 0.0) or not np.all(np.isfinite(thresholds)):
+    rising = (thresholds[:1] > 0.0).all() and (thresholds[1:] > thresholds[:-1]).all()
+    if not rising or not np.isfinite(thresholds).all():
         raise InputError(f"play thresholds {thresholds.tolist()}; allowed: above 0 and increasing")
 
 
 def _weighted(thresholds: Array, weights: Array, proportional: float, state: Array) -> tuple[Law, Array, float]:
-    table = np.stack((np.append(0.0, thresholds), np.append(proportional, weights)))
+    table = np.empty((2, thresholds.size + 1))
+    table[:, 0], table[0, 1:], table[1, 1:] = (0.0, proportional), thresholds, weights
     return Law(PLAYS, table), state, float(np.cumsum(table[1]).max())
 
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import scipy
 
 Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
 Discretisation = Literal["foh", "tustin"]
 
 
@@ -32,14 +33,14 @@ class DiscretePlant:
     fraction: float
     step: float
 
-    def response(self, frequency: npt.ArrayLike) -> npt.NDArray[np.complex128]:
+    def response(self, frequency: npt.ArrayLike) -> Complex:
         """Response of the position to the command at ``frequency`` [rad/s], of the difference equation itself."""
         wanted = np.asarray(frequency, dtype=np.float64)
         return _response(self, wanted.tobytes()).reshape(wanted.shape)
 
     @cached_property
-    def _rational(self) -> list[tuple[Array, Array]]:
-        """Numerator and denominator of each weight's way to the position.
+    def _rational(self) -> tuple[list[Array], Array]:
+        """Numerators of the three weights' ways to the position, and their denominator.
 
         x[n] = Φ·x[n-1] + w·u[n] is z·(z·I - Φ)⁻¹·w; with c that takes the position from x, the rational function after
         the z is (det(z·I - Φ + w·c) - det(z·I - Φ)) / det(z·I - Φ). That is `scipy.signal.ss2tf`, but a controller
@@ -47,18 +48,23 @@ class DiscretePlant:
         """
         position, bottom = np.eye(1, self.transition.shape[0]), np.asarray(np.poly(self.transition))
         ways = [np.outer(self.weights[:, lag], position) for lag in range(3)]
-        return [(np.asarray(np.poly(self.transition - way)) - bottom, bottom) for way in ways]
+        return [np.asarray(np.poly(self.transition - way)) - bottom for way in ways], bottom
 
 
 @lru_cache(maxsize=64)
-def _response(plant: DiscretePlant, content: bytes) -> npt.NDArray[np.complex128]:
+def _response(plant: DiscretePlant, content: bytes) -> Complex:
     """The response of the bytes of the frequencies: checks of cells that are alike ask for the same."""
-    z = np.exp(1j * np.frombuffer(content) * plant.step)
-    terms = [
-        np.polyval(top, z) / np.polyval(bottom, z) * z ** (1.0 - lag - plant.delay)
-        for lag, (top, bottom) in enumerate(plant._rational)  # noqa: SLF001 - its own
-    ]
-    return np.asarray(sum(terms))
+    z, shifts = _shifts(content, plant.step, plant.delay)
+    tops, bottom = plant._rational  # noqa: SLF001 - its own
+    below = np.polyval(bottom, z)
+    return np.asarray(sum(np.polyval(top, z) / below * shift for top, shift in zip(tops, shifts, strict=True)))
+
+
+@lru_cache(maxsize=64)
+def _shifts(content: bytes, step: float, delay: int) -> tuple[Complex, list[Complex]]:
+    """exp(jωT) of the bytes of the frequencies, and its powers that stand for the delays of the three weights."""
+    z = np.exp(1j * np.frombuffer(content) * step)
+    return z, [z ** (1.0 - lag - delay) for lag in range(3)]
 
 
 def _foh(a: Array, b: Array, step: float) -> tuple[Array, Array, Array]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the part does to the cut: where it has no material, where it is harder, how it gives way along it."""
+"""The part's effect on the cut: where it has no material, where it is harder, how it gives way along it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -53,7 +53,7 @@ def _check_window(what: str, start: float, width: float) -> None:
 
 @dataclass(frozen=True)
 class Part:
-    """What the part does to the cut.
+    """The part's effect on the cut.
 
     Attributes:
         radius: at which the cutting path is reckoned [m].

@@ -48,7 +48,8 @@ class NormalStream:
     """
 
     def __init__(self, seed: int, name: str, *, on: bool = True) -> None:
-        self._random = np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
+        if on:
+            self._random = np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
         size = DRAWN if on else 0
         self.drawn = Drawn(np.empty(size), np.array([size], np.int64))
 

@@ -137,7 +137,7 @@ def derivatives_at(
 
 @dataclass(frozen=True)
 class Demand:
-    """What a profile asks of a drive at its worst place."""
+    """The demand of a profile on a drive at its worst place."""
 
     stroke: float  #: largest displacement from the middle [m]
     velocity: float  #: [m/s]
@@ -181,7 +181,7 @@ class ProfileTable:
 
     Attributes:
         heights: [m], shape (m,).
-        table: polynomial coefficients of each interval, highest power first, shape (m, points, 4).
+        table: polynomial coefficients of each interval, highest power first, shape (m, points, 4); not to be written.
     """
 
     def __init__(self, profile: Profile, points: int = 4096) -> None:
@@ -193,9 +193,10 @@ class ProfileTable:
             values[-1] = values[0]
             spline = scipy.interpolate.CubicSpline(np.arange(points + 1.0), values, bc_type="periodic")
             row[:] = spline.c.T
+        self.table.flags.writeable = False
 
     def demand(self, speed: float, acceleration: float, feed: float) -> Demand:
-        """What the profile asks at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], ``feed`` in m/rev."""
+        """The profile's demand at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], ``feed`` in m/rev."""
         return _demand(self, speed, acceleration, feed)
 
 

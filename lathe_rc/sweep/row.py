@@ -31,9 +31,7 @@ from numpy.typing import NDArray
 from lathe_rc import messages
 from lathe_rc.analysis.metrology import FormErrors, form_errors
 from lathe_rc.analysis.tolerance import judge
-from lathe_rc.cell.batch import Errors
-from lathe_rc.cell.collect import Finite
-from lathe_rc.cell.engine import Engine
+from lathe_rc.cell.batch import Bench, Errors
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
@@ -183,24 +181,36 @@ def _digest(kept: Sequence[Samples]) -> str | None:
 
 
 def compute(
-    base: Scenario, values: Mapping[str, Value], targets: Sequence[str], measures: Sequence[Measure]
+    base: Scenario,
+    values: Mapping[str, Value],
+    targets: Sequence[str],
+    measures: Sequence[Measure],
+    bench: Bench | None = None,
 ) -> dict[str, Any]:
-    """The row of a cell but for its number and key; whatever is wrong with the cell stands in it."""
+    """The row of a cell but for its number and key; whatever is wrong with the cell stands in it.
+
+    Args:
+        base: the scenario that is varied.
+        values: how.
+        targets: those of them that are columns.
+        measures: what is measured.
+        bench: for cells of one kind; None: one of its own.
+    """
     start = time.perf_counter()
     row: dict[str, Any] = {"status": DONE, "version": revision()}
     row |= {target: values[target] for target in targets if target in values}
+    bench = bench or Bench()
     cell: Cell | None = None
     started = False
     try:
         scenario = base.varied(values)
         row["seed"] = scenario.shared.seed
-        cell = Cell(scenario.nodes)
+        cell = bench.cell(scenario)
         cell.check()
         keeper = _Keeper(cell, cell.samples, measures)
-        engine = Engine(cell, keeper.heard)
         started = True
-        engine.run([Finite(cell), keeper])
-        row |= _found(cell, keeper)
+        errors = bench.run(cell, keeper)
+        row |= _found(cell, keeper, errors)
     except LatheError as error:
         refused = isinstance(error, InputError) and not started
         row["status"] = REFUSED if refused else DIVERGED if isinstance(error, DivergedError) else FAILED
@@ -211,8 +221,7 @@ def compute(
     return row
 
 
-def _found(cell: Cell, keeper: _Keeper) -> dict[str, Any]:
-    errors = keeper.kept()
+def _found(cell: Cell, keeper: _Keeper, errors: FormErrors) -> dict[str, Any]:
     found: dict[str, Any] = {
         "limits": ", ".join(sorted(keeper.limited)),
         "samples": cell.samples,

@@ -22,6 +22,7 @@ import pyarrow as pa
 from distributed.scheduler import KilledWorker
 
 from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.batch import Bench
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, shown
@@ -85,14 +86,14 @@ def _scenario(name: str, text: str, identity: str) -> Scenario:
         raise InputError(
             f"{name} is another cell at a worker: another lathe_rc, or files that it names differ; allowed: the same"
         )
-    return found
+    return found.named()
 
 
 def compute(order: Order, jobs: Sequence[Job]) -> pa.Table:
     """The rows of some cells; a task of Dask."""
-    base = _scenario(order.name, order.text, order.identity)
+    base, bench = _scenario(order.name, order.text, order.identity), Bench()
     rows = [
-        {"cell": job.number, "key": job.key, **row.compute(base, job.values, order.targets, order.measures)}
+        {"cell": job.number, "key": job.key, **row.compute(base, job.values, order.targets, order.measures, bench)}
         for job in jobs
     ]
     return pa.Table.from_pylist(rows, order.schema)

@@ -25,7 +25,7 @@ QUIET += ["--disable-default-apps", "--no-default-browser-check", "--disable-dom
 
 
 class Visit:
-    """A page opened in headless Chromium.
+    """A page opened in headless Chromium: a file, or an address on this machine, whose server then is no stranger.
 
     Attributes:
         console: lines that the page wrote to the console.
@@ -35,9 +35,10 @@ class Visit:
 
     def __init__(self, page, folder, *options):
         log = folder / "net.json"
+        address, known = (page, page[: page.index("/", 7)]) if isinstance(page, str) else (page.as_uri(), page.as_uri())
         own = [f"--user-data-dir={folder / 'browser'}", f"--log-net-log={log}"]
         done = subprocess.run(
-            ["chromium", *HEADLESS, *QUIET, *own, *options, "--dump-dom", page.as_uri()],
+            ["chromium", *HEADLESS, *QUIET, *own, *options, "--dump-dom", address],
             capture_output=True,
             text=True,
             timeout=120,
@@ -49,7 +50,7 @@ class Visit:
         # The browser asks for things of its own, like the time; those have no origin.
         asked = [event["params"] for event in events if event.get("params", {}).get("initiator", BROWSER) != BROWSER]
         urls = {request["url"] for request in asked if "url" in request}
-        self.requests = sorted(url for url in urls if not url.startswith(("data:", page.as_uri())))
+        self.requests = sorted(url for url in urls if not url.startswith(("data:", known)))
 
 
 def by_hand(text, script, folder):

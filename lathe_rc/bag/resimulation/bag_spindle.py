@@ -155,7 +155,7 @@ def wire(
                 f"{source.path}: {of} has a step of {step_ns} ns, the scenario one of {master.shared.step_ns} ns; "
                 f"allowed: sample_rate = {1e9 / step_ns:.10g} Hz under /**"
             )
-    cell.stages[master.name] = _PlayedSpindle(master, recorded.tape(topic), samples, spindle)
+    cell.replace(_PlayedSpindle(master, recorded.tape(topic), samples, spindle))
     cell.check()
     compared = Comparison(recorded, cell, tool, topics) if tool and topics else None
     return cell, compared, _events(source) if original is not None else {}

@@ -10,7 +10,8 @@ is the scenario's, with the drive identified from the recorded command and posit
 
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,14 +30,13 @@ from lathe_rc.bag.writing.record import OfflineRecorder, begin
 from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.collect import Finite
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, UnpublishedError
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.names import instead
 from lathe_rc.part import ErrorsByRevolution
@@ -199,7 +199,8 @@ def resimulate(
         if parameters is not None:
             identify.write_parameters(parameters, chosen, drives)
         changed = original is None or chosen.nodes != original.nodes
-        cell, compared, events = wire(chosen, original, recorded, source)
+        with _without_strangers(path, changed=changed):
+            cell, compared, events = wire(chosen, original, recorded, source)
         for name, stage in cell.stages.items():
             for index, action in events.get(name, []):
                 stage.replay(action, index)
@@ -208,7 +209,7 @@ def resimulate(
         samples = cell.master.samples
         assert samples is not None, "a bag has an end"
         writer = begin(output, chosen) if output is not None else None
-        all_sinks: list[Sink] = [Finite(cell), digests, errors, *([compared] if compared else [])]
+        all_sinks: list[Sink] = [digests, errors, *([compared] if compared else [])]
         if writer is not None:
             all_sinks.append(OfflineRecorder(cell, samples, writer))
         engine = Engine(cell)
@@ -251,6 +252,25 @@ def _of_bag(recorded: Recorded, source: Source, folder: Path) -> Scenario:
     if provenance.SCENARIO not in source.about:
         raise InputError(f"{source.path}: {asked_for(recorded)}")
     return provenance.scenario_of(source.about, folder)
+
+
+@contextmanager
+def _without_strangers(path: Path, *, changed: bool) -> Iterator[None]:
+    """Say what to do where nobody publishes what a cell reads since nodes of others did: the bag has no more of them.
+
+    Args:
+        path: the bag.
+        changed: whether the cell is another than the recorded one; then it may be for another reason.
+    """
+    try:
+        yield
+    except UnpublishedError as error:
+        if changed:
+            raise
+        raise InputError(
+            f"{path}: {str(error).partition(';')[0]}: a node that the bag knows by its topics alone did; allowed: "
+            "--scenario FILE with a node of ours in its place (--identify finds its drive)"
+        ) from None
 
 
 _PAST = (

@@ -42,7 +42,7 @@ class Margins:
         self._suprema: dict[tuple[object, ...], float] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """What cannot be had again: a response is computed when it is asked for."""
+        """The state without responses, which are computed when they are asked for."""
         return {**self.__dict__, "_responses": {}}
 
     def _response(self, model: Identified) -> Response:

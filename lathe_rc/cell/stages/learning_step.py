@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the learning controller does with each sample."""
+"""The step of the learning controller."""
 
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ _INSIDE, _BEGIN, _END, _LOST, LOST_AT = range(5)
 
 
 class Memory(NamedTuple):
-    """What the step works on.
+    """Memory of the step.
 
     Attributes:
         control: the memory of the channel.

@@ -87,13 +87,15 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
         with named("play_thresholds", "play_weights", "play_proportional"):
             return self._plays(self.play_thresholds, self.play_weights, self.play_proportional)
 
-    def _identified(self, named: _Named) -> PrandtlIshlinskii | BoucWen | None:
-        """The linearisation's model of the hysteresis."""
+    def _identified(
+        self, named: _Named, real: PrandtlIshlinskii | BoucWen | None
+    ) -> PrandtlIshlinskii | BoucWen | None:
+        """The linearisation's model of the ``real`` hysteresis."""
         if not self.identified_weights:
             with named("identified_weights"):
                 if self.identified_thresholds or self.identified_proportional:
                     raise InputError("empty; allowed: one for each of identified_thresholds")
-            return self._hysteresis(named)
+            return real
         with named("identified_thresholds", "identified_weights", "identified_proportional"):
             return self._plays(
                 self.identified_thresholds or self.play_thresholds,
@@ -126,7 +128,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
 
         model, hysteresis = None, self._hysteresis(named)
         if self.linearisation == "inverse":
-            model = self._identified(named)
+            model = self._identified(named, hysteresis)
         with named("identified_scale"):
             inverse = model.identified(self.identified_scale).inverse() if model else None
         with named("amplifier_lag", "creep_shortest"):
@@ -137,7 +139,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
                 hysteresis=hysteresis,
                 inverse=inverse,
                 creep_per_decade=self.creep_per_decade,
-                creep_times=self.creep_shortest * np.logspace(0, self.creep_decades - 1, self.creep_decades),
+                creep_times=self.creep_shortest * 10.0 ** np.arange(self.creep_decades),
                 step=self.step,
                 method=self.discretisation,
             )

@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draws img/tip.png of signals.md."""
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.figure import Figure
 
 from lathe_rc.signals.profile import Harmonics
 from lathe_rc.signals.profile_table import ProfileTable
 from lathe_rc.signals.tip_path import TipPath, steepest_fall
+from place import PICTURES
 
-HERE = Path(__file__).parent
 RADIUS, TIP = 2e-3, 0.4e-3
 BLUE, RED, GREY = "#1f6f8b", "#c0392b", "#777777"
 
@@ -43,4 +41,4 @@ falling.set_ylim(-14, 18)
 lines = [*curves.get_lines(), *falling.get_lines()]
 curves.legend(lines, [str(line.get_label()) for line in lines], fontsize=8, loc="upper center", ncols=2)
 curves.grid(visible=True, alpha=0.25)
-figure.savefig(HERE / "img" / "tip.png", dpi=110)
+figure.savefig(PICTURES / "tip.png", dpi=110)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draws img/piezo.png of piezo.md and prints its tables."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,8 @@ from lathe_rc.cell import scenario
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuator, PiezoActuatorParameters
 from lathe_rc.cell.stages.series_drive import SeriesDriveParameters, SeriesDriveStage
+from place import CONFIG, PICTURES
 
-HERE = Path(__file__).parent
 STROKE, RATE = 15e-6, 64_000  # [m], [Hz]
 TABLE = np.array([500.0, 1000.0, 1500.0, 2000.0])  # [rad/s], the columns of paper 001
 KINDS = {"prandtl_ishlinskii": "#1f6f8b", "bouc_wen": "#c0392b"}
@@ -90,15 +89,16 @@ for frequency, noise in ((1.0, 0.0), (1.0, 50e-9), (10.0, 0.0), (100.0, 0.0)):
         f"{weights.min():.4f} … {weights.max():.4f} | {percent(rest)} |"
     )
 
-print("\n| ω [rad/s] | " + " | ".join(f"{w:.0f}" for w in TABLE) + " |")
+print("\n| $\\omega$ [rad/s] | " + " | ".join(f"{w:.0f}" for w in TABLE) + " |")
 print("| --- | ---: | ---: | ---: | ---: |")
 for damping in (0.299, 0.292):
     for ratio in (0.0, 0.1):
         cells = np.abs(1 - series(ratio, damping).drive.response(TABLE))
-        print(f"| \\|1 − Wpk\\|, m/M = {ratio:g}, ζ2 = {damping:g} | {' | '.join(f'{c:.4f}' for c in cells)} |")
-print(f"| bend of the piezo over x1, m/M = 0.1 | {' | '.join(f'{bend(w):.4f}' for w in TABLE)} |")
+        name = rf"$\lvert 1 - W_{{pk}}\rvert$, $m/M = {ratio:g}$, $\zeta_2 = {damping:g}$"
+        print(f"| {name} | {' | '.join(f'{c:.4f}' for c in cells)} |")
+print(f"| bend of the piezo over $x_1$, $m/M = 0.1$ | {' | '.join(f'{bend(w):.4f}' for w in TABLE)} |")
 
-parallel = scenario.load(HERE.parent / "config" / "direct_compensation.yaml", ["spindle_encoder.revolutions=60"])
+parallel = scenario.load(CONFIG / "direct_compensation.yaml", ["spindle_encoder.revolutions=60"])
 shared = parallel.shared.model_dump(include=set(SharedParameters.model_fields))
 direct = {"fine_use_command": False, "fine_use_reference": True, "fine_compensates": ["coarse"]}
 print("\n| arrangement | RMS form error in revolution 60 |")
@@ -127,4 +127,4 @@ coupling.set_title("what is left of a vibration", fontsize=10)
 for axes in (loops, left, coupling):
     axes.grid(visible=True, which="both", alpha=0.25)
     axes.legend(fontsize=8, loc="upper left")
-figure.savefig(HERE / "img" / "piezo.png", dpi=130)
+figure.savefig(PICTURES / "piezo.png", dpi=130)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prints the table of structures.md for a form that changes along the part: the formula against a run."""
 
-from pathlib import Path
-
 import numpy as np
 import numpy.typing as npt
 
@@ -10,9 +8,10 @@ from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import POINTS, measure, undulations
 from lathe_rc.analysis.structures import Channel, steady_error
 from lathe_rc.cell import scenario
+from place import CONFIG
 
 loaded = scenario.load(
-    Path(__file__).parents[1] / "config" / "piston.yaml",
+    CONFIG / "piston.yaml",
     [
         "spindle_encoder.deviation_amplitude=[0.0]",
         "spindle_encoder.revolutions=100",

@@ -39,7 +39,8 @@ print("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
 for name, channel, _ in channels:
     print(parameters(name, channel))
 
-print("\n| channel | sup\\|Q − Z\\|, ω [rad/s] | T0 off by [µs] | \\|Q − Z\\| at 500 … 2000 rad/s | cycles to 1 % |")
+NEAR = r"\lvert Q - Z\rvert$"
+print(f"\n| channel | $\\sup{NEAR}, ω [rad/s] | T0 off by [µs] | ${NEAR} at 500 … 2000 rad/s | cycles to 1 % |")
 print("| --- | ---: | ---: | --- | ---: |")
 for name, channel, highest in channels:
     print(convergence(name, channel, highest))

@@ -14,7 +14,7 @@ def row(name: str, spread: str, tuning: Tuning) -> str:
     return f"| {name} | {spread} | {coarse:.0f} {fine:.0f} | {sup} | {' '.join(f'{value:.1f}' for value in largest)} |"
 
 
-print("| search | factor | ωn coarse, fine [rad/s] | sup\\|Q − Z\\| | largest deviation by row [%] |")
+print(r"| search | factor | ωn coarse, fine [rad/s] | $\sup\lvert Q - Z\rvert$ | largest deviation by row [%] |")
 print("| --- | ---: | ---: | ---: | ---: |")
 print(row("start", "1", START))
 plain = nearest()

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from lathe_rc import harness, resources
 from lathe_rc.analysis.metrology import Lay, lay
 from lathe_rc.cell import scenario
+from place import PICTURES
 
-HERE = Path(__file__).parent
 BLUE, GREY = "#1f6f8b", "#777777"
 NOSE, FEED = 0.8e-3, 0.1e-3
 
@@ -32,4 +32,4 @@ trace.plot(errorless.height * 1e3, errorless.surface[16] * 1e6, color=GREY, lw=1
 trace.set(xlabel="height [mm]", ylabel="deviation of the radius [µm]")
 trace.grid(visible=True, alpha=0.25)
 trace.legend(fontsize=8)
-figure.savefig(HERE / "img" / "lay.png", dpi=110)
+figure.savefig(PICTURES / "lay.png", dpi=110)

@@ -12,11 +12,12 @@ from pathlib import Path
 from PIL import Image
 
 from lathe_rc.commands import view
+from place import PICTURES
 
 SIZE = (1500, 900)
 
 if len(sys.argv) != 2:
-    sys.exit("usage: python docs/view_screenshot.py BAG")
+    sys.exit("usage: python figures/view_screenshot.py BAG")
 view.require()
 with tempfile.TemporaryDirectory() as folder:
     recording, shot = Path(folder) / "shown.rrd", Path(folder) / "shot.png"
@@ -29,4 +30,4 @@ with tempfile.TemporaryDirectory() as folder:
     with Image.open(shot) as picture:
         small = picture.convert("RGB").resize(SIZE, Image.Resampling.LANCZOS)
     # Few colours, so that it stays small.
-    small.quantize(192, dither=Image.Dither.NONE).save(Path(__file__).parent / "img" / "view.png", optimize=True)
+    small.quantize(192, dither=Image.Dither.NONE).save(PICTURES / "view.png", optimize=True)

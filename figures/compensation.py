@@ -2,7 +2,6 @@
 """Draws img/compensation.png and prints the tables of compensation.md: what direct piezo compensation can do."""
 
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +12,7 @@ from lathe_rc.analysis.structures import limit_frequency, uncompensated
 from lathe_rc.analysis.tuning import FREQUENCIES, START
 from lathe_rc.analysis.vibration import describing_function, reduction, widest_band
 from lathe_rc.plants.hysteresis import PrandtlIshlinskii
+from place import PICTURES
 
 HERTZ = 2 * np.pi
 HIGHEST = 4e4  # [rad/s]
@@ -58,7 +58,8 @@ def random_reduction(band: float, rms: float) -> float:
     return float(vibration.std() / left.std())
 
 
-print("| response W | \\|1 − W\\| = 0.5 [Hz] | \\|1 − W\\| = 1 [Hz] | \\|1 − W\\| at 500 … 2000 rad/s |")
+NEAR = r"$\lvert 1 - W\rvert"
+print(f"| response $W$ | {NEAR} = 0.5$ [Hz] | {NEAR} = 1$ [Hz] | {NEAR}$ at 500 … 2000 rad/s |")
 print("| --- | ---: | ---: | --- |")
 responses: dict[str, Response] = {
     "coarse drive without its delay": lambda w: coarse.drive(w) * np.exp(1j * w * coarse.delay),
@@ -88,7 +89,7 @@ for name, response in compensators.items():
 times = " | ".join(f"{random_reduction(band, 0.2):.2f}" for band in BANDS)
 print(f"| 15 % hysteresis, noise of 0.2 half-strokes RMS, simulated | {times} | | |")
 
-print("\n| amplitude [half-strokes] | N | 1/\\|1 − N\\| |")
+print("\n| amplitude [half-strokes] | $N$ | $1/\\lvert 1 - N\\rvert$ |")
 print("| ---: | ---: | ---: |")
 for amplitude in (1 / 10, 1 / 3, 1.0):
     gain = describing_function(amplitude, THRESHOLDS, WEIGHTS, PROPORTIONAL)
@@ -111,4 +112,4 @@ by_band.set_title("reduction of a vibration from 0 Hz up", fontsize=10)
 for axes in (by_frequency, by_band):
     axes.grid(visible=True, which="both", alpha=0.25)
     axes.legend(fontsize=8)
-figure.savefig(Path(__file__).parent / "img" / "compensation.png", dpi=130)
+figure.savefig(PICTURES / "compensation.png", dpi=130)

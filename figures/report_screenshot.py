@@ -14,8 +14,8 @@ from PIL import Image
 from lathe_rc import harness, resources
 from lathe_rc.cell import scenario
 from lathe_rc.view import report
+from place import PICTURES
 
-PICTURES = Path(__file__).parent / "img"
 BROWSER = sys.argv[1] if len(sys.argv) > 1 else "chromium"
 HEADLESS = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--virtual-time-budget=10000"]
 WIDE, NARROW = (1280, 2350), (420, 1500)

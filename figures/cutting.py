@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draws img/cutting.png of cutting.md and prints its tables."""
 
-from pathlib import Path
-
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
@@ -14,10 +12,10 @@ from lathe_rc.plants.deflection import PAPER, REALISTIC, RIGID, Elasticity
 from lathe_rc.plants.workpiece import HardSpot, Part
 from lathe_rc.signals.allowance import PAPER_RMS, Allowance, mean_reverting
 from lathe_rc.transfer import TransferFunction
+from place import PICTURES
 
 Array = npt.NDArray[np.float64]
 
-HERE = Path(__file__).parent
 STIFFNESS = 233.3e3  # W4 of paper 004 [N/m]
 FEED = STEEL.feed_for(STIFFNESS)  # [m/rev]
 DEPTH = 150.0 / STIFFNESS  # [m]
@@ -158,4 +156,4 @@ for axes in (random, interrupted, chart, waves):
     legend = axes.legend(fontsize=8, loc="upper left" if axes in {random, waves} else "upper right", ncols=2)
     for line in legend.get_lines():
         line.set_linewidth(1.2)
-figure.savefig(HERE / "img" / "cutting.png", dpi=130)
+figure.savefig(PICTURES / "cutting.png", dpi=130)

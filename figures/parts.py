@@ -112,4 +112,4 @@ def passed(parameters: PassedParameters, track: Track = untracked) -> Passed:
     return Passed(parameters.widths, halves)
 
 
-STUDY = Study("passed", "Which waves the Hann filter of docs/parts.py passes", PassedParameters, passed)
+STUDY = Study("passed", "Which waves the Hann filter of figures/parts.py passes", PassedParameters, passed)

@@ -2,7 +2,6 @@
 """Prints the tables of safety.md: kinds of faults, states, reactions, and what is done about every fault."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 
@@ -10,8 +9,8 @@ from lathe_rc import harness, messages
 from lathe_rc.cell import scenario
 from lathe_rc.safety.faults import KINDS
 from lathe_rc.safety.state_machine import MEANING, Reaction, State, table
+from place import CONFIG
 
-CONFIG = Path(__file__).parents[1] / "config"
 SPINDLE = [
     "encoder.angle off",
     "encoder.angle stuck",

@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prints the table of learning.md: the steady-error formula against a run of 100 revolutions."""
 
-from pathlib import Path
-
 import numpy as np
 from scipy.integrate import trapezoid
 
 from lathe_rc import harness, messages
 from lathe_rc.cell import scenario
 from lathe_rc.cell.wiring import Cell
+from place import CONFIG
 
 WAVES = [2, 5, 10, 15, 20]
 AMPLITUDE = 10e-6  # [m]
 
 loaded = scenario.load(
-    Path(__file__).parents[1] / "config" / "piston.yaml",
+    CONFIG / "piston.yaml",
     [
         "spindle_encoder.deviation_amplitude=[0.0]",
         "spindle_encoder.revolutions=100",
@@ -34,7 +33,7 @@ last = slice(*result.errors.starts[-2:])
 angle = result.recording.of_type(messages.ENCODER)["angle_true"][last]
 error = result.recording.of_type(messages.TOOL)["error"][last]
 
-print("| waves | ω [rad/s] | \\|Q − γZ\\| | formula | run |")
+print(r"| waves | $\omega$ [rad/s] | $\lvert Q - \gamma Z\rvert$ | formula | run |")
 print("| ---: | ---: | ---: | ---: | ---: |")
 for waves in WAVES:
     at = np.array([waves])

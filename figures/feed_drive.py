@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draws img/feed_drive.png of feed_drive.md."""
 
-from pathlib import Path
-
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
@@ -11,10 +9,10 @@ from lathe_rc.plants.feed import FeedDrive
 from lathe_rc.plants.feed_models import dc_screw
 from lathe_rc.plants.friction import Friction, mobility
 from lathe_rc.plants.screw import Screw
+from place import PICTURES
 
 Array = npt.NDArray[np.float64]
 
-HERE = Path(__file__).parent
 GAIN, LAG, FORCE = 0.1, 0.045, 1000.0  # [m/s], [s], [N] at a command of 1
 BLUE, RED, GREY = "#1f6f8b", "#c0392b", "#777777"
 LUGRE = Friction("lugre", mobility(GAIN, LAG, FORCE), coulomb=10.0, static=15.0, speed=2e-3, stiffness=1e6, damping=1e4)
@@ -98,4 +96,4 @@ for axes in (steady, presliding, warm):
     axes.grid(visible=True, alpha=0.25)
     axes.legend(fontsize=8)
 circle.legend(fontsize=8, loc="lower left", bbox_to_anchor=(-0.2, -0.05))
-figure.savefig(HERE / "img" / "feed_drive.png", dpi=110)
+figure.savefig(PICTURES / "feed_drive.png", dpi=110)

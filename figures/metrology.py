@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draws img/metrology.png of metrology.md and prints its table: an eccentric, lobed form, measured."""
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
@@ -10,13 +8,13 @@ from matplotlib.projections.polar import PolarAxes
 from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import measure
 from lathe_rc.cell import scenario
+from place import CONFIG, PICTURES
 
-HERE = Path(__file__).parent
 CUTOFF = 50.0  # [UPR]
 SHOWN = {4: "#c0392b", 60: "#1f6f8b"}  # revolutions
 
 loaded = scenario.load(
-    HERE.parent / "config" / "piston.yaml",
+    CONFIG / "piston.yaml",
     [
         "tool.profile=harmonics",
         "tool.harmonic_order=[1, 2, 4, 12]",
@@ -71,4 +69,4 @@ by_order.set(xlabel="undulations per revolution", ylabel="amplitude [µm]", ysca
 by_order.set_title("undulations", fontsize=10)
 by_order.grid(visible=True, alpha=0.25)
 by_order.legend(fontsize=8)
-figure.savefig(HERE / "img" / "metrology.png", dpi=130)
+figure.savefig(PICTURES / "metrology.png", dpi=130)

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draws img/predistortion.png of predistortion.md and prints its tables."""
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.figure import Figure
 
 from lathe_rc.analysis.shaft import Shaft
 from lathe_rc.control.predistortion import Predistortion, cancelling, contraction, proportional, turned
+from place import PICTURES
 
-HERE = Path(__file__).parent
 STIFFNESS = 233.3e3  # W4 of paper 004 [N/m]
 DEPTH = 150.0 / STIFFNESS  # [m]
 LENGTH, DIAMETER = 0.6, 0.034  # [m]
@@ -74,4 +72,4 @@ learning.set_title("learned from part to part, from no model on", fontsize=10)
 for axes in (compliances, errors, learning):
     axes.grid(visible=True, which="both", alpha=0.25)
     axes.legend(fontsize=8, loc="upper left" if axes is compliances else "upper right")
-figure.savefig(HERE / "img" / "predistortion.png", dpi=130)
+figure.savefig(PICTURES / "predistortion.png", dpi=130)

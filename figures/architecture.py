@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Draws img/architecture.svg of index.md: the packages of lathe_rc in layers, and who imports whom.
+
+tests/test_site.py compares the picture with the imports in the code.
+"""
+
+from typing import NamedTuple
+
+from place import PICTURES
+
+
+class Layer(NamedTuple):
+    """Boxes side by side, by package, with what is in them."""
+
+    caption: str
+    boxes: dict[str, str]
+
+
+#: Who is in a layer imports from it and from those below.
+LAYERS = (
+    Layer("the command line", {"commands": "lathe run, sweep, view, report, …"}),
+    Layer("Python", {"studies": "tables and figures of the papers", "harness": "runs a scenario, scores it"}),
+    Layer("hosts", {"nodes": "ROS 2 nodes, processes, DDS", "sweep": "variations, tuning, on all cores"}),
+    Layer("to look at", {"view": "report, figures, Rerun, notebooks"}),
+    Layer("recordings", {"bag": "MCAP: record, read, check, recover, simulate again"}),
+    Layer("the cell", {"cell": "stages, blocks, scenario, checks, offline run"}),
+    Layer(
+        "around it",
+        {
+            "drawing": "pictures of arrays",
+            "analysis": "formulas, metrology, fits",
+            "safety": "faults, monitors, safe state",
+        },
+    ),
+    Layer("physics, laws", {"plants": "drives, cut, slides, spindle", "control": "learning, PID, decoupling"}),
+    Layer("signals", {"signals": "speed, encoder, form"}),
+)
+#: Arrows within a layer.
+BESIDE = (("studies", "harness"), ("drawing", "analysis"), ("plants", "control"))
+
+LEFT, WIDTH, RIGHT = 112, 640, 4
+HEIGHT, GAP, SPACE = 50, 22, 36  # of a box, between layers, between boxes
+TOP = 12
+STYLE = """
+  text { font-family: system-ui, "Segoe UI", Roboto, "Helvetica Neue", "DejaVu Sans", sans-serif; }
+  .box { fill: #e4f0f3; stroke: #1f6f8b; stroke-width: 1.5; }
+  .ros { fill: #fbecd9; stroke: #b5651d; }
+  .name { font-weight: 600; font-size: 15px; fill: #0f3542; }
+  .what { font-size: 12px; fill: #33505a; }
+  .caption { font-size: 12.5px; fill: #7f8c92; }
+  .arrow { stroke: #7f8c92; stroke-width: 1.6; fill: none; }
+"""
+
+
+def places() -> dict[str, tuple[float, float, float]]:
+    """Return left end, top and width of each box."""
+    found = {}
+    for row, layer in enumerate(LAYERS):
+        width = (WIDTH - SPACE * (len(layer.boxes) - 1)) / len(layer.boxes)
+        for column, name in enumerate(layer.boxes):
+            found[name] = (LEFT + column * (width + SPACE), TOP + row * (HEIGHT + GAP), width)
+    return found
+
+
+def arrow(path: str) -> str:
+    """Return an arrow along a path."""
+    return f'<path class="arrow" d="{path}" marker-end="url(#tip)"/>'
+
+
+def picture() -> str:
+    """Return the picture."""
+    found, drawn = places(), []
+    for row, layer in enumerate(LAYERS):
+        top = TOP + row * (HEIGHT + GAP)
+        drawn.append(f'<text class="caption" x="{LEFT - 14}" y="{top + 30}" text-anchor="end">{layer.caption}</text>')
+        if row:
+            drawn.append(arrow(f"M {LEFT + WIDTH / 2:g} {top - GAP + 1} V {top - 3}"))
+        for name, what in layer.boxes.items():
+            x, y, width = found[name]
+            kind = "box ros" if name == "nodes" else "box"
+            drawn += [
+                f'<rect class="{kind}" x="{x:g}" y="{y}" width="{width:g}" height="{HEIGHT}" rx="6"/>',
+                f'<text class="name" x="{x + width / 2:g}" y="{y + 21}" text-anchor="middle">{name}</text>',
+                f'<text class="what" x="{x + width / 2:g}" y="{y + 39}" text-anchor="middle">{what}</text>',
+            ]
+    for start, end in BESIDE:
+        (x, y, width), (other, _, _) = found[start], found[end]
+        drawn.append(arrow(f"M {x + width:g} {y + HEIGHT / 2:g} H {other - 3:g}"))
+    height = TOP + len(LAYERS) * (HEIGHT + GAP)
+    tip = '<marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
+    return "\n".join(
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {LEFT + WIDTH + RIGHT} {height}">',
+            "<!-- SPDX-License-Identifier: Apache-2.0; drawn by figures/architecture.py -->",
+            f"<style>{STYLE}</style>",
+            f'<defs>{tip}<path d="M 0 0 L 8 4 L 0 8 z" fill="#7f8c92"/></marker></defs>',
+            *drawn,
+            "</svg>\n",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    (PICTURES / "architecture.svg").write_text(picture(), encoding="utf-8")

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stages that run again: all that a run may change of a stage is set back to its start.
+
+A cell of a batch differs from the one before in a few tables. To make the other stages anew takes longer than to copy
+what their runs have changed, and their memories stay where the caches have them.
+"""
+
+import enum
+import types
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+
+from lathe_rc.cell.native import Entry
+from lathe_rc.cell.parameters import NodeParameters, Table
+from lathe_rc.cell.stage import Stage
+from lathe_rc.cell.wiring import new_stage
+from lathe_rc.extensions import is_ours
+
+#: what nobody changes
+_CONSTANT = (
+    type(None), bool, int, float, complex, str, bytes, range, slice, type, enum.Enum, PurePath, np.generic, np.dtype,
+    types.BuiltinFunctionType, types.ModuleType, Table, Entry,
+)  # fmt: skip
+
+
+class _Plain:
+    """An object with nothing but its attributes; those of other make may hide something."""
+
+
+class UnknownPartError(Exception):
+    """An object of which nobody here knows what a run may change of it."""
+
+
+class Start:
+    """The state of a stage before its run.
+
+    Args:
+        stage: which has not run.
+
+    Raises:
+        UnknownPartError: part of it is of a kind that cannot be set back, such as an open file.
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        self._seen: dict[int, Any] = {id(stage.room): stage.room}  # by address; what is for the step alone stays
+        self._arrays: list[tuple[np.ndarray, np.ndarray]] = []
+        self._back: list[Callable[[], None]] = []
+        self._look(stage)
+
+    def rewind(self) -> None:
+        """Set everything back."""
+        for array, content in self._arrays:
+            array[...] = content
+        for back in self._back:
+            back()
+
+    def _look(self, part: Any) -> None:
+        """Remember a part of the stage, and what hangs on it."""
+        if isinstance(part, _CONSTANT) or id(part) in self._seen:
+            return
+        self._seen[id(part)] = part
+        parts: list[Any] = []
+        if type(part) is np.ndarray:
+            self._look_at_array(part)
+        elif isinstance(part, tuple | frozenset) and not hasattr(part, "__dict__"):
+            parts = [*part]
+        elif type(part) in (list, dict, set):
+            content, parts = part.copy(), [*part.values()] if type(part) is dict else [*part]
+            self._back.append(lambda: _refill(part, content))
+        elif isinstance(part, np.random.Generator):
+            bits = part.bit_generator
+            state = bits.state
+            self._back.append(lambda: setattr(bits, "state", state))
+        elif isinstance(part, types.FunctionType) and part.__closure__ is None:
+            pass
+        elif isinstance(part, types.MethodType):
+            parts = [part.__self__]
+        elif type(part).__basicsize__ == _Plain.__basicsize__ and hasattr(part, "__dict__"):
+            attributes = {name: value for name, value in vars(part).items() if not _is_cache(part, name)}
+            parts = [*attributes.values()]
+            self._back.append(lambda: _reset(part, attributes))
+        else:
+            raise UnknownPartError(f"a {type(part).__name__}")
+        for each in parts:
+            self._look(each)
+
+    def _look_at_array(self, array: "np.ndarray[Any, Any]") -> None:
+        if array.dtype.hasobject:
+            raise UnknownPartError("an array of objects")
+        if array.flags.writeable:
+            self._arrays.append((array, array.copy()))
+
+
+def _is_cache(part: object, name: str) -> bool:
+    """Whether an attribute is computed once from others that nobody changes."""
+    return isinstance(getattr(type(part), name, None), cached_property)
+
+
+def _reset(part: Any, attributes: dict[str, Any]) -> None:
+    """Give an object the attributes that it had."""
+    there = vars(part)
+    for name, value in attributes.items():
+        if name not in there or there[name] is not value:
+            there[name] = value
+    if len(there) > len(attributes):
+        for name in [*there.keys() - attributes.keys()]:
+            if not _is_cache(part, name):
+                del there[name]
+
+
+def _refill(part: Any, content: Any) -> None:
+    """Give a list, dictionary or set what it held."""
+    if isinstance(part, list):
+        part[:] = content
+    else:
+        part.clear()
+        part.update(content)
+
+
+class Stock:
+    """The newest stage of each name, and its start; for cells that run one after the other."""
+
+    def __init__(self) -> None:
+        self._stages: dict[str, Stage] = {}
+        self._starts: dict[str, Start | None] = {}  # of those that were asked for again; None: they cannot be set back
+
+    def take(self, name: str, table: NodeParameters) -> Stage:
+        """The stage of a node: the one before if its table is the same, or a new one.
+
+        The first with a table is not remembered: the next cell may have another one.
+        """
+        before = self._stages.get(name)
+        again = before is not None and _same(before, table)
+        if before is not None and again and (start := self._starts.get(name)):
+            start.rewind()
+            return before
+        made = self._stages[name] = new_stage(name, table)
+        if not again:
+            self._starts.pop(name, None)
+        elif name not in self._starts:
+            self._starts[name] = _start(made)
+        return made
+
+
+def _start(stage: Stage) -> Start | None:
+    try:
+        if stage.is_compiled:
+            stage.native()
+        return Start(stage)
+    except UnknownPartError:
+        return None
+
+
+def _same(stage: Stage, table: NodeParameters) -> bool:
+    """Whether a stage has such a table; the name of the run counts for those of others, who may write it somewhere."""
+    before = stage.shared
+    if before is table:
+        return True
+    if type(before) is not type(table):
+        return False
+    ours = is_ours(type(stage).__module__)
+    old, new = vars(before), vars(table)
+    return all(old[name] is value or (ours and name == "run_id") for name, value in new.items())

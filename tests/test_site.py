@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The site says what the pages say, and its picture of the packages is true; linters build it."""
+
+import ast
+import re
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from markdown import Markdown
+from markdown_it import MarkdownIt
+
+import architecture
+import equations
+import pictures
+from gfm import for_python_markdown
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+EXTENSIONS = ["attr_list", "md_in_html", "pymdownx.betterem", "pymdownx.superfences", "sane_lists", "tables"]
+
+
+def elements(html):
+    """How many of each element there are, of those that a wrong indentation changes."""
+    return Counter(re.findall(r"<(h[1-6]|li|pre|table|tr|td|ul|ol|img)\b", html))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_a_page_has_the_same_lists_tables_and_blocks_on_the_site_as_on_github(page):
+    text = page.read_text(encoding="utf-8")
+    github = MarkdownIt("commonmark").enable("table").render(text)
+    site = Markdown(extensions=EXTENSIONS).convert(for_python_markdown(text))
+    assert elements(site) == elements(github)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_an_equation_in_a_line_has_nothing_that_github_takes_for_markdown(page):
+    """Before it looks for equations, GitHub takes \\, for a comma, and a bar ends a cell of a table."""
+    text = re.sub(r"^( *`{3,}).*?^ *`{3,}$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    found = [tex for _, tex in equations._INLINE.findall(text) if tex]
+    assert [tex for tex in found if re.search(r"\\[^a-zA-Z]|[|*]|<(?! )", tex)] == []
+
+
+def imports():
+    """Which package of lathe_rc imports which, and where it does."""
+    root = ROOT / "lathe_rc"
+    for path in sorted(root.rglob("*.py")):
+        package = path.relative_to(root).parts[0].removesuffix(".py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module == "lathe_rc":
+                names = [f"lathe_rc.{alias.name}" for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            else:
+                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            for name in names:
+                top, _, rest = name.partition(".")
+                if top == "lathe_rc" and rest and rest.split(".")[0] != package:
+                    yield package, rest.split(".")[0], path.relative_to(ROOT)
+
+
+def test_the_picture_of_the_architecture_is_true():
+    layer = {name: index for index, level in enumerate(architecture.LAYERS) for name in level.boxes}
+    packages = {path.parent.name for path in (ROOT / "lathe_rc").glob("*/__init__.py")} - {"msg_defs"}
+    assert set(layer) == packages - {"templates"}
+    known = [found for found in imports() if found[0] in layer and found[1] in layer]
+    upwards = [found for found in known if layer[found[1]] < layer[found[0]]]
+    assert upwards == [], "an import from a layer above"
+    beside = {(one, other) for one, other, _ in known if layer[one] == layer[other]}
+    assert beside == set(architecture.BESIDE)
+    assert {one for one, other, _ in known if other == "nodes"} <= {"commands", "harness"}, "who knows of ROS"
+    drawn = (ROOT / "docs" / "img" / "architecture.svg").read_text(encoding="utf-8")
+    assert drawn == architecture.picture(), "run: ./lathe python figures/architecture.py"
+
+
+class TestPictures:
+    def test_each_is_drawn_by_a_command_and_shown_by_its_page(self):
+        assert {path.name for path in pictures.PICTURES.iterdir()} == set(pictures.TABLE)
+        for name, picture in pictures.TABLE.items():
+            assert f"img/{name})" in (ROOT / "docs" / picture.page).read_text(encoding="utf-8"), picture.page
+
+    def test_no_script_draws_what_nobody_shows(self):
+        scripts = {path.name for path in (ROOT / "figures").glob("*.py")} - {"place.py"}
+        drawing = {Path(word).name for picture in pictures.TABLE.values() for word in picture.command.split()}
+        shown = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+        assert [name for name in scripts - drawing if f"figures/{name}" not in shown] == []
+
+    @pytest.mark.parametrize("name", [name for name, row in pictures.TABLE.items() if row.seconds <= pictures.QUICK])
+    def test_is_what_the_code_draws_and_its_page_has_what_it_prints(self, name, tmp_path):
+        """Of the quick ones; ./lathe docs --figures does it with all."""
+        found, _ = pictures.check(name, tmp_path)
+        assert found == [], f"run: ./lathe docs --figures {name}"
