@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the shell completes: commands, options, scenarios, nodes and parameters, studies.
+"""Completion by the shell: commands, options, scenarios, nodes and parameters, studies.
 
 To know the options of all commands takes seconds, since that imports all. So this is done once, and kept in a file
 until a module of lathe_rc has changed; `stand_in` makes commands of it that only complete.

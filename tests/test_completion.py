@@ -27,7 +27,7 @@ def cache(tmp_path_factory):
 
 
 def completed(*words):
-    """What may stand in the place of the last word."""
+    """The words that may take the place of the last one."""
     shell = ShellComplete(cli.main, {}, "lathe", "_LATHE_COMPLETE")
     return [found.value for found in shell.get_completions(list(words[:-1]), words[-1])]
 
