@@ -1,28 +1,60 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes img/report.png of report.md: the piston demo in real time, its report, and the top of that in a browser."""
+"""Makes the pictures of report.md: the piston demo in real time, and its report in a browser, light, dark and narrow.
+
+With a bag as second argument, from that bag.
+"""
 
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
+from PIL import Image
+
 from lathe_rc import harness, resources
 from lathe_rc.cell import scenario
 from lathe_rc.view import report
 from place import PICTURES
 
-PICTURE = PICTURES / "report.png"
 BROWSER = sys.argv[1] if len(sys.argv) > 1 else "chromium"
+HEADLESS = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--virtual-time-budget=10000"]
+WIDE, NARROW = (1280, 2350), (420, 1500)
+SMALLEST = 500  # [px] of a headless window; a narrower page is in a frame
 
-piston = scenario.load(
-    resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=200", "spindle_encoder.speed_factor=1.0"]
-)
+
+def shot(page: Path, size: tuple[int, int], *, dark: bool = False) -> Image.Image:
+    """A page as the browser shows it."""
+    (width, height), target = size, page
+    if width < SMALLEST:
+        target = page.with_name("frame.html")
+        frame = f'<iframe src="{page.as_uri()}" style="width:{width}px;height:{height}px;border:0"></iframe>'
+        target.write_text(f'<body style="margin:0">{frame}</body>', encoding="utf-8")
+    picture = page.with_name("shot.png")
+    options = [f"--user-data-dir={page.parent}/browser", f"--blink-settings=preferredColorScheme={0 if dark else 1}"]
+    options += [f"--screenshot={picture}", f"--window-size={max(width, SMALLEST)},{height}"]
+    subprocess.run([BROWSER, *HEADLESS, *options, target.as_uri()], check=True)
+    with Image.open(picture) as found:
+        return found.convert("RGB").crop((0, 0, width, height))
+
+
+def save(picture: Image.Image, name: str) -> None:
+    """With few colours, so that it stays small."""
+    picture.quantize(96, dither=Image.Dither.NONE).save(PICTURES / f"{name}.png", optimize=True)
+
+
 with tempfile.TemporaryDirectory() as folder:
     bag, page = Path(folder) / "piston_bag", Path(folder) / "report.html"
-    harness.run(piston, mode="processes", bag=bag)
+    if len(sys.argv) > 2:
+        bag = Path(sys.argv[2])
+    else:
+        overrides = ["spindle_encoder.revolutions=200", "spindle_encoder.speed_factor=1.0"]
+        harness.run(scenario.load(resources.find(Path("piston.yaml")), overrides), mode="processes", bag=bag)
     report.write(bag, page)
-    # The page says how it was made; that should not be a folder that is gone.
-    text = page.read_text(encoding="utf-8")
-    page.write_text(text.replace(f"{folder}/", ""), encoding="utf-8")
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--user-data-dir={folder}/browser"]
-    subprocess.run([BROWSER, *options, f"--screenshot={PICTURE}", "--window-size=1020,4050", page.as_uri()], check=True)
+    # The page names its command; the folder in it will be gone.
+    page.write_text(page.read_text(encoding="utf-8").replace(f"{folder}/", ""), encoding="utf-8")
+    save(shot(page, WIDE), "report")
+    save(shot(page, (WIDE[0], 1300), dark=True), "report_dark")
+    both = Image.new("RGB", (2 * NARROW[0] + 20, NARROW[1]), "#888")
+    for place, dark in enumerate((False, True)):
+        both.paste(shot(page, NARROW, dark=dark), (place * (NARROW[0] + 20), 0))
+    save(both, "report_narrow")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draws img/view.png of view.md: the demo's bag as it opens in Rerun, on a screen that is only in memory.
+"""Draws img/view.png of view.md: a bag as it opens in Rerun, on a screen that is only in memory.
 
 Needs rerun-sdk and, from apt: xvfb mesa-vulkan-drivers libegl1.
 """
@@ -17,16 +17,17 @@ from place import PICTURES
 SIZE = (1500, 900)
 
 if len(sys.argv) != 2:
-    sys.exit("usage: python figures/view_screenshot.py BAG   (bags/demo-1, which ./lathe demo records)")
+    sys.exit("usage: python figures/view_screenshot.py BAG")
 view.require()
 with tempfile.TemporaryDirectory() as folder:
-    recording, shot = Path(folder) / "demo.rrd", Path(folder) / "shot.png"
+    recording, shot = Path(folder) / "shown.rrd", Path(folder) / "shot.png"
     view.write(Path(sys.argv[1]), recording)
     # The mouse is in the middle of the screen, so beside the window.
     screen = ["xvfb-run", "-a", "-s", "-screen 0 4000x2600x24"]
     viewer = [sys.executable, "-m", "rerun", "--new", "--window-size", f"{SIZE[0]}x{SIZE[1]}"]
-    limit = ["timeout", "-k", "5", "60"]
+    limit = ["timeout", "-k", "5", "300"]
     subprocess.run([*limit, *screen, *viewer, "--screenshot-to", str(shot), str(recording)], check=True)
     with Image.open(shot) as picture:
         small = picture.convert("RGB").resize(SIZE, Image.Resampling.LANCZOS)
-    small.save(PICTURES / "view.png", optimize=True)
+    # Few colours, so that it stays small.
+    small.quantize(192, dither=Image.Dither.NONE).save(PICTURES / "view.png", optimize=True)

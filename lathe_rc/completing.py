@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the shell completes: commands, options, scenarios, nodes and parameters, studies.
+"""Completion by the shell: commands, options, scenarios, nodes and parameters, studies.
 
 To know the options of all commands takes seconds, since that imports all. So this is done once, and kept in a file
 until a module of lathe_rc has changed; `stand_in` makes commands of it that only complete.
@@ -18,6 +18,7 @@ import platformdirs
 from click.shell_completion import CompletionItem
 
 from lathe_rc import resources
+from lathe_rc.command_list import COMMANDS, imported
 
 _HERE = Path(__file__).parent
 _SCENARIO, _TARGET, _NODE, _KIND = "scenario", "target", "node", "kind"  # of what is completed in a way of its own
@@ -60,13 +61,12 @@ def known() -> Mapping[str, Any]:
 
 def look() -> dict[str, Any]:
     """Commands with what they take, and parameters by kind of node; a command whose packages are not here has none."""
-    from lathe_rc import cli
     from lathe_rc.cell.scenario import TABLES
 
     commands = {}
-    for name in cli.COMMANDS:
+    for name in COMMANDS:
         with contextlib.suppress(ImportError):
-            commands[name] = _told(name, cli.imported(name))
+            commands[name] = _told(name, imported(name))
     return {"commands": commands, "nodes": {kind: list(TABLES[kind].rows()) for kind in TABLES}}
 
 

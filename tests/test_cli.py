@@ -15,7 +15,8 @@ from click.testing import CliRunner
 
 from lathe_rc import harness
 from lathe_rc.cell.scenario import TABLES, load
-from lathe_rc.cli import COMMANDS, main
+from lathe_rc.cli import main
+from lathe_rc.command_list import COMMANDS
 
 CELL = """
 /spindle_encoder: {ros__parameters: {revolutions: 3.0}}

@@ -11,7 +11,7 @@ import pytest
 from click.shell_completion import ShellComplete
 from click.testing import CliRunner
 
-from lathe_rc import cli, completing
+from lathe_rc import cli, command_list, completing
 from lathe_rc.commands.completion import completion
 
 ROOT = Path(__file__).parents[1]
@@ -27,7 +27,7 @@ def cache(tmp_path_factory):
 
 
 def completed(*words):
-    """What may stand in the place of the last word."""
+    """The words that may take the place of the last one."""
     shell = ShellComplete(cli.main, {}, "lathe", "_LATHE_COMPLETE")
     return [found.value for found in shell.get_completions(list(words[:-1]), words[-1])]
 
@@ -74,9 +74,14 @@ def test_a_scenario_that_cannot_be_read_breaks_no_completion(tmp_path):
 
 def test_all_commands_are_known_with_their_options():
     """The stand-ins have the options of the commands, so nothing is completed that would be refused."""
-    for name in cli.COMMANDS:
+    for name in command_list.COMMANDS:
         with cli.main.make_context("lathe", [name], resilient_parsing=True) as ctx:
-            own = {option for each in cli.imported(name).get_params(ctx) for option in each.opts if option[0] == "-"}
+            own = {
+                option
+                for each in command_list.imported(name).get_params(ctx)
+                for option in each.opts
+                if option[0] == "-"
+            }
             known = {option for each in completing.stand_in(name).get_params(ctx) for option in each.opts}
         assert {option for option in known if option[0] == "-"} - {"-h"} == own - {"-h"}, name
 

@@ -25,7 +25,7 @@ COLOUR = "\x1b[96m"  # of the RMS
 
 
 def in_terminal(*options, width, **environment):
-    """What the command writes to a terminal of so many characters across."""
+    """The output of the command in a terminal of so many characters across."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, width, 0, 0))
     own = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES", "NO_COLOR")}

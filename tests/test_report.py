@@ -184,7 +184,7 @@ class TestPage:
 
 
 class TestVerdict:
-    """What the page begins with."""
+    """The head of the page."""
 
     def told(self, cell, place):
         harness.run(cell, bag=place / "bag")

@@ -18,6 +18,7 @@ from gfm import for_python_markdown
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 EXTENSIONS = ["attr_list", "md_in_html", "pymdownx.betterem", "pymdownx.superfences", "sane_lists", "tables"]
+QUICK = [name for name, row in pictures.TABLE.items() if row.steady and row.seconds <= pictures.QUICK]
 
 
 def elements(html):
@@ -85,7 +86,7 @@ class TestPictures:
         shown = "".join(page.read_text(encoding="utf-8") for page in PAGES)
         assert [name for name in scripts - drawing if f"figures/{name}" not in shown] == []
 
-    @pytest.mark.parametrize("name", [name for name, row in pictures.TABLE.items() if row.seconds <= pictures.QUICK])
+    @pytest.mark.parametrize("name", QUICK)
     def test_is_what_the_code_draws_and_its_page_has_what_it_prints(self, name, tmp_path):
         """Of the quick ones; ./lathe docs --figures does it with all."""
         found, _ = pictures.check(name, tmp_path)

@@ -16,7 +16,7 @@ from steps import exclusive
 from workplace import PYTHON, ROOT, VENV, RefusalError, StepError, say
 
 COMPLETES = "_LATHE_COMPLETE"  #: in the environment: a shell asks what may follow
-OWN = ("setup", "test", "python")  #: commands of ./lathe alone
+OWN = ("docs", "setup", "test", "python")  #: commands of ./lathe alone
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -76,7 +76,9 @@ TABLE = {
     "metrology.png": _script("metrology", 5),
     "piezo.png": _script("piezo", 30),
     "predistortion.png": _script("predistortion", 5),
-    "report.png": _photograph("report_screenshot", "report.md"),
+    "report.png": _photograph("report_screenshot", "report.md", " chromium turned"),
+    "report_dark.png": _photograph("report_screenshot", "report.md", " chromium turned"),
+    "report_narrow.png": _photograph("report_screenshot", "report.md", " chromium turned"),
     "site.png": _photograph("site_screenshots", "../CONTRIBUTING.md"),
     "site-narrow.png": _photograph("site_screenshots", "../CONTRIBUTING.md"),
     "study-angle-domain.png": _study("angle-domain", 30),
@@ -96,7 +98,9 @@ TABLE = {
     "sweep.png": Picture(_SWEEP, "sweeps.md", "sweep-piston/figures/heat-map.png", 60),
     "tip.png": _script("tip", 3, "signals"),
     "tuning.png": Picture(_TUNE, "tuning.md", "two_channel_tuned/history.png", 150),
-    "view.png": _photograph("view_screenshot", "view.md", " {root}/bags/demo-1"),
+    # a program of the page, which tests/test_tutorials.py follows from its first line
+    "tutorial_paper.png": Picture("python figure.py", "tutorials/control_researcher.md", "figure.png", steady=False),
+    "view.png": _photograph("view_screenshot", "view.md", " watched"),
 }
 
 

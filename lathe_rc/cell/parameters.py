@@ -177,8 +177,9 @@ class Table(BaseModel):
 def _check(table: type[Table], name: str) -> Callable[[object], Any]:
     """The check of a parameter's values, which returns the table's value; it raises ValidationError."""
     field = table.model_fields[name]
-    parts = (field.annotation, *field.metadata)
-    kind = cast("Any", Annotated)[parts] if field.metadata else field.annotation
+    annotated: Any = Annotated
+    parts: tuple[Any, ...] = (field.annotation, *field.metadata)
+    kind: Any = annotated[parts] if field.metadata else field.annotation
     config = ConfigDict(strict=True, allow_inf_nan=False)
     found: TypeAdapter[Any] = TypeAdapter(kind, config=config)
     return found.validate_python

@@ -91,8 +91,8 @@ class Wiring:
         order: of the stages.
     """
 
-    dense: Mapping[str, Source]
-    sparse: Mapping[str, Source]
+    dense: dict[str, Source]
+    sparse: dict[str, Source]
     order: Sequence[str]
 
 

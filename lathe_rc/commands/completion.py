@@ -20,7 +20,7 @@ class _Shell(NamedTuple):
 
     Attributes:
         rc: the file that it reads when it starts.
-        line: what stands there; {} is the script.
+        line: its line in that file; {} is the script.
     """
 
     rc: Path

@@ -48,7 +48,7 @@ class Charts:
 
     @property
     def scripts(self) -> list[str]:
-        """What draws the figures; nothing if there are none."""
+        """Those that draw the figures; none without figures."""
         return [library(), Path(__file__).with_name("charts.js").read_text(encoding="utf-8")] if self.specs else []
 
     @property

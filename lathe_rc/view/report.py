@@ -230,7 +230,7 @@ def _nodes(told: Gathered) -> Grid | None:
 
 
 def losses(told: Gathered) -> list[str]:
-    """What was refused, lost or failed, a line each."""
+    """Refusals, losses and failures, a line each."""
     host = told.host
     found = [f"reading stopped: {told.stopped}"] if told.stopped else []
     for topic, tally in islice(told.topics.items(), _MOST_ROWS):

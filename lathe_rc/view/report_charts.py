@@ -316,16 +316,16 @@ def _lines(
         layer=layer,
     )
     if limit > 0.0:
-        named = [{"v": _number(limit), "t": f"tolerance {limit:.3g} µm"}]
+        marked: Rows = [{"v": _number(limit), "t": f"tolerance {limit:.3g} µm"}]
         own = {"color": {"value": "#888"}}
         layer += [
             {
-                "data": {"values": named},
+                "data": {"values": marked},
                 "mark": {"type": "rule", "strokeDash": [6, 4], "clip": True},
                 "encoding": {"x": {"value": 0}, "x2": {"value": "width"}, "y": {"field": "v"}, **own},
             },
             {
-                "data": {"values": named},
+                "data": {"values": marked},
                 "mark": {"type": "text", "align": "right", "dy": -6, "clip": True, "fontSize": 11},
                 "encoding": {"x": {"value": "width"}, "y": {"field": "v"}, "text": {"field": "t"}, **own},
             },
@@ -357,7 +357,7 @@ def against_time(told: Gathered, curves: Mapping[str, Envelope], unit: str, scal
     bands = {}
     for name, series in curves.items():
         place, low, high = series.curve()
-        bands[plain(name)] = (told.at(place), *(limited(side) * scale for side in (low, high)))
+        bands[plain(name)] = (told.at(place), limited(low) * scale, limited(high) * scale)
     return _lines(_curves(bands, log=False), list(bands), "time since sample 0 [s]", unit, log=False, height=220)
 
 

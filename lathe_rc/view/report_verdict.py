@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a report says first: whether the part is in tolerance, what went wrong, and what limits the form error.
+"""The head of a report: whether the part is in tolerance, failures and faults, and the limits of the form error.
 
-All of it comes from the one pass through the bag: how the form error ends, how much of it repeats, what the speed did,
-and what the nodes said. What each cause has done, only a budget tells.
+All of it comes from the one pass through the bag: how the form error ends, how much of it repeats, the spindle speed,
+and the events of the nodes. The share of each cause is known by a budget alone.
 """
 
 import math
@@ -23,7 +23,7 @@ GOOD, BAD, WARN = "good", "bad", "warn"
 _FEWEST = 4  # revolutions of which is said how they go on
 _CHANGE = 0.05  # of the form error over the last revolutions, below which it stays as it is
 _VARIES = 0.005  # deviation of the speed from which on it is said to vary
-_SOME = 0.1  # share of the power from which on a part is told of
+_SOME = 0.1  # share of the power from which on a part is named
 _MOST = 6  # kinds of things that went wrong
 
 
@@ -37,7 +37,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Told:
-    """What the page begins with.
+    """The head of the page.
 
     Attributes:
         verdict: in tolerance or not.
@@ -105,7 +105,7 @@ def _causes(made_of: Budget) -> Iterator[Finding]:
 
 
 def _limited(told: Gathered) -> Iterator[Finding]:
-    """Who came to a limit."""
+    """Nodes that came to a limit."""
     for alike in told.curves.kinds.values():
         if alike.text.startswith(LIMITED):
             node = alike.topic.strip("/").removesuffix("/events")

@@ -109,7 +109,7 @@ def blueprint(types: Mapping[str, str], *, live: bool = False, silent: Collectio
         top.append(
             rrb.TimeSeriesView(
                 origin="/learning",
-                name="form error by revolution [10^y µm]: RMS blue, largest orange",
+                name="form error [10^y µm]: RMS blue, largest orange" + ", controllers green" * cycles,
                 plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=cycles > 1),
             )
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the cell and its nodes are in over time, as bands: the supervisor's states, faults, limits of commands."""
+"""States over time, as bands: of the supervisor, of faults, of commands at their limits."""
 
 from lathe_rc import messages
 from lathe_rc.cell.stage import Sparse

@@ -166,7 +166,7 @@ def test_a_telephone_shows_the_page_without_scrolling_sideways(page, tmp_path, s
 
 
 def test_paper_and_a_browser_without_scripts_have_the_pictures(page, tmp_path):
-    """What is printed are the pictures, light ones; the scripts' figures are left out."""
+    """The printed figures are the pictures, light ones, in place of those of the script."""
     from matplotlib.image import imread
 
     still = tmp_path / "still.html"

@@ -139,7 +139,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
                 hysteresis=hysteresis,
                 inverse=inverse,
                 creep_per_decade=self.creep_per_decade,
-                creep_times=self.creep_shortest * 10.0 ** np.arange(self.creep_decades),
+                creep_times=self.creep_shortest * 10.0 ** np.arange(self.creep_decades, dtype=np.float64),
                 step=self.step,
                 method=self.discretisation,
             )

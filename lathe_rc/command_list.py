@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands of ``lathe`` by name, with their summaries; the module of one is imported when it is asked for."""
+
+import importlib
+from typing import cast
+
+import click
+
+COMMANDS = {
+    "bag": "Ask bags what is in them; check and recover them; take a tachogram out.",
+    "budget": "Tell what the form error of a scenario is made of.",
+    "completion": "Make the shell complete the command line.",
+    "container": "Run several nodes in one process.",
+    "demo": "Turn a piston with ROS 2 processes and draw it.",
+    "export": "Export a recording as CSV, Parquet or NPZ.",
+    "fit": "Fit models to measurements.",
+    "measure": "Measure the part that a recorded run has turned.",
+    "new": "Begin a law, drive, stage or study of your own.",
+    "node": "Run one node, or list its parameters.",
+    "policy": "Make the SROS2 policy of a scenario.",
+    "record": "Record any topics into a new bag.",
+    "reference": "Print the reference of nodes and topics.",
+    "replay": "Send the messages of a bag again.",
+    "report": "Write a recording as one HTML page.",
+    "resim": "Run a recorded cell again, also with changes.",
+    "run": "Run a scenario to its end.",
+    "study": "Compute a table or figure of the papers.",
+    "sweep": "Compute many variations of a scenario into a table.",
+    "tune": "Search the parameters of a scenario that meet goals best.",
+    "view": "Show a bag in Rerun.",
+}  #: their summaries
+_BESIDES = {"container": "node"}  # commands in the module of another one
+
+
+def imported(name: str) -> click.Command:
+    """A command with its module."""
+    module = importlib.import_module(f"lathe_rc.commands.{_BESIDES.get(name, name)}")
+    return cast("click.Command", getattr(module, name))
