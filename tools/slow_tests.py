@@ -184,7 +184,7 @@ def coverage() -> str:
         total = json.loads((COVERAGE / FIGURES).read_text(encoding="utf-8"))["totals"]
         return _COVERAGE.format(total["percent_covered"], total["num_statements"], total["num_branches"])
     page = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
-    return next((line for line in page.splitlines() if line.startswith(_COVERAGE[:12])), _UNKNOWN)
+    return next((line for line in page.splitlines() if line.startswith("Coverage: ")), _UNKNOWN)
 
 
 # ---- the page
