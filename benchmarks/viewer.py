@@ -51,7 +51,7 @@ def measure(*, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
     """Export against single logs."""
     if importlib.util.find_spec("rerun_bindings") is None:
         return {"reason": "rerun is not installed (pip install rerun-sdk)"}
-    from lathe_rc.commands.view import write
+    from lathe_rc.view.rerun_bag import write
     from lathe_rc.view.rerun_signals import curves
 
     rounds = 2 if quick else 5

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from lathe_rc.commands import view
+from lathe_rc.view import rerun_bag
 from place import PICTURES
 
 SIZE = (1500, 900)
@@ -21,7 +21,7 @@ if len(sys.argv) != 2:
 view.require()
 with tempfile.TemporaryDirectory() as folder:
     recording, shot = Path(folder) / "shown.rrd", Path(folder) / "shot.png"
-    view.write(Path(sys.argv[1]), recording)
+    rerun_bag.write(Path(sys.argv[1]), recording)
     # The mouse is in the middle of the screen, so beside the window.
     screen = ["xvfb-run", "-a", "-s", "-screen 0 4000x2600x24"]
     viewer = [sys.executable, "-m", "rerun", "--new", "--window-size", f"{SIZE[0]}x{SIZE[1]}"]
