@@ -31,8 +31,8 @@ from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.commands.new import begin
 from lathe_rc.errors import LatheError
+from lathe_rc.scaffold import begin
 
 Say = Callable[[str], None]
 _CHUNK = 1024  # [sample] at a time in C: the quickest of 64 to 3200

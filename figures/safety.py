@@ -91,7 +91,7 @@ CASES = {
 
 def kinds() -> list[str]:
     """The table of the kinds of faults."""
-    lines = ["| kind | of | what the signal becomes | values |", "| --- | --- | --- | --- |"]
+    lines = ["| kind | of | effect on the signal | values |", "| --- | --- | --- | --- |"]
     for name, kind in KINDS.items():
         values = []
         for key, value in kind.values.items():
@@ -105,9 +105,9 @@ def kinds() -> list[str]:
 
 def states() -> list[str]:
     """The table of the states and what leads from one to another."""
-    lines = [f"| cause | {' | '.join(f'from {state.name.lower()}' for state in State)} |", "| --- |" + " --- |" * 4]
+    lines = [f"| cause | {' | '.join(f'in {state.name.lower()}' for state in State)} |", "| --- |" + " --- |" * 4]
     lines += [f"| {' | '.join(row)} |" for row in table()]
-    lines += ["", "| reaction | what is done |", "| --- | --- |"]
+    lines += ["", "| reaction | effect |", "| --- | --- |"]
     return lines + [f"| {reaction.name.lower()} | {said} |" for reaction, said in MEANING.items()]
 
 

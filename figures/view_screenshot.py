@@ -12,13 +12,14 @@ from pathlib import Path
 from PIL import Image
 
 from lathe_rc.view import rerun_bag
+from lathe_rc.view.rerun_output import require
 from place import PICTURES
 
 SIZE = (1500, 900)
 
 if len(sys.argv) != 2:
     sys.exit("usage: python figures/view_screenshot.py BAG")
-view.require()
+require()
 with tempfile.TemporaryDirectory() as folder:
     recording, shot = Path(folder) / "shown.rrd", Path(folder) / "shot.png"
     rerun_bag.write(Path(sys.argv[1]), recording)

@@ -11,7 +11,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from lathe_rc import __version__, completing
+from lathe_rc import __version__
 from lathe_rc.command_list import COMMANDS, imported
 from lathe_rc.errors import LatheError, shown
 
@@ -23,7 +23,13 @@ class _Command(click.Command):
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
     ) -> click.Context:
         """See `click.Command`."""
-        command = completing.stand_in(str(self.name)) if extra.get("resilient_parsing") else imported(str(self.name))
+        name = str(self.name)
+        if extra.get("resilient_parsing"):
+            from lathe_rc import completing
+
+            command = completing.stand_in(name)
+        else:
+            command = imported(name)
         return command.make_context(info_name, args, parent, **extra)
 
 

@@ -351,7 +351,9 @@ def test_what_a_monitor_cannot_watch_is_refused(values, says):
 
 def test_a_monitor_of_others_asks_for_a_retraction_only_where_somebody_listens():
     asked = {"drives": ["coarse"], "clear_position": 1e-4, "monitor_reactions": ["warn", "retract"]}
-    with pytest.raises(InputError, match="monitor parts:Drift asks for retract, but no node that moves coarse listens"):
+    with pytest.raises(
+        InputError, match="monitor parts:Drift asks for retract, but no node that moves coarse reads safety"
+    ):
         Cell(cell(learning_controller={"reaction_delay": 0}, supervisor=asked).nodes).check()
 
 

@@ -590,11 +590,12 @@ def checkers(monkeypatch):
     return seen
 
 
-@pytest.mark.parametrize("failing", [set(), {"ruff check"}, {"mypy", "ruff format"}, {"kernels"}, {"pytest"}])
+@pytest.mark.parametrize("failing", [set(), {"ruff check"}, {"mypy", "ruff format"}, {"docs"}, {"kernels"}, {"pytest"}])
 def test_all_checkers_run_and_any_failure_counts(checkers, failing):
     checkers.failing = failing
     assert (check.main([]) != 0) == bool(failing)
-    checkers.ran.remove("kernels")
+    for beside in ("docs", "kernels"):
+        checkers.ran.remove(beside)
     assert checkers.ran == list(check.LINTERS)
     for name in failing - {"pytest"}:
         assert f"{name} FAILED: see above" in checkers.verdicts
@@ -637,5 +638,5 @@ def test_what_the_machine_lacks_is_installed_or_said(monkeypatch, root, installe
 def test_mypy_judges_only_the_locked_numpy(checkers, monkeypatch):
     monkeypatch.setattr(check, "version", lambda _name: "1.26.4")
     assert check.main([]) == 0
-    assert set(checkers.ran) == {"kernels", *check.LINTERS} - {"mypy"}
+    assert set(checkers.ran) == {"docs", "kernels", *check.LINTERS} - {"mypy"}
     assert any("1.26.4" in line for line in checkers.verdicts)

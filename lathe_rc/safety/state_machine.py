@@ -28,9 +28,9 @@ class Reaction(IntEnum):
 
 MEANING = {
     Reaction.NONE: "nothing",
-    Reaction.WARN: "it is said and recorded",
+    Reaction.WARN: "the alarm is published and recorded",
     Reaction.FREEZE: "the controllers stop learning, and go on with what they have learned",
-    Reaction.FALL_BACK: "they stop learning; if so asked, their lead angle no longer follows the measured speed",
+    Reaction.FALL_BACK: "the controllers stop learning; if so asked, they lead by the nominal speed",
     Reaction.HOLD: "the commands of the tool stay as they are; the feeds stop",
     Reaction.RETRACT: "the tool moves out of the part along a bounded profile; the feeds stop",
     Reaction.STOP: "as retract; only a new run ends it",
