@@ -248,6 +248,31 @@ def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_i
     assert reader.read(bag).digests() == harness.run(load(PISTON, ["spindle_encoder.revolutions=6.0"])).digest
 
 
+def test_who_does_not_end_after_the_safe_state_is_killed_and_named(monkeypatch, tmp_path):
+    """It has said that it is done, as all others that still run: nobody waits a minute for DDS to let it go."""
+    monkeypatch.setattr("lathe_rc.harness.processes._FAREWELL", 1.0)
+    monkeypatch.setattr("lathe_rc.harness.processes._GRACE", 0.2)
+    cell, told = (
+        harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=1000.0"]), tmp_path / "bag", keep=True),
+        [],
+    )
+    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+        held = subprocess.Popen(["/bin/sh", "-c", "trap '' USR1; exec sleep 1000"])
+        processes._children["held"] = held
+        thread = threading.Thread(target=processes._listen, args=("held", socket.socket(), held))
+        thread.start()
+        processes.wait_for("cycle")
+        processes._say("done", "held")
+        os.kill(processes.pids["electrodynamic_actuator"], signal.SIGKILL)
+        for event in processes.events(60.0):
+            told.append(event)
+            if processes._ended == set(processes._children):
+                break
+        thread.join()
+    assert [event["node"] for event in told if event["event"] == "stuck"] == ["held"]
+    assert [event["lost"] for event in told if event["event"] == "safe"] == [["/electrodynamic_actuator"]]
+
+
 def test_who_crashes_while_leaving_a_complete_run_is_named_and_nothing_is_lost(tmp_path):
     told = []
     cell = harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=6.0"]), tmp_path / "bag", keep=True)

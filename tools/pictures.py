@@ -30,6 +30,7 @@ class Picture(NamedTuple):
         page: in docs/, which shows it and has what the command prints.
         made: what the command writes there; empty: the picture's own name.
         seconds: about how long that takes; those that take no more than QUICK the tests draw anew.
+        columns: width of the terminal.
         steady: whether it is the same each time; a photograph of a screen is not, and is made by hand.
     """
 
@@ -37,6 +38,7 @@ class Picture(NamedTuple):
     page: str
     made: str = ""
     seconds: int = 0
+    columns: int = 80
     steady: bool = True
 
 
@@ -48,8 +50,8 @@ def _photograph(name: str, page: str, argument: str = "") -> Picture:
     return Picture(f"python {{root}}/figures/{name}.py{argument}", page, seconds=60, steady=False)
 
 
-def _study(name: str, seconds: int, page: str = "studies", options: str = "") -> Picture:
-    return Picture(f"study {name}{options}", f"{page}.md", seconds=seconds)
+def _study(name: str, seconds: int, page: str = "studies", options: str = "", columns: int = 100) -> Picture:
+    return Picture(f"study {name}{options}", f"{page}.md", seconds=seconds, columns=columns)
 
 
 QUICK = 3
@@ -69,7 +71,7 @@ TABLE = {
     "architecture.svg": _script("architecture", 1, "index"),
     "compensation.png": _script("compensation", 5),
     "cutting.png": _script("cutting", 20),
-    "demo.png": Picture("demo", "index.md", "bags/demo-1.png", 10),
+    "demo.png": Picture("demo", "../README.md", "bags/demo-1.png", 10),
     "demo_interrupted.png": Picture("demo interrupted", "robust.md", "bags/demo-1.png", 60),
     "feed_drive.png": _script("feed_drive", 30),
     "lay.png": _script("lay", 5, "metrology"),
@@ -85,7 +87,7 @@ TABLE = {
     "study-best-law.png": _study("best-law", 600),
     "study-coupling.png": _study("coupling", 60),
     "study-decoupling.png": _study("decoupling", 30, "decoupling"),
-    "study-drive-models.png": _study("drive-models", 10),
+    "study-drive-models.png": _study("drive-models", 10, columns=80),
     "study-drive-tolerance.png": _study("drive-tolerance", 60),
     "study-invariance.png": _study("invariance", 10),
     "study-multichannel.png": _study("multichannel", 10),
@@ -108,7 +110,7 @@ def check(name: str, folder: Path) -> tuple[list[str], Path]:
     """Draw a picture in an empty folder; return what is no longer as it was, and where the new one is."""
     picture = TABLE[name]
     words = [word.format(root=ROOT) for word in picture.command.split()]
-    environ = os.environ | {"LATHE_PICTURES": str(folder), "COLUMNS": "80"}
+    environ = os.environ | {"LATHE_PICTURES": str(folder), "COLUMNS": str(picture.columns)}
     done = subprocess.run(
         [ROOT / "lathe", *words], cwd=folder, env=environ, capture_output=True, text=True, check=False
     )
@@ -124,7 +126,8 @@ def check(name: str, folder: Path) -> tuple[list[str], Path]:
 
 def printed(text: str) -> list[str]:
     """Return the tables in what a command prints, which pages show; what lies between them is different each time."""
-    return [table.strip("\n") for table in _TABLE.findall(text)]
+    bare = "".join(f"{line.rstrip()}\n" for line in text.splitlines())
+    return [table.strip("\n") for table in _TABLE.findall(bare)]
 
 
 def differences(old: Path, new: Path) -> list[str]:

@@ -32,6 +32,7 @@ from lathe_rc.starting import Child, Start
 if TYPE_CHECKING:
     pass
 
+from lathe_rc.harness.domain import free_domain
 from lathe_rc.harness.events import Event, how_it_ended, ignore
 
 _SILENCE_LIMIT = 120.0  # [s] without any event: the first start on a machine compiles kernels
@@ -39,13 +40,8 @@ _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag c
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
 _MOST_RESTARTS = 8  # of a process
 _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
-_NO_SIGN_OF_LIFE = {
-    "stall",
-    "foreign_message",
-    "stopped",
-    "continued",
-    "waits",
-}  # events of a cell that stands
+_NO_SIGN_OF_LIFE = {"stall", "foreign_message", "stopped", "continued", "waits"}  # events of a cell that stands
+_LAST_WORDS = {"done", "error", "abandoned", "masterless"}  # events of a node that has nothing more to do
 _LOOK = 0.05  # [s] between looks at what a process has written
 
 
@@ -66,18 +62,6 @@ def with_recorder(scenario: Scenario, bag: Path, *, keep: bool, snapshots: Path 
         others = [node for node in nodes if node != master]
         nodes[master] = nodes[master].model_copy(update={"members": others})
     return Scenario(scenario.name, nodes)
-
-
-@contextlib.contextmanager
-def free_domain(number: int | None = None) -> Iterator[int]:
-    """A ROS domain that nobody else on this machine uses; ``number`` if one is given."""
-    if number is not None:
-        yield number
-        return
-    from domain_coordinator import domain_id
-
-    with domain_id() as free:
-        yield int(free)
 
 
 class Processes:
@@ -117,6 +101,7 @@ class Processes:
         self._threads: list[threading.Thread] = []
         self._abandoned: set[str] = set()
         self._ended: set[str] = set()
+        self._left: set[str] = set()  # nodes that have nothing more to do
         self._newest: dict[str, Event] = {}
         self._lost: list[tuple[str, str]] = []  # nodes that the cell goes to its safe state without, and why
         self._restarts: Counter[str] = Counter()
@@ -209,11 +194,12 @@ class Processes:
         """
         heard = time.monotonic()
         while True:
-            wait = _FAREWELL if self._complete else min(silence, self._settling) if self._lost else silence
+            leaves = self._complete or self._all_leave
+            wait = _FAREWELL if leaves else min(silence, self._settling) if self._lost else silence
             try:
                 event = self._events.get(timeout=max(heard + wait - time.monotonic(), 0.0))
             except queue.Empty:
-                if self._complete and self._running:
+                if leaves and self._running:
                     self._end_the_silent()
                     continue
                 running = ", ".join(f"{name}{self._place(name)}" for name in self._running)
@@ -225,6 +211,8 @@ class Processes:
             self._newest[event["event"]] = event
             if event["event"] not in _NO_SIGN_OF_LIFE:
                 heard = time.monotonic()
+            if event["event"] in _LAST_WORDS:
+                self._left.add(event["node"])
             if event["event"] == "refused":
                 self.refused.update(event["senders"])
             if event["event"] == "not_reached":
@@ -248,6 +236,7 @@ class Processes:
         self._restarts[name] += 1
         if self._restarts[name] > _MOST_RESTARTS:
             return False
+        self._left.difference_update(group)
         self._start(group)
         self._say("restarted", name, pid=self._children[name].pid)
         return True
@@ -272,6 +261,11 @@ class Processes:
     def _complete(self) -> bool:
         """Whether all samples are in a bag that is closed: nothing can be lost any more."""
         return bool(self._newest.get("closed", {}).get("complete"))
+
+    @property
+    def _all_leave(self) -> bool:
+        """Whether each node of the processes that still run has done its part or given up."""
+        return bool(self._running) and all(node in self._left for name in self._running for node in name.split("+"))
 
     def _end_the_silent(self) -> None:
         """End processes that the run does not need any more, and that do not end by themselves; names them.

@@ -17,6 +17,7 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
+import dask
 import distributed
 import pyarrow as pa
 from distributed.scheduler import KilledWorker
@@ -123,12 +124,14 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[distribute
     # Ctrl-C is for this process, which ends its workers.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN) if _in_main_thread() else None
     try:
-        cluster = distributed.LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.CRITICAL,
-        )
+        # A worker that dies is blamed on every task that it has: so it has one, and none waits there.
+        with dask.config.set({"distributed.scheduler.worker-saturation": 1.0}):
+            cluster = distributed.LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,
+            )
     finally:
         if before is not None:
             signal.signal(signal.SIGINT, before)
