@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""./lathe docs: the documentation as a site, served on this machine; --build [DIR] writes it."""
+"""./lathe docs: the documentation as a site, served on this machine; --build writes it, --archive packs it."""
 
 import argparse
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -27,12 +28,31 @@ def build(folder: Path) -> list[str]:
     return [*MKDOCS, "build", "--strict", "--quiet", *CONFIG, "--site-dir", str(folder)]
 
 
+def archive(file: Path) -> int:
+    """Write the site as one file, and return the exit code."""
+    suffix = ".tar.gz"
+    if not file.name.endswith(suffix) or not file.absolute().parent.is_dir():
+        print(
+            f"lathe: docs --archive {file}; allowed: a name that ends in {suffix}, in a folder that exists",
+            file=sys.stderr,
+        )
+        return 2
+    name = file.name.removesuffix(suffix)
+    with TemporaryDirectory() as folder:
+        code = subprocess.run(build(Path(folder) / name), env=os.environ | QUIET, check=False).returncode
+        if code == 0:
+            shutil.make_archive(str(file.absolute().with_name(name)), "gztar", folder, name)
+            print(f"archive: {file} ({file.stat().st_size / 1e6:.1f} MB)")
+        return code
+
+
 def main(arguments: Sequence[str]) -> int:
     """Do what the arguments say and return the exit code."""
     parser = argparse.ArgumentParser("lathe docs", description="The documentation as a site: serve it, until Ctrl-C.")
     parser.add_argument("--port", type=int, default=8000, help="where on this machine; default: 8000")
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument("--build", nargs="?", type=Path, const=SITE, metavar="DIR", help="write it, to .lathe/site")
+    instead.add_argument("--archive", type=Path, metavar="FILE", help="write it as one .tar.gz, for a release")
     instead.add_argument("--check", action="store_true", help="see whether it can be built, docstrings left out")
     instead.add_argument("--figures", nargs="*", metavar="NAME", help="draw pictures anew; tell which are stale")
     chosen = parser.parse_args(arguments)
@@ -41,6 +61,8 @@ def main(arguments: Sequence[str]) -> int:
     if chosen.check:
         with TemporaryDirectory() as folder:
             return subprocess.run(build(Path(folder)), env=os.environ | QUIET | BARE, check=False).returncode
+    if chosen.archive:
+        return archive(chosen.archive)
     if chosen.build:
         code = subprocess.run(build(chosen.build.absolute()), env=os.environ | QUIET, check=False).returncode
         if code == 0:

@@ -103,6 +103,7 @@ TABLE = {
     # a program of the page, which tests/test_tutorials.py follows from its first line
     "tutorial_paper.png": Picture("python figure.py", "tutorials/control_researcher.md", "figure.png", steady=False),
     "view.png": _photograph("view_screenshot", "view.md", " watched"),
+    "view_light.png": _photograph("view_screenshot", "view.md", " watched"),
 }
 
 
