@@ -124,12 +124,14 @@ def test_parameters_have_defaults_within_their_limits(name):
 
 
 @pytest.mark.parametrize("name", KEYS)
-def test_json_has_exactly_the_promised_keys(folder, name):
+def test_json_has_exactly_the_promised_keys(folder, name, monkeypatch):
     """A study prints one line of JSON with these keys and what Python finds, draws its figure and says nothing more."""
 
     def refuse(constant):
         raise ValueError(constant)
 
+    computed = replace(STUDIES[name], run=lambda _parameters, _track: quick(name)[0])
+    monkeypatch.setattr(commands_study, "STUDIES", {name: computed})
     result = study(name, "--json", sets=QUICK[name])
     assert result.exit_code == 0, result.stderr
     assert result.stdout.count("\n") == 1
