@@ -156,7 +156,8 @@ class Reader:
     """Does what the console blocks of a page say, in a folder, with ``lathe`` in the path.
 
     Commands of lathe and Python programs run in this process, since Python and Numba take two seconds to start;
-    nodes, what imports rclpy, and all that needs a shell do not.
+    nodes, what imports rclpy, all that needs a shell, and all in the folder of a package of one's own do not: this
+    process may know another package of that name.
     """
 
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
@@ -208,7 +209,8 @@ class Reader:
         if words[0] == "cd":
             self._patch.chdir(os.path.expandvars(words[1]))
             return 0, ""
-        if words[0] != "lathe" or words[1] in _NODES or _SHELL.search(_QUOTED.sub("", text)):
+        own_package = any(Path().glob("*/__init__.py"))
+        if words[0] != "lathe" or words[1] in _NODES or own_package or _SHELL.search(_QUOTED.sub("", text)):
             process = self._start(text)
             came, _ = process.communicate(timeout=TIMEOUT)
             return process.returncode, came
