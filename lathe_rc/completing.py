@@ -17,7 +17,7 @@ import click
 import platformdirs
 from click.shell_completion import CompletionItem
 
-from lathe_rc import resources
+from lathe_rc import files, resources
 from lathe_rc.command_list import COMMANDS, imported
 
 _HERE = Path(__file__).parent
@@ -53,9 +53,8 @@ def known() -> Mapping[str, Any]:
         file.parent.mkdir(parents=True, exist_ok=True)
         for old in file.parent.glob("completion-*.json"):
             old.unlink(missing_ok=True)
-        new = file.with_suffix(f".{os.getpid()}")
-        new.write_text(json.dumps(found), encoding="utf-8")
-        new.replace(file)
+        with files.replacing(file) as new:
+            new.write(json.dumps(found).encode())
     return found
 
 

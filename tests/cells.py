@@ -75,13 +75,15 @@ class Seen:
 
     def wait_for(self, kind, **values):
         wanted = {"event": kind, **values}.items()
-        if any(wanted <= event.items() for event in self._events):
-            return
-        for event in self._processes.events(60.0):
-            self._events.append(event)
-            if wanted <= event.items():
-                return
-            self._processes._raise_failure(event)
+        self.until(lambda events: any(wanted <= event.items() for event in events))
+
+    def until(self, enough):
+        """Until ``enough`` holds of all events so far."""
+        coming = self._processes.events(60.0)
+        while not enough(self._events):
+            self._events.append(next(coming))
+            if not enough(self._events):
+                self._processes._raise_failure(self._events[-1])
 
 
 @contextlib.contextmanager

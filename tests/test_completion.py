@@ -2,7 +2,6 @@
 """``lathe completion``: what a shell completes, through the real bash, and how it is installed."""
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -95,7 +94,6 @@ def test_completing_imports_no_more_than_it_needs():
     assert done.stdout.strip() == "[]"
 
 
-@pytest.mark.skipif(not shutil.which("bash"), reason="no bash")
 @pytest.mark.parametrize("program", [str(ROOT / "lathe"), "./lathe"])
 def test_bash_completes_lathe_and_the_launcher_of_a_checkout(program):
     """The printed script, in a real bash: what its function gives for a command line."""
@@ -118,14 +116,6 @@ def test_bash_completes_lathe_and_the_launcher_of_a_checkout(program):
         "setup",  # of ./lathe alone
         "complete -o nosort -F _lathe_complete lathe",
     ]
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_scripts_can_be_read_by_their_shells(shell):
-    if not shutil.which(shell):
-        pytest.skip(f"no {shell}")
-    printed = CliRunner().invoke(completion, [shell]).output
-    subprocess.run([shell, "-n"], input=printed, text=True, check=True)
 
 
 class TestInstall:
@@ -158,7 +148,6 @@ class TestInstall:
         assert not script.exists()
         assert "nothing to remove" in CliRunner().invoke(completion, [shell, "--remove"]).output
 
-    @pytest.mark.skipif(not shutil.which("bash"), reason="no bash")
     def test_a_new_bash_has_it(self, home):
         done = CliRunner().invoke(completion, ["--install"], env={"SHELL": "/bin/bash"})
         assert done.exit_code == 0, done.output

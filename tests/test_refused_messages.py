@@ -3,13 +3,17 @@
 
 import contextlib
 import itertools
+import os
+import re
+import signal
 import threading
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from cells import STEP, block, scenario
+from cells import STEP, Seen, block, scenario
+from diagnostic_msgs.msg import DiagnosticArray
 from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, SafetyStatus, ToolBlock
 from mcap.reader import make_reader
 from rclpy.executors import SingleThreadedExecutor
@@ -18,6 +22,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from lathe_rc import harness, messages
+from lathe_rc.bag import reader
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.stage_node import StageNode
@@ -79,6 +84,34 @@ def all_the_time(sends, pause=0.002):
         thread.join()
 
 
+def refused_by_a_node(event):
+    """The sender of the message that an event reports as refused, as the counts of refused messages name it."""
+    if event["event"] != "foreign_message":
+        return None
+    topic, run, source = re.match(r"(\S+): message of run ('.*?') from (\S+);", event["message"]).groups()
+    return f"{'an unknown sender' if source == '?' else source} of run {run} on {topic}"
+
+
+def until_named(ghost, topic, readers):
+    """Wait until the ``readers`` of a topic, which have refused a message on it, name the ghost as its publisher.
+
+    DDS may tell a node of a publisher some seconds before it tells it the name.
+    """
+    left = set(readers)
+
+    def heard(array):
+        for status in array.status:
+            if "/haunted/ghost" in {pair.key: pair.value for pair in status.values}.get(f"publishers of {topic}", ""):
+                left.discard(status.name)
+
+    ghost.create_subscription(DiagnosticArray, "/diagnostics", heard, 100)
+    executor = SingleThreadedExecutor()
+    executor.add_node(ghost)
+    while left:
+        executor.spin_once(timeout_sec=1.0)
+    executor.shutdown()
+
+
 def diagnostics(bag):
     """Of each node, the last report in a bag."""
     with next(bag.glob("*.mcap")).open("rb") as stream:
@@ -110,15 +143,24 @@ def test_a_cell_goes_on_among_foreign_messages(ghost, domain, tmp_path):
         (progress, Progress(run_id="test", name="/made_up", blocks=2**40)),
         *((joints, joint_state(sample)) for sample in range(100, 120_000, 10_000)),
     ]
-    with all_the_time(sends):
-        result = harness.run(cell, mode="processes", groups=[], domain=domain, bag=tmp_path / "bag")
-    assert result.digest == harness.run(cell).digest
-    expected = set.union(*(senders(topic, own) for topic, (_, own) in on.items()))
-    assert expected <= set(result.refused)
-    others = set(result.refused) - expected
-    assert "/electrodynamic_actuator of run 'test' on /electrodynamic_actuator/joint_states" in others
-    assert {"/tool of run 'elsewhere' on /members", "/made_up of run 'test' on /members"} <= others
-    assert {"an unknown sender of run 'x' on /cell_state", "/tool of run 'x' on /progress"} <= others
+    expected = set.union(*(senders(topic, own) for topic, (_, own) in on.items())) | {
+        "/electrodynamic_actuator of run 'test' on /electrodynamic_actuator/joint_states",
+        "/tool of run 'elsewhere' on /members",
+        "/made_up of run 'test' on /members",
+        "an unknown sender of run 'x' on /cell_state",
+        "/tool of run 'x' on /progress",
+    }
+    recorded = harness.with_recorder(cell, tmp_path / "bag", keep=True)
+    nodes = [[name] for name in recorded.nodes]
+    with all_the_time(sends), harness.Processes(recorded, nodes, domain=domain) as processes:
+        seen = Seen(processes)
+        seen.wait_for("cycle")
+        os.kill(processes.pids["electrodynamic_actuator"], signal.SIGSTOP)  # the cell waits until all are refused
+        seen.until(lambda events: expected <= {refused_by_a_node(event) for event in events})
+        os.kill(processes.pids["electrodynamic_actuator"], signal.SIGCONT)
+        processes.wait_for_end()
+    assert reader.read(tmp_path / "bag").digests() == harness.run(cell).digest
+    assert expected <= set(processes.refused)
     values = {pair.key: pair.value for pair in diagnostics(tmp_path / "bag")["/learning_controller"].values}
     assert "from /nan of run 'test' on /tool" in values["refused"]
     assert "/haunted/ghost" in values["publishers of /tool"]
@@ -141,6 +183,8 @@ def test_who_speaks_in_the_name_of_a_member_makes_the_cell_safe_and_all_publishe
 
     def watch(event):
         if event["event"] == "cycle" and not sent:
+            publisher.publish(block(messages.TOOL, 0, "/tool", "elsewhere"))
+            until_named(ghost, "/tool", ["/learning_controller", "/recorder"])
             sent.append(publisher.publish(block(messages.TOOL, 0, "/tool", "test")))
 
     twice = r"failed: /tool: /tool goes from sample \d+ to 0: a block came twice; publishers of /tool: /haunted/ghost, "

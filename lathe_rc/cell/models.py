@@ -3,8 +3,8 @@
 
 A parameter that `lathe_rc.cell.parameters.parameter` marks with a quantity of the drive, and that nobody has given,
 gets the value of the drive that reads what the controller commands. Quantities with the same word before a dot belong
-together: a scenario gives all of them or none. The same holds for what a table
-``asks``: the node that knows it tells it.
+together: a scenario gives all of them or none. The same holds for what a table ``asks``: the node that knows it tells
+it.
 """
 
 from collections.abc import Iterator, Mapping

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.control.drive_regression import coefficients, excited
+from lathe_rc.control.drive_regression import add_products, coefficients, excited
 from lathe_rc.jit import inlined
 
 Array = npt.NDArray[np.float64]
@@ -62,16 +62,8 @@ def sum_up(
     sums, before = m.sums, m.before
     if again:
         v, a, r = velocity - before[0, here], acceleration - before[1, here], rest - before[2, here]
-        sums[0] += v * v
-        sums[1] += v * a
-        sums[2] += a * a
-        sums[3] += v * r
-        sums[4] += a * r
-    sums[5] += velocity * velocity
-    sums[6] += velocity * acceleration
-    sums[7] += acceleration * acceleration
-    sums[8] += velocity * rest
-    sums[9] += acceleration * rest
+        add_products(sums, 0, v, a, r)
+    add_products(sums, 5, velocity, acceleration, rest)
     mean = m.means
     mean[0] += 1.0
     mean[1] += velocity

@@ -62,6 +62,16 @@ def derivatives(stages: Array, bandwidth: float) -> tuple[float, float]:
 
 
 @inlined
+def add_products(sums: Array, place: int, velocity: float, acceleration: float, rest: float) -> None:
+    """Add what a sample says of dx/dt, d²x/dt² and u - x to five ``sums``, ``place`` on: vv, va, aa, vr and ar."""
+    sums[place] += velocity * velocity
+    sums[place + 1] += velocity * acceleration
+    sums[place + 2] += acceleration * acceleration
+    sums[place + 3] += velocity * rest
+    sums[place + 4] += acceleration * rest
+
+
+@inlined
 def excited(vv: float, va: float, aa: float) -> bool:
     """Whether sums of the squares of dx/dt and d²x/dt² and of their product tell the two apart.
 

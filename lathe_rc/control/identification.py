@@ -14,6 +14,7 @@ import numpy.typing as npt
 from lathe_rc.control.drive_regression import (
     STAGES,
     LowPass,
+    add_products,
     coefficients,
     derivatives,
     excited,
@@ -69,11 +70,7 @@ def accumulate(identifier: IdentifierTable, first: int, start: int, stop: int, p
         first_derivative, second_derivative = derivatives(low.position, low.bandwidth)
         u = low.command[STAGES]
         rest = u - low.position[STAGES]
-        sums[0] += first_derivative * first_derivative
-        sums[1] += first_derivative * second_derivative
-        sums[2] += second_derivative * second_derivative
-        sums[3] += first_derivative * rest
-        sums[4] += second_derivative * rest
+        add_products(sums, 0, first_derivative, second_derivative, rest)
         sums[5] += rest * rest
         sums[6] += u * u
 

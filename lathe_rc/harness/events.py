@@ -3,10 +3,7 @@
 
 import signal
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    pass
+from typing import Any
 
 Event = Mapping[str, Any]
 

@@ -17,23 +17,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING
 
 from lathe_rc import starting
 from lathe_rc.bag.writing.record import recorder_of
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.extensions import search_path
+from lathe_rc.harness.domain import free_domain
+from lathe_rc.harness.events import Event, how_it_ended, ignore
 from lathe_rc.namespace import absolute
 from lathe_rc.nodes import stale_shared_memory
 from lathe_rc.nodes.report import THROUGHPUT
 from lathe_rc.starting import Child, Start
-
-if TYPE_CHECKING:
-    pass
-
-from lathe_rc.harness.domain import free_domain
-from lathe_rc.harness.events import Event, how_it_ended, ignore
 
 _SILENCE_LIMIT = 120.0  # [s] without any event: the first start on a machine compiles kernels
 _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag closed

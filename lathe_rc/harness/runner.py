@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from lathe_rc import messages, starting
 from lathe_rc.bag import reader
@@ -22,16 +21,12 @@ from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.messages import Signals
-from lathe_rc.namespace import checked
-from lathe_rc.starting import Start
-
-if TYPE_CHECKING:
-    pass
-
 from lathe_rc.harness.events import Event, ignore
 from lathe_rc.harness.processes import Processes, with_recorder
 from lathe_rc.harness.result import Mode, Result
+from lathe_rc.messages import Signals
+from lathe_rc.namespace import checked
+from lathe_rc.starting import Start
 
 
 def run(

@@ -25,6 +25,8 @@ from lathe_rc.nodes.lifecycle import Lifecycle
 from lathe_rc.nodes.liveliness import this_host
 from lathe_rc.nodes.refused_messages import ForeignMessage
 
+_NOT_TOLD_YET = "_NODE_NAME_UNKNOWN_"  # what the graph calls a node whose name has not come
+
 
 class Membership(Lifecycle):
     """A node that announces itself, and knows the members of its cell by their announcements.
@@ -253,4 +255,6 @@ def _names(endpoints: list[Any]) -> set[str]:
 
 
 def _name(end: Any) -> str:
+    if end.node_name == _NOT_TOLD_YET:
+        return "a node whose name DDS has not told yet"
     return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
