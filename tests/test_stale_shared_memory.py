@@ -10,6 +10,7 @@ import select
 import signal
 from pathlib import Path
 
+import posix_ipc
 import pytest
 from cells import scenario
 
@@ -17,6 +18,7 @@ from lathe_rc import harness
 from lathe_rc.nodes import stale_shared_memory
 
 SEGMENT = "fastrtps_0123456789abcdef"
+MUTEX = "/fastrtps_port99999_mutex"
 
 
 @pytest.fixture
@@ -36,14 +38,17 @@ def domain(monkeypatch):
 
 @pytest.fixture
 def port(tmp_path):
-    file = tmp_path / "fastrtps_port7661"
+    """One that no domain has: its semaphore is the machine's."""
+    file = tmp_path / "fastrtps_port99999"
     file.write_bytes(b"broken")
-    return file
+    yield file
+    with contextlib.suppress(posix_ipc.ExistentialError):
+        posix_ipc.unlink_semaphore(MUTEX)
 
 
 def test_what_nobody_uses_is_removed_and_nothing_else(port, tmp_path):
-    others = {"sem.fastrtps_port7661_mutex", "fastrtps_0123456789abcdef0", "fastrtps_without_a_lock", "port7661"}
-    for name in others | {"fastrtps_port7661_el", SEGMENT, f"{SEGMENT}_el"}:
+    others = {"sem.fastrtps_port99999_mutex", "fastrtps_0123456789abcdef0", "fastrtps_without_a_lock", "port99999"}
+    for name in others | {"fastrtps_port99999_el", SEGMENT, f"{SEGMENT}_el"}:
         (tmp_path / name).touch()
     assert stale_shared_memory.sweep(tmp_path) == [port.name, SEGMENT]
     # A lock that stays would make DDS take what comes next for a port of a dead process.
@@ -67,6 +72,18 @@ def test_who_listens_is_left_alone(port, end):
         fcntl.flock(lock, fcntl.LOCK_SH)
         assert stale_shared_memory.sweep(port.parent) == []
     assert stale_shared_memory.sweep(port.parent) == [port.name]
+
+
+def test_who_is_about_to_listen_is_left_alone(port):
+    """DDS holds a semaphore while it makes a port and its lock; a lock of somebody else's would be an error to it."""
+    mutex = posix_ipc.Semaphore(MUTEX, posix_ipc.O_CREAT, initial_value=1)
+    with mutex:
+        assert stale_shared_memory.sweep(port.parent) == []
+        assert [file.name for file in port.parent.iterdir()] == [port.name]
+    assert stale_shared_memory.sweep(port.parent) == [port.name]
+    mutex.acquire(timeout=0)  # the sweep has left it free
+    mutex.release()
+    mutex.close()
 
 
 def test_who_has_it_in_memory_is_left_alone(port):

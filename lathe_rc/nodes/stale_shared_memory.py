@@ -6,6 +6,8 @@ comes next uses the file again. A process that is killed while it uses the queue
 one get lost, and its cell stands still before the first block. What a process sends is in its segment,
 /dev/shm/fastrtps_ and 16 digits, 0.5 MB; those of the killed would fill the memory (of a container, often 64 MB). So
 what nobody uses is removed before a node starts.
+
+DDS opens a port under a semaphore of its own, PORT_mutex: who holds that can remove a port while others start.
 """
 
 import fcntl
@@ -15,9 +17,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import posix_ipc
+
 FOLDER = Path("/dev/shm")  # noqa: S108 - where POSIX shared memory is on Linux
 _PORT = re.compile(r"fast(rtps|dds)_port\d{1,5}")
 _SEGMENT = re.compile(r"fast(rtps|dds)_[0-9a-f]{16}")
+# Somebody opens it, listens, or leaves; or it is another user's.
+_IN_USE = (posix_ipc.BusyError, BlockingIOError, FileNotFoundError, posix_ipc.PermissionsError)
 _LOCKS = ("_el", "_sl")  # of a process that listens alone, and of those that listen together
 
 
@@ -56,24 +62,43 @@ def _is_ours(file: Path) -> bool:
 
 def _remove_port(port: Path) -> bool:
     """Remove a port if nobody uses it; whether it has."""
-    alone, shared = (port.with_name(port.name + end) for end in _LOCKS)
-    made = not alone.exists()
-    locks = [*([shared] if shared.exists() else []), alone]
     with ExitStack() as held:
         try:
+            held.enter_context(_opened_by_nobody_else(port))
+            locks = [lock for end in _LOCKS if (lock := port.with_name(port.name + end)).exists()]
             for lock in locks:
-                stream = held.enter_context(lock.open("ab" if lock is alone else "rb"))
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except (BlockingIOError, FileNotFoundError):  # somebody listens, or has just removed it
+                fcntl.flock(held.enter_context(lock.open("rb")), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (
+            posix_ipc.BusyError,
+            posix_ipc.PermissionsError,
+            BlockingIOError,
+            FileNotFoundError,
+        ):  # somebody opens, uses or leaves it
             return False
-        # As long as the locks are held, no process can begin to listen; one that had begun before has it in memory.
-        free = not _is_mapped(port)
-        gone = [port, *locks] if free else []
-        if made and not free:
-            gone = [alone]  # DDS takes a lock file that nobody holds for that of a dead process
-        for file in gone:
+        if _is_mapped(port):
+            return False
+        for file in [port, *locks]:
             file.unlink(missing_ok=True)  # DDS removes some, too
-        return free
+        return True
+
+
+@contextmanager
+def _opened_by_nobody_else(port: Path) -> Iterator[None]:
+    """Keep DDS from opening or removing a port meanwhile; it waits up to 2 s.
+
+    Raises:
+        posix_ipc.BusyError: DDS does one of the two.
+        posix_ipc.PermissionsError: the semaphore is another user's.
+    """
+    opening = posix_ipc.Semaphore(f"/{port.name}_mutex", posix_ipc.O_CREAT, initial_value=1)
+    try:
+        opening.acquire(timeout=0)
+        try:
+            yield
+        finally:
+            opening.release()
+    finally:
+        opening.close()
 
 
 def _remove_segment(segment: Path) -> bool:
