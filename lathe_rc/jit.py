@@ -17,6 +17,7 @@ R = TypeVar("R")
 
 _PACKAGE = Path(__file__).parent
 _KERNELS = (
+    "arrays.py",
     "placed.py",
     "transfer.py",
     "signals/*.py",

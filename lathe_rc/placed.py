@@ -12,6 +12,7 @@ matrices of two or six rows. That is for few and small arrays, since each shape 
 
 import ctypes
 import itertools
+import operator
 import struct
 from collections.abc import Iterator
 from functools import cache
@@ -22,14 +23,16 @@ import numpy as np
 import numpy.typing as npt
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.core.imputils import lower_getattr_generic
 from numba.core.typing.templates import AttributeTemplate, infer_getattr
-from numba.extending import intrinsic, models, register_model
+from numba.extending import intrinsic, models, overload, register_model
 from numba.np.arrayobj import populate_array
 
 Integers = npt.NDArray[np.int64]
 
 _populate: Any = populate_array  # Numba has few types
+_proxy: Any = cgutils.create_struct_proxy
 _WORD = ir.IntType(64)
 _KINDS = {np.dtype(np.float64): types.float64, np.dtype(np.int64): types.int64, np.dtype(np.uint8): types.uint8}
 
@@ -297,6 +300,79 @@ def _array_of(element: types.Type) -> Any:
     return intrinsic(array)
 
 
+class Ports(types.Type):
+    """The type of the arrays of a step's inputs, however many there are: one after the other in a table of addresses.
+
+    A kernel counts them and takes one by its number, as of a tuple; a tuple would be another type for each number.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(name="Ports")
+
+
+_PORTS, _ARRAY = Ports(), types.Array(types.float64, 1, "C")
+
+
+@register_model(Ports)
+class _PortsModel(models.StructModel):
+    def __init__(self, manager: Any, kind: Ports) -> None:
+        members = [("table", types.int64), ("count", types.int64), ("samples", types.int64)]
+        super().__init__(manager, kind, members)  # type: ignore[no-untyped-call]  # Numba has few types
+
+
+def _ports(_context: object, _table: Any, _count: Any, _samples: Any) -> Any:
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        made = _proxy(signature.return_type)(context, builder)
+        made.table, made.count, made.samples = arguments
+        return made._getvalue()  # noqa: SLF001 - there is no other way
+
+    return _PORTS(types.int64, types.int64, types.int64), code
+
+
+def _count(_context: object, _ports: Any) -> Any:
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return _proxy(signature.args[0])(context, builder, value=arguments[0]).count
+
+    return types.int64(_PORTS), code
+
+
+def _port(_context: object, _ports: Any, _number: Any) -> Any:
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        known = _proxy(signature.args[0])(context, builder, value=arguments[0])
+        word = builder.add(known.table, builder.mul(arguments[1], _WORD(8)))
+        return _array(context, builder, _ARRAY, _load(builder, word, _WORD), [known.samples])
+
+    return _ARRAY(_PORTS, types.int64), code
+
+
+_counted: Any = intrinsic(_count)
+_numbered: Any = intrinsic(_port)
+
+
+@overload(len, strict=False)
+def _length(ports: object) -> Any:
+    def count(ports: Any) -> int:
+        found: int = _counted(ports)
+        return found
+
+    return count if isinstance(ports, Ports) else None
+
+
+@overload(operator.getitem, strict=False)
+def _one(ports: object, number: object) -> Any:
+    def take(ports: Any, number: int) -> Any:
+        return _numbered(ports, number if number >= 0 else number + _counted(ports))
+
+    return take if isinstance(ports, Ports) and isinstance(number, types.Integer) else None
+
+
+def _word(_context: object, _table: Any, _number: Any) -> Any:
+    def code(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return _load(builder, builder.add(arguments[0], builder.mul(arguments[1], _WORD(8))), _WORD)
+
+    return types.int64(types.int64, types.int64), code
+
+
 def _store(_context: object, _address: Any, _value: Any) -> Any:
     def code(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         builder.store(arguments[1], builder.inttoptr(arguments[0], _WORD.as_pointer()))
@@ -316,6 +392,8 @@ def _call(_context: object, _address: Any, _a: Any, _b: Any, _c: Any, _d: Any, _
 at: Any = intrinsic(_at)  #: (address, type): the NamedTuple of a `Placed` type that stands there
 floats: Any = _array_of(types.float64)  #: (table, number, size): the float64 whose address stands in a table
 octets: Any = _array_of(types.uint8)  #: the same of uint8
+word: Any = intrinsic(_word)  #: (table, number): the whole number that stands in a table
+ports: Any = intrinsic(_ports)  #: (table, count, size): the `Ports` whose addresses stand in a table
 store: Any = intrinsic(_store)  #: (address, value): write a whole number
 call: Any = intrinsic(_call)  #: (address, six whole numbers): call an `entry`
 #: decorates a function of six addresses and whole numbers that returns one, whose ``address`` others can call

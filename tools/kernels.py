@@ -5,13 +5,20 @@ import sys
 
 from lathe_rc import harness
 from lathe_rc.cell import scenario
+from lathe_rc.cell.ahead import compile_ahead
+from lathe_rc.cell.wiring import Cell
 from workplace import ROOT
 
 
 def main() -> int:
-    """Begin to run each scenario: what that needs is compiled on all cores before."""
-    for path in sorted((ROOT / "config").glob("*.yaml")):
-        harness.run(scenario.load(path, ["spindle_encoder.revolutions=0.5"]))
+    """Compile the steps of all scenarios on all cores, and begin to run each: what else that needs is compiled, too."""
+    scenarios = [
+        scenario.load(path, ["spindle_encoder.revolutions=0.5"]) for path in sorted((ROOT / "config").glob("*.yaml"))
+    ]
+    for _ in compile_ahead(stage for each in scenarios for stage in Cell(each.nodes).stages.values()):
+        pass
+    for each in scenarios:
+        harness.run(each)
     return 0
 
 

@@ -12,7 +12,7 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 
 from lathe_rc.cell import native
 from lathe_rc.cell.scenario import TABLES, kind_of
@@ -44,31 +44,35 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
         InputError: a step cannot be compiled.
         LatheError: a process that compiles has ended.
     """
-    left = uncompiled(stages)
-    names = [stage.name for stage in left]
-    parts = [left[k :: os.cpu_count() or 1] for k in range(os.cpu_count() or 1)]
+    left = dict(enumerate(uncompiled(stages)))
+    numbers, most = list(left), os.cpu_count() or 1
     done: queue.SimpleQueue[str] = queue.SimpleQueue()
-    processes = [_start(part, done) for part in parts if part]
+    processes = [
+        _start({number: left[number] for number in part}, done) for k in range(most) if (part := numbers[k::most])
+    ]
     try:
-        while names:
-            yield list(names)
-            name = done.get()
-            if name.startswith(_REFUSED):
-                raise InputError(name.removeprefix(_REFUSED))
-            if not name:
+        while left:
+            yield [stage.name for stage in left.values()]
+            told = done.get()
+            if told.startswith(_REFUSED):
+                raise InputError(told.removeprefix(_REFUSED))
+            if not told:
                 raise LatheError("a process that compiles the steps of stages has ended: see what it has written")
-            names.remove(name)
+            del left[int(told)]
     finally:
         for process in processes:
             process.kill()
             process.wait()
 
 
-def _start(stages: Sequence[Stage], done: "queue.SimpleQueue[str]") -> "subprocess.Popen[str]":
-    """Start a process that compiles the steps of some stages; ``done`` gets their names, and in the end nothing."""
+def _start(stages: Mapping[int, Stage], done: "queue.SimpleQueue[str]") -> "subprocess.Popen[str]":
+    """Start a process that compiles the steps of some stages; ``done`` gets their numbers, and nothing if it fails."""
     environment = os.environ | {"PYTHONPATH": search_path()}
     process = subprocess.Popen([sys.executable, "-m", __name__], stdin=-1, stdout=-1, text=True, env=environment)
-    asked = {stage.name: (kind_of(stage.name, stage.shared.stage), stage.shared.model_dump()) for stage in stages}
+    asked = [
+        (number, stage.name, kind_of(stage.name, stage.shared.stage), stage.shared.model_dump())
+        for number, stage in stages.items()
+    ]
 
     def talk() -> None:
         assert process.stdin is not None, "it is a pipe"
@@ -86,7 +90,7 @@ def _start(stages: Sequence[Stage], done: "queue.SimpleQueue[str]") -> "subproce
 
 def main() -> None:
     """Compile what the standard input names."""
-    for name, (kind, values) in json.load(sys.stdin).items():
+    for number, name, kind, values in json.load(sys.stdin):
         stage = STAGES[kind](name, TABLES[kind].read(name, values))
         try:
             with stage.named():
@@ -94,7 +98,7 @@ def main() -> None:
         except InputError as error:
             print(f"{_REFUSED}{error}", flush=True)
         else:
-            print(name, flush=True)
+            print(number, flush=True)
 
 
 if __name__ == "__main__":

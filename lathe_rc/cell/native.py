@@ -37,7 +37,7 @@ The source is {source}.
 """
 
 import {module}
-from lathe_rc.placed import at, entry, floats, octets, store
+from lathe_rc.placed import at, entry, floats, octets, ports, store, word
 
 STEP = {step}
 
@@ -70,6 +70,33 @@ def broken() -> LatheError:
     )
 
 
+class Table:
+    """Where the addresses of the arrays of a step stand in its table.
+
+    First the number of inputs of float64; then the inputs of uint8, of which one without an address stands for none;
+    then the outputs; and last those inputs of float64, so that all else has the same places however many there are.
+
+    Args:
+        inputs, outputs: element types of the arrays of all fields of all ports.
+
+    Attributes:
+        places: of the arrays, in order.
+        size: of the table.
+        flags: number of places of inputs of uint8.
+        floats: number of inputs of float64.
+        first: place of the first of them.
+    """
+
+    def __init__(self, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]) -> None:
+        self.floats = sum(kind == np.float64 for kind in inputs)
+        self.flags = max(len(inputs) - self.floats, 1)
+        self.first = 1 + self.flags + len(outputs)
+        self.size = self.first + self.floats
+        flags, floats = iter(range(1, self.first)), iter(range(self.first, self.size))
+        read = [next(floats if kind == np.float64 else flags) for kind in inputs]
+        self.places = [*read, *range(1 + self.flags, self.first)]
+
+
 class Native:
     """A step with its memory as a function of addresses.
 
@@ -92,7 +119,9 @@ class Native:
         self._words = Words(memory)
         self.words = self._words.words
         self._entry = _entry(step, self._words.kind, tuple(inputs), tuple(outputs))
-        self._reached, self._fields = np.zeros(1, np.int64), np.zeros(len(inputs) + len(outputs), np.int64)
+        table = Table(inputs, outputs)
+        self._places, self._reached, self._fields = table.places, np.zeros(1, np.int64), np.zeros(table.size, np.int64)
+        self._fields[0] = table.floats
 
     @property
     def name(self) -> str:
@@ -114,7 +143,7 @@ class Native:
 
     def __call__(self, first: int, start: int, fields: Sequence[npt.NDArray[Any]], samples: int) -> tuple[int, int]:
         """Call the step for the arrays of all fields, shape (samples,)."""
-        for place, array in enumerate(fields):
+        for place, array in zip(self._places, fields, strict=True):
             assert array.flags.c_contiguous, "kernels take it for contiguous"
             assert array.size == samples, "and as long as the block"
             self._fields[place] = array.ctypes.data
@@ -168,20 +197,21 @@ _entry = cache(Entry)  # made once for all that are alike
 
 def _text(step: Step, memory: Placed, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]) -> str:
     """The text of the module."""
+    table = Table(inputs, outputs)
 
-    def arrays(fields: Iterable[tuple[int, np.dtype[Any]]], *, without: str = "()") -> str:
-        made = [f"{_FIELDS[dtype]}(fields, {number}, samples)" for number, dtype in fields]
-        return f"({', '.join(made)},)" if made else without
+    def arrays(begin: int, kinds: Iterable[np.dtype[Any]]) -> str:
+        return "".join(f"{_FIELDS[kind]}(fields, {place}, samples), " for place, kind in enumerate(kinds, begin))
 
-    read = list(enumerate(inputs))
+    # Another package's step gets a tuple, which it may unpack; ours are compiled once for any number of inputs.
+    read = f"ports(fields + {8 * table.first}, word(fields, 0), samples)"
     return _MODULE.format(
         step=f"{step.__module__}.{step.__qualname__}",
         source=_source(step.__module__),
         module=step.__module__,
         memory=memory,
-        inputs=arrays(field for field in read if field[1] == np.float64),
-        flags=arrays((field for field in read if field[1] == np.uint8), without="(octets(fields, 0, 0),)"),
-        outputs=arrays(enumerate(outputs, len(inputs))),
+        inputs=read if is_ours(step.__module__) else f"({arrays(table.first, [np.dtype(np.float64)] * table.floats)})",
+        flags=f"({arrays(1, [np.dtype(np.uint8)] * table.flags)})",
+        outputs=f"({arrays(1 + table.flags, outputs)})",
     )
 
 

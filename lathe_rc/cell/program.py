@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.native import BROKEN, Integers, broken
+from lathe_rc.cell.native import BROKEN, Integers, Table, broken
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
 from lathe_rc.jit import kernel
@@ -85,7 +85,7 @@ def _run(
         plan: see above; one row more ends it.
         turn: spindle angle from which on each stage needs Python [rad].
         fields: of each the address of its first sample on the tape less the delay, the size of a sample, and the
-            address of the block at hand, shape (3, fields).
+            address of the block at hand, shape (3, fields); those of a stage are its `Table`.
         where: changed; where it has come to.
         base: place of sample 0 on the tape.
         end: see above.
@@ -196,15 +196,21 @@ class Program:
         fields: list[tuple[int, int, int]] = []
         told: list[int] = []
         for row, (stage, inputs, outputs) in zip(self._plan, stages, strict=False):
-            row[_FIELD], row[_ANGLE], angle = len(fields), -1, stage.angle_input
-            for place, port in enumerate(stage.inputs[: stage.own_inputs]):
-                if place == angle:
-                    row[_ANGLE] = len(fields) + port.fields.index("angle")
-                fields += [self._field(*inputs[place], name) for name in port.fields]
+            begin, angle, table = len(fields), stage.angle_input, Table(*stage.field_types)
+            row[_FIELD], row[_ANGLE] = begin, -1
+            fields += [(table.floats, 0, 0)] + [(0, 0, 0)] * (table.size - 1)
+            places = iter(begin + place for place in table.places)
+            for number, port in enumerate(stage.inputs[: stage.own_inputs]):
+                for name in port.fields:
+                    place = next(places)
+                    fields[place] = self._field(*inputs[number], name)
+                    if number == angle and name == "angle":
+                        row[_ANGLE] = place
             for tape, output in zip(outputs, stage.outputs, strict=True):
                 for name, dtype in messages.sample_fields(output.type).items():
-                    told += [len(fields)] if dtype == np.float64 else []
-                    fields.append(self._field(tape, 0, name))
+                    place = next(places)
+                    told += [place] if dtype == np.float64 else []
+                    fields[place] = self._field(tape, 0, name)
             if angle is not None and angle >= stage.own_inputs:
                 row[_ANGLE] = len(fields)
                 fields.append(self._field(*inputs[angle], "angle"))

@@ -506,15 +506,19 @@ class Stage(ABC):
         floats = tuple(field for field in fields[:inputs] if field.dtype == np.float64)
         return self.step(self.memory, first, start, floats, flags, tuple(fields[inputs:]))
 
+    @property
+    def field_types(self) -> tuple[list[np.dtype[Any]], list[np.dtype[Any]]]:
+        """Element types of the arrays that the step gets: of all fields of its own inputs, and of its outputs."""
+        read = [messages.sample_fields(p.type)[n] for p in self.inputs[: self.own_inputs] for n in p.fields]
+        return read, [kind for port in self.outputs for kind in messages.sample_fields(port.type).values()]
+
     def native(self) -> Native:
         """The step with the memory as it is now, as a function of addresses."""
         if self._native is None:
             assert self.step is not None, "a stage without a step has its own `process`"
             if not is_ours(type(self).__module__) and (why := unfit(self.memory)):
                 raise InputError(f"{self.name}: memory of a compiled step: {why}")
-            read = [messages.sample_fields(p.type)[n] for p in self.inputs[: self.own_inputs] for n in p.fields]
-            written = [kind for port in self.outputs for kind in messages.sample_fields(port.type).values()]
-            self._native = Native(self.step, self.memory, read, written)
+            self._native = Native(self.step, self.memory, *self.field_types)
         else:
             self._native.update(self.memory)
         return self._native

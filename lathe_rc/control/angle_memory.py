@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import put
 from lathe_rc.control.correction import invariant
 from lathe_rc.control.interpolation import cubic, read, read_along, read_derivatives
 from lathe_rc.control.q_filter import two_sided
@@ -122,8 +123,8 @@ def begin(m: AngleMemory, first: int, angle: Array, past_angle: Array, error: Ar
         angles[start + i], errors[start + i] = real[ANGLES + i], real[ERRORS + i]
     for k in range(start, n):
         angles[k + 3], errors[k + 3] = past_angle[k], error[k]
-    real[ANGLES : ANGLES + 3] = angles[n:]
-    real[ERRORS : ERRORS + 3] = errors[n:]
+    put(real[ANGLES : ANGLES + 3], angles[n:])
+    put(real[ERRORS : ERRORS + 3], errors[n:])
 
 
 @kernel

@@ -279,7 +279,8 @@ def _adopt(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
     m.model[0], m.model[1] = a1, a2
     for low, known in ((m.observer, m.learned), (m.learner, m.learner.command)):
         first, second = derivatives(low.position, low.bandwidth)
-        known[:] += more1 * first + more2 * second
+        for place in range(known.size):
+            known[place] += more1 * first + more2 * second
     if not m.memory.learns:
         return
     points = m.memory.value.size

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import put_scaled
 from lathe_rc.control.drive_regression import add_products, coefficients, excited
 from lathe_rc.jit import inlined
 
@@ -97,5 +98,5 @@ def fitted(m: FitTable) -> tuple[float, float]:
 @inlined
 def fade(m: FitTable) -> None:
     """A revolution has ended: what was measured before counts less."""
-    m.sums[:] *= m.forgetting
-    m.means[:] *= m.forgetting
+    put_scaled(m.sums, m.forgetting, m.sums)
+    put_scaled(m.means, m.forgetting, m.means)

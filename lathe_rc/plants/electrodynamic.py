@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import put
 from lathe_rc.jit import kernel
 from lathe_rc.plants.end_stops import between_stops
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
@@ -66,7 +67,7 @@ def advance(drive: CoarseTable, command: Array, position: Array, velocity: Array
         position[k], velocity[k] = x, v
         current[k] = (spring * (delayed - x) - damper * v) * force_per_current
     state[0], state[1] = x, v
-    line[:] = sent[command.size :]
+    put(line, sent[command.size :])
     drive.stopped[0] += stopped
 
 

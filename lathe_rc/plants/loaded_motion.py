@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import put
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.plants.chip import (
@@ -171,14 +172,14 @@ def _solve(
     for _ in range(_ROUNDS):
         guess = x1
         drive.reading[0] = quantise(guess + noise, drive.resolution)
-        trial[:] = memory
+        put(trial, memory)
         e, cuts = extend(drive.stack, trial, set_point - drive.reading[0])
         chip = _chip(drive, cut, free, e, here, stiffness, c)
         force = held(cut) + cut.process.lag_now * stiffness * max(chip, 0.0)
         x1 = _carriage(drive, free, e, drive.radial * force)
         if x1 == guess:
             break
-    memory[:] = trial
+    put(memory, trial)
     drive.counts[SATURATED] += cuts
     return e, chip
 

@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import put
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.end_stops import between_stops
@@ -111,12 +112,12 @@ def advance(
             for _ in range(_ROUNDS):
                 guess = x1
                 measured[k] = quantise(guess + noise[k], resolution)
-                trial[:] = memory
+                put(trial, memory)
                 e, cut = extend(stack, trial, set_point[k] - measured[k])
                 x1 = min(max(free[0] + fine[0, 0] * e, -carriage_stroke), carriage_stroke)
                 if x1 == guess:
                     break
-            memory[:] = trial
+            put(memory, trial)
         else:
             e, cut = extend(stack, memory, set_point[k])
         saturated += cut

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import put
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.linear import discretise
@@ -122,7 +123,7 @@ def turn(spindle: SpindleTable, first: int, force: Array, angle: Array, speed: A
             new[i] = spindle.motor[i] * torque[k] + spindle.load[i, 0] * load + spindle.load[i, 1] * loop[_LOAD]
             for j in range(order):
                 new[i] += transition[i, j] * state[j]
-        state[:] = new
+        put(state, new)
         loop[_LOAD], loop[_SPEED] = load, speed[k]
         angle[k] += state[0]
         speed[k] += state[1]

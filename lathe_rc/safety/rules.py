@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import put
 from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
@@ -135,7 +136,7 @@ def _changing(signal: Array, memory: Array) -> int:
     kept = max(window - size, 0)
     for k in range(kept):
         past[k] = past[k + size]
-    past[kept:] = signal[size - window + kept :]
+    put(past[kept:], signal[size - window + kept :])
     return found
 
 

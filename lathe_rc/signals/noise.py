@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import put
 from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
@@ -86,7 +87,7 @@ def measure(sensor: SensorTable, true: Array, measured: Array) -> None:
             measured[k] = true[k] + sensor.rms * noise[place + k]
         sensor.noise.used[0] = place + true.size
     else:
-        measured[:] = true
+        put(measured, true)
     if sensor.resolution > 0.0:
         for k in range(true.size):
             measured[k] = quantise(measured[k], sensor.resolution)

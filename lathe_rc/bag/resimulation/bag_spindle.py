@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc import messages
+from lathe_rc.arrays import put
 from lathe_rc.bag.reading.recorded import Recorded, Spindle
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import Tape
@@ -44,9 +45,11 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     """See `lathe_rc.cell.stage`."""
     angle, speed, angle_true, speed_true, index_pulse = outputs
     at, n = first - memory.span[0], angle.size
-    angle[:], speed[:] = memory.angle[at : at + n], memory.speed[at : at + n]
-    angle_true[:], speed_true[:] = memory.angle_true[at : at + n], memory.speed_true[at : at + n]
-    index_pulse[:] = memory.index_pulse[at : at + n]
+    put(angle, memory.angle[at : at + n])
+    put(speed, memory.speed[at : at + n])
+    put(angle_true, memory.angle_true[at : at + n])
+    put(speed_true, memory.speed_true[at : at + n])
+    put(index_pulse, memory.index_pulse[at : at + n])
     return n, DONE
 
 

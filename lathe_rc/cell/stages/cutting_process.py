@@ -9,6 +9,7 @@ from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc import messages
 from lathe_rc.analysis.shaft import STEEL_MODULUS, Shaft, Support
+from lathe_rc.arrays import put, put_scaled, subtract
 from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.errors import InputError
@@ -223,15 +224,15 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     displacement[:] = cross_position[:] = height[:] = 0.0
     if memory.tool >= 0:
         height = inputs[memory.tool + 2]
-        displacement[:] = inputs[memory.tool]
+        put(displacement, inputs[memory.tool])
         if memory.even:
-            displacement -= inputs[memory.tool + 1]
+            subtract(displacement, inputs[memory.tool + 1])
     if memory.cross >= 0:
-        cross_position[:] = -inputs[memory.cross]
+        put_scaled(cross_position, -1.0, inputs[memory.cross])
     if memory.longitudinal >= 0:
         height, feed_velocity = inputs[memory.longitudinal], inputs[memory.longitudinal + 1]
     else:
-        feed_velocity[:] = speed * memory.feed
+        put_scaled(feed_velocity, memory.feed, speed)
     allow(memory.allowance, angle, allowance)
     reached, reason = cut_along(
         memory.cut, angle, speed, height, cross_position, displacement, feed_velocity, allowance, force, deflection,

@@ -6,6 +6,7 @@ from typing import Annotated, Literal, NamedTuple
 from annotated_types import Ge, Gt
 
 from lathe_rc import messages
+from lathe_rc.arrays import put
 from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Stage
 from lathe_rc.control.decoupler import LAG, LEAK, PRESETS, Channels, Decoupler, compensators, decouple_along
@@ -73,9 +74,9 @@ class Memory(NamedTuple):
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`; set points and errors go on unchanged."""
-    force, force_set_point, force_error, position, position_set_point, position_error = inputs
-    outputs[1][:], outputs[2][:] = force_set_point, force_error
-    outputs[4][:], outputs[5][:] = position_set_point, position_error
+    force, position = inputs[0], inputs[3]
+    for place in (1, 2, 4, 5):
+        put(outputs[place], inputs[place])
     decouple_along(memory.k1, memory.state1, memory.k2, memory.state2, force, position, outputs[0], outputs[3])
     return force.size, DONE
 

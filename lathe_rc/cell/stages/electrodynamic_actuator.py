@@ -37,7 +37,7 @@ class ElectrodynamicActuatorParameters(PlantParameters):
 @kernel
 def step(memory: PlantMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
-    (command,), (position, velocity, effort, measured_position) = inputs, outputs
+    command, (position, velocity, effort, measured_position) = inputs[0], outputs
     given = limited(memory.limits, first, followed(memory.retraction, command))
     advance(memory.plant, given, position, velocity, effort)
     measure(memory.sensor, position, measured_position)

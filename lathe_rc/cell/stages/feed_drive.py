@@ -8,6 +8,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc import messages
+from lathe_rc.arrays import put
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse, Stage
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedParameters, remembered
@@ -218,7 +219,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
         given, samples, now = command[start:stop], stop - start, first + start
         if memory.listens or memory.safe:
             given = memory.room[0, :samples]
-            given[:] = command[start:stop]
+            put(given, command[start:stop])
         apply(memory.obedience, given)
         load = memory.room[1, : samples if memory.disturbance else 0]
         fill_disturbance(now, memory.period, memory.disturbance, load)

@@ -9,6 +9,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc import messages, resources
+from lathe_rc.arrays import put
 from lathe_rc.cell.parameters import NodeParameters, Value, about, parameter
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import InputError
@@ -162,7 +163,7 @@ def evaluate(
     _place(form, angle_true, position, height)
     deviation_along(form.heights, form.table, angle_true, height, reference)
     if form.alike and equal(angle, angle_true) and equal(position, measured):
-        expected[:] = reference
+        put(expected, reference)
     else:
         _place(form, angle, measured, expected)
         deviation_along(form.heights, form.told, angle, expected.copy(), expected)

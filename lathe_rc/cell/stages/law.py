@@ -157,7 +157,7 @@ def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
 
     def step(memory: LawMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
         """See `lathe_rc.cell.stage`."""
-        angle, speed, error_angle, error, form = inputs[:5]
+        angle, speed, error_angle, error, form = inputs[0], inputs[1], inputs[2], inputs[3], inputs[4]
         position, command = inputs[-1], outputs[0]
         while start < command.size:
             stop, learning = command.size, memory.learns[0] != 0

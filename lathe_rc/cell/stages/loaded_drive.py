@@ -10,6 +10,7 @@ from pydantic import create_model
 
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
+from lathe_rc.arrays import put, put_scaled
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedCommand, limited, remembered
@@ -216,13 +217,13 @@ def _advance(
     met, cross_position, feed_velocity, noise, still = room[0, :n], room[1, :n], room[2, :n], room[3, :n], room[4, :n]
     met[:] = cross_position[:] = still[:] = 0.0
     if memory.even:
-        met[:] = wanted
+        put(met, wanted)
     if memory.cross >= 0:
-        cross_position[:] = -inputs[memory.cross]
+        put_scaled(cross_position, -1.0, inputs[memory.cross])
     if memory.longitudinal >= 0:
         height, feed_velocity = inputs[memory.longitudinal], inputs[memory.longitudinal + 1]
     else:
-        feed_velocity[:] = speed * memory.feed
+        put_scaled(feed_velocity, memory.feed, speed)
     allow(memory.allowance, angle, allowance)
     measure(memory.noise, still, noise)
     given = limited(memory.limits, first, followed(memory.retraction, command))

@@ -128,7 +128,7 @@ def _loop(sample: Callable[[Any, float], Moved]) -> Callable[..., Reached]:
 
     def step(memory: PlantMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
         """See `lathe_rc.cell.stage`."""
-        (command,), (position, velocity, effort, measured_position) = inputs, outputs
+        command, (position, velocity, effort, measured_position) = inputs[0], outputs
         given = limited(memory.limits, first, followed(memory.retraction, command))
         for k in range(given.size):
             position[k], velocity[k], effort[k] = sample(memory.plant, given[k])

@@ -8,6 +8,7 @@ import numpy as np
 from annotated_types import Ge, Le, MinLen
 
 from lathe_rc import messages
+from lathe_rc.arrays import put
 from lathe_rc.cell.parameters import Value, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
 from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, evaluate
@@ -75,7 +76,9 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     if memory.form.heights.size:
         evaluate(memory.form, inputs, reference, known, height)
     else:
-        reference[:], known[:], height[:] = inputs[0], inputs[1], inputs[2]
+        put(reference, inputs[0])
+        put(known, inputs[1])
+        put(height, inputs[2])
     place = memory.begin
     for drive in range(memory.drives):
         add_drive(drive == 0, reference, known, inputs[place], inputs[place + 1], displacement, known, error)

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from annotated_types import Ge
 
 from lathe_rc import resources
+from lathe_rc.arrays import put
 from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
@@ -48,7 +49,7 @@ class Course(NamedTuple):
 def follow(course: Course, first: int, set_point: Samples) -> None:
     """Fill the set point from sample ``first`` on, shape (n,), which has been made ready."""
     begin = first - course.span[0]
-    set_point[:] = course.values[begin : begin + set_point.size]
+    put(set_point, course.values[begin : begin + set_point.size])
 
 
 class Trajectory:

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Array statements that kernels write as calls: of slices Numba compiles messages about shapes as well, for seconds."""
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.jit import inlined
+
+Array = npt.NDArray[np.float64]
+
+
+@inlined
+def put(into: Array, values: Array) -> None:
+    """``into[:] = values``, for arrays of the same shape (n,) that do not overlap."""
+    for k in range(into.size):
+        into[k] = values[k]
+
+
+@inlined
+def put_scaled(into: Array, factor: float, values: Array) -> None:
+    """``into[:] = factor * values``, likewise."""
+    for k in range(into.size):
+        into[k] = factor * values[k]
+
+
+@inlined
+def subtract(into: Array, values: Array) -> None:
+    """``into -= values``, likewise."""
+    for k in range(into.size):
+        into[k] -= values[k]
