@@ -2,10 +2,7 @@
 """Laws, drives, stages and studies from outside of lathe_rc: in every host, checked as ours, found by name."""
 
 import importlib
-import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -195,11 +192,11 @@ def test_two_packages_that_offer_one_name_are_refused(tmp_path, monkeypatch):
     offer(tmp_path, "first_maker", "first:Law")
     offer(tmp_path, "other_maker", "other:Law")
     monkeypatch.syspath_prepend(tmp_path)
-    extensions._offered.cache_clear()
+    extensions._offered_along.cache_clear()
     with pytest.raises(InputError, match=r"first_maker 1.0 and other_maker 1.0 offer 'shared_name'"):
         "shared_name" in STAGES  # noqa: B015 - it raises
     monkeypatch.undo()
-    extensions._offered.cache_clear()
+    extensions._offered_along.cache_clear()
 
 
 def test_where_a_class_comes_from_is_known(begin):
@@ -209,26 +206,6 @@ def test_where_a_class_comes_from_is_known(begin):
         "class": "my_law:MyLaw",
         "source": extensions.source_hash("my_law"),
     }
-
-
-def rms_in_another_process(file):
-    """RMS of the form error in the last of four revolutions [µm]."""
-    command = [sys.executable, "-m", "lathe_rc", "run", str(file), "--revolutions", "4", "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)["error_um"]["last"]["rms"]
-
-
-def test_a_changed_source_is_compiled_anew(begin):
-    """The step of another source never runs from the cache, be it that of the law or of a module that it uses."""
-    file = begin("law", "leaning_law")
-    edit("leaning_law", "TURN = 2.0 * np.pi", "from leaned_on import FACTOR\n\nTURN = 2.0 * np.pi")
-    edit("leaning_law", "memory.gain * (error", "FACTOR * memory.gain * (error")
-    Path("leaned_on.py").write_text("FACTOR = 1.0\n")
-    first = rms_in_another_process(file)
-    Path("leaned_on.py").write_text("FACTOR = 0.5\n")
-    assert (module := rms_in_another_process(file)) > 2 * first
-    edit("leaning_law", "FACTOR * memory.gain", "0.5 * FACTOR * memory.gain")
-    assert rms_in_another_process(file) > 1.5 * module
 
 
 # --- lathe new

@@ -47,6 +47,7 @@ class Manager:
 
     def __init__(self, ghost):
         self._ghost, self._clients = ghost, {}
+        self.processes = None  # of the cell, once there are any
 
     def _ask(self, service, kind, request):
         if service not in self._clients:
@@ -57,8 +58,12 @@ class Manager:
             while self._answer(client, nothing, 0.5) is None:
                 pass
         answer = self._answer(self._clients[service], request, 60.0)
-        assert answer is not None, f"{service} does not answer"
+        assert answer is not None, f"{service} does not answer{self._place_of(service.split('/')[1])}"
         return answer
+
+    def _place_of(self, node):
+        child = next((child for child in self.processes._children if node in child.split("+")), None)
+        return f"; {child} stands{self.processes._place(child)}" if child else ""
 
     def _answer(self, client, request, seconds):
         future = client.call_async(request)
@@ -84,6 +89,7 @@ def waiting(manager, domain, cell, together=()):
     """The processes of a cell that waits for its drive, and what lets that start."""
     groups = [list(together), *([name] for name in cell.nodes if name not in together)]
     with harness.Processes(cell, [group for group in groups if group], domain=domain) as processes:
+        manager.processes = processes
 
         def begin():
             assert manager.change(LAST, Transition.TRANSITION_CONFIGURE)

@@ -407,10 +407,10 @@ def installed(tmp_path, monkeypatch):
         "[lathe_rc.studies]\npassed = lathe_hann:STUDY\nbroken = lathe_hann:NONE\n"
     )
     monkeypatch.syspath_prepend(folder)
-    for found in (extensions._offered, extensions._packages):
+    for found in (extensions._offered_along, extensions._packages):
         found.cache_clear()
     yield folder
-    for found in (extensions._offered, extensions._packages):
+    for found in (extensions._offered_along, extensions._packages):
         found.cache_clear()
     sys.modules.pop("lathe_hann", None)
 

@@ -100,7 +100,7 @@ TABLE = {
     "sweep.png": Picture(_SWEEP, "sweeps.md", "sweep-piston/figures/heat-map.png", 60),
     "tip.png": _script("tip", 3, "signals"),
     "tuning.png": Picture(_TUNE, "tuning.md", "two_channel_tuned/history.png", 150),
-    # a program of the page, which tests/test_tutorials.py follows from its first line
+    # a program of the page, which tests/system/test_tutorials.py follows from its first line
     "tutorial_paper.png": Picture("python figure.py", "tutorials/control_researcher.md", "figure.png", steady=False),
     "view.png": _photograph("view_screenshot", "view.md", " watched"),
     "view_light.png": _photograph("view_screenshot", "view.md", " watched"),

@@ -236,6 +236,8 @@ def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
         with contextlib.suppress(Exception):  # the node itself says what is wrong
             if kind in STAGES.own and not names_others(STAGES[kind].Parameters, values):
                 compile_kernels(STAGES[kind](name, TABLES[kind].read(name, values)))
+                for row in TABLES[kind].rows().values():
+                    declare.descriptor(row)  # what installed packages offer
 
 
 def split(words: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:

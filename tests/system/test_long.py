@@ -5,9 +5,11 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from test_extending import begin, edit
 from test_security import CONFIG, ENDLESS, FILES, compare, members, named, observer, parsed, running, wait_for_block_0
 
 from lathe_rc import harness
@@ -15,7 +17,7 @@ from lathe_rc.cell import scenario
 from lathe_rc.cli import main
 
 pytestmark = pytest.mark.system
-__all__ = ["observer"]  # a fixture
+__all__ = ["begin", "observer"]  # fixtures
 
 
 def test_thirteen_processes_of_the_full_cell_give_its_digests():
@@ -82,3 +84,23 @@ def test_steps_are_compiled_once_and_those_that_are_alike_together(tmp_path):
     assert first[0] == ["spindle_encoder", "form"]
     assert len(first[1]) == 1
     assert second == []
+
+
+def rms_in_another_process(file):
+    """RMS of the form error in the last of four revolutions [µm]."""
+    command = [sys.executable, "-m", "lathe_rc", "run", str(file), "--revolutions", "4", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)["error_um"]["last"]["rms"]
+
+
+def test_a_changed_source_is_compiled_anew(begin):
+    """The step of another source never runs from the cache, be it that of the law or of a module that it uses."""
+    file = begin("law", "leaning_law")
+    edit("leaning_law", "TURN = 2.0 * np.pi", "from leaned_on import FACTOR\n\nTURN = 2.0 * np.pi")
+    edit("leaning_law", "memory.gain * (error", "FACTOR * memory.gain * (error")
+    Path("leaned_on.py").write_text("FACTOR = 1.0\n")
+    first = rms_in_another_process(file)
+    Path("leaned_on.py").write_text("FACTOR = 0.5\n")
+    assert (module := rms_in_another_process(file)) > 2 * first
+    edit("leaning_law", "FACTOR * memory.gain", "0.5 * FACTOR * memory.gain")
+    assert rms_in_another_process(file) > 1.5 * module
