@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The program of a cell and its tapes: what is read late is the past, and Python is asked where it is needed."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lathe_rc import messages
+from lathe_rc.cell.native import Native
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.program import Program, Tapes, wired
 from lathe_rc.cell.stage import NEVER, Input, Output, Sparse, Stage
@@ -15,6 +18,7 @@ from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import COMMAND, ENCODER
+from lathe_rc.placed import ports
 
 
 @given(
@@ -146,3 +150,41 @@ def test_a_stage_that_has_its_own_process_does_not_inherit_a_step():
 
     assert Other.step is None
     assert SpindleEncoder.step is not None
+
+
+@kernel
+def some_of(table, count, samples):
+    found = ports(table, count, samples)
+    return len(found), found[0][0], found[count - 1][samples - 1], found[-1][samples - 1]
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_kernel_takes_any_number_of_arrays_by_number(count):
+    arrays = [np.arange(4.0) + 10.0 * place for place in range(count)]
+    table = np.array([array.ctypes.data for array in arrays])
+    assert some_of(table.ctypes.data, count, 4) == (count, 0.0, arrays[-1][-1], arrays[-1][-1])
+    assert len(some_of.signatures) == 1, "compiled once for all"
+
+
+class Doubled(NamedTuple):
+    factor: float
+
+
+@kernel
+def unpacking_step(memory, first, start, inputs, flags, outputs):
+    (one, other), (flag,), (found, told) = inputs, flags, outputs
+    for k in range(found.size):
+        found[k], told[k] = one[k] - memory.factor * other[k], flag[k]
+    return found.size, 0
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_step_of_others_unpacks_its_inputs_wherever_flags_stand_among_them(place):
+    one, other, flag = np.arange(3.0), np.ones(3), np.array([7, 8, 9], np.uint8)
+    inputs = [one, other]
+    inputs.insert(place, flag)
+    outputs = [np.zeros(3), np.zeros(3, np.uint8)]
+    kinds = [[array.dtype for array in arrays] for arrays in (inputs, outputs)]
+    assert Native(unpacking_step, Doubled(2.0), *kinds)(0, 0, [*inputs, *outputs], 3) == (3, 0)
+    assert outputs[0].tolist() == [-2.0, -1.0, 0.0]
+    assert outputs[1].tolist() == [7, 8, 9]

@@ -12,9 +12,11 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections import deque
+from collections.abc import Iterable, Iterator
 
 from lathe_rc.cell import native
+from lathe_rc.cell.program import compile_loop
 from lathe_rc.cell.scenario import TABLES, kind_of
 from lathe_rc.cell.stage import Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
@@ -44,53 +46,58 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
         InputError: a step cannot be compiled.
         LatheError: a process that compiles has ended.
     """
-    left = dict(enumerate(uncompiled(stages)))
-    numbers, most = list(left), os.cpu_count() or 1
-    done: queue.SimpleQueue[str] = queue.SimpleQueue()
-    processes = [
-        _start({number: left[number] for number in part}, done) for k in range(most) if (part := numbers[k::most])
-    ]
+    # The longest first, so that all processes end at about the same time: the larger its memory, the more a step does.
+    numbered = enumerate(sorted(uncompiled(stages), key=lambda stage: -stage.native().words.size))
+    waiting = deque(numbered)
+    left = {number: stage.name for number, stage in waiting}
+    done: queue.SimpleQueue[tuple[int, str]] = queue.SimpleQueue()
+    processes = [_start() for _ in range(min(os.cpu_count() or 1, len(left)))]
+    for process in processes:
+        threading.Thread(target=_have_compiled, args=(process, waiting, done), daemon=True).start()
+    if left:
+        compile_loop()  # meanwhile
     try:
         while left:
-            yield [stage.name for stage in left.values()]
-            told = done.get()
+            yield list(left.values())
+            number, told = done.get()
             if told.startswith(_REFUSED):
                 raise InputError(told.removeprefix(_REFUSED))
             if not told:
                 raise LatheError("a process that compiles the steps of stages has ended: see what it has written")
-            del left[int(told)]
+            del left[number]
     finally:
         for process in processes:
             process.kill()
             process.wait()
 
 
-def _start(stages: Mapping[int, Stage], done: "queue.SimpleQueue[str]") -> "subprocess.Popen[str]":
-    """Start a process that compiles the steps of some stages; ``done`` gets their numbers, and nothing if it fails."""
+def _start() -> "subprocess.Popen[str]":
+    """Start a process that compiles the steps of the stages that it is told of."""
     environment = os.environ | {"PYTHONPATH": search_path()}
-    process = subprocess.Popen([sys.executable, "-m", __name__], stdin=-1, stdout=-1, text=True, env=environment)
-    asked = [
-        (number, stage.name, kind_of(stage.name, stage.shared.stage), stage.shared.model_dump())
-        for number, stage in stages.items()
-    ]
+    return subprocess.Popen([sys.executable, "-m", __name__], stdin=-1, stdout=-1, text=True, env=environment)
 
-    def talk() -> None:
-        assert process.stdin is not None, "it is a pipe"
-        assert process.stdout is not None, "the same"
-        with contextlib.suppress(BrokenPipeError), process.stdin as told:
-            told.write(json.dumps(asked))
-        for line in process.stdout:
-            done.put(line.rstrip())
-        if process.wait():
-            done.put("")
 
-    threading.Thread(target=talk, daemon=True).start()
-    return process
+def _have_compiled(
+    process: "subprocess.Popen[str]", waiting: deque[tuple[int, Stage]], done: "queue.SimpleQueue[tuple[int, str]]"
+) -> None:
+    """Tell a process of stages, one after the other; ``done`` gets its answers, and an empty one if it has ended."""
+    assert process.stdin is not None, "it is a pipe"
+    assert process.stdout is not None, "the same"
+    with contextlib.suppress(IndexError):  # nothing waits any more
+        while True:
+            number, stage = waiting.popleft()
+            asked = stage.name, kind_of(stage.name, stage.shared.stage), stage.shared.model_dump()
+            told = ""
+            with contextlib.suppress(BrokenPipeError):
+                print(json.dumps(asked), file=process.stdin, flush=True)
+                told = process.stdout.readline().rstrip()
+            done.put((number, told))
 
 
 def main() -> None:
-    """Compile what the standard input names."""
-    for number, name, kind, values in json.load(sys.stdin):
+    """Compile what each line of the standard input names."""
+    for line in sys.stdin:
+        name, kind, values = json.loads(line)
         stage = STAGES[kind](name, TABLES[kind].read(name, values))
         try:
             with stage.named():
@@ -98,7 +105,7 @@ def main() -> None:
         except InputError as error:
             print(f"{_REFUSED}{error}", flush=True)
         else:
-            print(number, flush=True)
+            print("compiled", flush=True)
 
 
 if __name__ == "__main__":

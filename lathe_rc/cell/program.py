@@ -149,6 +149,12 @@ def _passes(angle: Samples, turn: float) -> bool:
     return low < angle.size
 
 
+def compile_loop() -> None:
+    """Compile the loop, which is the same for all programs."""
+    none, fields, where = np.zeros((1, 5), np.int64), np.zeros((3, 0), np.int64), np.zeros(3, np.int64)
+    assert _run(none, np.empty(0), fields, where, 0, 0, 1, _NOBODY) == DONE, "it has no stage, and nothing to compute"
+
+
 def chunk_of(block: int, delays: Iterable[int]) -> int:
     """Samples that a stage computes in one go: whole blocks, no more than the shortest feedback; 0 is no feedback."""
     most = min([_CHUNK, *(delay for delay in delays if delay)])
