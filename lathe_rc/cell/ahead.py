@@ -72,7 +72,7 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
 
 
 def _start() -> "subprocess.Popen[str]":
-    """Start a process that compiles the steps of the stages that it is told of."""
+    """Start a process that compiles the steps of the stages that its input names."""
     environment = os.environ | {"PYTHONPATH": search_path()}
     return subprocess.Popen([sys.executable, "-m", __name__], stdin=-1, stdout=-1, text=True, env=environment)
 
@@ -80,7 +80,7 @@ def _start() -> "subprocess.Popen[str]":
 def _have_compiled(
     process: "subprocess.Popen[str]", waiting: deque[tuple[int, Stage]], done: "queue.SimpleQueue[tuple[int, str]]"
 ) -> None:
-    """Tell a process of stages, one after the other; ``done`` gets its answers, and an empty one if it has ended."""
+    """Name stages to a process, one after the other; ``done`` gets its answers, and an empty one if it has ended."""
     assert process.stdin is not None, "it is a pipe"
     assert process.stdout is not None, "the same"
     with contextlib.suppress(IndexError):  # nothing waits any more
