@@ -8,6 +8,8 @@ import os
 import re
 import select
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import posix_ipc
@@ -122,6 +124,18 @@ def locked_by(pid):
 
 def there(names):
     return {name for name in names if (stale_shared_memory.FOLDER / name).exists()}
+
+
+def test_an_error_of_dds_is_told_on_the_error_stream(domain):
+    """Programs read what a command prints: here DDS complains that another process holds the lock of its port."""
+    lock = stale_shared_memory.FOLDER / f"fastrtps_port{7400 + 250 * domain + 11}_el"
+    node = "import rclpy; rclpy.init(); rclpy.create_node('x'); print('made')"
+    with lock.open("ab") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        done = subprocess.run([sys.executable, "-c", node], capture_output=True, text=True, check=True)
+    lock.unlink(missing_ok=True)
+    assert done.stdout == "made\n"
+    assert "open_and_lock_file failed" in done.stderr
 
 
 def test_what_a_killed_node_has_left_is_removed_and_what_a_living_one_has_is_not(domain):

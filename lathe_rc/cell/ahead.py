@@ -54,9 +54,9 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
     processes = [_start() for _ in range(min(os.cpu_count() or 1, len(left)))]
     for process in processes:
         threading.Thread(target=_have_compiled, args=(process, waiting, done), daemon=True).start()
-    if left:
-        compile_loop()  # meanwhile
     try:
+        if left:
+            compile_loop()  # meanwhile
         while left:
             yield list(left.values())
             number, told = done.get()

@@ -70,7 +70,7 @@ def broken() -> LatheError:
     )
 
 
-class Table:
+class AddressTable:
     """Where the addresses of the arrays of a step stand in its table.
 
     First the number of inputs of float64; then the inputs of uint8, of which one without an address stands for none;
@@ -119,7 +119,7 @@ class Native:
         self._words = Words(memory)
         self.words = self._words.words
         self._entry = _entry(step, self._words.kind, tuple(inputs), tuple(outputs))
-        table = Table(inputs, outputs)
+        table = AddressTable(inputs, outputs)
         self._places, self._reached, self._fields = table.places, np.zeros(1, np.int64), np.zeros(table.size, np.int64)
         self._fields[0] = table.floats
 
@@ -197,7 +197,7 @@ _entry = cache(Entry)  # made once for all that are alike
 
 def _text(step: Step, memory: Placed, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]) -> str:
     """The text of the module."""
-    table = Table(inputs, outputs)
+    table = AddressTable(inputs, outputs)
 
     def arrays(begin: int, kinds: Iterable[np.dtype[Any]]) -> str:
         return "".join(f"{_FIELDS[kind]}(fields, {place}, samples), " for place, kind in enumerate(kinds, begin))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.native import BROKEN, Integers, Table, broken
+from lathe_rc.cell.native import BROKEN, AddressTable, Integers, broken
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
 from lathe_rc.jit import kernel
@@ -85,7 +85,7 @@ def _run(
         plan: see above; one row more ends it.
         turn: spindle angle from which on each stage needs Python [rad].
         fields: of each the address of its first sample on the tape less the delay, the size of a sample, and the
-            address of the block at hand, shape (3, fields); those of a stage are its `Table`.
+            address of the block at hand, shape (3, fields); those of a stage are its `AddressTable`.
         where: changed; where it has come to.
         base: place of sample 0 on the tape.
         end: see above.
@@ -202,7 +202,7 @@ class Program:
         fields: list[tuple[int, int, int]] = []
         told: list[int] = []
         for row, (stage, inputs, outputs) in zip(self._plan, stages, strict=False):
-            begin, angle, table = len(fields), stage.angle_input, Table(*stage.field_types)
+            begin, angle, table = len(fields), stage.angle_input, AddressTable(*stage.field_types)
             row[_FIELD], row[_ANGLE] = begin, -1
             fields += [(table.floats, 0, 0)] + [(0, 0, 0)] * (table.size - 1)
             places = iter(begin + place for place in table.places)
