@@ -4,8 +4,10 @@
 To list or complete the commands takes no more than their names and summaries, so both answer at once.
 """
 
+import io
 import os
 import signal
+import sys
 from typing import Any
 
 import click
@@ -46,6 +48,9 @@ class Group(click.Group):
         """See `click.Command`."""
         # SIGTERM ends a command as Ctrl-C does: children are ended and bags closed on the way out.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="replace")  # where an encoding has no µ
         try:
             return super().invoke(ctx)
         except LatheError as error:

@@ -373,3 +373,9 @@ def test_commands_are_listed_without_being_imported():
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_that_is_listed_exists(name):
     assert lathe(name, "--help").stdout.startswith(f"Usage: main {name}")
+
+
+def test_a_terminal_without_the_letter_gets_a_question_mark():
+    result = CliRunner(charset="ascii").invoke(main, ["run", "piston", "--revolutions", "2"])
+    assert result.exit_code == 0
+    assert "?m RMS" in result.output
