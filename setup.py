@@ -87,8 +87,7 @@ setup(
     entry_points={
         "console_scripts": [
             "lathe = lathe_rc.cli:main",
-            *(f"{node} = lathe_rc.nodes.executables:{node}" for node in NODES),
-            *(f"{node} = lathe_rc.nodes.{node}:main" for node in ALONE),
+            *(f"{node} = lathe_rc.nodes.executables:{node}" for node in (*NODES, *ALONE)),
         ],
     },
     zip_safe=False,

@@ -2,6 +2,7 @@
 """The command line of a node's executable, as `ros2 run` calls it: help, what ROS passes over, parameters that lose."""
 
 import importlib.util
+import subprocess
 import sys
 
 import pytest
@@ -23,10 +24,7 @@ def run(monkeypatch, capsys, executable, *words):
     monkeypatch.setattr(sys, "argv", [executable, *words])
     monkeypatch.setenv("COLUMNS", "200")
     try:
-        if executable in TABLES.own:
-            getattr(executables, executable)()
-        else:
-            importlib.import_module(f"lathe_rc.nodes.{executable}").main()
+        getattr(executables, executable)()
         code = 0
     except SystemExit as exit_:
         code = exit_.code
@@ -47,6 +45,16 @@ def test_executables_that_are_no_nodes_of_a_cell_have_help_too(monkeypatch, caps
     code, said, _ = run(monkeypatch, capsys, name, "-h")
     assert code == 0
     assert said.startswith(f"usage: ros2 run lathe_rc {name} ")
+
+
+@pytest.mark.parametrize("name", ["tool", "container"])
+def test_without_ros_an_executable_says_how_to_get_it(name):
+    program = "import sys; sys.modules['rclpy'] = None; from lathe_rc.nodes import executables; "
+    command = [sys.executable, "-c", f"{program}executables.{name}()"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("lathe: no module rclpy here: ")
+    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("name", ["tool", *ALONE])

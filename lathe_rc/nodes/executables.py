@@ -1,28 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executables of ``ros2 run lathe_rc KIND``: one for each kind of node of a cell, under its name.
+"""The executables of ``ros2 run lathe_rc NAME``: one for each kind of node of a cell, and those that are nodes alone.
 
-``python -m lathe_rc.nodes.executables KIND ...`` is the same without an installation.
+``python -m lathe_rc.nodes.executables NAME ...`` is the same without an installation.
 """
 
+import importlib
 import sys
 from collections.abc import Callable
 from functools import partial
-from typing import NoReturn
 
+from lathe_rc import extras
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.nodes import process
+
+ALONE = ("container", "replayer", "rerun_bridge", "topic_recorder")  #: modules beside this one, with a ``main`` each
 
 
-def __getattr__(kind: str) -> Callable[[], NoReturn]:
-    """The entry point of a kind of node.
+def __getattr__(name: str) -> Callable[[], None]:
+    """The entry point of an executable.
 
     Raises:
-        AttributeError: there is no such kind.
+        AttributeError: there is no such executable.
     """
-    if kind not in TABLES.own:
-        raise AttributeError(f"no node {kind!r}")
-    return partial(process.main, kind)
+    if name not in TABLES.own and name not in ALONE:
+        raise AttributeError(f"no node {name!r}")
+    return partial(_main, name)
+
+
+def _main(name: str) -> None:
+    try:
+        if name in ALONE:
+            importlib.import_module(f"lathe_rc.nodes.{name}").main()
+        else:
+            importlib.import_module("lathe_rc.nodes.process").main(name)
+    except ModuleNotFoundError as error:
+        if not (missing := extras.refusal(error.name)):
+            raise
+        print(f"lathe: {missing}", file=sys.stderr)
+        sys.exit(missing.exit_code)
 
 
 if __name__ == "__main__":
-    process.main(sys.argv.pop(1))
+    _main(sys.argv.pop(1))

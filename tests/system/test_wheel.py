@@ -120,6 +120,7 @@ def test_it_runs_without_ros(alone):
     alone.run("lathe", "report", "B", "-o", "report.html")
     assert (alone.folder / "report.html").stat().st_size > 100_000
     assert "Usage: " in alone.run("lathe", "study", "--help")
+    assert alone.run("tool", code=1).startswith("lathe: no module ")
     alone.run("lathe", "new", "law", "mine")
     notebook = """
 from pathlib import Path
