@@ -21,6 +21,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -152,6 +153,27 @@ def run_python(page: Path, folder: Path) -> None:
             assert not wrong, f"{page.name}:{block.line}:\n{wrong}"
 
 
+@dataclass
+class _Beside:
+    """A command in another terminal."""
+
+    command: Command
+    process: subprocess.Popen[str]
+    came: str = ""
+
+    def wait_for_a_line(self) -> None:
+        """Wait for its first line if the page shows any, as a reader does: the next command may need it."""
+        if self.command.shown and not self.came:
+            assert self.process.stdout is not None, "it is a pipe"
+            self.came = self.process.stdout.readline()
+
+    def end(self) -> tuple[int, str]:
+        """Wait for its end: exit code, and all that came."""
+        assert self.process.stdout is not None, "it is a pipe"
+        self.came += self.process.stdout.read()
+        return self.process.wait(), self.came
+
+
 class Reader:
     """Does what the console blocks of a page say, in a folder, with ``lathe`` in the path.
 
@@ -163,7 +185,7 @@ class Reader:
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
         self.folder, self._patch = folder, patch
         self._last: tuple[Command, str] | None = None  # whose output the page has not shown yet
-        self._beside: list[tuple[Command, subprocess.Popen[str]]] = []
+        self._beside: list[_Beside] = []
         tools = folder / ".tools"
         tools.mkdir()
         lathe = tools / "lathe"
@@ -184,8 +206,10 @@ class Reader:
         for block in blocks(page):
             if block.language == "console" and block.title:
                 (command,) = commands(block.text)
-                self._beside.append((command, self._start(command.text)))
+                self._beside.append(_Beside(command, self._start(command.text)))
             elif block.language == "console":
+                for other in self._beside:
+                    other.wait_for_a_line()
                 for command in commands(block.text):
                     code, came = self._run(command.text)
                     self._compare(page, command, code, came)
@@ -238,14 +262,13 @@ class Reader:
     def _wait(self, page: Path) -> None:
         """Wait for the commands in other terminals: they end with the one of the first."""
         while self._beside:
-            command, process = self._beside.pop(0)
-            came, _ = process.communicate(timeout=TIMEOUT)
-            self._compare(page, command, process.returncode, came)
+            other = self._beside.pop(0)
+            self._compare(page, other.command, *other.end())
 
     def leave(self) -> None:
         """End what still runs."""
-        for _, process in self._beside:
-            process.kill()
+        for other in self._beside:
+            other.process.kill()
 
 
 @contextlib.contextmanager
