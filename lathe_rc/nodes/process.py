@@ -33,7 +33,7 @@ from lathe_rc.cell.stages.encoder_device import EncoderDevice
 from lathe_rc.cell.stages.loaded_spindle import LoadedSpindleStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes import arguments, chain, dds, declare
+from lathe_rc.nodes import arguments, chain, dds, declare, overlooked
 from lathe_rc.nodes.encoder_node import EncoderNode
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.recorder_node import RecorderNode
@@ -147,6 +147,8 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
                 return
             if now >= look:
                 look = now + _LONGEST_WAIT
+                for node in nodes:
+                    overlooked.take(node)
                 if reporter.orphaned:
                     return
         due = _due(nodes, now)
