@@ -43,7 +43,7 @@ def test_what_nobody_has_announced_is_handed_over_once(ghost, raw):
 
 def test_a_request_that_nobody_has_announced_is_answered(ghost):
     ghost.create_service(Trigger, "ask", answered)
-    other = rclpy.create_node("asks")
+    other = rclpy.create_node("asks", namespace="/haunted")
     client = other.create_client(Trigger, "ask")
     assert client.wait_for_service(60.0)
     answer = client.call_async(Trigger.Request())
