@@ -79,11 +79,13 @@ class Seen:
 
     def until(self, enough):
         """Until ``enough`` holds of all events so far."""
-        coming = self._processes.events(60.0)
-        while not enough(self._events):
-            self._events.append(next(coming))
-            if not enough(self._events):
-                self._processes._raise_failure(self._events[-1])
+        if enough(self._events):
+            return
+        for event in self._processes.events(60.0):
+            self._events.append(event)
+            if enough(self._events):
+                return
+            self._processes._raise_failure(event)
 
 
 @contextlib.contextmanager

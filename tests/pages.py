@@ -162,16 +162,18 @@ class _Beside:
     came: str = ""
 
     def wait_for_a_line(self) -> None:
-        """Wait for its first line if the page shows any, as a reader does: the next command may need it."""
-        if self.command.shown and not self.came:
+        """Wait for its first line if the page shows it, as a reader does: the next command may need it."""
+        if self.command.shown and self.command.shown[0] != "..." and not self.came:
             assert self.process.stdout is not None, "it is a pipe"
-            self.came = self.process.stdout.readline()
+            line = b""  # byte by byte: what is left in a buffer of the pipe would be lost to `communicate`
+            while not line.endswith(b"\n") and (byte := os.read(self.process.stdout.fileno(), 1)):
+                line += byte
+            self.came = line.decode()
 
     def end(self) -> tuple[int, str]:
         """Wait for its end: exit code, and all that came."""
-        assert self.process.stdout is not None, "it is a pipe"
-        self.came += self.process.stdout.read()
-        return self.process.wait(), self.came
+        rest, _ = self.process.communicate(timeout=TIMEOUT)
+        return self.process.returncode, self.came + rest
 
 
 class Reader:

@@ -20,7 +20,8 @@ from lathe_rc import harness
 from lathe_rc.nodes import stale_shared_memory
 
 SEGMENT = "fastrtps_0123456789abcdef"
-MUTEX = "/fastrtps_port99999_mutex"
+PORT = f"fastrtps_port{70_000 + os.getpid() % 30_000}"  # no domain has it; its semaphore is the machine's
+MUTEX = f"/{PORT}_mutex"
 
 
 @pytest.fixture
@@ -40,8 +41,7 @@ def domain(monkeypatch):
 
 @pytest.fixture
 def port(tmp_path):
-    """One that no domain has: its semaphore is the machine's."""
-    file = tmp_path / "fastrtps_port99999"
+    file = tmp_path / PORT
     file.write_bytes(b"broken")
     yield file
     with contextlib.suppress(posix_ipc.ExistentialError):
@@ -49,8 +49,8 @@ def port(tmp_path):
 
 
 def test_what_nobody_uses_is_removed_and_nothing_else(port, tmp_path):
-    others = {"sem.fastrtps_port99999_mutex", "fastrtps_0123456789abcdef0", "fastrtps_without_a_lock", "port99999"}
-    for name in others | {"fastrtps_port99999_el", SEGMENT, f"{SEGMENT}_el"}:
+    others = {f"sem.{PORT}_mutex", "fastrtps_0123456789abcdef0", "fastrtps_without_a_lock", "port99999"}
+    for name in others | {f"{PORT}_el", SEGMENT, f"{SEGMENT}_el"}:
         (tmp_path / name).touch()
     assert stale_shared_memory.sweep(tmp_path) == [port.name, SEGMENT]
     # A lock that stays would make DDS take what comes next for a port of a dead process.

@@ -5,14 +5,13 @@
 """
 
 import importlib
+import importlib.util
 import sys
 from collections.abc import Callable
 from functools import partial
 
 from lathe_rc import extras
 from lathe_rc.cell.scenario import TABLES
-
-ALONE = ("container", "replayer", "rerun_bridge", "topic_recorder")  #: modules beside this one, with a ``main`` each
 
 
 def __getattr__(name: str) -> Callable[[], None]:
@@ -21,17 +20,17 @@ def __getattr__(name: str) -> Callable[[], None]:
     Raises:
         AttributeError: there is no such executable.
     """
-    if name not in TABLES.own and name not in ALONE:
+    if name not in TABLES.own and importlib.util.find_spec(f"lathe_rc.nodes.{name}") is None:
         raise AttributeError(f"no node {name!r}")
     return partial(_main, name)
 
 
 def _main(name: str) -> None:
     try:
-        if name in ALONE:
-            importlib.import_module(f"lathe_rc.nodes.{name}").main()
-        else:
+        if name in TABLES.own:
             importlib.import_module("lathe_rc.nodes.process").main(name)
+        else:
+            importlib.import_module(f"lathe_rc.nodes.{name}").main()
     except ModuleNotFoundError as error:
         if not (missing := extras.refusal(error.name)):
             raise

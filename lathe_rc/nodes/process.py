@@ -239,7 +239,7 @@ def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
             if kind in STAGES.own and not names_others(STAGES[kind].Parameters, values):
                 compile_kernels(STAGES[kind](name, TABLES[kind].read(name, values)))
                 for row in TABLES[kind].rows().values():
-                    declare.descriptor(row)  # what installed packages offer
+                    row.allowed()  # looks once for what installed packages offer
 
 
 def split(words: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:

@@ -68,12 +68,7 @@ def _remove_port(port: Path) -> bool:
             locks = [lock for end in _LOCKS if (lock := port.with_name(port.name + end)).exists()]
             for lock in locks:
                 fcntl.flock(held.enter_context(lock.open("rb")), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except (
-            posix_ipc.BusyError,
-            posix_ipc.PermissionsError,
-            BlockingIOError,
-            FileNotFoundError,
-        ):  # somebody opens, uses or leaves it
+        except _IN_USE:
             return False
         if _is_mapped(port):
             return False
