@@ -197,10 +197,11 @@ class Processes:
                 if leaves and self._running:
                     self._end_the_silent()
                     continue
+                tails = self._tails()  # before the processes write where they are
                 running = ", ".join(f"{name}{self._place(name)}" for name in self._running)
                 raise LatheError(
                     self._with_the_lost(
-                        f"no node has reported anything for {wait:.0f} s; still running: {running}{self._tails()}"
+                        f"no node has reported anything for {wait:.0f} s; still running: {running}{tails}"
                     )
                 ) from None
             self._newest[event["event"]] = event

@@ -12,7 +12,6 @@ from lathe_rc.errors import LatheError
 from lathe_rc.messages import START_NS, Samples, Signals
 
 _ROWS = 16  # of a sheet
-_MOST = 2**63  # messages
 
 
 class _Single(NamedTuple):
@@ -27,8 +26,9 @@ class _Single(NamedTuple):
 class Merger:
     """Collects the messages of all signal topics and writes them in the order of a bag.
 
-    A row of blocks leaves when every dense topic has brought its block and every source the sparse messages that the
-    block counts: then nothing with an earlier time can still come.
+    A row of blocks leaves when every dense topic has brought its block and every source the sparse messages up to its
+    end, which the block counts: then nothing with an earlier time can still come. Later ones do not count: a source
+    sends on several topics, and DDS keeps the order of each, not that between them.
 
     Args:
         writer: the bag, or what makes bags; its topics must have been added.
@@ -69,9 +69,10 @@ class Merger:
         self._sparse = sparse
         self._repeats: Counter[tuple[str, int, bytes]] = Counter()
         self._sequence = dict.fromkeys(sparse, 0)
-        self._received = dict.fromkeys(sparse.values(), 0)
-        self._needs: list[tuple[int, str, int]] = []  # row, source and the messages that it says it has sent
+        self._written: Counter[str] = Counter()  # sparse messages by source
+        self._needs: list[tuple[int, str, int]] = []  # row, source and the messages that it has sent up to its end
         self._waiting: list[_Single] = []
+        self._lost: set[str] = set()  # sources
         self.rows = self.samples = 0
         self.log_ns = START_NS
         self.complete = False
@@ -96,7 +97,7 @@ class Merger:
         sheet, within = self._find(row, block.samples)
         sheet.put(place, within, block, data)
         source = self._topics[place].source
-        if block.companions > self._received.get(source, 0):
+        if block.companions > self._written[source] and source not in self._lost:
             self._needs.append((row, source, block.companions))
         return self._brought(place, row + 1)
 
@@ -136,7 +137,6 @@ class Merger:
             return
         self._sequence[topic] += 1
         self._waiting.append(_Single(log_ns, topic, self._sequence[topic], data))
-        self._received[self._sparse[topic]] += 1
 
     def restarted(self, source: str) -> None:
         """Another process goes on in the place of a source: what waits of its sparse messages comes once more."""
@@ -146,8 +146,14 @@ class Merger:
 
     def forget(self, sources: Collection[str]) -> None:
         """Wait for no more sparse messages of sources that are lost."""
-        self._received |= dict.fromkeys(sources, _MOST)
+        self._lost.update(sources)
         self._needs = [need for need in self._needs if need[1] not in sources]
+
+    def _lacks(self, row: int, source: str, messages: int) -> bool:
+        """Whether some of the sparse messages of a source up to the end of a row have not come."""
+        end_ns = START_NS + (row + 1) * self._length * self._step_ns
+        came = sum(each.log_ns < end_ns and self._sparse[each.topic] == source for each in self._waiting)
+        return self._written[source] + came < messages
 
     def _check(self, place: int, first: int, samples: int, *, last: bool) -> int:
         """The row of the next block of a topic."""
@@ -205,7 +211,7 @@ class Merger:
         """
         ready = min(self._ends)
         if self._needs:
-            self._needs = [need for need in self._needs if self._received.get(need[1], 0) < need[2]]
+            self._needs = [need for need in self._needs if self._lacks(*need)]
             ready = min([ready, *(row for row, _, _ in self._needs)])
         if self._final is not None and ready > self._final and self._finals < len(self._topics):
             raise LatheError("topics are not cut into the same blocks: not all end with the same one (`last`)")
@@ -230,6 +236,7 @@ class Merger:
         due = sorted(single for single in self._waiting if single.log_ns <= first_ns) if self._waiting else []
         if due:
             self._waiting = [single for single in self._waiting if single.log_ns > first_ns]
+            self._written.update(self._sparse[single.topic] for single in due)
         if due and due[-1].log_ns == first_ns:
             # Among messages of one time the topic decides: this row has to be taken apart.
             due += [_Single(first_ns, each.topic, 0, sheet.message(k, within)) for k, each in enumerate(self._topics)]
