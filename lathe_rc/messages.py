@@ -27,6 +27,7 @@ MARGIN = f"{PACKAGE}/msg/MarginBlock"
 SAFETY = f"{PACKAGE}/msg/SafetyBlock"
 SAFETY_STATUS = f"{PACKAGE}/msg/SafetyStatus"
 MEMBER = f"{PACKAGE}/msg/Member"
+CELL_STATE = f"{PACKAGE}/msg/CellState"
 JOINTS = "sensor_msgs/msg/JointState"
 ALIVE = "alive"  #: topic of each node without messages: only its liveliness counts
 

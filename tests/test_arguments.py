@@ -14,7 +14,7 @@ from rclpy.node import Node
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
-from lathe_rc.nodes import declare, executables
+from lathe_rc.nodes import arguments, declare, executables
 
 ALONE = ["replayer", "topic_recorder", *(["rerun_bridge"] if importlib.util.find_spec("rerun") else [])]
 
@@ -139,3 +139,8 @@ def test_a_parameter_that_something_else_overrules_is_refused(domain, tmp_path, 
     """ROS keeps quiet about it."""
     with pytest.raises(InputError, match=r"^-p (tool:)?feed:=2\.0 does not reach (/left)?/tool, which " + said):
         feed_of(tmp_path, words, file)
+
+
+def test_command_line_without_anything_says_nothing():
+    """``lathe node NAME`` alone is the shortest command of all."""
+    assert [*arguments.rules([])] == []

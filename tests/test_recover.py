@@ -26,7 +26,7 @@ from lathe_rc.bag.repairing.salvage import Salvage
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cli import main
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import InputError, LatheError, LossyRunError
 
 MODES = [
     pytest.param(plugin, mode, id=f"{plugin.name}-{mode.name}".lower())
@@ -405,3 +405,14 @@ def test_a_file_that_unpacks_to_more_than_allowed_is_refused(tmp_path, monkeypat
     monkeypatch.setattr("lathe_rc.bag.reading.unpacking.MOST_UNPACKED", 1000)
     with pytest.raises(InputError, match="unpacks to more than 1000 B"):
         Source(path)
+
+
+def test_a_bag_of_a_cell_that_did_not_begin_is_not_clean(tmp_path):
+    """It has the state of the cell, and no signals."""
+    path = tmp_path / "bag"
+    writer = BagWriter(path, compression="none", chunk_size=4096, about={})
+    writer.add_topic("/cell_state", messages.CELL_STATE, offered_qos(1, "transient_local"))
+    writer.close()
+    result = lathe("bag", "check", path)
+    assert result.exit_code == LossyRunError.exit_code, result.output
+    assert "no block: the cell of this bag did not begin" in result.output

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from cells import STEP, Seen, block, scenario
+from cells import STEP, Seen, block, held, scenario
 from diagnostic_msgs.msg import DiagnosticArray
 from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, SafetyStatus, ToolBlock
 from mcap.reader import make_reader
@@ -166,14 +166,21 @@ def test_a_cell_goes_on_among_foreign_messages(ghost, domain, tmp_path):
     assert "/haunted/ghost" in values["publishers of /tool"]
 
 
-def test_a_cell_begins_in_a_flood_of_announcements(ghost, domain):
+def test_a_cell_begins_in_a_flood_of_announcements(ghost, domain, tmp_path):
     """A cell begins in a flood that pushes its own announcements out of the readers of nodes that start."""
     sends = [(ghost.create_publisher(Member, "/members", latched_qos(10)), Member(run_id="elsewhere", name="/x"))]
     cell = scenario(spindle_encoder={"revolutions": 2.0})
-    with all_the_time(sends, pause=0.0005):
-        result = harness.run(cell, mode="processes", groups=[], domain=domain)
-    assert result.digest == harness.run(cell).digest
-    assert result.refused["/x of run 'elsewhere' on /members"] > 256
+    recorded = harness.with_recorder(cell, tmp_path / "bag", keep=True)
+
+    def in_the_flood(events):
+        return {each["node"] for each in events if refused_by_a_node(each)} >= recorded.nodes.keys() - {"recorder"}
+
+    with all_the_time(sends, pause=0.0005), held(recorded, domain) as (processes, begin):
+        Seen(processes).until(in_the_flood)
+        begin()
+        processes.wait_for_end()
+    assert reader.read(tmp_path / "bag").digests() == harness.run(cell).digest
+    assert processes.refused["/x of run 'elsewhere' on /members"] > 256
 
 
 def test_who_speaks_in_the_name_of_a_member_makes_the_cell_safe_and_all_publishers_are_named(ghost, domain, tmp_path):

@@ -31,7 +31,7 @@ from lathe_rc.view import report as reporting
 from lathe_rc.view.report_figures import timing
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_gather import gather
-from lathe_rc.view.report_host import CELL_STATE, DIAGNOSTICS, Host
+from lathe_rc.view.report_host import DIAGNOSTICS, Host
 from lathe_rc.view.report_series import Envelope, MeanRows, Thinned
 from lathe_rc.view.report_verdict import judged
 
@@ -401,9 +401,9 @@ class TestHost:
         for k in range(200):
             host.add(DIAGNOSTICS, diagnostics(1.0 + k, level=2, message="broken"))
         assert host.errors == ["/spindle: broken"]
-        state = messages.store().types[CELL_STATE]
+        state = messages.store().types[messages.CELL_STATE]
         for k in range(200):
-            host.add(CELL_STATE, messages.encode(CELL_STATE, state("run", 3, k, "no tool", 0, [])))
+            host.add(messages.CELL_STATE, messages.encode(messages.CELL_STATE, state("run", 3, k, "no tool", 0, [])))
             host.add(DIAGNOSTICS, diagnostics(1.0, name=f"/n{k}"))
         assert host.errors[1] == "the cell failed at sample 0: no tool"
         assert len(host.errors) <= 50

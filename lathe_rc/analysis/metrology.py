@@ -49,7 +49,7 @@ class FormErrors:
 
 def _starts(turns: Array, step: Array, first: int = 0) -> npt.NDArray[np.int64]:
     """First sample of each complete revolution from ``first`` on and of the one after; ``step`` in revolutions."""
-    whole = int(np.floor(turns[-1] + 2 * step[-1]))
+    whole = int(np.floor(turns[-1] + min(2 * step[-1], 0.5)))
     return np.searchsorted(turns, np.arange(first, max(whole, first) + 1))
 
 

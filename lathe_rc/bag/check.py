@@ -129,6 +129,8 @@ def check(path: Path) -> Findings:
                 findings.wrong.append(f"{topic}: {counts[topic]} messages, {said.count} by the index")
         findings.messages = sum(counts.values())
     _ends(dense, findings, part=part is not None)
+    if not dense and messages.CELL_STATE in types.values():
+        findings.lost.append("no block: the cell of this bag did not begin")
     if part and not 0 < part[1] == findings.samples:
         why = f"it says that it has {part[1]}" if part[1] else "it was never closed"
         findings.lost.append(f"the snapshot has {findings.samples} samples, and {why}")

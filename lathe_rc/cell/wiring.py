@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lathe_rc.analysis.learning import Response
+from lathe_rc.cell import extremes
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stage import Input, Output, Stage
@@ -28,6 +29,8 @@ from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError, UnpublishedError
 from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.tip_path import steepest_fall
+
+_LEAST_SAMPLES = 4  # of a revolution
 
 
 @dataclass(frozen=True)
@@ -188,7 +191,9 @@ class Cell:
     ) -> None:
         self.unknown, self.unchecked = unknown or {}, list[str]()
         self.factors: dict[str, float] = {}
-        made = {name: stage(name, table) for name, table in nodes.items() if kind_of(name, table.stage) in STAGES}
+        self._tables = nodes
+        with extremes.refused(nodes):
+            made = {name: stage(name, table) for name, table in nodes.items() if kind_of(name, table.stage) in STAGES}
         ports = tuple(map(_ports, made.values()))
         self.wiring = _wire(ports, self.unknown) if self.unknown else _wire_alike(ports)
         self.dense, self.sparse = self.wiring.dense, self.wiring.sparse
@@ -279,12 +284,21 @@ class Cell:
                 that would rub, a tool that is not brought out of the part, a memory that would be read before it is
                 learned, a learning loop that does not converge.
         """
+        with extremes.refused(self._tables):
+            self._check()
+
+    def _check(self) -> None:
         self.unchecked.clear()
         self.factors.clear()
         low, high = self.master.speed_range()
         if low <= 0.0:
             raise InputError(
                 f"{self.master.name}.nominal_rpm and its deviations: speed falls to {low:.4g} rad/s; allowed: above 0"
+            )
+        if (samples := 2.0 * math.pi / (high * self.master.shared.step)) < _LEAST_SAMPLES:
+            raise InputError(
+                f"{self.master.name}.nominal_rpm and its deviations: a revolution takes {samples:.3g} samples at "
+                f"{high:.4g} rad/s; allowed: {_LEAST_SAMPLES} or more (turn slower, or raise sample_rate)"
             )
         for stage in self.stages.values():
             for port in stage.inputs:

@@ -4,6 +4,7 @@
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple, NoReturn
 
 from lathe_rc.cell.parameters import Table
@@ -108,7 +109,7 @@ def exit_with(work: Callable[[], int]) -> NoReturn:
 def rules(words: Sequence[str]) -> Iterator[Rule]:
     """Each ``-p`` of a command line that ROS has accepted."""
     is_ros = False
-    for word, following in zip(words, [*words[1:], ""], strict=True):
+    for word, following in pairwise([*words, ""]):
         if word in (ROS, "--"):
             is_ros = word == ROS
         elif is_ros and word in ("-p", "--param"):

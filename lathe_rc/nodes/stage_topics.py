@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 from functools import partial
 
 from lathe_rc import messages
+from lathe_rc.cell import extremes
 from lathe_rc.cell.block import Pool
 from lathe_rc.cell.framing import Framer
 from lathe_rc.cell.stage import Input, Sparse, Stage, compile_kernels
@@ -38,7 +39,8 @@ class StageTopics(CellNode):
 
     def configure_part(self) -> None:
         """Build the stage and compile its kernels: the first block then takes no longer than the next."""
-        self.stage = STAGES[self.kind](self.get_name(), self.table)
+        with extremes.refused({self.get_name(): self.table}):
+            self.stage = STAGES[self.kind](self.get_name(), self.table)
         compile_kernels(self.stage)
         self.blocks = 0
         self.samples = 0

@@ -9,8 +9,7 @@ from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
 from lathe_rc.view.report_series import Thinned
 
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
-CELL_STATE = f"{messages.PACKAGE}/msg/CellState"
-TYPES = frozenset({DIAGNOSTICS, CELL_STATE})
+TYPES = frozenset({DIAGNOSTICS, messages.CELL_STATE})
 
 _STATES = ("waiting", "running", "ended", "failed", "safe")
 _FAILED, _SAFE = 3, 4
@@ -76,7 +75,7 @@ class Host:
         except ValueError:
             self.unreadable += 1
             return
-        if msgtype == CELL_STATE:
+        if msgtype == messages.CELL_STATE:
             self._state(message)
             return
         for status in message.status:

@@ -27,7 +27,6 @@ from lathe_rc.names import instead
 _CATCH_UP = 4  # messages or rows that go to the disk for each that comes, until a snapshot has caught up
 _SPARE_ROWS = 2  # kept beyond the time before a trigger: a trigger may lie in the row before the newest
 _IN_FLIGHT = 16  # rows more that may be in memory: they come some at once
-_LATCHED = f"{messages.PACKAGE}/msg/CellState"
 _HEARD = (messages.EVENT, messages.SAFETY_STATUS)  # what may be a trigger
 
 
@@ -207,7 +206,7 @@ class Snapshots:
         while self._kept and self._kept[0].log_ns < oldest_ns:
             item = self._kept.popleft()
             self.held -= len(item.data)
-            if isinstance(item.key, str) and self._topics[item.key][0] == _LATCHED:
+            if isinstance(item.key, str) and self._topics[item.key][0] == messages.CELL_STATE:
                 self._latched[item.key] = item.data
 
     # ---- triggers -----------------------------------------------------------------------------------
@@ -267,7 +266,7 @@ class Snapshots:
         if isinstance(item.key, RowPlan):
             if item.log_ns >= first_ns:
                 bag.write_rows(item.key, item.log_ns, bytes(item.data))
-        elif item.log_ns >= first_ns or self._topics[item.key][0] == _LATCHED:
+        elif item.log_ns >= first_ns or self._topics[item.key][0] == messages.CELL_STATE:
             bag.write(item.key, max(item.log_ns, first_ns), item.data)
 
     def _catch_up(self, count: int) -> None:

@@ -3,7 +3,7 @@
 
 from typing import Annotated, Literal, NamedTuple
 
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, Le
 
 from lathe_rc import messages
 from lathe_rc.arrays import put
@@ -39,7 +39,7 @@ class DecouplerParameters(NodeParameters):
     k1: bool = parameter(default=True, doc="takes the effect of the cross command off the force")
     k2: bool = parameter(default=True, doc="takes the effect of the longitudinal command off the position")
     inverse_lag: Annotated[float, Gt(0)] = parameter(LAG, "lag for each order that an inverse is missing", "s")
-    leak: Annotated[float, Ge(0)] = parameter(LEAK, "of the integrators in K1 and K2; 0: none", "rad/s")
+    leak: Annotated[float, Ge(0), Le(1e6)] = parameter(LEAK, "of the integrators in K1 and K2; 0: none", "rad/s")
 
     @property
     def commanded_topic(self) -> str:
