@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``python -m lathe_rc``: the command line."""
 
-from lathe_rc.cli import main
+from lathe_rc.loading import load
 
 if __name__ == "__main__":
-    main(prog_name="lathe")
+    load("lathe_rc.cli").main(prog_name="lathe")

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands of ``lathe`` by name, with their summaries; the module of one is imported when it is asked for."""
 
-import importlib
 from typing import cast
 
 import click
+
+from lathe_rc.loading import load
 
 COMMANDS = {
     "bag": "Ask bags what is in them; check and recover them; take a tachogram out.",
@@ -34,5 +35,5 @@ _BESIDES = {"container": "node"}  # commands in the module of another one
 
 def imported(name: str) -> click.Command:
     """A command with its module."""
-    module = importlib.import_module(f"lathe_rc.commands.{_BESIDES.get(name, name)}")
+    module = load(f"lathe_rc.commands.{_BESIDES.get(name, name)}")
     return cast("click.Command", getattr(module, name))

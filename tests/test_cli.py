@@ -3,6 +3,7 @@
 
 import json
 import math
+import os
 import re
 import signal
 import subprocess
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lathe_rc import harness
+from lathe_rc import harness, loading
 from lathe_rc.cell.scenario import TABLES, load
 from lathe_rc.cli import main
 from lathe_rc.command_list import COMMANDS
@@ -379,3 +380,18 @@ def test_a_terminal_without_the_letter_gets_a_question_mark():
     result = CliRunner(charset="ascii").invoke(main, ["run", "piston", "--revolutions", "2"])
     assert result.exit_code == 0
     assert "?m RMS" in result.output
+
+
+def test_ctrl_c_during_an_import_ends_at_once_and_silently(tmp_path):
+    """A node takes a second to import; a traceback of half an import tells nobody anything."""
+    (tmp_path / "interrupted.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
+    words = [sys.executable, "-c", "from lathe_rc.loading import load; load('json'); load('interrupted')"]
+    environment = os.environ | {"PYTHONPATH": f"{Path(__file__).parents[1]}:{tmp_path}"}
+    ended = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGINT, b"", b"")
+
+
+def test_ctrl_c_after_an_import_is_an_exception_again():
+    before = signal.getsignal(signal.SIGINT)
+    loading.load("json")
+    assert signal.getsignal(signal.SIGINT) is before

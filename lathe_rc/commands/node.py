@@ -8,6 +8,7 @@ import click
 
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.errors import InputError
+from lathe_rc.loading import load
 from lathe_rc.nodes.arguments import help_or_refusal
 
 _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
@@ -45,6 +46,5 @@ def container(arguments: tuple[str, ...]) -> None:
 
 
 def _nodes(arguments: Sequence[str]) -> int:
-    from lathe_rc.nodes import process
-
-    return process.run(*process.split(arguments))
+    process = load("lathe_rc.nodes.process")
+    return int(process.run(*process.split(arguments)))

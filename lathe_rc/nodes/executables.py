@@ -4,7 +4,6 @@
 ``python -m lathe_rc.nodes.executables NAME ...`` is the same without an installation.
 """
 
-import importlib
 import importlib.util
 import sys
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from functools import partial
 
 from lathe_rc import extras
 from lathe_rc.cell.scenario import TABLES
+from lathe_rc.loading import load
 
 
 def __getattr__(name: str) -> Callable[[], None]:
@@ -28,9 +28,9 @@ def __getattr__(name: str) -> Callable[[], None]:
 def _main(name: str) -> None:
     try:
         if name in TABLES.own:
-            importlib.import_module("lathe_rc.nodes.process").main(name)
+            load("lathe_rc.nodes.process").main(name)
         else:
-            importlib.import_module(f"lathe_rc.nodes.{name}").main()
+            load(f"lathe_rc.nodes.{name}").main()
     except ModuleNotFoundError as error:
         if not (missing := extras.refusal(error.name)):
             raise
