@@ -13,7 +13,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from lathe_rc import __version__
+from lathe_rc import __version__, extras
 from lathe_rc.command_list import COMMANDS, imported
 from lathe_rc.errors import LatheError, shown
 
@@ -52,17 +52,11 @@ class Group(click.Group):
             if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="replace")  # where an encoding has no µ
         try:
-            return super().invoke(ctx)
+            with extras.named():
+                return super().invoke(ctx)
         except LatheError as error:
             click.echo(f"lathe: {error}", err=True)
             ctx.exit(error.exit_code)
-        except ModuleNotFoundError as error:
-            from lathe_rc import extras
-
-            if not (missing := extras.refusal(error.name)):
-                raise
-            click.echo(f"lathe: {missing}", err=True)
-            ctx.exit(missing.exit_code)
         except MemoryError as error:
             click.echo(f"lathe: not enough memory ({shown(error)})", err=True)
             ctx.exit(LatheError.exit_code)

@@ -2,6 +2,8 @@
 """Packages that not every installation has, and how to install them."""
 
 import importlib.util
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from lathe_rc.errors import LatheError
 
@@ -27,6 +29,21 @@ def refusal(module: str | None) -> LatheError | None:
     if extra is None:
         return None
     return LatheError(f"no module {module} here: {_CHECKOUT[extra]}, or pip install 'lathe_rc[{extra}]'")
+
+
+@contextmanager
+def named() -> Iterator[None]:
+    """Say in one line how to install what an import lacks.
+
+    Raises:
+        LatheError: a module of an extra is missing.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if missing := refusal(error.name):
+            raise missing from None
+        raise
 
 
 def require(module: str) -> None:

@@ -23,12 +23,9 @@ def run(monkeypatch, capsys, executable, *words):
     """Exit code, stdout and stderr of an executable."""
     monkeypatch.setattr(sys, "argv", [executable, *words])
     monkeypatch.setenv("COLUMNS", "200")
-    try:
+    with pytest.raises(SystemExit) as end:
         getattr(executables, executable)()
-        code = 0
-    except SystemExit as exit_:
-        code = exit_.code
-    return code, *capsys.readouterr()
+    return end.value.code, *capsys.readouterr()
 
 
 @pytest.mark.parametrize("name", TABLES.own)

@@ -2,18 +2,19 @@
 """Executable: nodes in one process, NAME[:STAGE]... [--ros-args ...]; for the harness and the launch file."""
 
 import sys
+from typing import NoReturn
 
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.nodes import arguments, process
 
 
-def main() -> None:
-    """Run the nodes."""
+def main() -> NoReturn:
+    """Run the nodes, and exit."""
     words = sys.argv[1:]
     if arguments.ask_for_help(words):
         print(f"usage: ros2 run lathe_rc container NAME[:STAGE] ... [{arguments.ROS} ...]")
         print(f"stages: {TABLES.allowed()}; ros2 run lathe_rc STAGE --help lists the parameters of one")
-        return
+        sys.exit(0)
     arguments.exit_with(lambda: process.run(*process.split(words)))
 
 

@@ -8,10 +8,12 @@ import importlib.util
 import sys
 from collections.abc import Callable
 from functools import partial
+from typing import NoReturn
 
 from lathe_rc import extras
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.loading import load
+from lathe_rc.nodes.arguments import exit_with
 
 
 def __getattr__(name: str) -> Callable[[], None]:
@@ -25,17 +27,15 @@ def __getattr__(name: str) -> Callable[[], None]:
     return partial(_main, name)
 
 
-def _main(name: str) -> None:
-    try:
-        if name in TABLES.own:
-            load("lathe_rc.nodes.process").main(name)
-        else:
-            load(f"lathe_rc.nodes.{name}").main()
-    except ModuleNotFoundError as error:
-        if not (missing := extras.refusal(error.name)):
-            raise
-        print(f"lathe: {missing}", file=sys.stderr)
-        sys.exit(missing.exit_code)
+def _main(name: str) -> NoReturn:
+    module, words = ("process", [name]) if name in TABLES.own else (name, [])
+
+    def work() -> NoReturn:
+        with extras.named():
+            load(f"lathe_rc.nodes.{module}").main(*words)
+        raise AssertionError("an executable exits by itself")
+
+    exit_with(work)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from builtin_interfaces.msg import Time
 from lathe_rc_msgs.msg import CellState, Member, Progress
@@ -328,8 +328,8 @@ def run(values: Mapping[str, object], args: Sequence[str]) -> int:
     return alone.run(KIND, ReplayerParameters, _work, values, args)
 
 
-def main() -> None:
-    """Run the node."""
+def main() -> NoReturn:
+    """Run the node, and exit."""
     arguments.executable(KIND, ReplayerParameters, partial(run, {}))
 
 

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import NoReturn
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -170,8 +171,8 @@ def run(values: Mapping[str, object], args: Sequence[str]) -> list[Shown]:
             return bridge.run()
 
 
-def main() -> None:
-    """Run the node."""
+def main() -> NoReturn:
+    """Run the node, and exit."""
 
     def bridge(words: Sequence[str]) -> int:
         run({}, words)

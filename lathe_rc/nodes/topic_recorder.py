@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
@@ -258,8 +258,8 @@ def run(values: Mapping[str, object], args: Sequence[str]) -> int:
     return alone.run(KIND, TopicRecorderParameters, _work, values, args)
 
 
-def main() -> None:
-    """Run the node."""
+def main() -> NoReturn:
+    """Run the node, and exit."""
     arguments.executable(KIND, TopicRecorderParameters, partial(run, {}))
 
 
