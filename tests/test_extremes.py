@@ -22,7 +22,7 @@ def made(scenario, values):
 @pytest.mark.parametrize("value", [1e300, 1e-300])
 def test_no_parameter_ends_in_a_failure_of_floating_point(value):
     """Every number of every stage, far beyond what it can be: the cell is made and checked, or refused in one line."""
-    seen = set()
+    seen, refused = set(), []
     for path in sorted(CONFIG.glob("*.yaml")):
         scenario = load(path)
         for node, table in scenario.nodes.items():
@@ -32,12 +32,13 @@ def test_no_parameter_ends_in_a_failure_of_floating_point(value):
                     try:
                         made(scenario, {f"{node}.{name}": value})
                     except LatheError as error:
-                        assert len(str(error).splitlines()) == 1
+                        refused.append(str(error))
     assert len(seen) > 300
+    assert not [message for message in refused if len(message.splitlines()) != 1]
 
 
 def test_what_is_far_from_its_default_is_named():
-    with pytest.raises(InputError, match=r"^feed_drive\.stop_time = 1e\+300 \[s\] \(default 1\): .*; take what a machine"):
+    with pytest.raises(InputError, match=r"^feed_drive\.stop_time = 1e\+300 \[s\] \(default 1\): .*; take what a"):
         made(load(CONFIG / "approach.yaml"), {"feed_drive.stop_time": 1e300})
 
 

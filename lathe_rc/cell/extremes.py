@@ -26,11 +26,11 @@ def refused(tables: Mapping[str, NodeParameters]) -> Iterator[None]:
     try:
         yield
     except (ArithmeticError, np.linalg.LinAlgError) as error:
-        far = [told for name, table in tables.items() for told in _far(name, table)]
+        far = [each for name, table in tables.items() for each in _far(name, table)]
         if not far:
             raise
-        why = error.args[-1]
-        raise InputError(f"{'; '.join(far)}: nothing can be computed with that ({why}); take what a machine has") from None
+        told = f"{'; '.join(far)}: nothing can be computed with that ({error.args[-1]}); take what a machine has"
+        raise InputError(told) from None
 
 
 def _far(name: str, table: NodeParameters) -> Iterator[str]:
@@ -40,4 +40,5 @@ def _far(name: str, table: NodeParameters) -> Iterator[str]:
             continue
         size, usual = abs(value), abs(row.default)
         if not (usual / _FAR < size < usual * _FAR if usual else size < _HUGE):
-            yield f"{name}.{row.name} = {value:g} {row.unit and f'[{row.unit}]'}".rstrip() + f" (default {row.default:g})"
+            unit = f" [{row.unit}]" if row.unit else ""
+            yield f"{name}.{row.name} = {value:g}{unit} (default {row.default:g})"
