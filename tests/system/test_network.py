@@ -30,7 +30,7 @@ _TUNSETIFF, _TAP, _NO_PI = 0x400454CA, 0x0002, 0x1000
 GROUPS = [["spindle_encoder"], ["learning_controller"], ["electrodynamic_actuator"], ["tool"], ["recorder"]]
 FAR = ("electrodynamic_actuator", "recorder")
 CELL = scenario(spindle_encoder={"revolutions": 30.0})
-CAUTIOUS = scenario(spindle_encoder={"revolutions": 30.0, "stall_reaction": "safe", "stall_time": 1.0})
+CAUTIOUS = scenario(spindle_encoder={"revolutions": 30.0, "stall_reaction": "safe", "stall_time": 2.0})
 
 
 def ip(*words):
