@@ -78,6 +78,18 @@ def test_last_sample_before_the_end_completes_a_revolution():
     assert form_errors(angle[:-3], np.ones(angle.size - 3)).rms.size == 1
 
 
+def test_revolutions_of_few_samples_have_their_error():
+    found = form_errors(np.arange(200) * 2.0 * np.pi / 1.5, np.ones(200))
+    assert found.rms == pytest.approx(np.ones(133))
+
+
+def test_revolution_without_a_sample_is_refused():
+    with pytest.raises(
+        InputError, match=r"^revolution \d+ has no sample; allowed: an angle that increases by less than"
+    ):
+        form_errors(np.arange(200) * 2.0 * np.pi / 0.7, np.ones(200))
+
+
 @pytest.mark.parametrize("samples", [0, 1, 2, 5])
 def test_very_short_run_has_no_revolution(samples):
     found = form_errors(np.arange(samples) * 1e-3, np.ones(samples))

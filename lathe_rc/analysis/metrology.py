@@ -72,6 +72,9 @@ def form_errors(angle: Array, error: Array, first: int = 0) -> FormErrors:
 
     The mean square is taken over the angle, not over time: a place that the spindle passes slowly counts once.
     A revolution that the run ends within is left out, unless less than two samples are missing.
+
+    Raises:
+        InputError: a revolution has no sample.
     """
     if angle.size < 2:
         return FormErrors(np.empty(0), np.empty(0), np.empty(0), np.zeros(1, dtype=np.int64))
@@ -82,6 +85,11 @@ def form_errors(angle: Array, error: Array, first: int = 0) -> FormErrors:
     starts = _starts(turns, step, first)
     whole = starts.size - 1
     edges = starts[:-1]
+    if not np.all(sampled := edges < starts[1:]):
+        raise InputError(
+            f"revolution {first + int(np.argmin(sampled))} has no sample; allowed: an angle that increases by less "
+            "than a revolution from sample to sample"
+        )
     squares = np.add.reduceat(error * error * step, edges)[:whole] if whole else np.empty(0)
     weight = np.add.reduceat(step, edges)[:whole] if whole else np.empty(0)
     if whole and starts[-1] < angle.size:
