@@ -57,17 +57,17 @@ class Manager:
             nothing = GetState.Request() if kind is GetState else ChangeState.Request(transition=Transition(id=255))
             while self._answer(client, nothing, 0.5) is None:
                 pass
-        # Once in sixty walks a state was asked for and no answer came in a minute, for a reason that is not known. To
-        # ask for it again changes nothing.
-        answer = self._answer(self._clients[service], request, 10.0 if kind is GetState else 60.0)
-        if answer is None and kind is GetState:
-            answer = self._answer(self._clients[service], request, 60.0)
+        answer = self._answer(self._clients[service], request, 60.0)
         assert answer is not None, f"{service} does not answer{self._place_of(service.split('/')[1])}"
         return answer
 
     def _place_of(self, node):
         child = next((child for child in self.processes._children if node in child.split("+")), None)
-        return f"; {child} stands{self.processes._place(child)}" if child else ""
+        if not child:
+            return ""
+        place, code = self.processes._place(child), self.processes._children[child].poll()
+        said = "\n".join(self.processes._log(child))
+        return f"; {child} {'stands' if code is None else f'has ended with {code}'}{place}; it said:\n{said}"
 
     def _answer(self, client, request, seconds):
         future = client.call_async(request)

@@ -7,10 +7,8 @@ on each announcement takes the message before: the newest one waits for the next
 start is overlooked stands still for ever. So a node looks itself from time to time.
 """
 
-from contextlib import suppress
 from typing import Any
 
-from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 
 _MOST = 64  # of one topic or service at a time: a flood keeps nobody from its neighbours
@@ -19,14 +17,14 @@ _MOST = 64  # of one topic or service at a time: a flood keeps nobody from its n
 def take(node: Node) -> None:
     """Hand over what waits at a node's subscriptions and services to their callbacks, as the executor does."""
     for subscription in [*node.subscriptions]:
-        with suppress(InvalidHandle), subscription.handle:  # a callback may destroy another one
+        with subscription.handle:
             for _ in range(_MOST):
                 if (found := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is None:
                     break
                 subscription.callback(found[0])
     for service in [*node.services]:
         kind: Any = service.srv_type  # rclpy does not say that it has requests and responses
-        with suppress(InvalidHandle), service.handle:
+        with service.handle:
             for _ in range(_MOST):
                 request, header = service.handle.service_take_request(kind.Request)
                 if header is None:

@@ -17,9 +17,6 @@ from typing import Any, NoReturn, cast
 
 import numpy as np
 import rclpy
-from rclpy.exceptions import InvalidHandle
-from rclpy.executors import Executor
-from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 from rclpy.type_support import check_for_type_support
@@ -35,6 +32,7 @@ from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import arguments, chain, dds, declare, overlooked
 from lathe_rc.nodes.encoder_node import EncoderNode
+from lathe_rc.nodes.events import Events
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.recorder_node import RecorderNode
 from lathe_rc.nodes.report import THROUGHPUT, Reporter
@@ -124,18 +122,8 @@ def _work(nodes: Sequence[CellNode], stop: _Stop, until: float) -> None:
             return
 
 
-def _spin(executor: Executor, wait: float) -> None:
-    """Let the executor wait for the next event, up to so many seconds, and handle it."""
-    # EventsExecutor hands over events of what a node has destroyed since, when it was cleaned up.
-    with contextlib.suppress(InvalidHandle):
-        executor.spin_once(timeout_sec=wait)
-
-
 def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
-    executor = EventsExecutor()
-    for node in nodes:
-        executor.add_node(node)
-    # EventsExecutor.spin() hangs in Jazzy and Kilted; a loop of spin_once() works and sees signals.
+    events = Events(nodes)
     look = 0.0
     while not stop.signal:
         now = time.monotonic()
@@ -153,13 +141,13 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
                     return
         due = _due(nodes, now)
         wait = 0.0 if any(node.due for node in nodes) else due - now
-        _spin(executor, min(max(wait, 0.0), _LONGEST_WAIT))
+        events.spin(min(max(wait, 0.0), _LONGEST_WAIT))
         # Take what else has arrived before computing: a burst in makes a burst out, and neighbours wake up once
         # for all of it. Waking them is the dearest part of a hop.
         # A flood must not keep anybody from signals and from its neighbours.
         handled, end = -1, time.monotonic() + _LONGEST_BURST
         while handled < (handled := sum(node.handled for node in nodes)) and not stop.signal:
-            _spin(executor, 0.0)
+            events.spin(0.0)
             if time.monotonic() >= end:
                 break
         _work(nodes, stop, due)

@@ -10,6 +10,7 @@ import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import chain, repeat
 from typing import Any
 
@@ -55,6 +56,8 @@ class CellNode(Listening):
         over: it has finished its part of the run.
         watch: whether those are alive that it cannot do without; there once it is active.
         patience: for messages to be acknowledged [s].
+        discarded: destroy the publishers, subscriptions and services that it had before it was cleaned up; for its
+            process to call.
         next_tick: monotonic time [s] at which it wants `tick` to be called.
     """
 
@@ -77,6 +80,7 @@ class CellNode(Listening):
         self.refused_messages = RefusedMessages(self._report_refused)
         self._diagnostics_due = time.monotonic() + _DIAGNOSTICS_PERIOD
         self._without_endpoints = self._endpoints()
+        self.discarded: list[Callable[[], object]] = []
         self._service_change_state.callback = self._refusing(self._service_change_state.callback)
         self._forget()
 
@@ -154,8 +158,7 @@ class CellNode(Listening):
             self._wait_for_acknowledgement([self._host["members"]])
             self.watch.close()
         for before, now, destroy in zip(self._without_endpoints, self._endpoints(), self._destroyers(), strict=True):
-            for endpoint in now - before:
-                destroy(endpoint)
+            self.discarded += [partial(destroy, endpoint) for endpoint in now - before]
         self._forget()
 
     def _shut_down(self) -> None:
