@@ -291,7 +291,7 @@ def told(bridge):
 
 def test_a_running_cell_is_shown_as_its_bag(offline, tmp_path):
     with harness.free_domain() as domain, watching(domain, tmp_path, "--once") as bridge:
-        with cell(tmp_path, domain, "spindle_encoder.speed_factor=0.3") as (processes, begin):
+        with cell(tmp_path, domain, "spindle_encoder.speed_factor=0.1") as (processes, begin):
             listens(bridge)
             begin()
             processes.wait_for_end()

@@ -121,6 +121,7 @@ def main(arguments: list[str]) -> int:
         return int(bool(failed))
     verdicts += [f"{name} FAILED: see above" for name in failed]
     verdicts.append("not run: the tests that need system packages or privileges (./lathe test --system)")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # rewriting the tests takes each worker 3 s: pytest keeps them
     with covered() if measure else contextlib.nullcontext():
         code = pytest.main(["-m", "not system", *AT_ONCE, *REPORTED, *arguments], plugins=[Verdicts(verdicts)])
     return int(code) or int(bool(failed))

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a node discards while events of it are on their way."""
+
+import time
+from functools import partial
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+import rclpy
+from rclpy.event_handler import SubscriptionEventCallbacks
+from std_msgs.msg import Empty
+
+from lathe_rc.nodes.events import Events
+
+
+@pytest.fixture
+def watcher(ghost):
+    node = rclpy.create_node("watcher")
+    node.discarded = []
+    yield node
+    node.destroy_node()
+
+
+def test_an_event_of_what_has_been_discarded_is_dropped(ghost, watcher):
+    """EventsExecutor alone crashes the process here."""
+    matched, discarded = [], []
+    publisher, go = ghost.create_publisher(Empty, "/watched", 1), ghost.create_publisher(Empty, "/go", 1)
+    events_of = SubscriptionEventCallbacks(matched=matched.append)
+    watched = watcher.create_subscription(Empty, "/watched", lambda _: None, 1, event_callbacks=events_of)
+
+    def discard(_):
+        if discarded:
+            return
+        watcher.discarded.append(partial(watcher.destroy_subscription, watched))
+        ghost.destroy_publisher(publisher)
+        while watched.get_publisher_count():  # from then on the event is on its way
+            time.sleep(0.01)
+        discarded.append(True)
+
+    watcher.create_subscription(Empty, "/go", discard, 1)
+    events = Events([watcher])
+    while not matched:
+        events.spin(0.1)
+    while not discarded:
+        go.publish(Empty())
+        events.spin(0.1)
+    heard = []
+    watcher.create_subscription(Empty, "/go", heard.append, 1)
+    while not heard:  # what came before has been handed over, or dropped
+        go.publish(Empty())
+        events.spin(0.1)
+    assert len(matched) == 1
+    assert not watcher.discarded
