@@ -115,6 +115,7 @@ def test_the_page_has_what_stands_in_groups():
         assert heading in lines
 
 
+@pytest.mark.system
 def test_bare_transport_passes_every_message(tmp_path):
     scenario = harness.with_recorder(ros.load("piston", spindle_encoder__revolutions=1.5), tmp_path / "bag", keep=True)
     passing = transport.Transport(scenario, tmp_path)

@@ -161,6 +161,7 @@ class TestFullCell:
         assert grouped.mode == "grouped"
         assert grouped.digest == offline.digest
 
+    @pytest.mark.system
     def test_recorder_and_loops_in_processes_of_their_own_give_its_digests(self, longer):
         loops = ["cutting_process", "longitudinal", "force_controller"]
         inside = [name for name in longer.scenario.nodes if name not in ("recorder", *loops)]

@@ -309,6 +309,7 @@ def test_a_running_cell_is_shown_as_its_bag(offline, tmp_path):
     assert_allclose(10 ** view.scalars("/learning/coarse/learning")[2] * 1e-6, learned)
 
 
+@pytest.mark.system
 def test_a_bridge_that_is_stuck_delays_no_member(offline, tmp_path):
     """Two of them: one continues before the run has ended, the other after that."""
     folders = [tmp_path / "goes_on", tmp_path / "until_the_end"]

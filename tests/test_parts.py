@@ -506,6 +506,7 @@ print(json.dumps([codes, reader.read(bag).digests()]))
 """
 
 
+@pytest.mark.system
 def test_a_bag_is_read_where_its_parts_are_not_installed(recorded, tmp_path):
     """Where the parts are not, a bag is read, checked, exported and reported, and resim says what is missing.
 

@@ -182,6 +182,7 @@ def test_mcap_reads_snapshots(recorded):
     st.integers(0, 1000),
     st.sampled_from([16, 64, 320]),
 )
+@pytest.mark.system
 def test_no_sample_is_missing_or_written_twice(tmp_path_factory, samples, pre, post, block):
     """No sample is missing or in two snapshots: spans that overlap or touch, or whose blocks do, are one."""
     path = tmp_path_factory.mktemp("spans") / "bag"

@@ -108,6 +108,7 @@ def test_the_server_ends_with_the_process_that_started_it():
         os.sched_yield()
 
 
+@pytest.mark.system
 def test_separate_interpreters_give_the_bits_of_forked_processes():
     cell = scenario()
     runs = [harness.run(cell, mode="composed", start=start) for start in ("fork", "spawn")]

@@ -292,6 +292,7 @@ def test_an_angle_that_no_spindle_has_is_refused(jump):
         list(Revolutions().add(100, angle, *np.zeros((3, 100))))
 
 
+@pytest.mark.system
 def test_a_long_run_stays_small(tmp_path):
     """Of 1200 revolutions the map has at most 512 rows, rings become rarer, nothing else piles up."""
     types = {"encoder": messages.ENCODER, "tool": messages.TOOL}

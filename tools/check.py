@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """./lathe test: the linters, then the tests, all of them, whatever the others find.
 
---lint: the linters alone; --system: the tests that need packages or privileges of the machine; --coverage: also which
-branches of lathe_rc the tests take; --table: no tests, but docs/tests.md from the report of the last.
+--lint: the linters alone; --system: the tests that need packages or privileges of the machine, or more time than
+others; --coverage: also which branches of lathe_rc the tests take; --table: no tests, but docs/tests.md from the report
+of the last.
 """
 
 import contextlib
@@ -101,7 +102,7 @@ def main(arguments: list[str]) -> int:
         if against := system.provide():
             print(f"lathe: {against}", file=sys.stderr)
             return 1
-        return int(pytest.main(["-m", "system", "tests/system", *arguments]))
+        return int(pytest.main(["-m", "system", "tests", *arguments]))
     if "--table" in arguments:
         return slow_tests.main()
     if measure := "--coverage" in arguments:
@@ -120,7 +121,7 @@ def main(arguments: list[str]) -> int:
         print(*verdicts, sep="\n", end="\n" if verdicts else "")
         return int(bool(failed))
     verdicts += [f"{name} FAILED: see above" for name in failed]
-    verdicts.append("not run: the tests that need system packages or privileges (./lathe test --system)")
+    verdicts.append("not run: the tests that need packages or privileges of the machine, or more time (./lathe test --system)")
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # rewriting the tests takes each worker 3 s: pytest keeps them
     with covered() if measure else contextlib.nullcontext():
         code = pytest.main(["-m", "not system", *AT_ONCE, *REPORTED, *arguments], plugins=[Verdicts(verdicts)])
