@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a node discards while events of it are on their way."""
+"""A node that discards a subscription while an event of it is on its way."""
 
 import time
 from functools import partial
@@ -48,7 +48,7 @@ def test_an_event_of_what_has_been_discarded_is_dropped(ghost, watcher):
         events.spin(0.1)
     heard = []
     watcher.create_subscription(Empty, "/go", heard.append, 1)
-    while not heard:  # what came before has been handed over, or dropped
+    while not heard:  # then the event has had its turn as well
         go.publish(Empty())
         events.spin(0.1)
     assert len(matched) == 1

@@ -121,7 +121,9 @@ def main(arguments: list[str]) -> int:
         print(*verdicts, sep="\n", end="\n" if verdicts else "")
         return int(bool(failed))
     verdicts += [f"{name} FAILED: see above" for name in failed]
-    verdicts.append("not run: the tests that need packages or privileges of the machine, or more time (./lathe test --system)")
+    verdicts.append(
+        "not run: the tests that need packages or privileges of the machine, or more time (./lathe test --system)"
+    )
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # rewriting the tests takes each worker 3 s: pytest keeps them
     with covered() if measure else contextlib.nullcontext():
         code = pytest.main(["-m", "not system", *AT_ONCE, *REPORTED, *arguments], plugins=[Verdicts(verdicts)])

@@ -3,13 +3,14 @@
 
 from collections.abc import Sequence
 
+from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 
 from lathe_rc.nodes.shell import CellNode
 
 
 class Events:
-    """What comes to some nodes.
+    """Waits for events of some nodes, and hands them over.
 
     EventsExecutor must not lose a publisher, subscription or service while it spins: an event of one that has come,
     and that it has not handed over yet, it then drops without the interpreter's lock, which crashes the process
@@ -24,7 +25,7 @@ class Events:
         self._nodes = nodes
         self._executor = self._made()
 
-    def _made(self) -> EventsExecutor:
+    def _made(self) -> Executor:
         executor = EventsExecutor()
         for node in self._nodes:
             executor.add_node(node)
