@@ -160,7 +160,7 @@ def test_what_comes_before_the_start_that_the_metadata_give_is_sent_too(strange,
     assert "metadata.yaml says first message at 5500000000 ns; the files: 5000000000" in ended.stderr
     assert f"{COUNT} messages sent" in ended.stderr
     listener.wait_for(lambda: sum(map(len, listener.heard.values())) >= COUNT)
-    assert listener.clock[0] == 5 * 10**9
+    assert 5 * 10**9 <= listener.clock[0] < 55 * 10**8  # /clock keeps the newest few: the first may be missed
 
 
 def test_a_part_of_some_topics(strange, listener):
