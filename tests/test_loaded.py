@@ -18,8 +18,8 @@ from lathe_rc.plants.coil import Coil
 from lathe_rc.plants.cutting import CuttingProcess
 from lathe_rc.plants.cutting_force import SpecificForce
 from lathe_rc.plants.deflection import RIGID
-from lathe_rc.plants.loaded import LoadedDrive, Piezo
 from lathe_rc.plants.piezo import Stack
+from lathe_rc.plants.tool_drive import Piezo, ToolDrive
 from lathe_rc.plants.workpiece import Part
 from lathe_rc.transfer import TransferFunction
 
@@ -38,7 +38,7 @@ def loaded(*, series=False, coil=None, radial=0.4, step=STEP, servo=None, stack=
         stroke=15e-6, amplifier_lag=0.0, hysteresis=None, inverse=None, creep_per_decade=0.0, creep_times=np.empty(0),
         step=step, method="foh",
     )  # fmt: skip
-    return LoadedDrive(
+    return ToolDrive(
         carriage_frequency=servo["natural_frequency"],
         carriage_damping=servo["damping"],
         delay=DELAY,

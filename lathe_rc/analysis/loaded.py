@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How tool drives give way to a force at the tool: x/F of `lathe_rc.plants.loaded` in continuous time.
+"""How tool drives give way to a force at the tool: x/F of `lathe_rc.plants.tool_drive` in continuous time.
 
 Its inverse is the dynamic stiffness, at p = 0 the static one. Times the radial part of the cutting force it is a
 deflection for `lathe_rc.analysis.regeneration`.

@@ -2,7 +2,7 @@
 """The chip of a sample, the force that it makes, and what that does to the edge: the cut for kernels.
 
 The equations are those of `lathe_rc.plants.cutting`. Here they stand sample by sample, so that what moves the edge can
-be solved together with the chip, see `lathe_rc.plants.loaded`.
+be solved together with the chip, see `lathe_rc.plants.tool_drive`.
 """
 
 from typing import NamedTuple

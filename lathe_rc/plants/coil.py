@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The current loop of a voice coil, sampled with the step of the cell: see `lathe_rc.plants.loaded`.
+"""The current loop of a voice coil, sampled with the step of the cell: see `lathe_rc.plants.tool_drive`.
 
     U = ωc·(L·(i* - i) + R·∫(i* - i)dt)
 

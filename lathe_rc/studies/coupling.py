@@ -20,8 +20,8 @@ from lathe_rc.cell.parameters import parameter
 from lathe_rc.plants.cutting import CuttingProcess
 from lathe_rc.plants.cutting_force import SpecificForce
 from lathe_rc.plants.deflection import RIGID
-from lathe_rc.plants.loaded import LoadedDrive
 from lathe_rc.plants.spindle import LoadedSpindle, SpeedLoop
+from lathe_rc.plants.tool_drive import ToolDrive
 from lathe_rc.plants.workpiece import Part
 from lathe_rc.studies.study import Study, StudyParameters, Track, comparison, untracked
 
@@ -181,8 +181,8 @@ def _chips(cut: CuttingProcess, turning: dict[str, Array], displacement: Array) 
     return made["force"]
 
 
-def _drive(given: CouplingParameters) -> LoadedDrive:
-    return LoadedDrive(
+def _drive(given: CouplingParameters) -> ToolDrive:
+    return ToolDrive(
         carriage_frequency=_FREQUENCY,
         carriage_damping=_DAMPING,
         delay=_DELAY,

@@ -28,8 +28,8 @@ from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
 from lathe_rc.plants.chip import CutTable
 from lathe_rc.plants.coil import Coil
-from lathe_rc.plants.loaded import LoadedDrive, Piezo
-from lathe_rc.plants.loaded_motion import LoadedTable, advance_loaded, failure
+from lathe_rc.plants.tool_drive import Piezo, ToolDrive
+from lathe_rc.plants.tool_motion import MotionTable, advance_loaded, failure
 from lathe_rc.signals.allowance import AllowanceTable, allow
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
@@ -185,7 +185,7 @@ class Memory(NamedTuple):
     limits: LimiterTable
     limits_fine: LimiterTable
     signs: Samples
-    drive: LoadedTable
+    drive: MotionTable
     cut: CutTable
     noise: SensorTable
     sensor: SensorTable
@@ -255,7 +255,7 @@ def step_series(memory: Memory, first: int, start: int, inputs: Fields, flags: F
 
 
 class LoadedDriveStage(CutStage, Drive):
-    """See `lathe_rc.plants.loaded`.
+    """See `lathe_rc.plants.tool_drive`.
 
     Attributes:
         parameters: its table.
@@ -292,7 +292,7 @@ class LoadedDriveStage(CutStage, Drive):
                 preload=fine.preload or np.inf,
             )
         with about(name, "coarse_bandwidth" if coil else "mass_ratio", "sample_rate"):
-            self.drive = LoadedDrive(
+            self.drive = ToolDrive(
                 carriage_frequency=coarse.natural_frequency,
                 carriage_damping=coarse.damping,
                 delay=coarse.delay,

@@ -23,7 +23,8 @@ from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import LimiterTable
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
-from lathe_rc.plants.series import SeriesDrive, SeriesTable, advance
+from lathe_rc.plants.tool_drive import Piezo, ToolDrive
+from lathe_rc.plants.tool_motion import MotionTable, advance
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
 _COARSE = "coarse"  # the displacement that the drive knows itself
@@ -70,7 +71,7 @@ class Memory(NamedTuple):
     limits: LimiterTable
     limits_fine: LimiterTable
     signs: Samples
-    drive: SeriesTable
+    drive: MotionTable
     noise: SensorTable
     sensor: SensorTable
 
@@ -93,7 +94,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class SeriesDriveStage(Drive):
-    """See `lathe_rc.plants.series`.
+    """See `lathe_rc.plants.tool_drive`.
 
     Attributes:
         parameters: its table.
@@ -109,21 +110,23 @@ class SeriesDriveStage(Drive):
         super().__init__(name, parameters)
         self.parameters = parameters
         coarse, fine = parameters.coarse, parameters.fine
-        stack = fine.stack(name, _FINE)
+        piezo = Piezo(
+            stack=fine.stack(name, _FINE),
+            tool_frequency=fine.natural_frequency,
+            tool_damping=fine.damping,
+            mass_ratio=parameters.mass_ratio,
+            full_voltage=fine.full_voltage,
+            feedback=_COARSE in fine.compensates,
+        )
         with about(name, "mass_ratio", "sample_rate"):
-            self.drive = SeriesDrive(
-                stack,
+            self.drive = ToolDrive(
                 carriage_frequency=coarse.natural_frequency,
                 carriage_damping=coarse.damping,
                 delay=coarse.delay,
                 carriage_stroke=coarse.stroke,
                 moving_mass=coarse.moving_mass,
                 force_constant=coarse.force_constant,
-                tool_frequency=fine.natural_frequency,
-                tool_damping=fine.damping,
-                full_voltage=fine.full_voltage,
-                mass_ratio=parameters.mass_ratio,
-                feedback=_COARSE in fine.compensates,
+                piezo=piezo,
                 resolution=coarse.resolution,
                 step=parameters.step,
                 method=parameters.discretisation,
@@ -146,7 +149,7 @@ class SeriesDriveStage(Drive):
 
     def responses(self) -> Mapping[str, Response]:
         """See `Drive`."""
-        return {"coarse/command": self.drive.coarse_response, "fine/command": self.drive.response}
+        return {"coarse/command": self.drive.coarse_response, "fine/command": self.drive.fine_response}
 
     def limits(self) -> Mapping[str, Limits]:
         """See `Drive`."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion of tool drives under the cutting force, sample by sample: drives and chip solved together, for kernels.
+"""Motion of tool drives, sample by sample, in air or together with the chip that they cut; for kernels.
 
-The equations are those of `lathe_rc.plants.loaded`.
+The equations are those of `lathe_rc.plants.tool_drive`.
 """
 
 from typing import NamedTuple
@@ -39,8 +39,8 @@ _TORN_OFF = DRAWN_IN + 1  # why the kernel stopped, beside the reasons of the cu
 STOPPED, SATURATED = 0, 1  #: what is counted
 
 
-class LoadedTable(NamedTuple):
-    """A `lathe_rc.plants.loaded.LoadedDrive` for kernels.
+class MotionTable(NamedTuple):
+    """A `lathe_rc.plants.tool_drive.ToolDrive` for kernels.
 
     Attributes:
         series: whether a piezo rides on the carriage.
@@ -52,7 +52,8 @@ class LoadedTable(NamedTuple):
         spring, damper, force_per_current: of the position loop.
         carriage_stroke: [m].
         stack, memory, full_voltage: of the piezo.
-        feedback, resolution: see `lathe_rc.plants.series.SeriesTable`.
+        feedback: whether the carriage's measured position is taken off the set point of the piezo.
+        resolution: of the carriage's position sensor [m].
         stiff, loss: ω2², 2ζ2ω2.
         tension: largest q before the stack is torn off its preload [m/s²]; inf for any.
         radial: ρ.
@@ -94,7 +95,7 @@ class LoadedTable(NamedTuple):
 
 
 @inlined
-def _begin(drive: LoadedTable, n: int, command: float, free: Array) -> float:
+def _begin(drive: MotionTable, n: int, command: float, free: Array) -> float:
     """Fill what the drives do without the extension and the force of sample ``n``; returns the delayed command [m]."""
     line, transition, coarse = drive.line, drive.transition, drive.coarse
     size, delay, part = line.size, drive.delay, drive.part
@@ -119,7 +120,7 @@ def _begin(drive: LoadedTable, n: int, command: float, free: Array) -> float:
 
 
 @inlined
-def _carriage(drive: LoadedTable, free: Array, e: float, pushes: float) -> float:
+def _carriage(drive: MotionTable, free: Array, e: float, pushes: float) -> float:
     """Position of the carriage [m] with an extension and a radial force, between its end stops."""
     stroke = drive.carriage_stroke
     return float(min(max(free[0] + drive.fine[0, 0] * e + drive.load[0, 0] * pushes, -stroke), stroke))
@@ -127,7 +128,7 @@ def _carriage(drive: LoadedTable, free: Array, e: float, pushes: float) -> float
 
 @inlined
 def _chip(
-    drive: LoadedTable, cut: CutTable, free: Array, e: float, here: tuple[float, ...], stiffness: float, c: float
+    drive: MotionTable, cut: CutTable, free: Array, e: float, here: tuple[float, ...], stiffness: float, c: float
 ) -> float:
     """Depth of cut with an extension, see `chip_of`; ``here``: place, angle, cross position, met form, allowance."""
     place, angle, cross_position, met, allowance = here
@@ -148,8 +149,8 @@ def _chip(
 
 @inlined
 def _solve(
-    drive: LoadedTable,
-    cut: CutTable,
+    drive: MotionTable,
+    cut: CutTable | None,
     free: Array,
     trial: Array,
     set_point: float,
@@ -158,24 +159,28 @@ def _solve(
     stiffness: float,
     c: float,
 ) -> tuple[float, float]:
-    """Extension [m] and depth of cut [m] of a sample; with feedback they are found by iteration.
+    """Extension [m] and depth of cut [m] of a sample, in air without one; with feedback they are found by iteration.
 
     The extension then needs the carriage's position of this sample and moves it by a thousandth of itself.
     """
-    memory, e, cuts = drive.memory, 0.0, False
+    memory, e, cuts, chip = drive.memory, 0.0, False, 0.0
     if not drive.feedback:
         if drive.series:
             e, cuts = extend(drive.stack, memory, set_point)
             drive.counts[SATURATED] += cuts
-        return e, _chip(drive, cut, free, e, here, stiffness, c)
-    chip, x1 = 0.0, _carriage(drive, free, drive.before[0], 0.0)
+        if cut is not None:
+            chip = _chip(drive, cut, free, e, here, stiffness, c)
+        return e, chip
+    x1 = _carriage(drive, free, drive.before[0], 0.0)
     for _ in range(_ROUNDS):
         guess = x1
         drive.reading[0] = quantise(guess + noise, drive.resolution)
         put(trial, memory)
         e, cuts = extend(drive.stack, trial, set_point - drive.reading[0])
-        chip = _chip(drive, cut, free, e, here, stiffness, c)
-        force = held(cut) + cut.process.lag_now * stiffness * max(chip, 0.0)
+        force = 0.0
+        if cut is not None:
+            chip = _chip(drive, cut, free, e, here, stiffness, c)
+            force = held(cut) + cut.process.lag_now * stiffness * max(chip, 0.0)
         x1 = _carriage(drive, free, e, drive.radial * force)
         if x1 == guess:
             break
@@ -185,7 +190,7 @@ def _solve(
 
 
 @inlined
-def _settle(drive: LoadedTable, free: Array, e: float, pushes: float, noise: float) -> None:
+def _settle(drive: MotionTable, free: Array, e: float, pushes: float, noise: float) -> None:
     """Where the drives are at the end of the sample, with its extension and its radial force."""
     state = drive.state
     for i in range(free.size):
@@ -197,9 +202,48 @@ def _settle(drive: LoadedTable, free: Array, e: float, pushes: float, noise: flo
         drive.reading[0] = quantise(state[0] + noise, drive.resolution)
 
 
+@inlined
+def _motion(drive: MotionTable, delayed: float) -> tuple[float, float, float, float, float, float, float]:
+    """Position, velocity, current and measured position of the carriage; extension, its velocity, voltage."""
+    state, extension, rate, voltage = drive.state, 0.0, 0.0, 0.0
+    current = (drive.spring * (delayed - state[0]) - drive.damper * state[1]) * drive.force_per_current
+    if drive.coil.on:
+        current = state[state.size - 1]
+    if drive.series:
+        extension, rate = state[2] - state[0], state[3] - state[1]
+        voltage = drive.memory[VOLTAGE] * drive.full_voltage
+    return state[0], state[1], current, drive.reading[0], extension, rate, voltage
+
+
+@kernel
+def advance(
+    drive: MotionTable,
+    first: int,
+    command: Array,
+    set_point: Array,
+    noise: Array,
+    carriage: Array,
+    carriage_velocity: Array,
+    current: Array,
+    measured: Array,
+    extension: Array,
+    extension_velocity: Array,
+    voltage: Array,
+) -> None:
+    """Step drives in air through a block, see `lathe_rc.plants.tool_drive.ToolDrive.block`."""
+    free, trial, nowhere = np.empty(drive.state.size), np.empty(drive.memory.size), (0.0, 0.0, 0.0, 0.0, 0.0)
+    for k in range(command.size):
+        delayed = _begin(drive, first + k, command[k], free)
+        e, _ = _solve(drive, None, free, trial, set_point[k], noise[k], nowhere, 0.0, 0.0)
+        _settle(drive, free, e, 0.0, noise[k])
+        (
+            carriage[k], carriage_velocity[k], current[k], measured[k], extension[k], extension_velocity[k], voltage[k]
+        ) = _motion(drive, delayed)  # fmt: skip
+
+
 @kernel
 def advance_loaded(
-    drive: LoadedTable,
+    drive: MotionTable,
     cut: CutTable,
     first: int,
     command: Array,
@@ -225,9 +269,13 @@ def advance_loaded(
     feed: Array,
     wear: Array,
 ) -> tuple[int, int]:
-    """Step drives and cut through a block, see `LoadedDrive.block`; returns the sample where it stopped and why."""
-    state, per_radian = drive.state, cut.process.grid / _TURN
-    free, trial = np.empty(state.size), np.empty(drive.memory.size)
+    """Step drives and cut through a block, see `lathe_rc.plants.tool_drive.ToolDrive.block`.
+
+    Returns:
+        The sample where it stopped, and why.
+    """
+    per_radian = cut.process.grid / _TURN
+    free, trial = np.empty(drive.state.size), np.empty(drive.memory.size)
     for k in range(command.size):
         place = angle[k] * per_radian
         reason, feed[k], stiffness, c = meet(cut, place, speed[k], height[k], angle[k], feed_velocity[k])
@@ -244,14 +292,12 @@ def advance_loaded(
         depth_of_cut[k] = chip = max(chip, 0.0)
         force[k], deflection[k] = press(cut, chip, stiffness, c, speed[k], 0.0, 0.0)
         _settle(drive, free, e, drive.radial * force[k], noise[k])
-        carriage[k], carriage_velocity[k], measured[k] = state[0], state[1], drive.reading[0]
-        current[k] = (drive.spring * (delayed - state[0]) - drive.damper * state[1]) * drive.force_per_current
-        if drive.coil.on:
-            current[k] = state[state.size - 1]
-        moved = state[0]
+        (
+            carriage[k], carriage_velocity[k], current[k], measured[k], extension[k], extension_velocity[k], voltage[k]
+        ) = _motion(drive, delayed)  # fmt: skip
+        moved = carriage[k]
         if drive.series:
-            extension[k], extension_velocity[k] = state[2] - state[0], state[3] - state[1]
-            voltage[k], moved = drive.memory[VOLTAGE] * drive.full_voltage, state[0] + extension[k]
+            moved += extension[k]
             if drive.stiff * (e - extension[k]) - drive.loss * extension_velocity[k] > drive.tension:
                 return k, _TORN_OFF
         leave(cut, place, chip, cross_position[k] + (moved - met[k]) + deflection[k])
