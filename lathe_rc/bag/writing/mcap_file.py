@@ -6,9 +6,10 @@ needs for a block. Here a message costs a header and two appends, a row of
 blocks one append, and the rest of the work is done once a chunk.
 """
 
+import io
 import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -21,7 +22,6 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Channel,
-    Chunk,
     ChunkIndex,
     DataEnd,
     Footer,
@@ -37,6 +37,7 @@ from mcap.writer import MCAP0_MAGIC
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _AFTER_LENGTH = _MESSAGE.size - 9  # bytes of it that the length counts
 TIMES = (16, 8)  #: where log time and publish time stand ahead of a message's bytes [B]
+_CHUNK = struct.Struct("<BQQQQI")  # opcode, length, first and last log time, bytes and CRC of the messages
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of what follows: log time and place in pairs
 _FOOTER = struct.Struct("<BQQQ")
 _ROOM, _ROOM_PER_CHUNK = 2**17, 1024  # kept of the disk for index and metadata [B]
@@ -95,13 +96,20 @@ class _Run:
         """Log time of the last."""
         return self.next_ns - self.plan.period_ns
 
-    def indexes(self) -> Iterator[tuple[int, npt.NDArray[np.uint64]]]:
-        """Log time and place of the messages of each channel, shape (count, 2)."""
-        rows = np.arange(self.count)
-        first = np.stack([self.first_ns + rows * self.plan.period_ns, self.start + rows * self.plan.size], axis=1)
-        places = np.zeros((len(self.plan.places), 1, 2), np.int64)
-        places[:, 0, 1] = [place - _MESSAGE.size for place in self.plan.places.values()]
-        yield from zip(self.plan.places, (first + places).astype(np.uint64), strict=True)
+    def rows(self) -> npt.NDArray[np.int64]:
+        """Log time and place of each row, shape (count, 2)."""
+        numbers = np.arange(self.count, dtype=np.int64)
+        times, places = self.first_ns + numbers * self.plan.period_ns, self.start + numbers * self.plan.size
+        return np.stack([times, places], axis=1)
+
+
+def _indexes(runs: Sequence[_Run]) -> Iterator[tuple[int, npt.NDArray[np.uint64]]]:
+    """Log time and place of the messages of each channel, shape (messages, 2), in runs of one plan."""
+    rows = np.concatenate([run.rows() for run in runs]).astype(np.uint64)
+    for channel, place in runs[0].plan.places.items():
+        index = rows.copy()
+        index[:, 1] += np.uint64(place - _MESSAGE.size)
+        yield channel, index
 
 
 def message_head(channel: int, log_ns: int, length: int) -> bytes:
@@ -151,6 +159,7 @@ class McapFile:
         self.counts: dict[int, int] = {}
         self.first_ns: int | None = None
         self.last_ns: int | None = None
+        self._chunk = io.BytesIO()  # the messages of the chunk, and behind them what earlier ones have left
         self._begin_chunk()
         self._offset = 0
         self._reserve = path.with_name(f"{path.name}.reserve")
@@ -159,22 +168,23 @@ class McapFile:
         self._put(MCAP0_MAGIC + _encoded(Header("ros2", "lathe_rc")))
 
     def _begin_chunk(self) -> None:
-        self._parts: list[bytes | memoryview] = []
+        self._chunk.seek(0)  # its memory is used again
         self._size = 0
         self._singles: dict[int, list[int]] = {}  # log time and place of each message that is not in a row, by channel
         self._runs: list[_Run] = []
 
-    def _put(self, data: bytes) -> None:
+    def _put(self, *parts: bytes | memoryview) -> None:
         """Write at the end; what does not fit leaves no trace."""
-        rest = memoryview(data)
         try:
-            while rest:
-                rest = rest[self._stream.write(rest) :]
+            for part in parts:
+                rest = memoryview(part)
+                while rest:
+                    rest = rest[self._stream.write(rest) :]
         except OSError:
             self._stream.truncate(self._offset)
             self._stream.seek(self._offset)
             raise
-        self._offset += len(data)
+        self._offset += sum(map(len, parts))
 
     def _keep_room(self) -> None:
         """Hold as much of the disk as completing the file will take: then a full disk cannot make it unreadable."""
@@ -212,8 +222,7 @@ class McapFile:
 
     def _append(self, data: bytes) -> None:
         self._described += len(data)
-        self._parts.append(data)
-        self._size += len(data)
+        self._size += self._chunk.write(data)
 
     def add_message(self, channel: int, log_ns: int, data: bytes | memoryview) -> None:
         """Append a message."""
@@ -221,23 +230,25 @@ class McapFile:
         if index is None:
             index = self._singles[channel] = []
         index += (log_ns, self._size)
-        head = message_head(channel, log_ns, len(data))
-        self._parts += (head, data)
-        self._size += len(data) + len(head)
+        self._size += self._chunk.write(message_head(channel, log_ns, len(data))) + self._chunk.write(data)
         if self._size > self._chunk_size:
             self.flush()
 
-    def add_rows(self, plan: RowPlan, first_ns: int, data: bytes) -> None:
+    def add_rows(self, plan: RowPlan, first_ns: int, data: bytes | memoryview) -> None:
         """Append rows, the first with log time ``first_ns``."""
-        run = self._runs[-1] if self._runs else None
-        if run is None or run.plan is not plan or run.end != self._size or run.next_ns != first_ns:
-            run = _Run(plan, self._size, first_ns, 0)
-            self._runs.append(run)
-        run.count += len(data) // plan.size
-        self._parts.append(data)
-        self._size += len(data)
-        if self._size > self._chunk_size:
-            self.flush()
+        rest = memoryview(data)
+        while rest:
+            run = self._runs[-1] if self._runs else None
+            if run is None or run.plan is not plan or run.end != self._size or run.next_ns != first_ns:
+                run = _Run(plan, self._size, first_ns, 0)
+                self._runs.append(run)
+            fill = max(self._chunk_size - self._size, 0) // plan.size + 1
+            part, rest = rest[: fill * plan.size], rest[fill * plan.size :]
+            run.count += len(part) // plan.size
+            first_ns = run.next_ns
+            self._size += self._chunk.write(part)
+            if self._size > self._chunk_size:
+                self.flush()
 
     def flush(self) -> None:
         """Hand every message so far to the operating system, as a chunk; if it does not take it, they are lost."""
@@ -258,8 +269,8 @@ class McapFile:
         found: dict[int, list[npt.NDArray[np.uint64]]] = {
             channel: [np.array(index, np.uint64).reshape(-1, 2)] for channel, index in self._singles.items()
         }
-        for run in self._runs:
-            for channel, index in run.indexes():
+        for plan in {id(run.plan): run.plan for run in self._runs}.values():
+            for channel, index in _indexes([run for run in self._runs if run.plan is plan]):
                 found.setdefault(channel, []).append(index)
         return {channel: _in_order(parts) for channel, parts in found.items()}
 
@@ -268,24 +279,21 @@ class McapFile:
         singles = [times for index in self._singles.values() for times in index[::2]]
         first = min([*singles, *(run.first_ns for run in self._runs)])
         last = max([*singles, *(run.last_ns for run in self._runs)])
-        whole = b"".join(self._parts)
-        chunk = Chunk(
-            compression="zstd" if self._compressor else "",
-            data=self._compressor.compress(whole) if self._compressor else whole,
-            message_start_time=first,
-            message_end_time=last,
-            uncompressed_crc=crc32(whole),
-            uncompressed_size=len(whole),
-        )
-        record = _encoded(chunk)
-        start, offsets, parts = self._offset, {}, [record]
-        end = start + len(record)
-        for channel, index in indexes.items():
-            offsets[channel] = end
-            text = index.tobytes()
-            parts += (_INDEX.pack(Opcode.MESSAGE_INDEX, len(text) + _INDEX.size - 9, channel, len(text)), text)
-            end += _INDEX.size + len(text)
-        self._put(b"".join(parts))
+        compression = b"zstd" if self._compressor else b""
+        with self._chunk.getbuffer() as memory, memory[: self._size] as whole:
+            data = self._compressor.compress(whole) if self._compressor else whole
+            length = _CHUNK.size - 9 + 4 + len(compression) + 8 + len(data)
+            head = _CHUNK.pack(Opcode.CHUNK, length, first, last, self._size, crc32(whole))
+            head += struct.pack(f"<I{len(compression)}sQ", len(compression), compression, len(data))
+            start, size = self._offset, len(data)
+            offsets, end = {}, start + len(head) + size
+            parts: list[bytes] = []
+            for channel, index in indexes.items():
+                offsets[channel] = end
+                text = index.tobytes()
+                parts += (_INDEX.pack(Opcode.MESSAGE_INDEX, len(text) + _INDEX.size - 9, channel, len(text)), text)
+                end += _INDEX.size + len(text)
+            self._put(head, data, b"".join(parts))
         for channel, index in indexes.items():
             self.counts[channel] += len(index)
         self.first_ns = first if self.first_ns is None else min(first, self.first_ns)
@@ -295,12 +303,12 @@ class McapFile:
                 message_start_time=first,
                 message_end_time=last,
                 chunk_start_offset=start,
-                chunk_length=len(record),
+                chunk_length=len(head) + size,
                 message_index_offsets=offsets,
-                message_index_length=self._offset - start - len(record),
-                compression=chunk.compression,
-                compressed_size=len(chunk.data),
-                uncompressed_size=chunk.uncompressed_size,
+                message_index_length=self._offset - start - len(head) - size,
+                compression=compression.decode(),
+                compressed_size=size,
+                uncompressed_size=self._size,
             )
         )
 

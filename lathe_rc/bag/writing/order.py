@@ -11,7 +11,7 @@ from lathe_rc.cell.block import Block
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import START_NS, Samples, Signals
 
-_ROWS = 16  # of a sheet
+_SHEET = 2**20  # bytes of a sheet's rows, or one row
 
 
 class _Single(NamedTuple):
@@ -63,6 +63,7 @@ class Merger:
         self._final: int | None = None  # the last row
         self._finals = 0  # topics that have brought it
         self._plan = Plan(self._topics, run_id, step_ns, samples)
+        self._sheet_rows = max(_SHEET // self._plan.mcap.size, 1)  # rows
         self._sheets: dict[int, Sheet] = {}  # by number
         self._free: list[Sheet] = []
         self._tail: Sheet | None = None  # the last row, if it is shorter
@@ -190,11 +191,11 @@ class Merger:
                 self._tail = Sheet(Plan(self._topics, self._run_id, self._step_ns, samples), 1)
                 self._tail.begin(row * self._length)
             return self._tail, 0
-        number, within = divmod(row, _ROWS)
+        number, within = divmod(row, self._sheet_rows)
         sheet = self._sheets.get(number)
         if sheet is None:
-            sheet = self._sheets[number] = self._free.pop() if self._free else Sheet(self._plan, _ROWS)
-            sheet.begin(number * _ROWS * self._length)
+            sheet = self._sheets[number] = self._free.pop() if self._free else Sheet(self._plan, self._sheet_rows)
+            sheet.begin(number * self._sheet_rows * self._length)
         return sheet, within
 
     # ---- what goes out ------------------------------------------------------------------------------
@@ -221,7 +222,7 @@ class Merger:
 
     def _together(self, ready: int) -> int:
         """Where the rows end that can be written at once: they are on one sheet, and no sparse message is between."""
-        end = min(ready, (self.rows // _ROWS + 1) * _ROWS)
+        end = min(ready, (self.rows // self._sheet_rows + 1) * self._sheet_rows)
         if self._tail is not None and self.rows != self._final and end > (self._final or 0):
             end -= 1
         if self._waiting:
@@ -245,13 +246,13 @@ class Merger:
             self._writer.write(single.topic, single.log_ns, single.data)
         if first < end:
             skip = first - self.rows
-            data = sheet.bytes[within + skip : within + end - self.rows].tobytes()
+            data = sheet.bytes[within + skip : within + end - self.rows].reshape(-1).data
             self._writer.write_rows(sheet.plan.mcap, first_ns + skip * sheet.plan.mcap.period_ns, data)
         self.rows, self.samples = end, (end - 1) * self._length + sheet.plan.samples
         self.log_ns = START_NS + (self.samples - 1) * self._step_ns
         self.complete = self._final is not None and end > self._final
-        if end % _ROWS == 0 and sheet is not self._tail:
-            self._free.append(self._sheets.pop(end // _ROWS - 1))
+        if end % self._sheet_rows == 0 and sheet is not self._tail:
+            self._free.append(self._sheets.pop(end // self._sheet_rows - 1))
 
     def write_rest(self) -> None:
         """Write everything that is left, sorted: what an interrupted run has of its last blocks.

@@ -161,13 +161,13 @@ class Snapshots:
         if self._table.triggers and self._topics[topic][0] in _HEARD:
             self._hear(topic, data)
 
-    def write_rows(self, plan: RowPlan, first_ns: int, data: bytes) -> None:
+    def write_rows(self, plan: RowPlan, first_ns: int, data: bytes | memoryview) -> None:
         """See `Output`.
 
         Raises:
             LatheError: the disk does not take it, or too much is kept.
         """
-        whole = memoryview(data)
+        whole = memoryview(bytes(data))  # the caller uses its memory again
         for row, start in enumerate(range(0, len(data), plan.size)):
             self._take(_Item(first_ns + row * plan.period_ns, plan, whole[start : start + plan.size]))
 
@@ -265,7 +265,7 @@ class Snapshots:
         first_ns = self._stamp(snapshot.first)
         if isinstance(item.key, RowPlan):
             if item.log_ns >= first_ns:
-                bag.write_rows(item.key, item.log_ns, bytes(item.data))
+                bag.write_rows(item.key, item.log_ns, item.data)
         elif item.log_ns >= first_ns or self._topics[item.key][0] == messages.CELL_STATE:
             bag.write(item.key, max(item.log_ns, first_ns), item.data)
 

@@ -40,7 +40,7 @@ class Both:
         self._first.write(topic, log_ns, data)
         self._second.write(topic, log_ns, data)
 
-    def write_rows(self, plan: RowPlan, first_ns: int, data: bytes) -> None:
+    def write_rows(self, plan: RowPlan, first_ns: int, data: bytes | memoryview) -> None:
         """See `Output`."""
         self._first.write_rows(plan, first_ns, data)
         self._second.write_rows(plan, first_ns, data)

@@ -78,7 +78,7 @@ class Output(Protocol):
     def write(self, topic: str, log_ns: int, data: bytes) -> None:
         """Append a message; see `BagWriter`."""
 
-    def write_rows(self, plan: RowPlan, first_ns: int, data: bytes) -> None:
+    def write_rows(self, plan: RowPlan, first_ns: int, data: bytes | memoryview) -> None:
         """Append rows of blocks; see `BagWriter`."""
 
     def flush(self) -> None:
@@ -271,7 +271,7 @@ class BagWriter:
         """The number of a topic in the file."""
         return self._channels[topic]
 
-    def write_rows(self, plan: RowPlan, first_ns: int, data: bytes) -> None:
+    def write_rows(self, plan: RowPlan, first_ns: int, data: bytes | memoryview) -> None:
         """Append rows of blocks, the first with log time ``first_ns``; see `lathe_rc.bag.writing.rows`.
 
         Raises:
