@@ -115,6 +115,24 @@ def _block(system: System, state: Array, command: Array, output: Array) -> None:
         output[k] = step(system, state, command[k])
 
 
+def realise(transfer: TransferFunction) -> tuple[Array, Array, Array, float]:
+    """A balanced realisation x' = a·x + b·u, y = c·x + d·u, shapes (m, m), (m,), (m,): a companion matrix, scaled.
+
+    `scipy.signal` has it as tf2ss; to import that takes half as long as all else that a cell needs before its start.
+    """
+    top, bottom = (np.trim_zeros(np.array(part), "f") for part in (transfer.numerator, transfer.denominator))
+    if bottom.size == 1 or not top.size:  # a gain alone
+        return np.empty((0, 0)), np.empty(0), np.empty(0), float(top[0] / bottom[0]) if top.size else 0.0
+    top = np.concatenate((np.zeros(bottom.size - top.size), top)) / bottom[0]
+    bottom = bottom / bottom[0]
+    # Poles far apart make a companion matrix of coefficients that differ by many powers of ten.
+    companion = scipy.linalg.companion(bottom)
+    a, (scale, _) = scipy.linalg.matrix_balance(companion, permute=False, separate=True)
+    b: Array = np.eye(1, bottom.size - 1)[0] / scale
+    c: Array = (top[1:] - top[0] * bottom[1:]) * scale
+    return np.asarray(a, np.float64), b, c, float(top[0])
+
+
 def discretise(transfer: TransferFunction, step_s: float, hold: Hold) -> System:
     """Discretise a transfer function.
 
@@ -124,16 +142,10 @@ def discretise(transfer: TransferFunction, step_s: float, hold: Hold) -> System:
         hold: ``zoh``: exact for an input that is constant from sample to sample; ``foh``: exact for one that is
             linear between samples; ``tustin``: the bilinear rule.
     """
-    top, bottom = (np.trim_zeros(np.array(part), "f") for part in (transfer.numerator, transfer.denominator))
-    if bottom.size == 1 or not top.size:  # a gain alone, for which tf2ss has an idle state or a warning
-        through = float(top[0] / bottom[0]) if top.size else 0.0
-        return System(np.empty((0, 0)), np.empty(0), np.empty(0), np.empty(0), through)
-    a, b, c, d = scipy.signal.tf2ss(top, bottom)
-    order = a.shape[0]
-    # Poles far apart make a companion matrix of coefficients that differ by many powers of ten.
-    a, (scale, _) = scipy.linalg.matrix_balance(a, permute=False, separate=True)
-    b, c = b / scale[:, None], c * scale[None, :]
-    column = b[:, 0]
+    a, column, c, through = realise(transfer)
+    order = column.size
+    if not order:
+        return System(a, column, column, c, through)
     if hold == "tustin":
         left = np.linalg.inv(np.eye(order) - a * step_s / 2.0)
         transition = left @ (np.eye(order) + a * step_s / 2.0)
@@ -146,7 +158,7 @@ def discretise(transfer: TransferFunction, step_s: float, hold: Hold) -> System:
         before, now = (held, np.zeros(order)) if hold == "zoh" else (held - rising, rising)
     return System(
         np.ascontiguousarray(transition), np.ascontiguousarray(before), np.ascontiguousarray(now),
-        np.ascontiguousarray(c[0]), float(d[0, 0]),
+        np.ascontiguousarray(c), through,
     )  # fmt: skip
 
 

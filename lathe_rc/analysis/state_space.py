@@ -8,10 +8,8 @@ out wrong by several rad/s. Each system is balanced by itself before it is conne
 from typing import Any, TypeAlias
 
 import control
-import numpy as np
-import scipy
 
-from lathe_rc.transfer import TransferFunction
+from lathe_rc.transfer import TransferFunction, realise
 
 Lti: TypeAlias = Any  # control.lti.LTI, which has no types
 Plant: TypeAlias = TransferFunction | Lti
@@ -23,13 +21,8 @@ def state_space(plant: Plant) -> Lti:
     """A balanced realisation of a transfer function; any other system of python-control as it realises it."""
     if not isinstance(plant, TransferFunction):
         return control.ss(plant)
-    if not np.any(plant.numerator):
-        return control.ss([], [], [], [[0.0]])
-    if len(plant.denominator) == 1:  # tf2ss would give a gain an idle state
-        return control.ss([], [], [], [[plant.numerator[-1] / plant.denominator[0]]])
-    a, b, c, d = scipy.signal.tf2ss(plant.numerator, plant.denominator)
-    balanced, (scale, _) = scipy.linalg.matrix_balance(a, permute=False, separate=True)
-    return control.ss(balanced, b / scale[:, None], c * scale[None, :], d)
+    a, b, c, d = realise(plant)
+    return control.ss(a, b[:, None], c[None, :], [[d]])
 
 
 def delay(seconds: float) -> Lti:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-import scipy
 
 from lathe_rc.errors import InputError
 from lathe_rc.transfer import TransferFunction
@@ -78,9 +77,10 @@ def realise(model: TransferFunction) -> tuple[Array, Array]:
         )
     a = np.diag(np.ones(order - 1), 1)
     a[-1] = -bottom[:0:-1] / bottom[0]
-    impulse = np.eye(1, order + 1)[0]
-    markov = scipy.signal.lfilter(np.concatenate((np.zeros(bottom.size - top.size), top)), bottom, impulse)
-    return a, np.asarray(markov[1:])
+    # The Markov parameters: the quotient as a series of 1/p, by long division.
+    padded = np.concatenate((np.zeros(bottom.size - top.size), top, np.zeros(order)))
+    markov, _ = np.polydiv(padded / bottom[0], bottom / bottom[0])
+    return a, markov[1:]
 
 
 def settles(model: TransferFunction) -> tuple[float, bool]:

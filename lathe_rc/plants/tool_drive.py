@@ -44,7 +44,7 @@ from lathe_rc.plants.coil import Coil, coil_table
 from lathe_rc.plants.cutting import CuttingProcess
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
 from lathe_rc.plants.piezo import Stack, StackTable
-from lathe_rc.plants.tool_motion import SATURATED, STOPPED, MotionTable, advance, advance_loaded, failure
+from lathe_rc.plants.tool_motion import SATURATED, STOPPED, MotionTable, Weights, advance, advance_loaded, failure
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -200,10 +200,7 @@ class ToolDrive:
         stack = piezo.stack if piezo else _no_stack(step)
         self.table = MotionTable(
             series=piezo is not None,
-            transition=self._coarse.transition,
-            coarse=weights,
-            fine=self._fine.weights,
-            load=load.weights,
+            weights=Weights(self._coarse.transition, weights, self._fine.weights, load.weights),
             tool=tool,
             delay=self._coarse.delay,
             part=self._coarse.fraction,
@@ -291,11 +288,11 @@ class ToolDrive:
         row[order - 1] = -1.0
         wanted = table.spring * table.force_per_current
         closed, weight = np.zeros((order + 1, order + 1)), np.zeros(order + 1)
-        closed[:order, :order] = table.transition
-        closed[:order] += np.outer(table.coarse[:, 0], gain * row + coil.integral * np.eye(order + 1)[order])
+        closed[:order, :order] = table.weights.transition
+        closed[:order] += np.outer(table.weights.coarse[:, 0], gain * row + coil.integral * np.eye(order + 1)[order])
         closed[order] = coil.step * row
         closed[order, order] = 1.0
-        weight[:order], weight[order] = table.coarse[:, 0] * gain * wanted, coil.step * wanted
+        weight[:order], weight[order] = table.weights.coarse[:, 0] * gain * wanted, coil.step * wanted
         return closed, weight
 
     def _of(self, place: int, frequency: npt.ArrayLike, *, command: bool) -> Complex:
@@ -310,7 +307,7 @@ class ToolDrive:
             late = (1.0 - table.part) * z ** -(table.delay + 1.0) + table.part * z ** -(table.delay + 2.0)
             right = weight * late
         else:
-            extends = np.append(table.fine[:, :2], [[0.0, 0.0]], axis=0)
+            extends = np.append(table.weights.fine[:, :2], [[0.0, 0.0]], axis=0)
             right = extends[:, 0] + extends[:, 1] / z
         left = np.eye(weight.size) - transition / z[:, :, None]
         return np.asarray(np.linalg.solve(left, right[:, :, None])[:, place, 0].reshape(wanted.shape))

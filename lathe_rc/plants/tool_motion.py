@@ -12,6 +12,7 @@ import numpy.typing as npt
 from lathe_rc.arrays import put
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import inlined, kernel
+from lathe_rc.placed import sized
 from lathe_rc.plants.chip import (
     APART,
     BACKWARDS,
@@ -39,14 +40,28 @@ _TORN_OFF = DRAWN_IN + 1  # why the kernel stopped, beside the reasons of the cu
 STOPPED, SATURATED = 0, 1  #: what is counted
 
 
+@sized
+class Weights(NamedTuple):
+    """Weights of the motion in a sample.
+
+    Attributes:
+        transition: of positions, velocities and, with a current loop, the current, shape (m, m).
+        coarse: of the command, or of the voltage, shape (m, 3).
+        fine, load: of the extension e and of the radial force, shape (m, 3).
+    """
+
+    transition: Array
+    coarse: Array
+    fine: Array
+    load: Array
+
+
 class MotionTable(NamedTuple):
     """A `lathe_rc.plants.tool_drive.ToolDrive` for kernels.
 
     Attributes:
         series: whether a piezo rides on the carriage.
-        transition: of positions, velocities and, with a current loop, the current, shape (m, m).
-        coarse: weights of the command, or of the voltage, shape (m, 3).
-        fine, load: weights of the extension e and of the radial force, shape (m, 3).
+        weights: see `Weights`.
         tool: place of the tool's position.
         delay, part: of the command [sample].
         spring, damper, force_per_current: of the position loop.
@@ -66,10 +81,7 @@ class MotionTable(NamedTuple):
     """
 
     series: bool
-    transition: Array
-    coarse: Array
-    fine: Array
-    load: Array
+    weights: Weights
     tool: int
     delay: int
     part: float
@@ -97,25 +109,27 @@ class MotionTable(NamedTuple):
 @inlined
 def _begin(drive: MotionTable, n: int, command: float, free: Array) -> float:
     """Fill what the drives do without the extension and the force of sample ``n``; returns the delayed command [m]."""
-    line, transition, coarse = drive.line, drive.transition, drive.coarse
+    line, weights, state = drive.line, drive.weights, drive.state
+    transition, coarse, fine, load = weights.transition, weights.coarse, weights.fine, weights.load
     size, delay, part = line.size, drive.delay, drive.part
     line[n % size] = command
     u0, u1, u2 = line[(n - delay) % size], line[(n - delay - 1) % size], line[(n - delay - 2) % size]
     d0, d1, d2 = u0, u1, u2
     if drive.coil.on:
-        wanted, state = (1.0 - part) * u1 + part * u2, drive.state
+        wanted = (1.0 - part) * u1 + part * u2
         asked = (drive.spring * (wanted - state[0]) - drive.damper * state[1]) * drive.force_per_current
         d0, d1, d2 = applied(drive.coil, n, asked, state[state.size - 1]), 0.0, 0.0
-    for i in range(free.size):
+    order = transition.shape[0]  # known to the compiler, as that of `free` is not
+    for i in range(order):
         # In the order of the drives that feel no force, for the same bits.
         free[i] = 0.0
         if drive.series:
-            free[i] = coarse[i, 0] * d0 + coarse[i, 1] * d1 + coarse[i, 2] * d2 + drive.fine[i, 1] * drive.before[0]
-        for j in range(free.size):
-            free[i] += transition[i, j] * drive.state[j]
+            free[i] = coarse[i, 0] * d0 + coarse[i, 1] * d1 + coarse[i, 2] * d2 + fine[i, 1] * drive.before[0]
+        for j in range(order):
+            free[i] += transition[i, j] * state[j]
         if not drive.series:
             free[i] = free[i] + coarse[i, 0] * d0 + coarse[i, 1] * d1 + coarse[i, 2] * d2
-        free[i] += drive.load[i, 1] * drive.before[1]
+        free[i] += load[i, 1] * drive.before[1]
     return float((1.0 - part) * u0 + part * u1)
 
 
@@ -123,7 +137,7 @@ def _begin(drive: MotionTable, n: int, command: float, free: Array) -> float:
 def _carriage(drive: MotionTable, free: Array, e: float, pushes: float) -> float:
     """Position of the carriage [m] with an extension and a radial force, between its end stops."""
     stroke = drive.carriage_stroke
-    return float(min(max(free[0] + drive.fine[0, 0] * e + drive.load[0, 0] * pushes, -stroke), stroke))
+    return float(min(max(free[0] + drive.weights.fine[0, 0] * e + drive.weights.load[0, 0] * pushes, -stroke), stroke))
 
 
 @inlined
@@ -133,14 +147,16 @@ def _chip(
     """Depth of cut with an extension, see `chip_of`; ``here``: place, angle, cross position, met form, allowance."""
     place, angle, cross_position, met, allowance = here
     kept, tool = drive.radial * held(cut), drive.tool
-    displacement = free[tool] + drive.fine[tool, 0] * e + drive.load[tool, 0] * kept
+    displacement = free[tool] + drive.weights.fine[tool, 0] * e + drive.weights.load[tool, 0] * kept
     if drive.series:  # in the rounding of two states that are added
         x1 = _carriage(drive, free, e, kept)
         displacement = x1 + (displacement - x1)
-    give = drive.radial * drive.load[tool, 0]
+    give = drive.radial * drive.weights.load[tool, 0]
     chip = chip_of(cut, place, angle, cross_position, displacement - met, allowance, stiffness, c, give, 0.0)
     if not drive.series:
-        x1 = free[0] + drive.load[0, 0] * (kept + drive.radial * cut.process.lag_now * stiffness * max(chip, 0.0))
+        x1 = free[0] + drive.weights.load[0, 0] * (
+            kept + drive.radial * cut.process.lag_now * stiffness * max(chip, 0.0)
+        )
         if abs(x1) > drive.carriage_stroke:  # an end stop holds it, and it does not give way
             x1 = drive.carriage_stroke if x1 > 0.0 else -drive.carriage_stroke
             chip = chip_of(cut, place, angle, cross_position, x1 - met, allowance, stiffness, c, 0.0, 0.0)
@@ -192,9 +208,9 @@ def _solve(
 @inlined
 def _settle(drive: MotionTable, free: Array, e: float, pushes: float, noise: float) -> None:
     """Where the drives are at the end of the sample, with its extension and its radial force."""
-    state = drive.state
-    for i in range(free.size):
-        state[i] = free[i] + drive.fine[i, 0] * e + drive.load[i, 0] * pushes
+    state, fine, load = drive.state, drive.weights.fine, drive.weights.load
+    for i in range(fine.shape[0]):
+        state[i] = free[i] + fine[i, 0] * e + load[i, 0] * pushes
     drive.before[0], drive.before[1] = e, pushes
     state[0], state[1], stops = between_stops(state[0], state[1], drive.carriage_stroke)  # the tool swings on
     drive.counts[STOPPED] += stops

@@ -198,14 +198,15 @@ def _drive(given: CouplingParameters) -> ToolDrive:
 def _apart(given: CouplingParameters, command: Array, turning: dict[str, Array], delay: int) -> tuple[Array, Array]:
     """Position and velocity, shape (n, 2), and the force as it acts: that of the chip ``delay`` samples before."""
     table, cut, samples = _drive(given).table, _cut(given), command.size
+    weights = table.weights
     sent = np.concatenate((np.zeros(table.delay + 2), command))
     moved, force = np.zeros((samples + 1, 2)), np.zeros(samples + delay + 1)
-    driven = np.stack([sent[2 - k : samples + 2 - k] for k in range(3)], axis=1) @ table.coarse.T
+    driven = np.stack([sent[2 - k : samples + 2 - k] for k in range(3)], axis=1) @ weights.coarse.T
     for begin in range(0, samples, delay):
         block = slice(begin, min(begin + delay, samples))
         for n in range(block.start, block.stop):
-            late = table.load[:, 0] * force[n + 1] + table.load[:, 1] * force[n]
-            moved[n + 1] = table.transition @ moved[n] + driven[n] + given.radial_ratio * late
+            late = weights.load[:, 0] * force[n + 1] + weights.load[:, 1] * force[n]
+            moved[n + 1] = weights.transition @ moved[n] + driven[n] + given.radial_ratio * late
         here = {name: values[block] for name, values in turning.items()}
         edge = moved[block.start + 1 : block.stop + 1, 0] - command[block]
         force[begin + delay + 1 : block.stop + delay + 1] = _chips(cut, here, edge)
