@@ -78,7 +78,7 @@ def paced(seconds: float, arrangement: str, setting: Setting | None = None, exec
     with tempfile.TemporaryDirectory(prefix="lathe-bench-") as folder:
         file = Path(folder) / "durations.npz"
         with ros.container(LATHE_BENCH_DURATIONS=str(file), LATHE_BENCH_EXECUTOR=executor):
-            run = ros.run(scenario, partial(ros.split, name="piston", arrangement=arrangement), setting)
+            run = ros.run(scenario, partial(ros.split, arrangement=arrangement), setting)
         with np.load(file) as found:
             lateness, latency = found["lateness"], found["latency"]
     block = scenario.shared.block_size * scenario.shared.step
@@ -110,7 +110,7 @@ def _idle(arrangement: str, state: str, missing: list[str]) -> float:
         spindle = complete.nodes["spindle_encoder"]
         members = [*getattr(spindle, "members"), *missing]  # noqa: B009 - of this kind of node only
         complete.nodes["spindle_encoder"] = spindle.model_copy(update={"members": members})
-        with harness.Processes(complete, ros.split(complete, "piston", arrangement)) as cell:
+        with harness.Processes(complete, ros.split(complete, arrangement)) as cell:
             waiting = set(complete.nodes)
             while waiting:
                 waiting.discard(cell.wait_for(state)["node"])

@@ -2,8 +2,8 @@
 """The cell over ROS, everything recorded: how fast, at what cost, and how much faster than the obvious way.
 
 Cells of 5, 8 and 13 nodes (recorder included) run as fast as they can, one process a node, grouped in two processes
-(the piston: all but the recorder, and the recorder) and composed in one, for blocks of 64, 256 and 1024 samples. The
-loops of the 13 close within 64 samples, so they know no longer blocks. Of each run:
+(the recorder in one, all others in the other) and composed in one, for blocks of 64, 256 and 1024 samples. The loops of
+the 13 close within 64 samples, so they know no longer blocks. Of each run:
 
 - ``real_time_factor``: simulated over wall time from block 0 to the last block in the bag; the target beside it;
 - ``cpu_us_per_block``: processor time of each process in that span over the blocks of a topic, and
@@ -41,19 +41,13 @@ from lathe_rc.cell.wiring import Cell
 
 ROOT = Path(__file__).resolve().parents[1]
 PISTON = ("spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder")
-#: Simulated revolutions by scenario and block size.
+#: Simulated revolutions by scenario and block size, with one process a node.
 REVOLUTIONS = {
     "piston": {64: 60, 256: 150, 1024: 300},
     "vibration": {64: 30, 256: 75, 1024: 150},
-    "full_cell": {64: 10},
+    "full_cell": {64: 20},
 }
-_DRIVES = ["spindle_encoder", "learning_controller", "electrodynamic_actuator"]
-#: Nodes that share a process where a cell is grouped; the others share another.
-GROUPS = {
-    "piston": [*_DRIVES, "tool"],
-    "vibration": [*_DRIVES, "profile", "vibration", "piezo_actuator"],
-    "full_cell": [*_DRIVES, "fine_controller", "piezo_actuator"],
-}
+_LONGER = {"processes": 1, "grouped": 5, "composed": 10}  # by arrangement: the quicker, the more revolutions
 TARGETS = {"processes": {64: 3, 256: 10, 1024: 25}, "composed": {64: 6, 256: 20, 1024: 60}}
 Say = Callable[[str], None]
 _HOPS = 5
@@ -97,13 +91,13 @@ def load(name: str, **values: object) -> Scenario:
     return scenarios.load(resources.find(Path(f"{name}.yaml")), changes)
 
 
-def split(scenario: Scenario, name: str, arrangement: str) -> list[list[str]]:
+def split(scenario: Scenario, arrangement: str) -> list[list[str]]:
     """Names of the nodes in each process."""
     if arrangement == "composed":
         return [list(scenario.nodes)]
     if arrangement == "processes":
         return [[node] for node in scenario.nodes]
-    return [GROUPS[name], [node for node in scenario.nodes if node not in GROUPS[name]]]
+    return [[node for node in scenario.nodes if node != "recorder"], ["recorder"]]
 
 
 def cpu_s(pid: int) -> float:
@@ -178,10 +172,11 @@ def _cells(
     """A scenario for some block sizes, arranged in some ways, in turn."""
     found: dict[str, Any] = {}
     for size in sizes:
-        scenario = load(name, block_size=size, spindle_encoder__revolutions=share * REVOLUTIONS[name][size])
         runs: dict[str, list[Run]] = {arrangement: [] for arrangement in arrangements}
         for arrangement in [*arrangements] * rounds:
-            done = run(scenario, partial(split, name=name, arrangement=arrangement))
+            turns = share * REVOLUTIONS[name][size] * _LONGER[arrangement]
+            scenario = load(name, block_size=size, spindle_encoder__revolutions=turns)
+            done = run(scenario, partial(split, arrangement=arrangement))
             runs[arrangement].append(done)
             say(f"  {name}, blocks of {size}, {arrangement}: {done.real_time_factor:.2f} x real time")
         found[f"block_{size}"] = {each: figures(runs[each]) for each in arrangements}
@@ -193,7 +188,7 @@ def _cells(
 
 def _alone(scenario: Scenario) -> float:
     """Real-time factor of the piston with one process a node."""
-    return run(scenario, partial(split, name="piston", arrangement="processes")).real_time_factor
+    return run(scenario, partial(split, arrangement="processes")).real_time_factor
 
 
 def _pace(transport: Transport) -> float:
@@ -225,7 +220,7 @@ def _latency(rounds: int) -> dict[str, Any]:
     scenario = load("piston", window=1, spindle_encoder__revolutions=20)
 
     def side(arrangement: str) -> float:
-        alone = run(scenario, partial(split, name="piston", arrangement=arrangement))
+        alone = run(scenario, partial(split, arrangement=arrangement))
         return alone.wall_s / alone.blocks / _HOPS * 1e6
 
     found = sides.alternate({each: partial(side, each) for each in ("processes", "composed")}, rounds)
@@ -238,7 +233,7 @@ def _executors(rounds: int) -> dict[str, Any]:
 
     def side(executor: str) -> float:
         with container(LATHE_BENCH_EXECUTOR=executor):
-            return run(scenario, partial(split, name="piston", arrangement="processes")).real_time_factor
+            return run(scenario, partial(split, arrangement="processes")).real_time_factor
 
     found = sides.alternate({each: partial(side, each) for each in ("events", "single")}, rounds)
     return {

@@ -330,6 +330,18 @@ def test_the_command_closes_its_bag_on_a_signal(number, mode, tmp_path):
         assert sum(1 for _ in bags.messages()) > 10
 
 
+def test_a_process_with_a_whole_cell_that_runs_flat_out_is_not_deaf(tmp_path):
+    """What lets the next blocks go comes from its own nodes; signals, requests and timers have their turn in between.
+
+    They had it after the last block.
+    """
+    cell = harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=2000.0"]), tmp_path / "bag", keep=True)
+    with harness.Processes(cell, [list(cell.nodes)]) as processes:
+        processes.wait_for("cycle")
+        os.kill(processes.pids["tool"], signal.SIGTERM)
+        assert not processes.wait_for("closed")["complete"]
+
+
 @pytest.mark.parametrize(
     ("node", "arguments", "expected"),
     [
