@@ -331,10 +331,7 @@ def test_the_command_closes_its_bag_on_a_signal(number, mode, tmp_path):
 
 
 def test_a_process_with_a_whole_cell_that_runs_flat_out_is_not_deaf(tmp_path):
-    """What lets the next blocks go comes from its own nodes; signals, requests and timers have their turn in between.
-
-    They had it after the last block.
-    """
+    """Its own nodes let the next blocks go; signals, requests and timers have their turn in between, not at the end."""
     cell = harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=2000.0"]), tmp_path / "bag", keep=True)
     with harness.Processes(cell, [list(cell.nodes)]) as processes:
         processes.wait_for("cycle")

@@ -222,7 +222,7 @@ class SpindleNode(LossWatch):
 
     def advance(self) -> None:
         """Take what members in this process have told: not at once, the block that they report may be under way."""
-        for _ in range(len(self._told)):  # what they tell of the blocks that this lets go has its turn later
+        for _ in range(len(self._told)):  # their reports on the blocks that this lets go have their turn later
             self._on_progress(self._told.popleft())
         if self._inputs and self.chain is None:
             self.release()  # what has come from the cut may let blocks go
