@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How time and memory grow: what should be flat, is it?
 
-The offline engine alone, with nobody who keeps anything, runs ``config/one_channel.yaml`` with an oval, varied in one
+The offline engine alone, without sinks, runs ``config/one_channel.yaml`` with an oval, varied in one
 respect:
 
 - ``length``: blocks (of 64 samples) in the run,

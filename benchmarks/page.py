@@ -290,7 +290,7 @@ def page(result: Mapping[str, Any]) -> str:
         "",
         f"- **Machine**: {where}; {machine.get('system', '')}, Python {machine.get('python', '?')}.",
         f"- **Commit**: `{result.get('commit', '?')}`{' (quick: rough figures)' if result.get('quick') else ''}.",
-        "- **Figures** are medians on this machine, the lowest and the highest run in brackets. What is compared was",
+        "- **Figures** are medians on this machine, the lowest and the highest run in brackets. Compared sides were",
         "  measured in turn (A B A B …), and a **ratio** is the median of the quotients, one a round: it holds while",
         "  the speed of the machine wanders. Absolute figures are worth less.",
         *([f"- **Note**: {result['note']}"] if "note" in result else []),

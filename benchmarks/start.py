@@ -11,7 +11,7 @@
 ``import_..._s``: a Python process that imports and ends. Compiled code: with an empty NUMBA_CACHE_DIR, then once more:
 ``compiled_on_second_start`` counts files of the cache that are new or changed, and has to be 0.
 
-python -m benchmarks.start ARGUMENTS is ``lathe ARGUMENTS`` and tells of the moments above.
+python -m benchmarks.start ARGUMENTS is ``lathe ARGUMENTS`` and reports the moments above.
 """
 
 import importlib

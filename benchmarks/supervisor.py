@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What monitors and a supervisor cost: the piston with every monitor on, against the same with less.
+"""The cost of monitors and of a supervisor: the piston with every monitor on, against the same with less.
 
 The scenarios are `supervised`, with nothing allowed to break (`watched`), the same with every monitor off (`idle`),
-with every monitor off and no margin published for them (`unwatched`), and `piston`, which has no supervisor and nobody
-who obeys one (`alone`); the signals that they have in common are the same to the bit. A ratio is the real-time factor
-with every monitor on over that of another side: `same_topics` of `idle`, `monitors` of `unwatched`, `supervisor` of
-`alone`.
+with every monitor off and no margin published for them (`unwatched`), and `piston`, which has neither a supervisor nor
+a node that obeys one (`alone`); the signals that they have in common are the same to the bit. A ratio is the real-time
+factor with every monitor on over that of another side: `same_topics` of `idle`, `monitors` of `unwatched`,
+`supervisor` of `alone`.
 
 - `engine`: the offline engine alone, processor time of whole chunks, engines that take turns after each; from the
   revolution on at which nothing is forgiven any more (12): before, a controller takes 15 ms for its stability margins.
