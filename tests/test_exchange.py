@@ -48,7 +48,9 @@ def test_a_member_that_completes_a_block_at_once_does_not_get_it_twice(spindle):
     spindle.exchange.listen("/encoder", "/eager", complete)
     spindle.trigger_activate()
     spindle._begin()
-    spindle.work()
+    while spindle.due:  # as the loop of its process
+        spindle.due = False
+        spindle.work()
     assert spindle.done
     assert seen == list(range(0, 64 * len(seen), 64))
 
