@@ -88,6 +88,15 @@ def test_who_is_about_to_listen_is_left_alone(port):
     mutex.close()
 
 
+def test_who_was_killed_while_it_made_a_port_keeps_nobody_from_it(port):
+    """Nobody has the semaphore in memory that it has left taken: it is as good as free."""
+    posix_ipc.Semaphore(MUTEX, posix_ipc.O_CREAT, initial_value=0).close()
+    assert stale_shared_memory.sweep(port.parent) == [port.name]
+    with posix_ipc.Semaphore(MUTEX, posix_ipc.O_CREAT, initial_value=1) as mutex:
+        assert mutex.value == 0, "the next one can take it"
+    mutex.close()
+
+
 def test_who_has_it_in_memory_is_left_alone(port):
     with port.open("r+b") as stream, mmap.mmap(stream.fileno(), 0):
         assert stale_shared_memory.sweep(port.parent) == []
@@ -166,5 +175,7 @@ def test_a_cell_runs_where_killed_ones_have_left_broken_ports(domain):
     for participant in range(8):
         port = 7400 + 250 * domain + 11 + 2 * participant  # of its messages (DDSI-RTPS 2.5, 9.6.2)
         (stale_shared_memory.FOLDER / f"fastrtps_port{port}").write_bytes(bytes(52400))
+        if participant % 2:  # as a process leaves it that is killed while it makes the port
+            posix_ipc.Semaphore(f"/fastrtps_port{port}_mutex", posix_ipc.O_CREAT, initial_value=0).close()
     cell = scenario(spindle_encoder={"revolutions": 5.0})
     assert harness.run(cell, mode="processes", domain=domain).digest == harness.run(cell).digest

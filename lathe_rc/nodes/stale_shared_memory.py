@@ -14,7 +14,7 @@ import fcntl
 import os
 import re
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import posix_ipc
@@ -85,15 +85,33 @@ def _opened_by_nobody_else(port: Path) -> Iterator[None]:
         posix_ipc.BusyError: DDS does one of the two.
         posix_ipc.PermissionsError: the semaphore is another user's.
     """
-    opening = posix_ipc.Semaphore(f"/{port.name}_mutex", posix_ipc.O_CREAT, initial_value=1)
+    opening = _taken(f"{port.name}_mutex")
     try:
-        opening.acquire(timeout=0)
-        try:
-            yield
-        finally:
-            opening.release()
+        yield
     finally:
+        opening.release()
         opening.close()
+
+
+def _taken(name: str) -> posix_ipc.Semaphore:
+    """Take a semaphore that is free, or that a killed process has held: it would stay taken for ever.
+
+    A process that is killed while DDS makes a port leaves an empty one, and the next that opens it waits without end.
+
+    Raises:
+        posix_ipc.BusyError: a living process holds it.
+    """
+    semaphore = posix_ipc.Semaphore(f"/{name}", posix_ipc.O_CREAT, initial_value=1)
+    try:
+        semaphore.acquire(timeout=0)
+    except posix_ipc.BusyError:
+        semaphore.close()
+        if _is_mapped(FOLDER / f"sem.{name}"):
+            raise
+        with suppress(posix_ipc.ExistentialError):  # DDS removes some, too
+            posix_ipc.unlink_semaphore(f"/{name}")
+        return _taken(name)
+    return semaphore
 
 
 def _remove_segment(segment: Path) -> bool:
@@ -110,11 +128,17 @@ def _remove_segment(segment: Path) -> bool:
 
 
 def _is_mapped(file: Path) -> bool:
-    """Whether a process has a file in its memory."""
+    """Whether a process has a file in its memory, by its number: who makes a semaphore has it under another name."""
+    try:
+        number = str(file.stat().st_ino)
+    except FileNotFoundError:
+        return False
     for maps in Path("/proc").glob("[0-9]*/maps"):
         try:
-            if str(file) in maps.read_text(encoding="utf-8", errors="replace").split():
-                return True
+            text = maps.read_text(encoding="utf-8", errors="replace")
         except (FileNotFoundError, ProcessLookupError, PermissionError):
             continue  # it has ended; or it is another user's, who cannot use this user's ports
+        mapped = (line.split(maxsplit=5) for line in text.splitlines() if number in line)
+        if any(len(parts) > 5 and parts[4] == number and parts[5].startswith(f"{file.parent}/") for parts in mapped):
+            return True
     return False
