@@ -223,7 +223,9 @@ class SpindleNode(LossWatch):
     def advance(self) -> None:
         """Take what members in this process have told: not at once, the block that they report may be under way."""
         for _ in range(len(self._told)):  # their reports on the blocks that this lets go have their turn later
-            self._on_progress(self._told.popleft())
+            report = self._told.popleft()
+            self.due = self.due or bool(self._told)  # an error leaves the rest for the next turn
+            self._on_progress(report)
         if self._inputs and self.chain is None:
             self.release()  # what has come from the cut may let blocks go
 
