@@ -4,7 +4,6 @@
 import contextlib
 import importlib.util
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -249,14 +248,6 @@ def compare(observer, root):
     assert differences(found, wanted) == {}, "used, but not allowed"
 
 
-def native_stacks(pid):
-    """The stacks of a process that stands still in a library, where gdb is installed."""
-    if not (gdb := shutil.which("gdb")):
-        return ""
-    command = [gdb, "-p", str(pid), "-batch", "-ex", "thread apply all backtrace 25"]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False).stdout
-
-
 @contextlib.contextmanager
 def running(folder, commands):
     """Processes with a log each in ``folder``; ended, whatever happens; one that goes on is killed and named."""
@@ -284,12 +275,11 @@ def running(folder, commands):
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     child.wait(GRACE)
                 if child.poll() is None:
-                    native = native_stacks(child.pid)
                     child.send_signal(signal.SIGUSR1)
                     with contextlib.suppress(subprocess.TimeoutExpired):
                         child.wait(1.0)
                     child.kill()
-                    warnings.warn(f"did not end on SIGTERM: {log.read_text()[-2000:]}{native}", stacklevel=1)
+                    warnings.warn(f"did not end on SIGTERM: {log.read_text()[-2000:]}", stacklevel=1)
 
 
 def members(loaded, root, folder):

@@ -44,7 +44,7 @@ from lathe_rc.plants.coil import Coil, coil_table
 from lathe_rc.plants.cutting import CuttingProcess
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
 from lathe_rc.plants.piezo import Stack, StackTable
-from lathe_rc.plants.tool_motion import SATURATED, STOPPED, MotionTable, Weights, advance, advance_loaded, failure
+from lathe_rc.plants.tool_motion import SATURATED, STOPPED, MotionTable, Weights, advance_loaded, failure
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -137,7 +137,7 @@ class ToolDrive:
         kept: samples of which it is kept whether the current loop was limited, a power of two.
 
     Attributes:
-        table: for `advance` and `advance_loaded`.
+        table: for `advance` and `advance_loaded` of `lathe_rc.plants.tool_motion`.
 
     Raises:
         InputError: the current loop is too fast for the step, or it oscillates; direct compensation would oscillate, or
@@ -229,16 +229,16 @@ class ToolDrive:
         if piezo and piezo.feedback:  # judged with a current that is there at once
             _check_feedback(discretise(servo, extends[: 2 * masses], 0.0, step, method), piezo)
 
-    def block(self, cut: CuttingProcess | None, first: int, given: Mapping[str, Array]) -> dict[str, Array]:
+    def block(self, cut: CuttingProcess, first: int, given: Mapping[str, Array]) -> dict[str, Array]:
         """Step drives and cut from sample ``first`` on; at rest at 0 before sample 0.
 
         Args:
-            cut: what the tool cuts; its state goes on. None: it moves in air.
+            cut: what the tool cuts; its state goes on.
             first: index of the first sample.
-            given: by name, of shape (n,): ``command`` [m], and for a cut ``angle`` [rad], ``speed`` [rad/s] and
-                ``feed_velocity`` [m/s]; 0 unless given: ``set_point`` of the piezo [m], ``noise`` of the carriage's
-                sensor [m], ``met``, the form that the blank has already [m], and ``height``, ``cross_position`` and
-                ``allowance`` as in `lathe_rc.plants.cutting.CuttingProcess.block`.
+            given: by name, of shape (n,): ``command`` [m], ``angle`` [rad], ``speed`` [rad/s] and ``feed_velocity``
+                [m/s]; 0 unless given: ``set_point`` of the piezo [m], ``noise`` of the carriage's sensor [m], ``met``,
+                the form that the blank has already [m], and ``height``, ``cross_position`` and ``allowance`` as in
+                `lathe_rc.plants.cutting.CuttingProcess.block`.
 
         Returns:
             By name: ``position``, ``velocity``, ``current`` and ``measured`` of the carriage, ``extension``,
@@ -251,9 +251,6 @@ class ToolDrive:
         none = np.zeros_like(given["command"])
         taken = [given.get(name, none) for name in _GIVEN]
         made = {name: np.zeros_like(none) for name in _MADE}
-        if cut is None:
-            advance(self.table, first, *taken[:3], *[made[name] for name in _MADE[:7]])
-            return made
         reached, reason = advance_loaded(self.table, cut.table, first, *taken, *made.values())
         if reason != DONE:
             raise failure(reason, given["angle"][reached], given["speed"][reached], made["feed"][reached])

@@ -246,7 +246,22 @@ def advance(
     extension_velocity: Array,
     voltage: Array,
 ) -> None:
-    """Step drives in air through a block, see `lathe_rc.plants.tool_drive.ToolDrive.block`."""
+    """Step drives in air through a block.
+
+    Args:
+        drive: its state goes on; at rest at 0 before sample 0.
+        first: index of the first sample.
+        command: set point of the carriage [m], shape (n,) as all that follow.
+        set_point: of the piezo, without what the feedback takes off [m].
+        noise: of the carriage's position sensor [m].
+        carriage: filled, as all that follow: true position [m].
+        carriage_velocity: [m/s].
+        current: of the coil [A].
+        measured: position of the carriage as its sensor reads it [m].
+        extension: of the piezo, the tool against the carriage [m].
+        extension_velocity: [m/s].
+        voltage: at the piezo [V].
+    """
     free, trial, nowhere = np.empty(drive.state.size), np.empty(drive.memory.size), (0.0, 0.0, 0.0, 0.0, 0.0)
     for k in range(command.size):
         delayed = _begin(drive, first + k, command[k], free)

@@ -20,6 +20,7 @@ from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters
 from lathe_rc.cell.stages.retraction import OwnRetraction, followed
+from lathe_rc.cell.stages.series_drive import COARSE, FINE, piezo_on_carriage, tool_drive
 from lathe_rc.cell.stages.set_point import SetPoint, sum_up
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import CommandLimits, LimiterTable, limiter
@@ -28,13 +29,11 @@ from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
 from lathe_rc.plants.chip import CutTable
 from lathe_rc.plants.coil import Coil
-from lathe_rc.plants.tool_drive import Piezo, ToolDrive
 from lathe_rc.plants.tool_motion import MotionTable, advance_loaded, failure
 from lathe_rc.signals.allowance import AllowanceTable, allow
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
-_COARSE = "coarse"  # the displacement that the drive knows itself
-_FINE, _CUT = "fine_", "cut_"  # begin the parameters of the fine drive and of the cut
+_CUT = "cut_"  # begins the parameters of the cut
 _COIL = "coil"  # whose limits are told
 _NO_LIMITS = limiter(CommandLimits(np.inf, np.inf, np.inf, np.inf), 1.0, 1)
 _REFERENCE = Input("reference", messages.REFERENCE, ("reference", "height"))
@@ -128,7 +127,7 @@ class LoadedSeriesParameters(LoadedParameters):
     @property
     def fine(self) -> LoadedFineParameters:
         """The table of the fine drive."""
-        return self.part(_FINE, LoadedFineParameters)
+        return self.part(FINE, LoadedFineParameters)
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
         """See `NodeParameters`; each drive by itself, without force and current loop."""
@@ -159,7 +158,7 @@ LoadedSeriesDriveParameters = create_model(
     __module__=__name__,
     **{
         **_OF_COARSE_AND_CUT,
-        **prefixed(_FINE, LoadedFineParameters),
+        **prefixed(FINE, LoadedFineParameters),
         "coarse_moving_mass": (Annotated[float, Gt(0)], parameter(1.2, "carriage and coil, without the tool", "kg")),
     },
 )
@@ -280,31 +279,16 @@ class LoadedDriveStage(CutStage, Drive):
         ]
         if isinstance(parameters, LoadedSeriesParameters):
             fine = parameters.fine
-            self._set_point = SetPoint(name, fine, inside=(_COARSE,), prefix=_FINE)
+            self._set_point = SetPoint(name, fine, inside=(COARSE,), prefix=FINE)
             self._limited.append(LimitedCommand(name, fine, "fine"))
-            piezo = Piezo(
-                stack=fine.stack(name, _FINE),
-                tool_frequency=fine.natural_frequency,
-                tool_damping=fine.damping,
-                mass_ratio=parameters.mass_ratio,
-                full_voltage=fine.full_voltage,
-                feedback=_COARSE in fine.compensates,
-                preload=fine.preload or np.inf,
-            )
+            piezo = piezo_on_carriage(name, fine, parameters.mass_ratio, fine.preload or np.inf)
         with about(name, "coarse_bandwidth" if coil else "mass_ratio", "sample_rate"):
-            self.drive = ToolDrive(
-                carriage_frequency=coarse.natural_frequency,
-                carriage_damping=coarse.damping,
-                delay=coarse.delay,
-                carriage_stroke=coarse.stroke,
-                moving_mass=coarse.moving_mass,
-                force_constant=coarse.force_constant,
+            self.drive = tool_drive(
+                coarse,
+                parameters,
                 radial=parameters.radial_ratio,
                 coil=coil,
                 piezo=piezo,
-                resolution=coarse.resolution,
-                step=parameters.step,
-                method=parameters.discretisation,
                 kept=messages.MAX_BLOCK if coil else 1,
             )
         self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)

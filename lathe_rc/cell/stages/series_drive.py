@@ -2,7 +2,7 @@
 """Piezo and tool on the coarse carriage: both drives as one stage, for no block may cut what couples them."""
 
 from collections.abc import Mapping
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -27,8 +27,8 @@ from lathe_rc.plants.tool_drive import Piezo, ToolDrive
 from lathe_rc.plants.tool_motion import MotionTable, advance
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
-_COARSE = "coarse"  # the displacement that the drive knows itself
-_FINE = "fine_"  # begins the parameters of the fine drive
+COARSE = "coarse"  #: the displacement that the drive knows itself
+FINE = "fine_"  #: begins the parameters of the fine drive
 
 
 class SeriesParameters(ComposedParameters):
@@ -44,7 +44,7 @@ class SeriesParameters(ComposedParameters):
     @property
     def fine(self) -> PiezoActuatorParameters:
         """The table of the fine drive."""
-        return self.part(_FINE, PiezoActuatorParameters)
+        return self.part(FINE, PiezoActuatorParameters)
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
         """See `NodeParameters`; each drive by itself, without what one does to the other."""
@@ -58,7 +58,7 @@ SeriesDriveParameters = create_model(
     __module__=__name__,
     **{
         **prefixed("coarse_", ElectrodynamicActuatorParameters),
-        **prefixed(_FINE, PiezoActuatorParameters),
+        **prefixed(FINE, PiezoActuatorParameters),
         "coarse_moving_mass": (Annotated[float, Gt(0)], parameter(1.2, "carriage and coil, without the tool", "kg")),
     },
 )
@@ -93,6 +93,42 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     return command.size, DONE
 
 
+def piezo_on_carriage(name: str, fine: PiezoActuatorParameters, mass_ratio: float, preload: float = np.inf) -> Piezo:
+    """The piezo of a node, at rest, with the tool on the carriage.
+
+    Args:
+        name: of the node.
+        fine: its table of the fine drive.
+        mass_ratio: mass of the tool over that of the carriage.
+        preload: of the stack [N].
+    """
+    return Piezo(
+        stack=fine.stack(name, FINE),
+        tool_frequency=fine.natural_frequency,
+        tool_damping=fine.damping,
+        mass_ratio=mass_ratio,
+        full_voltage=fine.full_voltage,
+        feedback=COARSE in fine.compensates,
+        preload=preload,
+    )
+
+
+def tool_drive(coarse: ElectrodynamicActuatorParameters, shared: ComposedParameters, **beside: Any) -> ToolDrive:
+    """The machine of a coarse drive's table, and of what is given ``beside`` it, see `ToolDrive`."""
+    return ToolDrive(
+        carriage_frequency=coarse.natural_frequency,
+        carriage_damping=coarse.damping,
+        delay=coarse.delay,
+        carriage_stroke=coarse.stroke,
+        moving_mass=coarse.moving_mass,
+        force_constant=coarse.force_constant,
+        resolution=coarse.resolution,
+        step=shared.step,
+        method=shared.discretisation,
+        **beside,
+    )
+
+
 class SeriesDriveStage(Drive):
     """See `lathe_rc.plants.tool_drive`.
 
@@ -110,31 +146,13 @@ class SeriesDriveStage(Drive):
         super().__init__(name, parameters)
         self.parameters = parameters
         coarse, fine = parameters.coarse, parameters.fine
-        piezo = Piezo(
-            stack=fine.stack(name, _FINE),
-            tool_frequency=fine.natural_frequency,
-            tool_damping=fine.damping,
-            mass_ratio=parameters.mass_ratio,
-            full_voltage=fine.full_voltage,
-            feedback=_COARSE in fine.compensates,
-        )
+        piezo = piezo_on_carriage(name, fine, parameters.mass_ratio)
         with about(name, "mass_ratio", "sample_rate"):
-            self.drive = ToolDrive(
-                carriage_frequency=coarse.natural_frequency,
-                carriage_damping=coarse.damping,
-                delay=coarse.delay,
-                carriage_stroke=coarse.stroke,
-                moving_mass=coarse.moving_mass,
-                force_constant=coarse.force_constant,
-                piezo=piezo,
-                resolution=coarse.resolution,
-                step=parameters.step,
-                method=parameters.discretisation,
-            )
+            self.drive = tool_drive(coarse, parameters, piezo=piezo)
         self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
         self._retraction = OwnRetraction(coarse, coarse.stroke)
         self._limited = LimitedCommand(name, coarse, "coarse"), LimitedCommand(name, fine, "fine")
-        self._set_point = SetPoint(name, fine, inside=(_COARSE,), prefix=_FINE)
+        self._set_point = SetPoint(name, fine, inside=(COARSE,), prefix=FINE)
         # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
         self._coarse_noise = Sensor(coarse.noise_rms, 0.0, parameters.seed, f"{name}/coarse")
         self._fine_sensor = Sensor(fine.noise_rms, fine.resolution, parameters.seed, f"{name}/fine")
