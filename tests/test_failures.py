@@ -89,9 +89,21 @@ sys.meta_path.insert(0, Finder())
 RUN = ["spindle_encoder.revolutions=100.0", "spindle_encoder.safe_time=0.1", "recorder.chunk_size=65536"]
 
 
-@pytest.mark.parametrize("node", ["learning_controller", "electrodynamic_actuator", "supervisor"])
-def test_the_death_of_a_member_ends_in_the_safe_state(node, tmp_path):
-    """When a member dies, all others go on to the end that the time master declares; the drive retracts by itself."""
+@pytest.mark.parametrize(
+    ("node", "told_late"), [("learning_controller", False), ("electrodynamic_actuator", False), ("supervisor", True)]
+)
+def test_the_death_of_a_member_ends_in_the_safe_state(node, told_late, monkeypatch, tmp_path):
+    """When a member dies, all others go on to the end that the time master declares; the drive retracts by itself.
+
+    The harness says how it died, also if the server that started it tells that after the end of the cell.
+    """
+    if told_late:
+        say = harness.Processes._say
+        monkeypatch.setattr(
+            harness.Processes,
+            "_say",
+            lambda self, event, name, **values: say(self, event, name, **values) if event != "exit" else None,
+        )
     bag, events = tmp_path / "bag", []
     scenario = load(CONFIG / "supervised.yaml", RUN)
     killer = Killer(node, signal.SIGKILL)

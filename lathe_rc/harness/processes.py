@@ -99,6 +99,7 @@ class Processes:
         self._left: set[str] = set()  # nodes that have nothing more to do
         self._newest: dict[str, Event] = {}
         self._lost: list[tuple[str, str]] = []  # nodes that the cell goes to its safe state without, and why
+        self._dead: set[str] = set()  # members whose process has ended, as the time master has noticed
         self._restarts: Counter[str] = Counter()
         self.pids: dict[str, int] = {}
         self.refused: Counter[str] = Counter()
@@ -209,6 +210,8 @@ class Processes:
                 heard = time.monotonic()
             if event["event"] in _LAST_WORDS:
                 self._left.add(event["node"])
+            if event["event"] == "dead":
+                self._dead.add(event["member"])
             if event["event"] == "refused":
                 self.refused.update(event["senders"])
             if event["event"] == "not_reached":
@@ -322,7 +325,7 @@ class Processes:
         if event["event"] == "exit" and event["code"] > 0 and "safe" in self._newest:
             return  # all say so whose cell went there
         if event["event"] == "exit" and event["code"] and node in self._ended - self._abandoned:
-            self._lose(node, f"{how_it_ended(event)}{self._crash(node) if event['code'] < 0 else self._tail(node)}")
+            self._lose(node, self._end_of(node, event["code"]))
 
     def _is_no_cause(self, node: str) -> None:
         """The end of the process of a node needs no other explanation."""
@@ -331,8 +334,21 @@ class Processes:
     def _lose(self, name: str, why: str, error: type[LatheError] = LatheError) -> None:
         """Raise why a node or process has ended, or keep it until the time master says how the cell went on."""
         if not self._goes_on(name):
+            self._hear_of_the_dead()
             raise error(self._with_the_lost(why))
         self._lost.append((name, why))
+
+    def _hear_of_the_dead(self) -> None:
+        """Learn how those processes ended whose death the cell has noticed before their end was told here."""
+        for name in self._running:
+            if self._restarts[name] or not self._dead & {absolute(self._namespace, node) for node in name.split("+")}:
+                continue
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._lost.append((name, self._end_of(name, self._children[name].wait(timeout=_GRACE))))
+
+    def _end_of(self, name: str, code: int) -> str:
+        """How a process has ended, and where it says why."""
+        return f"{how_it_ended({'node': name, 'code': code})}{self._crash(name) if code < 0 else self._tail(name)}"
 
     def _with_the_lost(self, message: str) -> str:
         """A message after what became of nodes, as far as it does not say that itself."""
