@@ -19,7 +19,6 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 
 from lathe_rc import starting
-from lathe_rc.bag.writing.record import recorder_of
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.extensions import search_path
@@ -38,25 +37,6 @@ _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
 _NO_SIGN_OF_LIFE = {"stall", "foreign_message", "stopped", "continued", "waits"}  # events of a cell that stands
 _LAST_WORDS = {"done", "error", "abandoned", "masterless"}  # events of a node that has nothing more to do
 _LOOK = 0.05  # [s] between looks at what a process has written
-
-
-def with_recorder(scenario: Scenario, bag: Path, *, keep: bool, snapshots: Path | None = None) -> Scenario:
-    """The scenario as its processes run it: with a recorder on ``bag``, and a spindle that waits for all members.
-
-    With ``snapshots`` it makes those too, in that folder; what is not to be kept has none.
-    """
-    nodes = dict(scenario.nodes)
-    name, table = recorder_of(scenario)
-    changes: dict[str, object] = {"bag": str(bag.resolve())}
-    if not keep:
-        changes |= {"compression": "none", "mode": "continuous"}
-    elif snapshots is not None:
-        changes |= {"mode": "both", "snapshots": str(snapshots.resolve())}
-    nodes[name] = table.model_copy(update=changes)
-    for master in scenario.masters:
-        others = [node for node in nodes if node != master]
-        nodes[master] = nodes[master].model_copy(update={"members": others})
-    return Scenario(scenario.name, nodes)
 
 
 class Processes:

@@ -22,7 +22,8 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.harness.events import Event, ignore
-from lathe_rc.harness.processes import Processes, with_recorder
+from lathe_rc.harness.processes import Processes
+from lathe_rc.harness.recorded import with_recorder
 from lathe_rc.harness.result import Mode, Result
 from lathe_rc.messages import Signals
 from lathe_rc.namespace import checked
