@@ -25,7 +25,6 @@ from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
-from unittest import mock
 
 from benchmarks import sides
 
@@ -130,8 +129,8 @@ def main() -> None:
 
     if "offline" in sys.argv:
         _told(importlib.import_module("lathe_rc.harness"))
-    with mock.patch.object(starting.ForkServer, "preload", preload):
-        cli.main()
+    setattr(starting.ForkServer, "preload", preload)  # noqa: B010 - mypy would not have it assigned
+    cli.main()
 
 
 if __name__ == "__main__":

@@ -3,13 +3,16 @@
 
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
+
+if TYPE_CHECKING:
+    from rosbags.interfaces.typing import Typesdict
 
 PACKAGE = "lathe_rc_msgs"
 
@@ -41,20 +44,30 @@ Signals = dict[str, Samples]  #: the arrays of a block by field name
 
 
 @cache
-def store() -> Typestore:
-    """ROS 2's own types and those of lathe_rc."""
-    types = get_typestore(Stores.ROS2_JAZZY)
-    own = {}
+def _own() -> "Typesdict":
+    """The types of lathe_rc."""
+    found: Typesdict = {}
     for path in sorted((Path(__file__).with_name("msg_defs") / "msg").glob("*.msg")):
-        own.update(get_types_from_msg(path.read_text(encoding="utf-8"), f"{PACKAGE}/msg/{path.stem}"))
-    types.register(own)
+        found.update(get_types_from_msg(path.read_text(encoding="utf-8"), f"{PACKAGE}/msg/{path.stem}"))
+    return found
+
+
+@cache
+def store() -> Typestore:
+    """ROS 2's own types and those of lathe_rc; they take a while to load, and a run without a bag needs none."""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    types.register(_own())
     return types
+
+
+def fields(msgtype: str) -> list[tuple[str, Any]]:
+    """Names and kinds of a type's fields, in order, as rosbags has them."""
+    return list((_own() if msgtype in _own() else store().fielddefs)[msgtype][1])
 
 
 def _with(field: str) -> frozenset[str]:
     """The types of lathe_rc that have a field."""
-    own = (name for name in store().fielddefs if name.startswith(f"{PACKAGE}/msg/"))
-    return frozenset(name for name in own if any(field == given for given, _ in store().fielddefs[name][1]))
+    return frozenset(name for name in _own() if any(field == given for given, _ in fields(name)))
 
 
 @cache
@@ -78,12 +91,12 @@ def signal_types() -> frozenset[str]:
 @cache
 def sample_fields(msgtype: str) -> dict[str, np.dtype[Any]]:
     """The array fields of a block type, in order, with their element types."""
-    fields = {}
-    for name, (kind, detail) in store().fielddefs[msgtype][1]:
+    found = {}
+    for name, (kind, detail) in fields(msgtype):
         if kind == Nodetype.SEQUENCE:
             ((_, (element, _)), _) = cast("tuple[tuple[Any, tuple[str, int]], int]", detail)
-            fields[name] = np.dtype(element)
-    return fields
+            found[name] = np.dtype(element)
+    return found
 
 
 def full(topic: str) -> str:

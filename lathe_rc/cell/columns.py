@@ -65,7 +65,7 @@ def columns(msgtype: str) -> tuple[Column, ...]:
         fields = messages.sample_fields(msgtype)
     else:
         left_out = {*NOT_SIGNALS, "sample_index"}
-        given = messages.store().fielddefs[msgtype][1]
+        given = messages.fields(msgtype)
         fields = {name: _element(kind, detail) for name, (kind, detail) in given if name not in left_out}
     return (*_FIRST, *(Column(name, dtype, known.get(name, "")) for name, dtype in fields.items()))
 

@@ -143,6 +143,15 @@ class Scenario:
         """Names of the nodes that give the cell its time: one, in a cell that can work."""
         return [name for name in self.nodes if self.kind(name) in MASTERS]
 
+    @property
+    def recorder(self) -> tuple[str, RecorderParameters]:
+        """Name and table of its recorder; what a recorder is by itself if it has none."""
+        for name, table in self.nodes.items():
+            if isinstance(table, RecorderParameters):
+                return name, table
+        shared = {name: getattr(self.shared, name) for name in SharedParameters.model_fields}
+        return RECORDER, RecorderParameters(**shared)
+
     def processes(self, groups: Iterable[Iterable[str]] | None = None, what: str = "processes") -> list[list[str]]:
         """Names of the nodes in each process.
 

@@ -4,7 +4,6 @@
 import math
 
 import numpy as np
-import plotext
 from rich.console import Console
 from rich.text import Text
 
@@ -31,6 +30,8 @@ def drawn(result: harness.Result, width: int) -> Text | None:
         result: of the run.
         width: [characters].
     """
+    import plotext  # takes a while, and many look at no plot
+
     rms, largest = np.asarray(result.errors.rms) * 1e6, np.asarray(result.errors.largest) * 1e6
     if rms.size < 2 or not (np.isfinite(largest).all() and rms.all()):
         return None

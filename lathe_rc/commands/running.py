@@ -8,7 +8,6 @@ import click
 from rich.console import Console
 
 from lathe_rc import harness, part
-from lathe_rc.bag.writing.record import recorder_of
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.commands import budgeting, outcome, picture, plot
 from lathe_rc.commands import scenario as scenarios
@@ -91,7 +90,7 @@ def run(
     if as_json:
         click.echo(json.dumps(result.summary() | ({"budget": found.summary()} if found else {})))
     else:
-        asks_for_snapshots = recorder_of(loaded)[1].mode != "continuous"
+        asks_for_snapshots = loaded.recorder[1].mode != "continuous"
         told = _NO_SNAPSHOTS if asks_for_snapshots and not bag else ""
         files = {name: path for name, path in (("profile", profile), ("figure", figure)) if path}
         outcome.show(result, files, told=told, budget=found)

@@ -3,7 +3,6 @@
 
 from pathlib import Path
 
-from lathe_rc.bag.writing.record import recorder_of
 from lathe_rc.cell.scenario import Scenario
 
 
@@ -13,7 +12,7 @@ def with_recorder(scenario: Scenario, bag: Path, *, keep: bool, snapshots: Path 
     With ``snapshots`` it makes those too, in that folder; what is not to be kept has none.
     """
     nodes = dict(scenario.nodes)
-    name, table = recorder_of(scenario)
+    name, table = scenario.recorder
     changes: dict[str, object] = {"bag": str(bag.resolve())}
     if not keep:
         changes |= {"compression": "none", "mode": "continuous"}

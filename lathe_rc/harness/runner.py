@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run, in any host, from the checks to the bag."""
+"""One run, in any host, from the checks to the bag.
+
+What writes and reads bags is imported where there is one: a run without a bag does not wait for that.
+"""
 
 import contextlib
 import tempfile
@@ -9,11 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from lathe_rc import messages, starting
-from lathe_rc.bag import reader
-from lathe_rc.bag.check import write_digests
-from lathe_rc.bag.repairing import recover
-from lathe_rc.bag.writing.record import OfflineRecorder, begin, begin_snapshots, recorder_of
-from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.collect import Collector, check_room
 from lathe_rc.cell.durations import Lateness
@@ -82,10 +80,14 @@ def run(
     for what in cell.unchecked:
         watch({"event": "unchecked", "node": cell.master.name, "message": what})
     if bag is not None:
+        from lathe_rc.bag.writing.writer import refuse_existing
+
         refuse_existing(bag)
     result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace), start)
     result = replace(result, unchecked=cell.unchecked)
     if result.bag is not None:
+        from lathe_rc.bag.check import write_digests
+
         write_digests(result.bag, result.digest)
     return result
 
@@ -107,11 +109,14 @@ def _run(
         watch({"event": "compiling", "node": left[0], "nodes": left})
     if mode == "offline":
         return _offline(scenario, cell, bag, watch)
+    from lathe_rc.bag import reader
+    from lathe_rc.bag.repairing import recover
+
     if start == "fork":
         nodes = {name: (scenario.kind(name), table.model_dump()) for name, table in scenario.nodes.items()}
         starting.server().preload(nodes)
     with contextlib.ExitStack() as stack:
-        table = recorder_of(scenario)[1]
+        table = scenario.recorder[1]
         folder = table.snapshots_of(bag) if bag is not None and table.mode != "continuous" else None
         place = kept = _whole(scenario, bag)
         if place is None:
@@ -152,7 +157,7 @@ def _lateness(events: Mapping[str, Event]) -> Lateness | None:
 
 def _whole(scenario: Scenario, bag: Path | None) -> Path | None:
     """The bag that keeps the whole run, if one does."""
-    return None if recorder_of(scenario)[1].mode == "snapshot" else bag
+    return None if scenario.recorder[1].mode == "snapshot" else bag
 
 
 def _bags_in(folder: Path | None) -> list[Path]:
@@ -183,6 +188,8 @@ def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[
     sinks: list[Sink] = [collector, _Watcher(watch)]
     recorder = snapshots = None
     if bag is not None:
+        from lathe_rc.bag.writing.record import OfflineRecorder, begin, begin_snapshots
+
         snapshots = begin_snapshots(bag, scenario, cell)
         recorder = OfflineRecorder(cell, engine.samples, begin(bag, scenario, snapshots), snapshots)
         sinks.append(recorder)

@@ -14,7 +14,7 @@ from lathe_rc.bag.writing.tee import Both
 from lathe_rc.bag.writing.writer import BagWriter, Output, offered_qos
 from lathe_rc.cell.framing import Framer
 from lathe_rc.cell.parameters import SharedParameters
-from lathe_rc.cell.recorder import KIND, RecorderParameters
+from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
@@ -54,18 +54,9 @@ def begin(path: Path, scenario: Scenario, snapshots: Snapshots | None = None) ->
     Raises:
         InputError: the folder exists or cannot be made.
     """
-    output = bag_of(path, recorder_of(scenario)[1], snapshots)
+    output = bag_of(path, scenario.recorder[1], snapshots)
     output.tell(provenance.tell(scenario, []))
     return output
-
-
-def recorder_of(scenario: Scenario) -> tuple[str, RecorderParameters]:
-    """Name and table of a scenario's recorder; what a recorder is by itself if it has none."""
-    for name, table in scenario.nodes.items():
-        if isinstance(table, RecorderParameters):
-            return name, table
-    shared = {name: getattr(scenario.shared, name) for name in SharedParameters.model_fields}
-    return KIND, RecorderParameters(**shared)
 
 
 def begin_snapshots(path: Path, scenario: Scenario, cell: Cell) -> Snapshots | None:
@@ -74,7 +65,7 @@ def begin_snapshots(path: Path, scenario: Scenario, cell: Cell) -> Snapshots | N
     Raises:
         InputError: see `Snapshots` and its `prepare`.
     """
-    name, table = recorder_of(scenario)
+    name, table = scenario.recorder
     if table.mode == "continuous":
         return None
     snapshots = Snapshots(table.snapshots_of(path), table, name=name)
