@@ -62,7 +62,8 @@ def prepared(name: str, count: int) -> float:
     total, samples = 0.0, 0
     with ThreadPoolExecutor(_CORES) as pool:
         for _ in range(0, count, READY):
-            engines = [Engine(Cell(each.nodes), ()) for each in variations(name, READY)]
+            cells = [Cell(each.nodes) for each in variations(name, READY)]
+            engines = [Engine(cell, batch.Errors(cell, 0).heard) for cell in cells]
             samples += sum(engine.samples for engine in engines)
             total += seconds(partial(_run, pool, engines))
     return total * _CORES / samples

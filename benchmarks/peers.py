@@ -25,7 +25,7 @@ from scipy import signal
 from benchmarks import sides
 from benchmarks.others.peer import Peer, missing
 from lathe_rc import messages, resources
-from lathe_rc.analysis.metrology import form_errors
+from lathe_rc.analysis.form_errors import form_errors
 from lathe_rc.cell import scenario
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.stage import Sparse

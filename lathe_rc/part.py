@@ -9,7 +9,8 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.analysis import profile_csv
-from lathe_rc.analysis.metrology import FormErrors, Lay, Measurement, evenly, form_errors, lay, measure, turns_before
+from lathe_rc.analysis.form_errors import RunningErrors, turns_before
+from lathe_rc.analysis.metrology import Lay, Measurement, evenly, lay, measure
 from lathe_rc.analysis.tolerance import Verdict, judge
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recording import Recording
@@ -130,10 +131,7 @@ class ErrorsByRevolution:
 
     def __init__(self, types: Mapping[str, str]) -> None:
         self._topics = _encoder_and_tool(types)
-        self._angle: list[np.ndarray] = []  # pieces
-        self._error: list[np.ndarray] = []
-        self._rms: list[np.ndarray] = []
-        self._done = 0  # revolutions
+        self._errors: RunningErrors | None = None
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
@@ -141,27 +139,14 @@ class ErrorsByRevolution:
         if encoder is None or tool is None:
             return
         named = {full(topic): signals for topic, signals in dense.items()}
-        if not self._angle:
-            self._done = turns_before(named[encoder]["angle_true"])
-        self._angle.append(named[encoder]["angle_true"].copy())
-        self._error.append(named[tool]["error"].copy())
-        if self._angle[-1][-1] - self._angle[0][0] > _TOGETHER * 2.0 * np.pi:
-            # A start two samples from the end may still move: it stays for the next piece.
-            angle, error, found = self._together()
-            whole = int(np.searchsorted(found.starts, angle.size - 2)) - 1
-            self._rms.append(found.rms[:whole])
-            self._done += whole
-            keep = int(found.starts[whole])
-            self._angle, self._error = [angle[keep:]], [error[keep:]]
-
-    def _together(self) -> tuple[np.ndarray, np.ndarray, FormErrors]:
-        """Angle, error and form errors of the pieces."""
-        angle, error = (np.concatenate([np.empty(0), *pieces]) for pieces in (self._angle, self._error))
-        return angle, error, form_errors(angle, error, self._done)
+        angle, error = named[encoder]["angle_true"], named[tool]["error"]
+        if self._errors is None:
+            self._errors = RunningErrors(turns_before(angle))
+        self._errors.add(angle, error)
 
     def rms(self) -> np.ndarray:
-        """RMS form error of each complete revolution [m], shape (revolutions,); to be asked at the end."""
-        return np.concatenate([*self._rms, self._together()[2].rms])
+        """RMS form error of each complete revolution [m], shape (revolutions,), if the run ends here."""
+        return (self._errors or RunningErrors()).found().rms
 
 
 class FirstAndLast:

@@ -220,7 +220,7 @@ def test_the_drive_is_identified_while_it_cuts():
     made = load("robust_cutting", "controller.allow_unstable=true").varied(drive(0.8, 1.2, 1.0, 1.0))
     cell = Cell(made.nodes)
     keeper = batch.Errors(cell, cell.samples)
-    Engine(cell, ()).run([keeper])
+    Engine(cell, keeper.heard).run([keeper])
     a1, a2 = cell.stages["controller"].law.known.model
     assert_allclose([a1, a2], [2 * 0.804 * 1.2 / (0.8 * 1038.0), 1 / (0.8 * 1038.0) ** 2], rtol=0.03)
 

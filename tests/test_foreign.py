@@ -20,7 +20,7 @@ pytest.importorskip("rclpy")
 from lathe_rc_msgs.msg import Member
 
 from lathe_rc import harness, messages
-from lathe_rc.analysis.metrology import form_errors
+from lathe_rc.analysis.form_errors import form_errors
 from lathe_rc.bag import reader
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters

@@ -2,6 +2,7 @@
 """Form errors and roundness, revolution by revolution, and profiles as files."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +10,14 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_rc import cli, harness
 from lathe_rc.analysis import profile_csv
+from lathe_rc.analysis.form_errors import RunningErrors, form_errors
 from lathe_rc.analysis.metrology import (
     POINTS,
     evenly,
-    form_errors,
     gaussian,
     lay,
     measure,
@@ -88,6 +89,28 @@ def test_revolution_without_a_sample_is_refused():
         InputError, match=r"^revolution \d+ has no sample; allowed: an angle that increases by less than"
     ):
         form_errors(np.arange(200) * 2.0 * np.pi / 0.7, np.ones(200))
+
+
+@given(
+    first=st.integers(0, 2),
+    begin=st.floats(0.0, 2.0),
+    steps=st.lists(st.floats(1e-3, 0.9), min_size=1, max_size=300),
+    cuts=st.lists(st.integers(0, 300), max_size=5),
+)
+def test_errors_of_pieces_are_those_of_the_whole_and_each_is_its_sum(first, begin, steps, cuts):
+    turns = begin + np.cumsum(steps)
+    angle, error = turns * TURN, np.sin(np.arange(turns.size) ** 2.0)
+    running = RunningErrors(max(first, math.ceil(angle[0] / TURN)))
+    for piece in np.split(np.arange(turns.size), sorted(cuts)):
+        running.add(angle[piece], error[piece])
+    found, whole = running.found(), form_errors(angle, error, max(first, math.ceil(angle[0] / TURN)))
+    for name in ("rms", "largest", "peak_to_valley", "starts"):
+        assert_array_equal(getattr(found, name), getattr(whole, name))
+    turns = angle / TURN
+    goes = np.append(np.diff(turns), np.diff(turns)[-1:])
+    for a, b, rms, largest in zip(found.starts, found.starts[1:], found.rms, found.largest, strict=False):
+        assert rms == pytest.approx(np.sqrt(np.average(error[a:b] ** 2, weights=goes[a:b])), rel=1e-12)
+        assert largest == np.abs(error[a:b]).max()
 
 
 @pytest.mark.parametrize("samples", [0, 1, 2, 5])

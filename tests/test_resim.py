@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
 from lathe_rc import harness, part
-from lathe_rc.analysis.metrology import form_errors
+from lathe_rc.analysis.form_errors import form_errors
 from lathe_rc.bag import provenance, reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import feed

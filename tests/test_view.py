@@ -16,6 +16,7 @@ RrdReader = pytest.importorskip("rerun.chunk").RrdReader
 
 from lathe_rc import harness, messages, resources  # noqa: E402
 from lathe_rc.analysis import metrology  # noqa: E402
+from lathe_rc.analysis.form_errors import form_errors  # noqa: E402
 from lathe_rc.bag import reader  # noqa: E402
 from lathe_rc.cell.scenario import load  # noqa: E402
 from lathe_rc.cell.stage import Sparse  # noqa: E402
@@ -93,7 +94,7 @@ def form(recording):
 
 
 def test_the_learning_curve_is_that_of_the_workshop(turned, shown):
-    expected = metrology.form_errors(*form(turned[1]))
+    expected = form_errors(*form(turned[1]))
     for name in ("rms", "largest"):
         time, revolution, value = shown.scalars(f"/learning/form_error/{name}")
         assert_allclose(10**value * 1e-6, getattr(expected, name), rtol=1e-9)

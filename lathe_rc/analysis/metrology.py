@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The form of the part, revolution by revolution, as the workshop reads it.
 
-`form_errors` weighs the samples of a run by the angle that they stand for. All else starts from `evenly`, which
-interpolates them at even angles, so that it does not matter how fast the spindle passed a place; a profile is then an
-array of shape (revolutions, points) whose last axis goes once round from angle 0.
+`lathe_rc.analysis.form_errors` weighs the samples of a run by the angle that they stand for. All else starts from
+`evenly`, which interpolates them at even angles, so that it does not matter how fast the spindle passed a place; a
+profile is then an array of shape (revolutions, points) whose last axis goes once round from angle 0.
 
 Undulations per revolution are UPR. Terms are those of ISO 12181-1 (roundness) and ISO 21920-2 (roughness), the filter
 is that of ISO 16610-21 for closed profiles.
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from lathe_rc.analysis.form_errors import FormErrors, form_errors, turns_at_end
 from lathe_rc.errors import InputError
 
 Array = npt.NDArray[np.float64]
@@ -22,83 +23,6 @@ Array = npt.NDArray[np.float64]
 POINTS = 4096  #: even angles in a revolution, about as many as the cell has samples at 1000 rpm
 _PER_MARK = 64  # places between revolutions
 _PER_UNDULATION = 7  # points that an undulation at the filter's cut-off needs
-
-
-@dataclass(frozen=True)
-class FormErrors:
-    """Form error of each complete revolution, shape (revolutions,).
-
-    Attributes:
-        rms: root mean square over the angle [m].
-        largest: largest magnitude [m].
-        peak_to_valley: largest less smallest value [m].
-        starts: index of the first sample of each revolution, and of the sample after the last.
-    """
-
-    rms: Array
-    largest: Array
-    peak_to_valley: Array
-    starts: npt.NDArray[np.int64]
-
-    def told(self) -> list[str]:
-        """In words: how many revolutions, and the error in the first and last of them, if there are any."""
-        count = f"{self.rms.size} revolution{'' if self.rms.size == 1 else 's'}"
-        ends = [f"{rms * 1e6:.4g}" for rms in (*self.rms[:1], *self.rms[1:][-1:])]
-        return [count, f"form error {' to '.join(ends)} µm RMS"] if ends else [count]
-
-
-def _starts(turns: Array, step: Array, first: int = 0) -> npt.NDArray[np.int64]:
-    """First sample of each complete revolution from ``first`` on and of the one after; ``step`` in revolutions."""
-    whole = int(np.floor(turns[-1] + min(2 * step[-1], 0.5)))
-    return np.searchsorted(turns, np.arange(first, max(whole, first) + 1))
-
-
-def turns_before(angle: Array) -> int:
-    """Revolutions before the first complete one: 0 of a run, which begins in its first; more of a snapshot.
-
-    Args:
-        angle: true spindle angle [rad], shape (n,).
-    """
-    return int(np.ceil(angle[0] / (2.0 * np.pi))) if angle.size and angle[0] >= 2.0 * np.pi else 0
-
-
-def form_errors(angle: Array, error: Array, first: int = 0) -> FormErrors:
-    """Form error by revolution.
-
-    Args:
-        angle: true spindle angle [rad], increasing, shape (n,).
-        error: form error [m], shape (n,).
-        first: revolutions before the first sample, of a run that is looked at in pieces.
-
-    The mean square is taken over the angle, not over time: a place that the spindle passes slowly counts once.
-    A revolution that the run ends within is left out, unless less than two samples are missing.
-
-    Raises:
-        InputError: a revolution has no sample.
-    """
-    if angle.size < 2:
-        return FormErrors(np.empty(0), np.empty(0), np.empty(0), np.zeros(1, dtype=np.int64))
-    turns = angle / (2.0 * np.pi)
-    step = np.empty_like(turns)
-    np.subtract(turns[1:], turns[:-1], out=step[:-1])
-    step[-1] = 2 * turns[-1] - turns[-2] - turns[-1]
-    starts = _starts(turns, step, first)
-    whole = starts.size - 1
-    edges = starts[:-1]
-    if not np.all(sampled := edges < starts[1:]):
-        raise InputError(
-            f"revolution {first + int(np.argmin(sampled))} has no sample; allowed: an angle that increases by less "
-            "than a revolution from sample to sample"
-        )
-    squares = np.add.reduceat(error * error * step, edges)[:whole] if whole else np.empty(0)
-    weight = np.add.reduceat(step, edges)[:whole] if whole else np.empty(0)
-    if whole and starts[-1] < angle.size:
-        # reduceat runs its last piece to the end of the array; the rest belongs to no complete revolution.
-        last = slice(starts[-2], starts[-1])
-        squares[-1], weight[-1] = np.sum(error[last] ** 2 * step[last]), np.sum(step[last])
-    inside = error[: starts[-1]]
-    highest, lowest = (of.reduceat(inside, edges) if whole else np.empty(0) for of in (np.maximum, np.minimum))
-    return FormErrors(np.sqrt(squares / weight), np.maximum(highest, -lowest), highest - lowest, starts)
 
 
 def evenly(angle: Array, values: Array, points: int = POINTS) -> Array:
@@ -127,7 +51,7 @@ def evenly(angle: Array, values: Array, points: int = POINTS) -> Array:
             "(take the true one, not that of the encoder)"
         )
     turns = angle / (2.0 * np.pi)
-    whole = _starts(turns, np.array([turns[-1] - turns[-2]])).size - 1
+    whole = max(turns_at_end(*turns[-2:]), 0)
     at = np.arange(whole * points) / points
     spline = scipy.interpolate.CubicSpline(turns, values)
     return np.asarray(spline(np.clip(at, turns[0], turns[-1]))).reshape(whole, points)

@@ -18,10 +18,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-import numpy as np
-
 from lathe_rc import messages
-from lathe_rc.analysis.metrology import FormErrors, form_errors
+from lathe_rc.analysis.form_errors import FormErrors, RunningErrors
 from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.recording import Recording
@@ -42,7 +40,7 @@ class Keeper(Sink, Protocol[K_co]):
 
     @property
     def heard(self) -> Collection[str]:
-        """Relative topics whose sparse messages it takes; others are not made."""
+        """Relative topics that it takes; of others nothing is kept."""
 
     def kept(self) -> K_co:
         """The kept result, at the end of the run."""
@@ -152,22 +150,20 @@ def _outcome(scenario: Scenario, keep: Make[K_co], idle: deque[Bench]) -> Outcom
 class Errors:
     """Keeps the form error by revolution."""
 
-    heard: Collection[str] = ()
-
     def __init__(self, cell: Cell, samples: int) -> None:
         named = {source.type: topic for topic, source in reversed(cell.dense.items())}
         self._encoder, self._tool = named.get(messages.ENCODER), named.get(messages.TOOL)
-        self._angle, self._error = np.empty((2, samples if self._tool else 0))
+        self.heard: Collection[str] = [topic for topic in (self._encoder, self._tool) if topic]
+        self._errors = RunningErrors()
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
         if self._encoder and self._tool:
-            self._angle[first : first + samples] = dense[self._encoder]["angle_true"]
-            self._error[first : first + samples] = dense[self._tool]["error"]
+            self._errors.add(dense[self._encoder]["angle_true"], dense[self._tool]["error"])
 
     def kept(self) -> FormErrors:
         """Of each complete revolution; of none if the scenario has no tool."""
-        return form_errors(self._angle, self._error)
+        return self._errors.found()
 
 
 class Topics(Collector):
@@ -184,7 +180,7 @@ class Topics(Collector):
 
     def __init__(self, cell: Cell, samples: int, topics: Collection[str]) -> None:
         super().__init__(cell, samples, topics)
-        self.heard = [topic for topic in topics if topic in cell.sparse]
+        self.heard = topics
 
     def kept(self) -> Recording:
         """By fully qualified topic."""

@@ -21,7 +21,7 @@ class Sink(Protocol):
     """A sink for the results of a run, piece by piece, in order."""
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Take the samples ``first`` on of every topic and the sparse messages among them, by relative topic."""
+        """Take the samples ``first`` on of every topic heard, and the sparse messages among them, by relative topic."""
 
 
 class Engine:
@@ -32,37 +32,48 @@ class Engine:
 
     Args:
         cell: the wired cell; must have passed its check.
-        heard: topics whose sparse messages the sinks take; None: all.
+        heard: topics that the sinks take, by relative name; None: all. Of the others nothing is kept, and no sparse
+            message is made.
 
     Raises:
         InputError: the run has no end.
     """
 
     def __init__(self, cell: Cell, heard: Collection[str] | None = None) -> None:
-        chunk = chunk_of(cell.master.shared.block_size, [cell.shortest_feedback or 0])
-        self._piece = MAX_BLOCK // chunk * chunk
-        topics = {topic: (source.type, longest_delays(cell.inputs(topic))) for topic, source in cell.dense.items()}
-        self._tapes = Tapes(topics, self._piece)
-        self._take(cell, heard)
+        self._chunk = chunk_of(cell.master.shared.block_size, [cell.shortest_feedback or 0])
+        self._piece = MAX_BLOCK // self._chunk * self._chunk
+        self._heard = frozenset((*cell.dense, *cell.sparse) if heard is None else heard)
+        self._take(cell)
         wires = [wired(stage) for stage in self._stages]
-        self._topics = [each.outputs for each in wires]
-        self._program = Program(wires, self._tapes, chunk)
+        # Joint states are made of the samples of a stage's outputs.
+        joints = {topic for each in wires if each.stage.tells_joints for topic in each.outputs}
+        self._kept = [[topic for topic in each.outputs if topic in self._heard | joints] for each in wires]
+        topics = {topic: (source.type, longest_delays(cell.inputs(topic))) for topic, source in cell.dense.items()}
+        passing = topics.keys() - {topic for kept in self._kept for topic in kept}
+        self._tapes = Tapes(topics, self._piece, passing, self._chunk)
+        self._program = Program(wires, self._tapes, self._chunk)
 
-    def _take(self, cell: Cell, heard: Collection[str] | None) -> None:
+    def _take(self, cell: Cell) -> None:
         """Have the stages of a cell ready."""
         self.samples = cell.samples
         self._wiring, self._block = cell.wiring, cell.master.shared.block_size
         self._stages = list(cell.stages.values())
         for stage in self._stages:
-            unheard = () if heard is None else stage.sparse_topics
-            stage.unheard = {topic for topic in unheard if remapped(stage.shared, topic) not in (heard or ())}
+            names = {remapped(stage.shared, topic): topic for topic in stage.sparse_topics}
+            stage.unheard = {topic for name, topic in names.items() if name not in self._heard}
             compile_kernels(stage)
 
     def begin(self, cell: Cell, heard: Collection[str] | None = None) -> bool:
-        """Begin anew with another cell; whether that can be: it must be wired as the one before, and checked too."""
+        """Begin anew with another cell, which has passed its check.
+
+        Returns:
+            Whether that can be: it must be wired as the one before, and as much heard of it.
+        """
         if cell.wiring is not self._wiring or cell.master.shared.block_size != self._block:
             return False
-        self._take(cell, heard)
+        if self._heard != frozenset((*cell.dense, *cell.sparse) if heard is None else heard):
+            return False
+        self._take(cell)
         self._tapes.rewind()
         self._program.begin(self._stages)
         return True
@@ -95,14 +106,16 @@ class Engine:
                 if not broken:
                     self._hand_over(first, self._program.reached, sinks)
             if broken:
-                self._break_off(first)
+                self._break_off()
             yield self._program.reached
 
-    def _break_off(self, first: int) -> NoReturn:
-        """Name the first sample of the piece that is not finite, as nodes do."""
+    def _break_off(self) -> NoReturn:
+        """Name the first sample that is not finite, as nodes do: it is in the newest chunk."""
         found: list[tuple[int, int, str]] = []
+        end = self._program.reached
+        first = (end - 1) // self._chunk * self._chunk
         for topic, source in self._wiring.dense.items():
-            for name, array in self._tapes.view(topic, first, self._program.reached - first).items():
+            for name, array in self._tapes.view(topic, first, end - first).items():
                 try:
                     check_finite(f"/{source.node}", name, array, first)
                 except NotFiniteError as error:
@@ -115,12 +128,12 @@ class Engine:
             return
         dense: dict[str, Signals] = {}
         sparse: dict[str, list[Sparse]] = {}
-        for number, (stage, topics) in enumerate(zip(self._stages, self._topics, strict=True)):
+        for number, (stage, topics) in enumerate(zip(self._stages, self._kept, strict=True)):
             outputs = [self._tapes.view(topic, first, end - first) for topic in topics]
             dense.update(zip(topics, outputs, strict=True))
             # Where a stage has failed, those before it have gone on.
             said = self._program.said(number, end)
-            for message in stage.conclude(first, said, outputs, last=end == self.samples):
+            for message in stage.conclude(first, end, said, outputs, last=end == self.samples):
                 sparse.setdefault(remapped(stage.shared, message.topic), []).append(message)
         for sink in sinks:
             sink.chunk(first, end - first, dense, sparse)

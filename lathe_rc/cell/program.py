@@ -5,7 +5,7 @@ It comes back where Python is needed: a stage asks for it, an event is due, or a
 at that stage and sample.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,22 +24,32 @@ _CHUNK = 1024  # samples that a stage computes in one go, at most: what stages h
 class Tapes:
     """The samples of some topics, one piece after the other; of what is read late, those before the piece as well.
 
-    Before sample 0 everything is zero.
+    Before sample 0 everything is zero. What is handed on inside a chunk alone has room for a chunk, and stays in the
+    cache.
 
     Args:
         topics: message type and, by field, the longest delay [sample] at which it is read, by relative topic.
         samples: length of a piece, at most.
+        passing: topics of which nobody needs a sample after the chunk in which it was computed, unless it is read late.
+        chunk: length of a chunk, at most.
     """
 
-    def __init__(self, topics: Mapping[str, tuple[str, Mapping[str, int]]], samples: int) -> None:
+    def __init__(
+        self,
+        topics: Mapping[str, tuple[str, Mapping[str, int]]],
+        samples: int,
+        passing: Collection[str] = (),
+        chunk: int = 0,
+    ) -> None:
         self._delays = {
             (topic, name): delays.get(name, 0)
             for topic, (kind, delays) in topics.items()
             for name in messages.sample_fields(kind)
         }
         self.history = max(self._delays.values(), default=0)
-        self.arrays = {
-            (topic, name): np.zeros(self.history + samples, dtype)
+        self._passing = {key for key, delay in self._delays.items() if key[0] in passing and not delay}
+        self._arrays = {
+            (topic, name): np.zeros(chunk if (topic, name) in self._passing else self.history + samples, dtype)
             for topic, (kind, _) in topics.items()
             for name, dtype in messages.sample_fields(kind).items()
         }
@@ -47,22 +57,31 @@ class Tapes:
         self.begin = 0  #: sample index with which the piece begins
 
     def view(self, topic: str, first: int, samples: int, delay: int = 0) -> Signals:
-        """Views of what a reader with this delay sees at the samples ``first`` on."""
+        """Views of what a reader with this delay sees at the samples ``first`` on; what passes is seen of one chunk."""
         start = self.history + first - self.begin - delay
-        return {name: self.arrays[topic, name][start : start + samples] for name in self._fields[topic]}
+        whole, passing = slice(start, start + samples), slice(samples)
+        return {
+            name: self._arrays[topic, name][passing if (topic, name) in self._passing else whole]
+            for name in self._fields[topic]
+        }
+
+    def place(self, topic: str, name: str, delay: int) -> tuple[int, int]:
+        """Where a reader with this delay finds a field: its first address, and by how much it moves with a sample."""
+        array = self._arrays[topic, name]
+        return address(array) - delay * array.itemsize, 0 if (topic, name) in self._passing else array.itemsize
 
     def advance(self, first: int) -> None:
         """Begin the next piece with sample ``first``."""
         shift = first - self.begin
         for key, delay in self._delays.items():
             if delay:
-                array, kept = self.arrays[key], slice(self.history - delay, self.history)
+                array, kept = self._arrays[key], slice(self.history - delay, self.history)
                 array[kept] = array[kept.start + shift : kept.stop + shift].copy()
         self.begin = first
 
     def rewind(self) -> None:
         """Begin again before sample 0."""
-        for array in self.arrays.values():
+        for array in self._arrays.values():
             array.fill(0)
         self.begin = 0
 
@@ -84,8 +103,8 @@ def _run(
     Args:
         plan: see above; one row more ends it.
         turn: spindle angle from which on each stage needs Python [rad].
-        fields: of each the address of its first sample on the tape less the delay, the size of a sample, and the
-            address of the block at hand, shape (3, fields); those of a stage are its `AddressTable`.
+        fields: of each the address of its first sample on the tape less the delay, by how much it moves with a sample,
+            and the address of the block at hand, shape (3, fields); those of a stage are its `AddressTable`.
         where: changed; where it has come to.
         base: place of sample 0 on the tape.
         end: see above.
@@ -237,8 +256,7 @@ class Program:
             self._load(number)
 
     def _field(self, tape: str, delay: int, name: str) -> tuple[int, int, int]:
-        array = self._tapes.arrays[tape, name]
-        return address(array) - delay * array.itemsize, array.itemsize, 0
+        return *self._tapes.place(tape, name, delay), 0
 
     def _load(self, number: int) -> None:
         """Take what a stage has in its memory now, and when it wants Python next."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.analysis.metrology import FormErrors, form_errors, turns_before
+from lathe_rc.analysis.form_errors import FormErrors, form_errors, turns_before
 from lathe_rc.cell.columns import Column, columns, dense_rows, sparse_rows
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.drawing import html

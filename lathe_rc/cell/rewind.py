@@ -139,6 +139,8 @@ class Stock:
             start.rewind()
             return before
         made = self._stages[name] = new_stage(name, table)
+        if before is not None:
+            made.take_room(before)
         if not again:
             self._starts.pop(name, None)
         elif name not in self._starts:

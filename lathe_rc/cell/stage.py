@@ -357,7 +357,8 @@ class Stage(ABC):
         """
         with self.named():
             sparse = self.compute(first, inputs, outputs)
-        return self.conclude(first, sparse, outputs, last=last)
+        end = first + next(iter(outputs[0].values())).size
+        return self.conclude(first, end, sparse, outputs, last=last)
 
     @contextmanager
     def named(self) -> Iterator[None]:
@@ -377,12 +378,20 @@ class Stage(ABC):
         return self.process(first, own, outputs)
 
     def conclude(
-        self, first: int, sparse: list[Sparse], outputs: Sequence[Signals], *, last: bool = False
+        self, first: int, end: int, sparse: list[Sparse], outputs: Sequence[Signals], *, last: bool = False
     ) -> list[Sparse]:
-        """The sparse messages of the samples ``first`` on, by sample: those of `compute` and what follows from all."""
+        """The sparse messages of the samples from ``first`` on and before ``end``, by sample.
+
+        Args:
+            first: see above.
+            end: see above.
+            sparse: those of `compute`.
+            outputs: of these samples; a stage whose joint states nobody reads needs none.
+            last: whether the run ends with them.
+        """
         if last:
-            sparse = sparse + self.finish(first + next(iter(outputs[0].values())).size - 1)
-        if self._joints and f"{self.name}/joint_states" not in self.unheard:
+            sparse = sparse + self.finish(end - 1)
+        if self.tells_joints:
             for place, joint in self._joints:
                 sparse = sparse + self._joint_states(first, joint, outputs[place])
         if len(sparse) > 1:
@@ -450,6 +459,11 @@ class Stage(ABC):
     def mend(self, fault: Fault | None) -> bool:
         """Be as before a fault, or before all; whether there was one. Stages with ``devices`` have their own."""
         raise NotImplementedError(fault)
+
+    @property
+    def tells_joints(self) -> bool:
+        """Whether it has joint states that somebody reads."""
+        return bool(self._joints) and f"{self.name}/joint_states" not in self.unheard
 
     def _joint_states(self, first: int, joint: Joint, signals: Signals) -> list[Sparse]:
         period = self.shared.joint_state_period
@@ -529,6 +543,11 @@ class Stage(ABC):
         if self._room is None:
             self._room = np.empty((self.rooms, messages.MAX_BLOCK))
         return self._room
+
+    def take_room(self, other: "Stage") -> None:
+        """Take the room of a stage that does not run any more, if it has as much."""
+        if other.rooms == self.rooms:
+            self._room = other.room
 
     def __getstate__(self) -> dict[str, Any]:
         """The state without addresses and scratch arrays."""

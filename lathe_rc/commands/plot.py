@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from lathe_rc import harness, messages
-from lathe_rc.analysis.metrology import turns_before
+from lathe_rc.analysis.form_errors import turns_before
 
 _HEIGHT = 14  # lines
 _NARROWEST = 40  # characters

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from lathe_rc import part
-from lathe_rc.analysis.metrology import FormErrors, Lay, Measurement
+from lathe_rc.analysis.form_errors import FormErrors
+from lathe_rc.analysis.metrology import Lay, Measurement
 from lathe_rc.analysis.tolerance import Verdict
 from lathe_rc.cell.durations import Lateness
 from lathe_rc.cell.recording import Recording

@@ -93,7 +93,8 @@ class ChainMember(Restartable):
         for (copies, _), signals in zip(memory, outputs, strict=True):
             for name, array in copies.items():
                 array[:] = signals[name]
-        sparse = self.stage.conclude(self.samples, sparse, [copies for copies, _ in memory], last=last)
+        outputs = [copies for copies, _ in memory]
+        sparse = self.stage.conclude(self.samples, self.samples + samples, sparse, outputs, last=last)
         self._publish(sparse, memory, last=last)
 
     def pass_over(self, inside: Collection[str]) -> None:

@@ -127,10 +127,9 @@ class SensorMapResult:
 class _Largest:
     """Keeps the largest error [µm] from the begin of the deviation on."""
 
-    heard = ()
-
     def __init__(self, cell: Cell, samples: int) -> None:
         self._tool = next(topic for topic, source in cell.dense.items() if source.type == messages.TOOL)
+        self.heard = [self._tool]
         self._begins = round(_BEGINS / cell.master.shared.step)
         self._largest = 0.0
 

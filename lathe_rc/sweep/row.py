@@ -21,7 +21,7 @@
 import hashlib
 import math
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +29,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from lathe_rc import messages
-from lathe_rc.analysis.metrology import FormErrors, form_errors
+from lathe_rc.analysis.form_errors import FormErrors, RunningErrors
 from lathe_rc.analysis.tolerance import judge
 from lathe_rc.cell.batch import Bench, Errors
 from lathe_rc.cell.parameters import Value
@@ -130,36 +130,40 @@ class _Keeper(Errors):
 
     def __init__(self, cell: Cell, samples: int, measures: Sequence[Measure]) -> None:
         super().__init__(cell, samples)
-        self.heard: Collection[str] = [topic for topic, source in cell.sparse.items() if source.type == messages.EVENT]
+        self._events = [topic for topic, source in cell.sparse.items() if source.type == messages.EVENT]
+        self.heard = [*self.heard, *self._events, *(asked.topic for asked in measures)]
         self.limited: set[str] = set()
         self.tolerance = next(
             (stage.parameters.tolerance for stage in cell.stages.values() if isinstance(stage, Tool)), 0.0
         )
         self._measures = [(each, np.empty(samples)) for each in measures]
-        # A cell without a tool has no form error, but revolutions all the same.
-        self._turned = np.empty(samples if measures and self._encoder and not self._tool else 0)
+        self._turns = RunningErrors()  # a cell without a tool has no form error, but revolutions all the same
+        self._hash = hashlib.sha256()
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
         super().chunk(first, samples, dense, sparse)
-        for topic in self.heard:
+        for topic in self._events:
             if any(message.values["action"].startswith(LIMITS) for message in sparse.get(topic, ())):
                 self.limited.add(topic.removesuffix("/events"))
-        if self._turned.size and self._encoder:
-            self._turned[first : first + samples] = dense[self._encoder]["angle_true"]
+        if self._tool:
+            self._hash.update(_bytes(dense[self._tool]["error"]))
+        elif self._measures and self._encoder:
+            angle = dense[self._encoder]["angle_true"]
+            self._turns.add(angle, angle)
         for asked, kept in self._measures:
             kept[first : first + samples] = dense[asked.topic][asked.field]
 
     def measured(self, errors: FormErrors) -> dict[str, float]:
         """By column; over the whole run, if there is no complete revolution."""
-        starts = errors.starts if self._tool else form_errors(self._turned, self._turned).starts
+        starts = (errors if self._tool else self._turns.found()).starts
         last = slice(*starts[-2:]) if starts.size > 1 else slice(None)
         return {asked.name: STATISTICS[asked.statistic](kept[last]) for asked, kept in self._measures}
 
     @property
     def digest(self) -> str | None:
         """See `digest`."""
-        return _digest([self._error] if self._tool else [kept for _, kept in self._measures])
+        return self._hash.hexdigest() if self._tool else _digest([kept for _, kept in self._measures])
 
 
 def digest(recording: Recording, measures: Sequence[Measure]) -> str | None:
@@ -176,8 +180,12 @@ def digest(recording: Recording, measures: Sequence[Measure]) -> str | None:
 def _digest(kept: Sequence[Samples]) -> str | None:
     found = hashlib.sha256()
     for samples in kept:
-        found.update(samples.astype("<f8", copy=False).data)
+        found.update(_bytes(samples))
     return found.hexdigest() if kept else None
+
+
+def _bytes(samples: Samples) -> memoryview:
+    return samples.astype("<f8", copy=False).data
 
 
 def compute(

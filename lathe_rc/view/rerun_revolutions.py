@@ -49,7 +49,7 @@ class Revolution:
 class Revolutions:
     """Collects samples and gives the revolutions that are complete.
 
-    RMS and largest error are those of `lathe_rc.analysis.metrology.form_errors`.
+    RMS and largest error are those of `lathe_rc.analysis.form_errors`.
     """
 
     def __init__(self) -> None:

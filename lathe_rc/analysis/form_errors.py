@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The form error of a run, revolution by revolution, from samples that come in pieces.
+
+A revolution begins with the first sample at or behind its angle. Its mean square is taken over the angle, not over
+time: a place that the spindle passes slowly counts once. So each sample weighs as much as the spindle turns up to the
+next one. A revolution that the run ends within is left out, unless less than two samples are missing.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import InputError
+from lathe_rc.jit import inlined, kernel
+
+Array = npt.NDArray[np.float64]
+
+_TURN = 2.0 * np.pi
+# The state: samples so far; turns at the last sample and at the one before, error of the last; number of the revolution
+# under way and index of its first sample; its sums: square and weight; its largest and smallest error.
+_SAMPLES, _TURNS, _BEFORE, _ERROR, _NUMBER, _START, _SQUARE, _WEIGHT, _HIGH, _LOW = range(10)
+_ROWS = 64  # complete revolutions that the kernel hands over at once
+
+
+@dataclass(frozen=True)
+class FormErrors:
+    """Form error of each complete revolution, shape (revolutions,).
+
+    Attributes:
+        rms: root mean square over the angle [m].
+        largest: largest magnitude [m].
+        peak_to_valley: largest less smallest value [m].
+        starts: index of the first sample of each revolution, and of the sample after the last.
+    """
+
+    rms: Array
+    largest: Array
+    peak_to_valley: Array
+    starts: npt.NDArray[np.int64]
+
+    def told(self) -> list[str]:
+        """In words: how many revolutions, and the error in the first and last of them, if there are any."""
+        count = f"{self.rms.size} revolution{'' if self.rms.size == 1 else 's'}"
+        ends = [f"{rms * 1e6:.4g}" for rms in (*self.rms[:1], *self.rms[1:][-1:])]
+        return [count, f"form error {' to '.join(ends)} µm RMS"] if ends else [count]
+
+
+def turns_before(angle: Array) -> int:
+    """Revolutions before the first complete one: 0 of a run, which begins in its first; more of a snapshot.
+
+    Args:
+        angle: true spindle angle [rad], shape (n,).
+    """
+    return int(np.ceil(angle[0] / _TURN)) if angle.size and angle[0] >= _TURN else 0
+
+
+def turns_at_end(before: float, last: float) -> int:
+    """Revolutions that are complete at the end of a run, by the turns at the last sample and at the one before."""
+    return int(np.floor(last + min(2.0 * (last - before), 0.5)))
+
+
+@inlined
+def _close(row: Array, start: float, square: float, weight: float, high: float, low: float) -> None:
+    """Hand over a revolution: first sample, RMS, largest and smallest error."""
+    row[0], row[1], row[2], row[3] = start, np.sqrt(square / weight), high, low
+    if not row[1] < np.inf:  # comparisons pass over what is no number
+        row[2] = row[3] = row[1]
+
+
+@kernel
+def _add(state: Array, rows: Array, angle: Array, error: Array, start: int) -> tuple[int, int]:
+    """Take samples from ``start`` on, until all are taken or all rows are filled.
+
+    Returns:
+        Samples that have been taken; rows that have been filled, or -1 if a revolution has no sample.
+    """
+    samples, last, before, held = state[_SAMPLES], state[_TURNS], state[_BEFORE], state[_ERROR]
+    number, begin = state[_NUMBER], state[_START]
+    square, weight, high, low = state[_SQUARE], state[_WEIGHT], state[_HIGH], state[_LOW]
+    found, k = 0, start
+    while k < angle.size and 0 <= found < rows.shape[0]:
+        turns = angle[k] / _TURN
+        if samples > 0.0:
+            # The last sample counts, now that it is known how far it goes.
+            square += held * held * (turns - last)
+            weight += turns - last
+            high, low = max(high, held), min(low, held)
+        if turns >= number + 1.0:
+            if begin >= 0.0:
+                _close(rows[found], begin, square, weight, high, low)
+                found += 1
+            number += 1.0
+            begin, square, weight, high, low = samples, 0.0, 0.0, -np.inf, np.inf
+            if turns >= number + 1.0:
+                found = -1
+        samples += 1.0
+        last, before, held = turns, last, error[k]
+        k += 1
+    state[_SAMPLES], state[_TURNS], state[_BEFORE], state[_ERROR] = samples, last, before, held
+    state[_NUMBER], state[_START] = number, begin
+    state[_SQUARE], state[_WEIGHT], state[_HIGH], state[_LOW] = square, weight, high, low
+    return k, found
+
+
+@kernel
+def _end(state: Array, row: Array) -> None:
+    """Complete the revolution under way with the last sample, which goes as far as the one before."""
+    held, step = state[_ERROR], state[_TURNS] - state[_BEFORE]
+    square, weight = state[_SQUARE] + held * held * step, state[_WEIGHT] + step
+    _close(row, state[_START], square, weight, max(state[_HIGH], held), min(state[_LOW], held))
+
+
+class RunningErrors:
+    """Form errors by revolution, of samples that come piece by piece.
+
+    Args:
+        first: revolutions before the first that counts, see `turns_before`.
+    """
+
+    def __init__(self, first: int = 0) -> None:
+        self._state = np.zeros(10)
+        self._state[_NUMBER], self._state[_START] = first - 1, -1
+        self._rows: list[Array] = []
+
+    def add(self, angle: Array, error: Array) -> None:
+        """Take the next samples.
+
+        Args:
+            angle: true spindle angle [rad], increasing, shape (n,).
+            error: form error [m], shape (n,).
+
+        Raises:
+            InputError: a revolution has no sample.
+        """
+        angle, error = (np.require(each, np.float64, ["C", "W"]) for each in (angle, error))
+        start, rows = 0, np.empty((_ROWS, 4))
+        while start < angle.size:
+            start, found = _add(self._state, rows, angle, error, start)
+            if found < 0:
+                raise InputError(
+                    f"revolution {int(self._state[_NUMBER])} has no sample; allowed: an angle that increases by less "
+                    "than a revolution from sample to sample"
+                )
+            self._rows.append(rows[:found].copy())
+
+    def found(self) -> FormErrors:
+        """Of all complete revolutions, if the run ends with the samples that have come."""
+        state, rows = self._state.copy(), [np.empty((0, 4)), *self._rows]
+        if state[_SAMPLES] < 2.0:
+            return FormErrors(np.empty(0), np.empty(0), np.empty(0), np.zeros(1, np.int64))
+        end = state[_START] if state[_START] >= 0.0 else state[_SAMPLES]
+        if end < state[_SAMPLES] and turns_at_end(state[_BEFORE], state[_TURNS]) > state[_NUMBER]:
+            row, end = np.empty((1, 4)), state[_SAMPLES]
+            _end(state, row[0])
+            rows.append(row)
+        start, rms, high, low = np.concatenate(rows).T
+        return FormErrors(rms, np.maximum(high, -low), high - low, np.append(start, end).astype(np.int64))
+
+
+def form_errors(angle: Array, error: Array, first: int = 0) -> FormErrors:
+    """Form error by revolution of a run at once; see `RunningErrors`."""
+    running = RunningErrors(first)
+    running.add(angle, error)
+    return running.found()
