@@ -2,6 +2,10 @@
 """Every transition of a node's lifecycle, and what a node says that waits."""
 
 import contextlib
+import os
+import signal
+import subprocess
+from types import SimpleNamespace
 
 import pytest
 from cells import Seen, scenario
@@ -18,6 +22,7 @@ from lathe_rc import harness, messages
 from lathe_rc.bag import reader
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.exchange import Exchange
+from lathe_rc.nodes.liveliness import this_host
 from lathe_rc.nodes.stage_node import StageNode
 
 WALK = [  # transition, whether it is possible, and where the node is then
@@ -184,6 +189,23 @@ def test_who_waits_names_each_member_and_topic_that_is_missing(tool):
     assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
     node._on_cell_state(CellState(state=CellState.RUNNING))
     assert node.missing() == []
+
+
+def test_a_member_that_is_stopped_is_silent_whatever_dds_says_of_it(tool):
+    """Fast DDS takes it for alive for ever if its last sign of life comes when its lease runs out."""
+    watch = tool[0].watch
+    with subprocess.Popen(["/bin/sleep", "1000"]) as child:
+        watch.follow(Member(name="/stopped", pid=child.pid, host=this_host()))
+        watch._changed("/stopped", SimpleNamespace(alive_count=1, not_alive_count=0))
+        for number, change, silent in (
+            (signal.SIGSTOP, os.WSTOPPED, ["/stopped"]),
+            (signal.SIGCONT, os.WCONTINUED, []),
+        ):
+            child.send_signal(number)
+            os.waitid(os.P_PID, child.pid, change)
+            watch.look()
+            assert list(watch.silent) == silent
+        child.kill()
 
 
 def test_what_is_missing_is_told_now_and_then_until_it_is_there(tool):

@@ -14,6 +14,7 @@ from cells import refusals, scenario, started
 from geometry_msgs.msg import Point
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
@@ -83,9 +84,9 @@ class Listener:
         self.node.create_subscription(Clock, "/clock", self._on_clock, 50_000)
         for topic in self.heard:
             self.node.create_subscription(Point, topic, self._keeper(topic), qos)
-        self.executor = SingleThreadedExecutor()
+        self.executor, self.over = SingleThreadedExecutor(), Future()
         self.executor.add_node(self.node)
-        self.thread = threading.Thread(target=self.executor.spin)
+        self.thread = threading.Thread(target=self.executor.spin_until_future_complete, args=(self.over,))
         self.thread.start()
 
     def _keeper(self, topic):
@@ -112,8 +113,10 @@ class Listener:
         return future.result()
 
     def close(self):
-        self.executor.shutdown()
+        # An executor that is shut down while another thread spins it may crash that.
+        self.over.set_result(None)
         self.thread.join()
+        self.executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown()
 

@@ -3,6 +3,10 @@
 
 DDS asserts a node's liveliness from a thread of its own, whatever the node computes. It cannot tell a process that has
 died from one that is stopped; where the process is on this machine, the operating system can.
+
+Fast DDS may go on taking a writer for alive that says nothing any more: if a sign of life comes at the moment at which
+its lease has run out, the timer of the lease is not started again, and only a further sign would start it. So a process
+on this machine that is stopped is silent, whatever DDS says.
 """
 
 import os
@@ -32,6 +36,15 @@ def this_host() -> str:
     return f"{boot} {Path('/proc/self/ns/pid').stat().st_ino}"
 
 
+def _is_stopped(pid: int) -> bool:
+    """Whether a process of this machine has been stopped by a signal."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
+    except OSError:
+        return False  # it has ended
+    return stat.rpartition(") ")[2][:1] in ("T", "t")
+
+
 def liveliness() -> QoSProfile:
     """Of the topic `lathe_rc.messages.ALIVE`."""
     return QoSProfile(
@@ -47,13 +60,14 @@ class Watch:
         told: called when a member has become silent, or is heard again.
 
     Attributes:
-        silent: since when DDS does not hear a member any more [s], monotonic, by fully qualified name.
+        silent: since when a member is not heard any more, or stopped [s], monotonic, by fully qualified name.
     """
 
     def __init__(self, node: LifecycleNode, told: Callable[[], None]) -> None:
         self._node, self._told, self._host = node, told, this_host()
         self._pids: dict[str, int] = {}
         self._processes: dict[str, int] = {}  # file descriptors by member
+        self._unheard: set[str] = set()  # by DDS
         self.silent: dict[str, float] = {}
 
     def follow(self, member: Member) -> None:
@@ -85,13 +99,19 @@ class Watch:
             os.close(self._processes.popitem()[1])
 
     def _changed(self, name: str, status: Any) -> None:
-        before = name in self.silent
+        before = self.silent.keys() & {name}
         if status.alive_count:
-            self.silent.pop(name, None)
+            self._unheard.discard(name)
         elif status.not_alive_count:
-            self.silent.setdefault(name, time.monotonic())
-        if before != (name in self.silent):
+            self._unheard.add(name)
+        self.look()
+        if before != self.silent.keys() & {name}:
             self._told()
+
+    def look(self) -> None:
+        """See who is silent."""
+        silent = self._unheard | {name for name in self._processes if _is_stopped(self._pids[name])}
+        self.silent = {name: self.silent.get(name, time.monotonic()) for name in silent}
 
     def ended(self) -> set[str]:
         """Members whose process, on this machine, has ended."""

@@ -383,6 +383,7 @@ class CellNode(Listening):
         if self._host:
             if not self._ready:
                 self.attempt(self._settle)
+            self.watch.look()
             self.attempt(self.look_after_others)
             self._repeat(now)
             if now >= self._tell_due:
