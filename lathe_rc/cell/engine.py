@@ -44,6 +44,8 @@ class Engine:
         self._piece = MAX_BLOCK // self._chunk * self._chunk
         self._heard = frozenset((*cell.dense, *cell.sparse) if heard is None else heard)
         self._take(cell)
+        for stage in self._stages:
+            compile_kernels(stage)
         wires = [wired(stage) for stage in self._stages]
         # Joint states are made of the samples of a stage's outputs.
         joints = {topic for each in wires if each.stage.tells_joints for topic in each.outputs}
@@ -61,7 +63,6 @@ class Engine:
         for stage in self._stages:
             names = {remapped(stage.shared, topic): topic for topic in stage.sparse_topics}
             stage.unheard = {topic for name, topic in names.items() if name not in self._heard}
-            compile_kernels(stage)
 
     def begin(self, cell: Cell, heard: Collection[str] | None = None) -> bool:
         """Begin anew with another cell, which has passed its check.

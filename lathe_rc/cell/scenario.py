@@ -243,16 +243,17 @@ class Scenario:
             lathe_rc.errors.InputError: learning_controller.lead_tim: unknown parameter; did you mean lead_time, ...
         """
         changes: dict[str, dict[str, Value]] = {}
+        kinds = {node: self.kind(node) for node in self.nodes}
         for target, value in values.items():
             whole, element = _element(target)
-            node, name = _target(whole, {node: self.kind(node) for node in self.nodes}, target)
+            node, name = _target(whole, kinds, target)
             for each in [node] if node != _EVERYONE else self.nodes:
                 found = changes.setdefault(each, {})
                 if element is not None:
                     before = found.get(name, getattr(self.nodes[each], name, None))
                     found[name] = _with_element(target, before, element, value)
                 else:
-                    found[name] = _absolute(self.kind(each), name, value, Path())
+                    found[name] = _absolute(kinds[each], name, value, Path())
         tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
         given = "run_id" in values or self.shared.run_id != _identity(fingerprints)
         for node, changed in changes.items():
