@@ -42,7 +42,7 @@ class Engine:
     def __init__(self, cell: Cell, heard: Collection[str] | None = None) -> None:
         self._chunk = chunk_of(cell.master.shared.block_size, [cell.shortest_feedback or 0])
         self._piece = MAX_BLOCK // self._chunk * self._chunk
-        self._heard = frozenset((*cell.dense, *cell.sparse) if heard is None else heard)
+        self._heard = _heard(cell, heard)
         self._take(cell)
         for stage in self._stages:
             compile_kernels(stage)
@@ -70,9 +70,8 @@ class Engine:
         Returns:
             Whether that can be: it must be wired as the one before, and as much heard of it.
         """
-        if cell.wiring is not self._wiring or cell.master.shared.block_size != self._block:
-            return False
-        if self._heard != frozenset((*cell.dense, *cell.sparse) if heard is None else heard):
+        block = cell.master.shared.block_size
+        if cell.wiring is not self._wiring or block != self._block or _heard(cell, heard) != self._heard:
             return False
         self._take(cell)
         self._tapes.rewind()
@@ -138,3 +137,8 @@ class Engine:
                 sparse.setdefault(remapped(stage.shared, message.topic), []).append(message)
         for sink in sinks:
             sink.chunk(first, end - first, dense, sparse)
+
+
+def _heard(cell: Cell, heard: Collection[str] | None) -> frozenset[str]:
+    """The topics that the sinks of a cell take; see `Engine`."""
+    return frozenset((*cell.dense, *cell.sparse) if heard is None else heard)

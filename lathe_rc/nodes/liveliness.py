@@ -99,13 +99,13 @@ class Watch:
             os.close(self._processes.popitem()[1])
 
     def _changed(self, name: str, status: Any) -> None:
-        before = self.silent.keys() & {name}
+        before = name in self.silent
         if status.alive_count:
             self._unheard.discard(name)
         elif status.not_alive_count:
             self._unheard.add(name)
         self.look()
-        if before != self.silent.keys() & {name}:
+        if before != (name in self.silent):
             self._told()
 
     def look(self) -> None:
