@@ -6,6 +6,7 @@ what their runs have changed, and their memories stay where the caches have them
 """
 
 import enum
+import operator
 import types
 from collections.abc import Callable
 from functools import cached_property
@@ -13,6 +14,7 @@ from pathlib import PurePath
 from typing import Any
 
 import numpy as np
+from numba.types import Type
 
 from lathe_rc.cell.native import Entry
 from lathe_rc.cell.parameters import NodeParameters, Table
@@ -20,10 +22,10 @@ from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import new_stage
 from lathe_rc.extensions import is_ours
 
-#: what nobody changes
+#: what nobody changes; a compiler's types and an entry are those of stages in other threads too
 _CONSTANT = (
     type(None), bool, int, float, complex, str, bytes, range, slice, type, enum.Enum, PurePath, np.generic, np.dtype,
-    types.BuiltinFunctionType, types.ModuleType, Table, Entry,
+    types.BuiltinFunctionType, types.ModuleType, Table, Entry, Type,
 )  # fmt: skip
 
 
@@ -113,10 +115,12 @@ def _reset(part: Any, attributes: dict[str, Any]) -> None:
 
 
 def _refill(part: Any, content: Any) -> None:
-    """Give a list, dictionary or set what it held."""
+    """Give a list, dictionary or set what it held; one that is as it was may be read by another thread meanwhile."""
     if isinstance(part, list):
         part[:] = content
-    else:
+    elif [*part] != [*content] or (
+        isinstance(part, dict) and not all(map(operator.is_, part.values(), content.values()))
+    ):
         part.clear()
         part.update(content)
 
