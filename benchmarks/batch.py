@@ -4,8 +4,9 @@
 1000 two-channel cells of 20 revolutions that differ in five parameters, and 200 full cells that differ in three; what
 is kept of each is the form error by revolution. A ratio is the speed a core over that of C: 1 is as fast as C on every
 core. ``prepared_c_ratio`` counts the computing alone: the cells stand ready, and threads run them. ``c_ratio`` counts
-all of it, from the scenario's values to the errors. The threads share Python's lock: preparing a cell is Python,
-computing is not. ``memory_mb`` is what the process takes more after the whole batch than after a tenth of it.
+all of it, from the scenario's values to the errors. Those of ``all_cores`` are against C that computes on every core at
+once, as the batch does. The threads share Python's lock: preparing a cell is Python, computing is not. ``memory_mb`` is
+what the process takes more after the whole batch than after a tenth of it.
 """
 
 import os
@@ -86,17 +87,25 @@ def measure(*, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
         say(f"batch {name}")
         count, rounds = (cells // 5, 2) if quick else (cells, 5)
         c = plain(name, _REVOLUTIONS * 5, "-ffp-contract=off")
+        c_on_all = plain(name, _REVOLUTIONS * 5, "-ffp-contract=off", at_once=_CORES)
         c()
         _whole(name, count // 10)
         before = _taken()
         _whole(name, count)
         grown = _taken() - before
-        turns = {"batch": partial(_whole, name, count), "prepared": partial(prepared, name, count), "c": c}
+        turns = {
+            "batch": partial(_whole, name, count),
+            "prepared": partial(prepared, name, count),
+            "c": c,
+            "c_on_all": c_on_all,
+        }
         times = alternate(turns, rounds)
         found[name] = {
             "cells": count,
             "c_ratio": ratio(times["c"], times["batch"]),
             "prepared_c_ratio": ratio(times["c"], times["prepared"]),
+            "all_cores_c_ratio": ratio(times["c_on_all"], times["batch"]),
+            "all_cores_prepared_c_ratio": ratio(times["c_on_all"], times["prepared"]),
             **_TARGETS,
             "cells_per_s": spread([_CORES / (time * 64_000 * 1.2) for time in times["batch"]]),
             "memory_mb": grown,

@@ -16,6 +16,7 @@ closed, on one core, also of the scenario as it stands.
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -116,15 +117,15 @@ def _engine_of(chosen: Scenario) -> float:
     return _engine(Cell(chosen.nodes))
 
 
-def plain(name: str, revolutions: float, *flags: str) -> Callable[[], float]:
-    """A side that runs a cell in C, compiled with ``flags``."""
+def plain(name: str, revolutions: float, *flags: str, at_once: int = 1) -> Callable[[], float]:
+    """A side that runs a cell in C, compiled with ``flags``; so many of them at once."""
     library = compiled(name, *flags)
 
     def side() -> float:
-        made = cell(name, revolutions)
-        samples = Engine(made).samples
-        plain = PlainC(name, library, made, _CHUNK)
-        return seconds(lambda: plain.run(samples)) / samples
+        samples = Engine(cell(name, revolutions)).samples
+        runs = [PlainC(name, library, cell(name, revolutions), _CHUNK) for _ in range(at_once)]
+        with ThreadPoolExecutor(at_once) as pool:
+            return seconds(lambda: list(pool.map(lambda run: run.run(samples), runs))) / samples
 
     return side
 

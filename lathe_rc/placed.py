@@ -207,7 +207,7 @@ def address(array: npt.NDArray[Any]) -> int:
 def _of(array: npt.NDArray[Any]) -> tuple[int, ...]:
     """The words of an array."""
     assert array.flags.c_contiguous, "kernels take it for contiguous"
-    return address(array), *array.shape
+    return address(array) if array.size else 0, *array.shape
 
 
 def _replaced(kind: Placed, begin: int, value: tuple[Any, ...], known: tuple[Any, ...]) -> Iterator[tuple[int, Any]]:

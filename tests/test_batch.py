@@ -3,6 +3,7 @@
 
 import gc
 import itertools
+import sys
 import weakref
 from functools import cache, partial
 from pathlib import Path
@@ -15,7 +16,8 @@ from hypothesis import strategies as st
 from lathe_rc import harness, resources
 from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.engine import Engine
-from lathe_rc.cell.wiring import Cell
+from lathe_rc.cell.rewind import Start
+from lathe_rc.cell.wiring import Cell, new_stage
 from lathe_rc.errors import InputError, LatheError
 
 
@@ -127,6 +129,49 @@ def test_errors_are_those_of_a_run():
         for name in ("rms", "largest", "peak_to_valley", "starts"):
             assert np.array_equal(getattr(kept, name), getattr(alone, name))
     assert round_part.rms.size == 0, "it has no tool"
+
+
+def test_what_no_run_has_changed_is_left_alone_when_a_stage_is_set_back():
+    """Stages that run in other threads may read it: types of memories were empty for a moment, and cells failed."""
+    stage = new_stage("learning_controller", load("piston", 3).nodes["learning_controller"])
+    stage.read_by_all, stage.own = {"a": 1, "b": 2}, {"c": 3}
+    start, sizes = Start(stage), set()
+    stage.own["d"] = 4
+    sys.setprofile(lambda *_: sizes.add(len(stage.read_by_all)))
+    try:
+        start.rewind()
+    finally:
+        sys.setprofile(None)
+    assert sizes == {2}
+    assert stage.own == {"c": 3}
+
+
+class Field:
+    """Keeps a field of the tool, and looks at another."""
+
+    heard = ("tool.error",)
+
+    def __init__(self, looked_at=""):
+        self.pieces, self.looked_at = [], looked_at
+
+    def chunk(self, first, samples, dense, sparse):
+        assert ([*dense], [*dense["tool"]]) == (["tool"], ["error"])
+        self.pieces.append(dense["tool"]["error"].copy())
+        if self.looked_at:
+            topic, _, name = self.looked_at.partition(".")
+            dense[topic][name]
+
+    def kept(self):
+        return np.concatenate(self.pieces)
+
+
+def test_what_is_asked_for_is_kept_of_a_run_and_nothing_else():
+    piston = load("piston", 3)
+    bench = batch.Bench()
+    assert np.array_equal(bench.run(bench.cell(piston), Field()), harness.run(piston).recording.dense["/tool"]["error"])
+    for looked_at, told in (("tool.reference", "tool.reference"), ("encoder.angle", "encoder")):
+        with pytest.raises(KeyError, match=f"{told} is not kept: `heard` of the sink has to name it"):
+            bench.run(bench.cell(piston), Field(looked_at))
 
 
 def test_a_cell_that_cannot_work_is_an_outcome_and_the_others_go_on():

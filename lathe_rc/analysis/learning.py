@@ -39,7 +39,7 @@ def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[floa
     peaks = np.append(inner, (0, _COARSE - 1))
     peaks = peaks[np.argsort(size[peaks])[-_PEAKS:]]
     beside = highest / (_COARSE - 1)
-    near = np.concatenate([np.linspace(w - beside, w + beside, _FINE) for w in waves[peaks]]).clip(0.0, highest)
+    near = np.linspace(waves[peaks] - beside, waves[peaks] + beside, _FINE, axis=1).ravel().clip(0.0, highest)
     fine = np.abs(operator(near))
     return float(fine.max()), float(near[np.argmax(fine)])
 

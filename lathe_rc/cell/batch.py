@@ -40,7 +40,7 @@ class Keeper(Sink, Protocol[K_co]):
 
     @property
     def heard(self) -> Collection[str]:
-        """Relative topics that it takes; of others nothing is kept."""
+        """What it takes, relative topics or ``TOPIC.FIELD``; nothing else is kept."""
 
     def kept(self) -> K_co:
         """The kept result, at the end of the run."""
@@ -153,7 +153,8 @@ class Errors:
     def __init__(self, cell: Cell, samples: int) -> None:
         named = {source.type: topic for topic, source in reversed(cell.dense.items())}
         self._encoder, self._tool = named.get(messages.ENCODER), named.get(messages.TOOL)
-        self.heard: Collection[str] = [topic for topic in (self._encoder, self._tool) if topic]
+        read = {self._encoder: "angle_true", self._tool: "error"}
+        self.heard: Collection[str] = [f"{topic}.{field}" for topic, field in read.items() if topic]
         self._errors = RunningErrors()
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:

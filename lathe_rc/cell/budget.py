@@ -108,7 +108,7 @@ class _Keep:
             "error": (named[messages.TOOL], "error"),
             "height": (named[messages.TOOL], "height"),
         }
-        self.heard = {topic for topic, _ in self._fields.values()}
+        self.heard = [".".join(place) for place in self._fields.values()]
         self._kept = {name: np.empty(self.samples) for name in self._fields}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:

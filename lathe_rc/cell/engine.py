@@ -3,10 +3,12 @@
 
 import gc
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import NoReturn, Protocol
+from types import MappingProxyType
+from typing import NoReturn, Protocol, TypeVar
 
 import numpy as np
 
+from lathe_rc import messages
 from lathe_rc.cell.block import NotFiniteError, check_finite
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.program import Program, Tapes, chunk_of, wired
@@ -14,7 +16,9 @@ from lathe_rc.cell.stage import Sparse, compile_kernels
 from lathe_rc.cell.track import longest_delays
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError
-from lathe_rc.messages import MAX_BLOCK, Signals
+from lathe_rc.messages import MAX_BLOCK, Samples, Signals
+
+K = TypeVar("K")
 
 
 class Sink(Protocol):
@@ -32,8 +36,8 @@ class Engine:
 
     Args:
         cell: the wired cell; must have passed its check.
-        heard: topics that the sinks take, by relative name; None: all. Of the others nothing is kept, and no sparse
-            message is made.
+        heard: what the sinks take: relative names of topics, or ``TOPIC.FIELD`` for one field of signals; None: all.
+            Nothing else is kept, and no other sparse message is made.
 
     Raises:
         InputError: the run has no end.
@@ -47,11 +51,16 @@ class Engine:
         for stage in self._stages:
             compile_kernels(stage)
         wires = [wired(stage) for stage in self._stages]
-        # Joint states are made of the samples of a stage's outputs.
-        joints = {topic for each in wires if each.stage.tells_joints for topic in each.outputs}
-        self._kept = [[topic for topic in each.outputs if topic in self._heard | joints] for each in wires]
         topics = {topic: (source.type, longest_delays(cell.inputs(topic))) for topic, source in cell.dense.items()}
-        passing = topics.keys() - {topic for kept in self._kept for topic in kept}
+        fields = {topic: list(messages.sample_fields(kind)) for topic, (kind, _) in topics.items()}
+        # Joint states are made of the samples of a stage's outputs.
+        whole = self._heard.union(*(each.outputs for each in wires if each.stage.tells_joints))
+        kept = {
+            topic: [name for name in names if topic in whole or f"{topic}.{name}" in self._heard]
+            for topic, names in fields.items()
+        }
+        self._kept = [{topic: kept[topic] for topic in each.outputs if kept[topic]} for each in wires]
+        passing = [(topic, name) for topic, names in fields.items() for name in names if name not in kept[topic]]
         self._tapes = Tapes(topics, self._piece, passing, self._chunk)
         self._program = Program(wires, self._tapes, self._chunk)
 
@@ -126,11 +135,14 @@ class Engine:
         """Give a piece to the sinks."""
         if first == end:
             return
-        dense: dict[str, Signals] = {}
+        dense = _Kept[Signals]()
         sparse: dict[str, list[Sparse]] = {}
-        for number, (stage, topics) in enumerate(zip(self._stages, self._kept, strict=True)):
-            outputs = [self._tapes.view(topic, first, end - first) for topic in topics]
-            dense.update(zip(topics, outputs, strict=True))
+        for number, (stage, kept) in enumerate(zip(self._stages, self._kept, strict=True)):
+            outputs = [
+                _Kept[Samples](self._tapes.view(topic, first, end - first, names=names), of=f"{topic}.")
+                for topic, names in kept.items()
+            ]
+            dense.update(zip(kept, outputs, strict=True))
             # Where a stage has failed, those before it have gone on.
             said = self._program.said(number, end)
             for message in stage.conclude(first, end, said, outputs, last=end == self.samples):
@@ -139,6 +151,17 @@ class Engine:
             sink.chunk(first, end - first, dense, sparse)
 
 
+class _Kept(dict[str, K]):
+    """What is kept for sinks, by name."""
+
+    def __init__(self, content: Mapping[str, K] = MappingProxyType({}), of: str = "") -> None:
+        super().__init__(content)
+        self._of = of
+
+    def __missing__(self, name: str) -> NoReturn:
+        raise KeyError(f"{self._of}{name} is not kept: `heard` of the sink has to name it")
+
+
 def _heard(cell: Cell, heard: Collection[str] | None) -> frozenset[str]:
-    """The topics that the sinks of a cell take; see `Engine`."""
+    """What the sinks of a cell take; see `Engine`."""
     return frozenset((*cell.dense, *cell.sparse) if heard is None else heard)

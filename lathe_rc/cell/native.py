@@ -119,7 +119,7 @@ class Native:
         self._words = Words(memory)
         self.words = self._words.words
         self._entry = _entry(step, self._words.kind, tuple(inputs), tuple(outputs))
-        table = AddressTable(inputs, outputs)
+        table = self._entry.table
         self._places, self._reached, self._fields = table.places, np.zeros(1, np.int64), np.zeros(table.size, np.int64)
         self._fields[0] = table.floats
 
@@ -180,7 +180,8 @@ class Entry:
     def __init__(
         self, step: Step, memory: Placed, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]
     ) -> None:
-        self._memory, self._text = memory, _text(step, memory, inputs, outputs)
+        self.table = AddressTable(inputs, outputs)
+        self._memory, self._text = memory, _text(step, memory, self.table, outputs)
         self.name = f"step_{hashlib.sha256(self._text.encode()).hexdigest()[:16]}"
 
     @cached_property
@@ -195,9 +196,8 @@ class Entry:
 _entry = cache(Entry)  # made once for all that are alike
 
 
-def _text(step: Step, memory: Placed, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]) -> str:
+def _text(step: Step, memory: Placed, table: AddressTable, outputs: Sequence[np.dtype[Any]]) -> str:
     """The text of the module."""
-    table = AddressTable(inputs, outputs)
 
     def arrays(begin: int, kinds: Iterable[np.dtype[Any]]) -> str:
         return "".join(f"{_FIELDS[kind]}(fields, {place}, samples), " for place, kind in enumerate(kinds, begin))

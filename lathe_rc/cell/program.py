@@ -30,7 +30,8 @@ class Tapes:
     Args:
         topics: message type and, by field, the longest delay [sample] at which it is read, by relative topic.
         samples: length of a piece, at most.
-        passing: topics of which nobody needs a sample after the chunk in which it was computed, unless it is read late.
+        passing: fields, with their topics, of which nobody needs a sample after the chunk in which it was computed,
+            unless it is read late.
         chunk: length of a chunk, at most.
     """
 
@@ -38,7 +39,7 @@ class Tapes:
         self,
         topics: Mapping[str, tuple[str, Mapping[str, int]]],
         samples: int,
-        passing: Collection[str] = (),
+        passing: Collection[tuple[str, str]] = (),
         chunk: int = 0,
     ) -> None:
         self._delays = {
@@ -47,7 +48,7 @@ class Tapes:
             for name in messages.sample_fields(kind)
         }
         self.history = max(self._delays.values(), default=0)
-        self._passing = {key for key, delay in self._delays.items() if key[0] in passing and not delay}
+        self._passing = {key for key in passing if not self._delays[key]}
         self._arrays = {
             (topic, name): np.zeros(chunk if (topic, name) in self._passing else self.history + samples, dtype)
             for topic, (kind, _) in topics.items()
@@ -56,13 +57,23 @@ class Tapes:
         self._fields = {topic: list(messages.sample_fields(kind)) for topic, (kind, _) in topics.items()}
         self.begin = 0  #: sample index with which the piece begins
 
-    def view(self, topic: str, first: int, samples: int, delay: int = 0) -> Signals:
-        """Views of what a reader with this delay sees at the samples ``first`` on; what passes is seen of one chunk."""
+    def view(
+        self, topic: str, first: int, samples: int, delay: int = 0, names: Collection[str] | None = None
+    ) -> Signals:
+        """Views of what a reader with this delay sees at the samples ``first`` on; what passes is seen of one chunk.
+
+        Args:
+            topic: relative name.
+            first: sample index.
+            samples: how many.
+            delay: of the reader [sample].
+            names: of the fields; None: all.
+        """
         start = self.history + first - self.begin - delay
         whole, passing = slice(start, start + samples), slice(samples)
         return {
             name: self._arrays[topic, name][passing if (topic, name) in self._passing else whole]
-            for name in self._fields[topic]
+            for name in (self._fields[topic] if names is None else names)
         }
 
     def place(self, topic: str, name: str, delay: int) -> tuple[int, int]:

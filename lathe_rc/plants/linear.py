@@ -46,9 +46,11 @@ class DiscretePlant:
         the z is (det(z·I - Φ + w·c) - det(z·I - Φ)) / det(z·I - Φ). That is `scipy.signal.ss2tf`, but a controller
         asks for it in mid-run, and half a second to load that module is no time to stand still.
         """
-        position, bottom = np.eye(1, self.transition.shape[0]), np.asarray(np.poly(self.transition))
-        ways = [np.outer(self.weights[:, lag], position) for lag in range(3)]
-        return [np.asarray(np.poly(self.transition - way)) - bottom for way in ways], bottom
+        matrices = np.repeat(self.transition[np.newaxis], 4, axis=0)
+        matrices[1:, :, 0] -= self.weights.T
+        eigenvalues = np.linalg.eigvals(matrices)
+        bottom, *tops = [np.asarray(np.poly(roots if roots.imag.any() else roots.real)) for roots in eigenvalues]
+        return [top - bottom for top in tops], bottom
 
 
 @lru_cache(maxsize=64)

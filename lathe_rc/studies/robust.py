@@ -233,7 +233,7 @@ class _Judge:
         samples: of the run.
     """
 
-    heard = ("encoder", "tool", "coarse/state")
+    heard = ("encoder.angle_true", "tool.error", "coarse/state.effort")
 
     def __init__(self, cell: Cell, samples: int) -> None:
         drive: Any = cell.stages["loaded_drive"].shared

@@ -129,7 +129,7 @@ class _Largest:
 
     def __init__(self, cell: Cell, samples: int) -> None:
         self._tool = next(topic for topic, source in cell.dense.items() if source.type == messages.TOOL)
-        self.heard = [self._tool]
+        self.heard = [f"{self._tool}.error"]
         self._begins = round(_BEGINS / cell.master.shared.step)
         self._largest = 0.0
 

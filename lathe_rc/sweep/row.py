@@ -131,7 +131,7 @@ class _Keeper(Errors):
     def __init__(self, cell: Cell, samples: int, measures: Sequence[Measure]) -> None:
         super().__init__(cell, samples)
         self._events = [topic for topic, source in cell.sparse.items() if source.type == messages.EVENT]
-        self.heard = [*self.heard, *self._events, *(asked.topic for asked in measures)]
+        self.heard = [*self.heard, *self._events, *(f"{asked.topic}.{asked.field}" for asked in measures)]
         self.limited: set[str] = set()
         self.tolerance = next(
             (stage.parameters.tolerance for stage in cell.stages.values() if isinstance(stage, Tool)), 0.0
