@@ -40,7 +40,7 @@ class Keeper(Sink, Protocol[K_co]):
 
     @property
     def heard(self) -> Collection[str]:
-        """What it takes, relative topics or ``TOPIC.FIELD``; nothing else is kept."""
+        """Relative topics that it takes, or single fields, ``TOPIC.FIELD``; nothing else is kept."""
 
     def kept(self) -> K_co:
         """The kept result, at the end of the run."""

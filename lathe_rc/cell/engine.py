@@ -152,7 +152,7 @@ class Engine:
 
 
 class _Kept(dict[str, K]):
-    """What is kept for sinks, by name."""
+    """Signals that are kept for sinks, by name."""
 
     def __init__(self, content: Mapping[str, K] = MappingProxyType({}), of: str = "") -> None:
         super().__init__(content)
@@ -163,5 +163,5 @@ class _Kept(dict[str, K]):
 
 
 def _heard(cell: Cell, heard: Collection[str] | None) -> frozenset[str]:
-    """What the sinks of a cell take; see `Engine`."""
+    """Topics and fields that the sinks of a cell take; see `Engine`."""
     return frozenset((*cell.dense, *cell.sparse) if heard is None else heard)

@@ -14,7 +14,7 @@ from pathlib import PurePath
 from typing import Any
 
 import numpy as np
-from numba.types import Type
+from numba.core.types import Type
 
 from lathe_rc.cell.native import Entry
 from lathe_rc.cell.parameters import NodeParameters, Table
