@@ -11,7 +11,7 @@ import tempfile
 import threading
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -36,6 +36,16 @@ _MOST = 4096  # cells of a task
 _LEAST = 8  # towards the end tasks get shorter, down to this part of the others
 _AHEAD = 2  # tasks for each thread of the workers
 _CONNECT = 5  # [s] to reach a scheduler
+_SETTINGS = {  # of this machine's workers
+    # A worker that dies is blamed on every task that it has: so it has one, and none waits there.
+    "distributed.scheduler.worker-saturation": 1.0,
+    # Dask looks every 10 ms where a worker is, every 20 whether its loop is late, and every 100 at its memory: that
+    # takes a tenth of the time of short cells.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "200ms",
+    "distributed.worker.memory.monitor-interval": "1s",
+    "distributed.admin.system-monitor.interval": "2s",
+}
 
 
 class Job(NamedTuple):
@@ -72,6 +82,14 @@ class Order(NamedTuple):
     schema: pa.Schema
 
 
+@dataclass(frozen=True)
+class Share:
+    """The jobs of a task. Dask looks for other tasks in all lists and tuples that it is given, but not in this."""
+
+    order: Order
+    jobs: Sequence[Job]
+
+
 @lru_cache(maxsize=4)
 def _scenario(name: str, text: str, identity: str) -> Scenario:
     """The scenario at a worker.
@@ -90,12 +108,13 @@ def _scenario(name: str, text: str, identity: str) -> Scenario:
     return found.named()
 
 
-def compute(order: Order, jobs: Sequence[Job]) -> pa.Table:
+def compute(share: Share) -> pa.Table:
     """The rows of some cells; a task of Dask."""
+    order = share.order
     base, bench = _scenario(order.name, order.text, order.identity), Bench()
     rows = [
         {"cell": job.number, "key": job.key, **row.compute(base, job.values, order.targets, order.measures, bench)}
-        for job in jobs
+        for job in share.jobs
     ]
     return pa.Table.from_pylist(rows, order.schema)
 
@@ -124,10 +143,7 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[distribute
     # Ctrl-C is for this process, which ends its workers.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN) if _in_main_thread() else None
     try:
-        # A worker that dies is blamed on every task that it has: so it has one, and none waits there. Dask looks every
-        # 10 ms where a worker is: that takes a twelfth of the time of short cells, and shows compiled loops alone.
-        settings = {"distributed.scheduler.worker-saturation": 1.0, "distributed.worker.profile.enabled": False}
-        with dask.config.set(settings):
+        with dask.config.set(_SETTINGS):
             cluster = distributed.LocalCluster(
                 n_workers=workers,
                 threads_per_worker=1,
@@ -169,7 +185,7 @@ def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: i
                 if not (some := list(islice(waiting, max(min(size, fair), size // _LEAST, 1)))):
                     break
                 left -= len(some)
-                future = client.submit(compute, order, some, pure=False)
+                future = client.submit(compute, Share(order, some), pure=False)
                 sent[future] = some
                 arriving.add(future)
             if not sent:
