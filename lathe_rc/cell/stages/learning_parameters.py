@@ -15,7 +15,6 @@ from lathe_rc.control.lead import LeadLaw, Preview
 from lathe_rc.control.q_check import check
 from lathe_rc.control.q_filter import Exponential, Gaussian, LowPass, MovingAverage, QFilter
 from lathe_rc.extensions import Named, Registry, code_of_others
-from lathe_rc.signals.speed import constant
 
 _LEAD_LAWS = {law.name.lower(): law for law in LeadLaw}
 #: by name, ours and those of other packages; each is made of its width in grid points and the grid points of a cycle
@@ -162,11 +161,10 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         Raises:
             InputError: the deviations do not fit together.
         """
-        law = _LEAD_LAWS[self.lead_law]
         return Preview(
-            law,
+            _LEAD_LAWS[self.lead_law],
             self.preview_time,
-            self.speed_law(node) if law is LeadLaw.EXACT_PREVIEW else constant(self.nominal_speed),
+            self.speed_law(node),
             self.step,
             self.acceleration_window,
             self.constant_lead,
