@@ -47,7 +47,7 @@ def variations(name: str, count: int) -> Iterator[Scenario]:
 
 def _whole(name: str, count: int) -> float:
     """Time of a batch, by sample and core [s]."""
-    failed, samples = 0, Engine(Cell(next(variations(name, 1)).nodes)).samples
+    failed, samples = 0, Cell(next(variations(name, 1)).nodes).samples
 
     def go() -> None:
         nonlocal failed

@@ -122,7 +122,7 @@ def plain(name: str, revolutions: float, *flags: str, at_once: int = 1) -> Calla
     library = compiled(name, *flags)
 
     def side() -> float:
-        samples = Engine(cell(name, revolutions)).samples
+        samples = cell(name, revolutions).samples
         runs = [PlainC(name, library, cell(name, revolutions), _CHUNK) for _ in range(at_once)]
         with ThreadPoolExecutor(at_once) as pool:
             return seconds(lambda: list(pool.map(lambda run: run.run(samples), runs))) / samples

@@ -3,7 +3,6 @@
 
 import gc
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from types import MappingProxyType
 from typing import NoReturn, Protocol, TypeVar
 
 import numpy as np
@@ -135,7 +134,7 @@ class Engine:
         """Give a piece to the sinks."""
         if first == end:
             return
-        dense = _Kept[Signals]()
+        dense = _Kept[Signals]({})
         sparse: dict[str, list[Sparse]] = {}
         for number, (stage, kept) in enumerate(zip(self._stages, self._kept, strict=True)):
             outputs = [
@@ -154,7 +153,7 @@ class Engine:
 class _Kept(dict[str, K]):
     """Signals that are kept for sinks, by name."""
 
-    def __init__(self, content: Mapping[str, K] = MappingProxyType({}), of: str = "") -> None:
+    def __init__(self, content: Mapping[str, K], of: str = "") -> None:
         super().__init__(content)
         self._of = of
 
