@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rclpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lathe_rc_msgs.srv import Schedule
 
 from lathe_rc import harness
 from lathe_rc.bag import reader
@@ -20,6 +22,8 @@ from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import sample_fields
+from lathe_rc.nodes import lost_ports
+from lathe_rc.nodes.stale_shared_memory import FOLDER
 
 CONFIG = Path(__file__).parents[1] / "config"
 BLOCK = 64
@@ -48,7 +52,7 @@ def commands(cell, table, recording, keep_at, path):
     whole, said = [], []
     for block in range(samples(recording) // BLOCK):
         if block in keep_at:
-            state_file.save(path, {"stage": stage, "tracks": tracks})
+            state_file.save(path, state_file.dump({"stage": stage, "tracks": tracks}))
             fresh = {"stage": Cell(cell.nodes).stages[OWN], "tracks": tracks}
             state = state_file.load(path, table, fresh)
             stage, tracks = state["stage"], state["tracks"]
@@ -113,6 +117,42 @@ def test_a_killed_controller_goes_on_in_another_process_to_the_bit(tmp_path):
     assert [event["member"] for event in killer.all("dead")] == [f"/{OWN}"] * 2
     assert len(killer.all("resumed")) == 2
     assert not killer.all("safe")
+
+
+def test_who_listens_where_nobody_finds_it_is_found_again(tmp_path, monkeypatch):
+    """The file of a port is the name by which a restarted controller finds it; DDS has removed that of the recorder."""
+
+    class Thief(Killer):
+        def __call__(self, event):
+            if event["event"] == "progress" and self.at and event["samples"] >= self.at[0]:
+                monkeypatch.setattr(lost_ports, "_OWN", Path(f"/proc/{self.pids['recorder']}"))
+                for port in lost_ports._listened():
+                    (FOLDER / port).unlink()
+            super().__call__(event)
+
+    kept = [f"{OWN}.restart_file={tmp_path}/state", "spindle_encoder.revolutions=20.0"]
+    cell, thief = load(CONFIG / "piston.yaml", kept), Thief(OWN, [30_000])
+    assert harness.run(cell, mode="processes", bag=tmp_path / "bag", watch=thief).digest == harness.run(cell).digest
+    assert len(thief.all("resumed")) == 1
+
+
+def test_an_event_that_was_asked_for_is_kept_when_a_state_of_before_is_written(ghost, domain, tmp_path):
+    """Killed at once after it has promised to freeze its memory, a controller keeps its word, at the same sample."""
+    cell = load(CONFIG / "piston.yaml", [f"{OWN}.restart_file={tmp_path}/state", "spindle_encoder.revolutions=20.0"])
+    client = ghost.create_client(Schedule, f"/{OWN}/schedule")
+    recorded = harness.with_recorder(cell, tmp_path / "bag", keep=True)
+    with harness.Processes(recorded, [[name] for name in recorded.nodes], domain=domain) as processes:
+        processes.wait_for("cycle")
+        assert client.wait_for_service(20.0)
+        future = client.call_async(Schedule.Request(action="freeze"))
+        rclpy.spin_until_future_complete(ghost, future)
+        os.kill(processes.pids[OWN], signal.SIGKILL)
+        processes.wait_for_end()
+    promised = future.result().sample_index
+    expected = harness.run(load(CONFIG / "piston.yaml", [
+        "spindle_encoder.revolutions=20.0", f"{OWN}.events=['sample {promised}: freeze']",
+    ]))  # fmt: skip
+    assert reader.read(tmp_path / "bag").digests() == expected.digest
 
 
 def test_a_controller_whose_state_is_lost_is_not_waited_for(tmp_path):
@@ -198,7 +238,7 @@ def test_an_array_takes_no_more_than_its_bytes(tmp_path):
 
 def test_a_state_that_others_may_write_is_refused(tmp_path):
     path = tmp_path / "state"
-    state_file.save(path, {"stage": 1})
+    state_file.save(path, state_file.dump({"stage": 1}))
     path.chmod(0o620)
     with pytest.raises(LatheError, match="another user owns or may write this state; allowed: your own file, mode 600"):
         loaded(path)

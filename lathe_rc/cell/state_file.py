@@ -60,10 +60,18 @@ class _Reader(pickle.Unpickler):
     """Args: the file's content, parameters of the node, and names of classes; without these any, and they are noted."""
 
     def __init__(self, data: bytes, table: Table, classes: frozenset[_Name] | None) -> None:
-        super().__init__(io.BytesIO(data))
+        self._stream = io.BytesIO(data)
+        super().__init__(self._stream)
         self._table, self._classes = table, classes
         self._arrays: dict[int, np.ndarray] = {}
         self.met: set[_Name] = set()
+
+    def whole(self) -> dict[str, Any]:
+        """The state with all that has changed since."""
+        state: dict[str, Any] = {}
+        while self._stream.tell() < self._stream.getbuffer().nbytes:
+            state |= self.load()
+        return state
 
     def persistent_load(self, told: Any) -> Any:
         if told == _TABLE:
@@ -102,8 +110,10 @@ def dump(state: Mapping[str, object]) -> bytes:
     return buffer.getvalue()
 
 
-def save(path: Path, state: Mapping[str, object]) -> None:
-    """Write a state; a reader finds the one before or this one, also after this process was killed.
+def save(path: Path, *parts: bytes) -> None:
+    """Write a state as `dump` gives it, and what has changed in it since, as well.
+
+    A reader finds the one before or this one, also after this process was killed.
 
     Raises:
         LatheError: it cannot be written.
@@ -112,7 +122,7 @@ def save(path: Path, state: Mapping[str, object]) -> None:
     try:
         new.unlink(missing_ok=True)
         with open(new, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
-            file.write(dump(state))
+            file.writelines(parts)
         new.replace(path)
     except OSError as error:
         raise LatheError(f"{path}: the state cannot be kept ({error.strerror})") from None
@@ -137,17 +147,17 @@ def load(path: Path, table: Table, fresh: Mapping[str, object], *others: type) -
         LatheError: it cannot be read, somebody else may have written it, or it is none.
     """
     own = _Reader(dump(fresh), table, None)
-    own.load()
+    own.whole()
     classes = own.met | {(each.__module__, each.__qualname__) for each in others}
     try:
         _check_owner(path)
-        state = _Reader(contents(path, _MOST), table, frozenset(classes)).load()
+        state = _Reader(contents(path, _MOST), table, frozenset(classes)).whole()
     except LatheError:
         raise
     except OSError as error:
         raise LatheError(f"{path}: the state cannot be read ({error.strerror})") from None
     except Exception as error:  # noqa: BLE001 - pickle lets through whatever a damaged file leads to
         raise LatheError(f"{path}: not a state of this node ({type(error).__name__}: {shown(error)})") from None
-    if not isinstance(state, dict) or state.keys() != fresh.keys():
+    if state.keys() != fresh.keys():
         raise LatheError(f"{path}: not a state of this node")
     return state

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Restart of a node in mid-run: it keeps its state in a file, and another process goes on from there."""
+"""Restart of a node in mid-run: it keeps its state in a file, and another process goes on from there.
+
+The newest blocks of a process may be lost with it: DDS sends nothing again for the dead. No reader is more than a
+window behind, so the state in the file is at least a window old, and the new process sends the blocks since then once
+more. Nor is it older than two windows: suppliers, which may be a window ahead, keep three and some more.
+"""
 
 from collections import deque
 from collections.abc import Sequence
@@ -27,6 +32,8 @@ class Restartable(StageTopics):
         super().configure_part()
         self._restart_file = getattr(self.table, "restart_file", "")
         self._keep_at = 0
+        # The newest states: after how many blocks, the state, and events that were asked for since.
+        self._states: deque[tuple[int, bytes, list[tuple[str, int]]]] = deque()
         if self._restart_file and not self.table.window:
             raise InputError(f"{self.get_name()}.restart_file with window = 0: nobody waits for a restart; allowed: ''")
 
@@ -78,9 +85,23 @@ class Restartable(StageTopics):
         self.due = True
 
     def _keep(self) -> None:
-        """Keep the state, as long as those who supply it still hold the blocks that follow."""
+        """Keep the state, and write the one of a window ago."""
         self._keep_at = self.blocks + self.table.window
-        state_file.save(Path(self._restart_file), self._kept())
+        self._states.append((self.blocks, state_file.dump(self._kept()), []))
+        while len(self._states) > 1 and self._states[1][0] <= self.blocks - self.table.window:
+            self._states.popleft()
+        self._write()
+
+    def keep_event(self, action: str, index: int) -> None:
+        """Let another process know of an event that this one was asked for; nothing without a ``restart_file``."""
+        for _, _, events in self._states:
+            events.append((action, index))
+        if self._states:
+            self._write()
+
+    def _write(self) -> None:
+        _, state, events = self._states[0]
+        state_file.save(Path(self._restart_file), state, state_file.dump({"events": events}))
 
     def _kept(self) -> dict[str, object]:
         """All that the next block depends on, and of which start of the cell it is."""
@@ -91,6 +112,7 @@ class Restartable(StageTopics):
             "samples": self.samples,
             "companions": self._framer.companions,
             "stage": self.stage,
+            "events": [],
             "tracks": self._tracks,
             "queues": {topic: queue.state() for topic, queue in self._queues.items()},
         }
@@ -104,6 +126,8 @@ class Restartable(StageTopics):
         self.blocks, self.samples, self._started = state["blocks"], state["samples"], True
         self._reported_blocks, self._framer.companions = self.blocks, state["companions"]
         self.stage, self._tracks = state["stage"], state["tracks"]
+        for action, index in state["events"]:
+            self.stage.schedule(action, index)
         assert self.master is not None, "it has announced all members"
         sources = {topic: name for name in self.master.members for topic in self.members[name].publishes}
         for topic, queue in self._queues.items():

@@ -71,8 +71,8 @@ class StageNode(ChainMember):
         except InputError as error:
             response.message = str(error)
             return response
-        if self._restart_file and not self.over:
-            self.attempt(self._keep)  # another process has to know of it
+        if not self.over:
+            self.attempt(partial(self.keep_event, request.action, index))
         response.accepted, response.sample_index = True, index
         return response
 

@@ -20,15 +20,15 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
 
-_SPARE, _FREE_RUNNING = 32, 1024  # messages
+_SPARE, _FREE_RUNNING = 32, 2080  # messages
 
 
 def signal_depth(shared: SharedParameters) -> int:
     """Queue length of signal topics: all blocks in flight and some more; many where nothing holds the spindle back.
 
-    A reader of a feedback edge may be a window behind itself, and the publisher a window ahead of it.
+    A publisher may be a window ahead of a reader that goes on in the place of a dead one, from two windows before.
     """
-    return 2 * (shared.window or _FREE_RUNNING) + _SPARE
+    return 3 * shared.window + _SPARE if shared.window else _FREE_RUNNING
 
 
 def bag_of(path: Path, table: RecorderParameters, snapshots: Snapshots | None) -> Output:

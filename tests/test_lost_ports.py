@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A port that has lost its name is made anew; a healthy one is left alone. A whole cell: tests/test_restart.py."""
+
+import pytest
+import rclpy
+
+from lathe_rc.errors import LatheError
+from lathe_rc.nodes import lost_ports
+from lathe_rc.nodes.stale_shared_memory import FOLDER
+
+LOOKS = 5  # until a port counts as lost
+
+
+@pytest.fixture
+def ports(domain):
+    """Those of a node of this process; nodes of other tests may listen, too."""
+    before = lost_ports._listened()
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    node = rclpy.create_node("listener", context=context)
+    yield sorted(lost_ports._listened() - before)
+    node.destroy_node()
+    context.shutdown()
+
+
+def test_a_lost_port_is_marked_as_broken_and_others_are_left_alone(ports, monkeypatch):
+    watch = lost_ports.LostPorts()
+    assert not any(watch.mend() for _ in range(2 * LOOKS))
+    lost = ports[0]
+    old = [number for number, _, _ in lost_ports._mapped(lost)]
+    (FOLDER / lost).unlink()
+    assert [watch.mend() for _ in range(LOOKS)] == [*([[]] * (LOOKS - 1)), [lost]]
+    while [number for number, _, _ in lost_ports._mapped(lost)] in (old, []):  # DDS looks at the mark
+        pass
+    assert (FOLDER / lost).exists()
+
+
+def test_memory_that_is_laid_out_otherwise_is_not_written(ports, monkeypatch):
+    monkeypatch.setattr(lost_ports._Head, "plausible", property(lambda _: False))
+    watch = lost_ports.LostPorts()
+    (FOLDER / ports[0]).unlink()
+    for _ in range(LOOKS - 1):
+        watch.mend()
+    with pytest.raises(LatheError, match=f"^{FOLDER}/{ports[0]} has no file any more, and is not laid out as Fast DDS"):
+        watch.mend()
