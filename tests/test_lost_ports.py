@@ -8,8 +8,6 @@ from lathe_rc.errors import LatheError
 from lathe_rc.nodes import lost_ports
 from lathe_rc.nodes.stale_shared_memory import FOLDER
 
-LOOKS = 5  # until a port counts as lost
-
 
 @pytest.fixture
 def ports(domain):
@@ -23,13 +21,19 @@ def ports(domain):
     context.shutdown()
 
 
-def test_a_lost_port_is_marked_as_broken_and_others_are_left_alone(ports, monkeypatch):
-    watch = lost_ports.LostPorts()
-    assert not any(watch.mend() for _ in range(2 * LOOKS))
+def test_a_lost_port_is_marked_as_broken_and_others_are_left_alone(ports):
+    said = []
+    watch = lost_ports.LostPorts(said.append)
+    for now in range(10):
+        watch.look(float(now))
     lost = ports[0]
     old = [number for number, _, _ in lost_ports._mapped(lost)]
     (FOLDER / lost).unlink()
-    assert [watch.mend() for _ in range(LOOKS)] == [*([[]] * (LOOKS - 1)), [lost]]
+    watch.look(10.0)
+    watch.look(10.4)
+    assert said == []  # DDS might be making it anew
+    watch.look(10.5)
+    assert said == [f"no other process finds {lost} any more; DDS makes it anew"]
     while [number for number, _, _ in lost_ports._mapped(lost)] in (old, []):  # DDS looks at the mark
         pass
     assert (FOLDER / lost).exists()
@@ -37,9 +41,8 @@ def test_a_lost_port_is_marked_as_broken_and_others_are_left_alone(ports, monkey
 
 def test_memory_that_is_laid_out_otherwise_is_not_written(ports, monkeypatch):
     monkeypatch.setattr(lost_ports._Head, "plausible", property(lambda _: False))
-    watch = lost_ports.LostPorts()
+    watch = lost_ports.LostPorts(print)
     (FOLDER / ports[0]).unlink()
-    for _ in range(LOOKS - 1):
-        watch.mend()
+    watch.look(0.0)
     with pytest.raises(LatheError, match=f"^{FOLDER}/{ports[0]} has no file any more, and is not laid out as Fast DDS"):
-        watch.mend()
+        watch.look(1.0)

@@ -12,8 +12,7 @@ a process whose port has been without a name for half a second sets that mark it
 
 import re
 import struct
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -44,25 +43,37 @@ class _Head(NamedTuple):
 
 _HEAD = struct.Struct("=7I")
 _NOT_BROKEN = 1
-_PATIENCE = 5  # looks: DDS may be making the port anew just now
+_PATIENCE = 0.5  # [s]: DDS may be making the port anew just now
 
 
 class LostPorts:
-    """The ports at which this process listens, to be looked at ten times a second once it has all its nodes."""
+    """The ports at which this process listens, once it has all its nodes.
 
-    def __init__(self) -> None:
+    Args:
+        warn: told of a port that is made anew.
+    """
+
+    def __init__(self, warn: Callable[[str], object]) -> None:
+        self._warn = warn
         self._files = dict.fromkeys(sorted(_listened()), 0)  # the file of each that was last seen in this memory
-        self._lost: Counter[str] = Counter()  # looks in a row
+        self._since: dict[str, float] = {}  # when each of those that are lost was first missed
 
-    def mend(self) -> list[str]:
-        """Let DDS make those ports anew that have lost their name; their file names.
+    def look(self, now: float) -> None:
+        """Let DDS make those ports anew that have lost their name, and say so; to be called some ten times a second.
+
+        Args:
+            now: monotonic time [s].
 
         Raises:
             LatheError: the memory of a port is not laid out as that of Fast DDS 2.14.
         """
         for name in self._files:
-            self._lost[name] = self._lost[name] + 1 if self._is_lost(name) else 0
-        return [name for name, looks in self._lost.items() if looks and looks % _PATIENCE == 0 and _mark(name)]
+            if not self._is_lost(name):
+                self._since.pop(name, None)
+            elif now - self._since.setdefault(name, now) >= _PATIENCE:
+                del self._since[name]
+                if _mark(name):
+                    self._warn(f"no other process finds {name} any more; DDS makes it anew")
 
     def _is_lost(self, name: str) -> bool:
         try:

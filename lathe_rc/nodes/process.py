@@ -124,7 +124,7 @@ def _work(nodes: Sequence[CellNode], stop: _Stop, until: float) -> None:
 
 
 def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
-    events, ports = Events(nodes), LostPorts()
+    events, ports = Events(nodes), LostPorts(nodes[0].get_logger().warning)
     look = 0.0
     while not stop.signal:
         now = time.monotonic()
@@ -138,8 +138,7 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
                 look = now + _LONGEST_WAIT
                 for node in nodes:
                     overlooked.take(node)
-                for port in ports.mend():
-                    nodes[0].get_logger().warning(f"no other process finds {port} any more; DDS makes it anew")
+                ports.look(now)
                 if reporter.orphaned:
                     return
         due = _due(nodes, now)
