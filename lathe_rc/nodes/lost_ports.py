@@ -50,7 +50,7 @@ class LostPorts:
     """The ports at which this process listens, once it has all its nodes.
 
     Args:
-        warn: told of a port that is made anew.
+        warn: takes a line for each port that is made anew.
     """
 
     def __init__(self, warn: Callable[[str], object]) -> None:
