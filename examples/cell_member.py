@@ -42,16 +42,18 @@ class CellMember(Node):
             nonlocal end
             if message.block.run_id != self.me.run_id or self.me.state == Member.FAILED:
                 return
+            if message.block.first_index < end:
+                return  # a controller that was killed and goes on sends some blocks once more
             if message.block.first_index == end:
                 end += callback(message)
             else:
                 self.announce(Member.FAILED, f"{topic} goes from sample {end} to {message.block.first_index}")
 
-        self.me.subscribes.append(self.create_subscription(kind, topic, take, latched(2 * self.window + 32)).topic_name)
+        self.me.subscribes.append(self.create_subscription(kind, topic, take, latched(3 * self.window + 32)).topic_name)
 
     def publishes(self, kind, topic):
         """A publisher of blocks."""
-        publisher = self.create_publisher(kind, topic, latched(2 * self.window + 32))
+        publisher = self.create_publisher(kind, topic, latched(3 * self.window + 32))
         self.me.publishes.append(publisher.topic_name)
         self.me.types.append(f"lathe_rc_msgs/msg/{kind.__name__}")
         self.me.sparse.append(False)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A port that has lost its name is made anew; a healthy one is left alone. A whole cell: tests/test_restart.py."""
 
+import time
+
 import pytest
 import rclpy
 
@@ -35,7 +37,7 @@ def test_a_lost_port_is_marked_as_broken_and_others_are_left_alone(ports):
     watch.look(10.5)
     assert said == [f"no other process finds {lost} any more; DDS makes it anew"]
     while [number for number, _, _ in lost_ports._mapped(lost)] in (old, []):  # DDS looks at the mark
-        pass
+        time.sleep(0.01)
     assert (FOLDER / lost).exists()
 
 
@@ -46,3 +48,15 @@ def test_memory_that_is_laid_out_otherwise_is_not_written(ports, monkeypatch):
     watch.look(0.0)
     with pytest.raises(LatheError, match=f"^{FOLDER}/{ports[0]} has no file any more, and is not laid out as Fast DDS"):
         watch.look(1.0)
+
+
+def test_a_process_that_may_not_look_says_so_and_goes_on(ports, monkeypatch, tmp_path):
+    said = []
+    watch = lost_ports.LostPorts(said.append)
+    (FOLDER / ports[0]).unlink()
+    monkeypatch.setattr(lost_ports, "_OWN", tmp_path)
+    watch.look(0.0)
+    watch.look(1.0)
+    assert said == [
+        f"this process cannot see whether others still find it: [Errno 2] No such file or directory: '{tmp_path}/mem'"
+    ]

@@ -59,19 +59,11 @@ def _dtype(text: object) -> np.dtype[Any]:
 class _Reader(pickle.Unpickler):
     """Args: the file's content, parameters of the node, and names of classes; without these any, and they are noted."""
 
-    def __init__(self, data: bytes, table: Table, classes: frozenset[_Name] | None) -> None:
-        self._stream = io.BytesIO(data)
-        super().__init__(self._stream)
+    def __init__(self, stream: io.BytesIO, table: Table, classes: frozenset[_Name] | None) -> None:
+        super().__init__(stream)
         self._table, self._classes = table, classes
         self._arrays: dict[int, np.ndarray] = {}
         self.met: set[_Name] = set()
-
-    def whole(self) -> dict[str, Any]:
-        """The state with all that has changed since."""
-        state: dict[str, Any] = {}
-        while self._stream.tell() < self._stream.getbuffer().nbytes:
-            state |= self.load()
-        return state
 
     def persistent_load(self, told: Any) -> Any:
         if told == _TABLE:
@@ -146,12 +138,16 @@ def load(path: Path, table: Table, fresh: Mapping[str, object], *others: type) -
     Raises:
         LatheError: it cannot be read, somebody else may have written it, or it is none.
     """
-    own = _Reader(dump(fresh), table, None)
-    own.whole()
+    own = _Reader(io.BytesIO(dump(fresh)), table, None)
+    own.load()
     classes = own.met | {(each.__module__, each.__qualname__) for each in others}
     try:
         _check_owner(path)
-        state = _Reader(contents(path, _MOST), table, frozenset(classes)).whole()
+        stream, state = io.BytesIO(contents(path, _MOST)), dict[str, Any]()
+        while (
+            stream.tell() < stream.getbuffer().nbytes
+        ):  # each part by its own reader: what one names is none of the next
+            state |= _Reader(stream, table, frozenset(classes)).load()
     except LatheError:
         raise
     except OSError as error:

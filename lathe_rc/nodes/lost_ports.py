@@ -20,7 +20,7 @@ from typing import NamedTuple
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.stale_shared_memory import FOLDER
 
-_LISTENS = re.compile(rf"{FOLDER}/(fast(?:rtps|dds)_port(\d+))_[es]l")
+_LISTENS = re.compile(rf"{FOLDER}/(fast(?:rtps|dds)_port(\d+))_[es]l(?: \(deleted\))?")
 _OWN = Path("/proc/self")
 
 
@@ -33,16 +33,21 @@ class _Head(NamedTuple):
     wait_timeout_ms: int
     capacity: int
     waiting: int
-    marks: int  # 1: not broken; 2: one process listens alone; 4: somebody listens
+    marks: int  # 1: sound; 2: one process listens alone; 4: somebody listens
 
     @property
     def plausible(self) -> bool:
-        """Whether this is the head of a port at which somebody listens."""
-        return self.listeners > 0 and self.wait_timeout_ms == self.healthy_check_timeout_ms // 3 and 4 <= self.marks < 8
+        """Whether this can be the head of a port."""
+        return self.wait_timeout_ms == self.healthy_check_timeout_ms // 3 and self.marks < 8
+
+    @property
+    def listens(self) -> bool:
+        """Whether somebody listens there and takes it for sound."""
+        return self.listeners > 0 and self.marks & _LISTENED == _LISTENED
 
 
 _HEAD = struct.Struct("=7I")
-_NOT_BROKEN = 1
+_SOUND, _LISTENED = 1, 5
 _PATIENCE = 0.5  # [s]: DDS may be making the port anew just now
 
 
@@ -65,27 +70,37 @@ class LostPorts:
             now: monotonic time [s].
 
         Raises:
-            LatheError: the memory of a port is not laid out as that of Fast DDS 2.14.
+            LatheError: the memory of a lost port is not laid out as that of Fast DDS 2.14.
         """
-        for name in self._files:
-            if not self._is_lost(name):
-                self._since.pop(name, None)
-            elif now - self._since.setdefault(name, now) >= _PATIENCE:
-                del self._since[name]
-                if _mark(name):
-                    self._warn(f"no other process finds {name} any more; DDS makes it anew")
+        try:
+            for name in self._files:
+                if not self._is_lost(name):
+                    self._since.pop(name, None)
+                elif now - self._since.setdefault(name, now) >= _PATIENCE:
+                    del self._since[name]
+                    if _mark(name):
+                        self._warn(f"no other process finds {name} any more; DDS makes it anew")
+        except OSError as error:
+            self._warn(f"this process cannot see whether others still find it: {error}")
+            self._files = {}
 
     def _is_lost(self, name: str) -> bool:
-        try:
-            file = (FOLDER / name).stat().st_ino
-        except FileNotFoundError:
-            file = 0
-        if file and file == self._files[name]:
+        file = _file(name)
+        if file == self._files[name]:
             return False
-        if file in (number for number, _, _ in _mapped(name)):
+        heads = [*_heads(name)]
+        where = {number for number, _, head in heads if head.listens} or {number for number, _, _ in _mapped(name)}
+        if file in where:
             self._files[name] = file
-            return False
-        return True
+        return file not in where
+
+
+def _file(name: str) -> int:
+    """The number of the file of a port; -1 if there is none."""
+    try:
+        return (FOLDER / name).stat().st_ino
+    except FileNotFoundError:
+        return -1
 
 
 def _listened() -> set[str]:
@@ -106,24 +121,34 @@ def _mapped(name: str) -> Iterator[tuple[int, int, int]]:
             yield int(number), int(first, 16), int(end, 16)
 
 
-def _mark(name: str) -> bool:
-    """Mark a port as broken, in all memory that this process has of it; whether it was not yet."""
-    number, marked = int(name.partition("port")[2]), False
+def _heads(name: str) -> Iterator[tuple[int, int, _Head]]:
+    """The heads of a port in this process's memory: number of the file, address and content."""
+    wanted = struct.pack("=I", int(name.partition("port")[2]))
     # as a file: memory that DDS gives back meanwhile is an error then, no crash
-    with (_OWN / "mem").open("r+b", buffering=0) as memory:
-        for _, first, end in _mapped(name):
-            memory.seek(first)
-            content = memory.read(end - first)
-            place = content.find(struct.pack("=I", number))
+    with (_OWN / "mem").open("rb", buffering=0) as memory:
+        for number, first, end in _mapped(name):
+            content = b""
+            with suppress(OSError):  # DDS has given it back
+                memory.seek(first)
+                content = memory.read(end - first)
+            place = content.find(wanted)
             while 0 <= place <= len(content) - _HEAD.size:
                 head = _Head(*_HEAD.unpack_from(content, place))
                 if head.plausible:
+                    yield number, first + place, head
                     break
-                place = content.find(struct.pack("=I", number), place + 1)
-            else:
-                raise LatheError(f"{FOLDER}/{name} has no file any more, and is not laid out as Fast DDS 2.14 does it")
-            if head.marks & _NOT_BROKEN:
-                memory.seek(first + place + _HEAD.size - 4)
-                memory.write(struct.pack("=I", head.marks & ~_NOT_BROKEN))
-                marked = True
-    return marked
+                place = content.find(wanted, place + 1)
+
+
+def _mark(name: str) -> bool:
+    """Mark a port as broken wherever this process listens to another file than that of its name; whether it did."""
+    heads, file = [*_heads(name)], _file(name)
+    if not heads:
+        raise LatheError(f"{FOLDER}/{name} has no file any more, and is not laid out as Fast DDS 2.14 does it")
+    lost = [(address, head) for number, address, head in heads if head.listens and number != file]
+    with (_OWN / "mem").open("r+b", buffering=0) as memory:
+        for address, head in lost:
+            with suppress(OSError):  # DDS has given it back
+                memory.seek(address + _HEAD.size - 4)
+                memory.write(struct.pack("=I", head.marks & ~_SOUND))
+    return bool(lost)

@@ -84,6 +84,10 @@ class Restartable(StageTopics):
         self._keep()
         self.due = True
 
+    def at_once(self) -> int:
+        """Blocks to compute in one go, at most: up to the one after which the state is to be kept."""
+        return max(min(self.together, self._keep_at - self.blocks), 1) if self._restart_file else self.together
+
     def _keep(self) -> None:
         """Keep the state, and write the one of a window ago."""
         self._keep_at = self.blocks + self.table.window

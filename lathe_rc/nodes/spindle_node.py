@@ -117,6 +117,10 @@ class SpindleNode(LossWatch):
             why = f"expected run {self.table.run_id!r}"
             raise ForeignMessage(self._host["progress"].topic_name, progress.name, progress.run_id, why)
         if progress.blocks <= self._completed.get(progress.name, progress.blocks):
+            if progress.name in self._completed and self.restarts(
+                progress.name
+            ):  # it computes again, and is not silent
+                self._heard = self._members_moved[progress.name] = time.monotonic()
             return
         if progress.blocks > self.blocks:
             raise LatheError(f"{progress.name} claims {progress.blocks} blocks; {self.blocks} were sent")

@@ -99,7 +99,7 @@ class StageNode(ChainMember):
             # Alone, a node may join a stream that is under way; in a cell it begins at 0.
             self._join(self._forward[0].blocks[0].first_index)
             self._check_cut([queue.blocks[0].first_index for queue in self._forward], "begin")
-        end, ended = self.samples + self.together * self._size, False
+        end, ended = self.samples + self.at_once() * self._size, False
         for queue in self._forward:
             end = min(end, queue.end)
             ended = ended or queue.ended

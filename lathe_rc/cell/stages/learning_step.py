@@ -123,8 +123,8 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
                 _lose(memory, reached, stop, command)
                 reached, reason = stop, DONE
             elif memory.identifies:
+                command_sent(memory.identifier, first, start, reached, command)  # a piece may be longer than the delay
                 accumulate(memory.identifier, first, start, reached, inputs[4 + memory.finer])
-                command_sent(memory.identifier, first, start, reached, command)
         for published in range(1, len(outputs)):
             outputs[published][start:reached] = memory.margin[0]
         if reason != DONE:
