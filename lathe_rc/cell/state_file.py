@@ -103,7 +103,7 @@ def dump(state: Mapping[str, object]) -> bytes:
 
 
 def save(path: Path, *parts: bytes) -> None:
-    """Write a state as `dump` gives it, and what has changed in it since, as well.
+    """Write a state, and changes of it since then, each as `dump` gives it.
 
     A reader finds the one before or this one, also after this process was killed.
 
@@ -144,9 +144,8 @@ def load(path: Path, table: Table, fresh: Mapping[str, object], *others: type) -
     try:
         _check_owner(path)
         stream, state = io.BytesIO(contents(path, _MOST)), dict[str, Any]()
-        while (
-            stream.tell() < stream.getbuffer().nbytes
-        ):  # each part by its own reader: what one names is none of the next
+        # Each part by a reader of its own: the names of one are unknown to the next.
+        while stream.tell() < stream.getbuffer().nbytes:
             state |= _Reader(stream, table, frozenset(classes)).load()
     except LatheError:
         raise

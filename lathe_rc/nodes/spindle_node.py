@@ -116,10 +116,9 @@ class SpindleNode(LossWatch):
         if progress.run_id != self.table.run_id:
             why = f"expected run {self.table.run_id!r}"
             raise ForeignMessage(self._host["progress"].topic_name, progress.name, progress.run_id, why)
-        if progress.blocks <= self._completed.get(progress.name, progress.blocks):
-            if progress.name in self._completed and self.restarts(
-                progress.name
-            ):  # it computes again, and is not silent
+        known = progress.name in self._completed
+        if not known or progress.blocks <= self._completed[progress.name]:
+            if known and self.restarts(progress.name):  # it computes once more: that is no silence
                 self._heard = self._members_moved[progress.name] = time.monotonic()
             return
         if progress.blocks > self.blocks:
