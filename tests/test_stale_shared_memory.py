@@ -170,6 +170,34 @@ def test_what_a_killed_node_has_left_is_removed_and_what_a_living_one_has_is_not
     assert not there(own)
 
 
+@pytest.mark.parametrize("content", [b"", bytes(52400), b"\1".ljust(52400, b"\0")])
+def test_a_port_that_nobody_makes_any_more_is_given_up_and_no_other(port, content):
+    made = port.with_name(f"{PORT}0")
+    made.write_bytes(b"\2".ljust(52400, b"\0"))
+    port.write_bytes(content)
+    assert stale_shared_memory.release(port.parent) == [], "somebody may be making it"
+    for file in (made, port):
+        os.utime(file, (0.0, 0.0))
+    with port.open("rb") as waits:
+        assert stale_shared_memory.release(port.parent) == [PORT]
+        assert waits.read(4) == b"\3\0\0\0", "whoever has opened it sees that it is corrupted"
+    assert [file.name for file in port.parent.iterdir()] == [made.name]
+
+
+@pytest.mark.parametrize("size", [0, 52400])
+def test_who_waits_for_a_port_that_nobody_makes_any_more_is_let_go(domain, monkeypatch, size):
+    """Killed processes leave such ports at any time: here after the harness has looked for them, before the start."""
+    ports = [stale_shared_memory.FOLDER / f"fastrtps_port{7400 + 250 * domain + 11 + 2 * k}" for k in range(2)]
+
+    def sweep():
+        for file in ports:
+            file.write_bytes(bytes(size))
+
+    monkeypatch.setattr(stale_shared_memory, "sweep", sweep)
+    cell = scenario(spindle_encoder={"revolutions": 5.0})
+    assert harness.run(cell, mode="processes", domain=domain).digest == harness.run(cell).digest
+
+
 def test_a_cell_runs_where_killed_ones_have_left_broken_ports(domain):
     """Without the sweep it stands still before the first block, as it does with those of processes that were killed."""
     for participant in range(8):

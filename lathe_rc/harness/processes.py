@@ -37,6 +37,7 @@ _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
 _NO_SIGN_OF_LIFE = {"stall", "foreign_message", "stopped", "continued", "waits"}  # events of a cell that stands
 _LAST_WORDS = {"done", "error", "abandoned", "masterless"}  # events of a node that has nothing more to do
 _LOOK = 0.05  # [s] between looks at what a process has written
+_PATIENCE = 1.0  # [s] without any event until the harness looks for what processes wait for
 
 
 class Processes:
@@ -172,9 +173,13 @@ class Processes:
         while True:
             leaves = self._complete or self._all_leave
             wait = _FAREWELL if leaves else min(silence, self._settling) if self._lost else silence
+            left = heard + wait - time.monotonic()
             try:
-                event = self._events.get(timeout=max(heard + wait - time.monotonic(), 0.0))
+                event = self._events.get(timeout=max(min(left, _PATIENCE), 0.0))
             except queue.Empty:
+                if left > _PATIENCE:
+                    stale_shared_memory.release()  # what a process that starts may wait for
+                    continue
                 if leaves and self._running:
                     self._end_the_silent()
                     continue

@@ -25,7 +25,7 @@ from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes import declare
+from lathe_rc.nodes import declare, stale_shared_memory
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.listening import Listening
 from lathe_rc.nodes.liveliness import SILENCE, Watch, liveliness
@@ -360,6 +360,7 @@ class CellNode(Listening):
         """Say now and then what it waits for: nobody else knows."""
         self._tell_due = now + next(self._tell_after)
         if missing := self.missing():
+            stale_shared_memory.release()  # what those may wait for
             self.get_logger().warning(f"waits for {'; '.join(missing)}")
             self.reporter("waits", self.get_name(), missing=missing)
 

@@ -8,11 +8,17 @@ one get lost, and its cell stands still before the first block. What a process s
 what nobody uses is removed before a node starts.
 
 DDS opens a port under a semaphore of its own, PORT_mutex: who holds that can remove a port while others start.
+
+A process that is killed while it makes a port leaves it without content, and the next that opens it waits without end
+until it is made; it cannot help itself. So the harness, and nodes that wait for others, look for such ports: see
+`release`.
 """
 
 import fcntl
 import os
 import re
+import struct
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -25,6 +31,10 @@ _SEGMENT = re.compile(r"fast(rtps|dds)_[0-9a-f]{16}")
 # Somebody opens it, listens, or leaves; or it is another user's.
 _IN_USE = (posix_ipc.BusyError, BlockingIOError, FileNotFoundError, posix_ipc.PermissionsError)
 _LOCKS = ("_el", "_sl")  # of a process that listens alone, and of those that listen together
+# The first word of a segment, by Boost.Interprocess: 0 and 1 until it is made.
+_FIRST = struct.Struct("=I")
+_MADE, _CORRUPTED = 2, 3
+_LONG = 1.0  # [s] to make a port: it takes a millisecond
 
 
 def sweep(folder: Path = FOLDER) -> list[str]:
@@ -41,6 +51,31 @@ def sweep(folder: Path = FOLDER) -> list[str]:
         ports = [file for file in ours if _PORT.fullmatch(file.name) and _remove_port(file)]
         segments = [file for file in ours if _SEGMENT.fullmatch(file.name) and _remove_segment(file)]
         return [file.name for file in (*ports, *segments)]
+
+
+def release(folder: Path = FOLDER) -> list[str]:
+    """Let those go on that wait for a port whose maker was killed; the names of such ports.
+
+    The port loses its name and is marked as corrupted: whoever waits gives it up and makes another one. Should its
+    maker live after all, it has a lost port: see `lathe_rc.nodes.lost_ports`.
+    """
+    if not folder.is_dir():
+        return []
+    with _alone(folder):
+        files = [file for file in sorted(folder.iterdir()) if _PORT.fullmatch(file.name) and _is_ours(file)]
+        return [file.name for file in files if _give_up(file)]
+
+
+def _give_up(port: Path) -> bool:
+    """Give up a port that has been in the making for too long; whether it has."""
+    with suppress(FileNotFoundError), port.open("r+b") as stream:
+        first = stream.read(_FIRST.size).ljust(_FIRST.size, b"\0")
+        if _FIRST.unpack(first)[0] < _MADE and time.time() - os.fstat(stream.fileno()).st_mtime > _LONG:
+            port.unlink()
+            stream.seek(0)
+            stream.write(_FIRST.pack(_CORRUPTED).ljust(os.sysconf("SC_PAGESIZE"), b"\0"))
+            return True
+    return False
 
 
 @contextmanager
