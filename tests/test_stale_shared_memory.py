@@ -138,13 +138,17 @@ def there(names):
 def test_an_error_of_dds_is_told_on_the_error_stream(domain):
     """Programs read what a command prints: here DDS complains that another process holds the lock of its port."""
     lock = stale_shared_memory.FOLDER / f"fastrtps_port{7400 + 250 * domain + 11}_el"
-    node = "import rclpy; rclpy.init(); rclpy.create_node('x'); print('made')"
+    # It is killed once it has told: as it ends by itself, Fast DDS may wait for itself.
+    node = "import rclpy, signal; rclpy.init(); rclpy.create_node('x'); print('made', flush=True); signal.pause()"
     with lock.open("ab") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        done = subprocess.run([sys.executable, "-c", node], capture_output=True, text=True, check=True)
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        with subprocess.Popen([sys.executable, "-c", node], text=True, **pipes) as process:
+            assert process.stdout.readline() == "made\n"
+            assert any("open_and_lock_file failed" in line for line in process.stderr)
+            process.kill()
+            assert process.stdout.read() == ""
     lock.unlink(missing_ok=True)
-    assert done.stdout == "made\n"
-    assert "open_and_lock_file failed" in done.stderr
 
 
 def test_what_a_killed_node_has_left_is_removed_and_what_a_living_one_has_is_not(domain):
