@@ -2,6 +2,7 @@
 """The learning cell against the formulas of papers 000 and 001."""
 
 import re
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lathe_rc import harness, messages
+from lathe_rc.analysis.learning import LearningLoop
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 
@@ -58,6 +60,25 @@ def test_supremum_is_the_largest_over_all_waves():
     loop = learning_loop(lead_time=2e-3)
     waves = np.linspace(0.0, 512.0, 10_001)
     assert loop.supremum(NOMINAL) == pytest.approx(np.abs(loop.operator(waves, NOMINAL)).max(), rel=1e-4)
+
+
+def test_supremum_is_computed_once_for_loops_that_are_alike(monkeypatch):
+    """Two cells have two loops; a drive that is no constant may change meanwhile."""
+    asked = []
+    operator = LearningLoop.operator
+    monkeypatch.setattr(LearningLoop, "operator", lambda *loop: asked.append(loop) or operator(*loop))
+    speed, lead = 0.987 * NOMINAL, {"lead_time": 1.4321e-3}
+    first = learning_loop(**lead)
+    found = first.worst(speed)
+    looks = len(asked)
+    assert learning_loop(**lead).worst(speed) == found
+    assert len(asked) == looks
+    assert learning_loop(lead_time=1.4322e-3).worst(speed) != found
+    size = [1.0]
+    other = replace(first, drive=lambda frequency: size[0] * first.drive(frequency))
+    assert other.worst(speed) == found
+    size[0] = 0.5
+    assert other.worst(speed) != found
 
 
 def test_supremum_rises_with_the_speed():

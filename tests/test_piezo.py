@@ -72,7 +72,7 @@ def test_drive_answers_a_sine_as_its_response_says(kind, lag, method):
     frequency = 2 * np.pi / (period * STEP)
     set_point = 0.5 * STROKE * np.sin(frequency * np.arange(40 * period) * STEP)
     position, velocity, _ = drive(machine, set_point)
-    expected = machine.response(frequency) * 0.5 * STROKE
+    expected = machine.linear.response(frequency) * 0.5 * STROKE
     assert_allclose(amplitude(position, frequency, period), expected, rtol=1e-9)
     assert abs(amplitude(velocity, frequency, period)) == pytest.approx(frequency * abs(expected), rel=1e-3)
     assert machine.saturated == 0
@@ -80,18 +80,18 @@ def test_drive_answers_a_sine_as_its_response_says(kind, lag, method):
 
 def test_response_of_the_resonance_is_the_plant():
     machine = make_drive()
-    assert np.array_equal(machine.response(TABLE), machine.plant.response(TABLE))
+    assert np.array_equal(machine.linear.response(TABLE), machine.linear.plant.response(TABLE))
 
 
 @pytest.mark.parametrize("lag", [0.0, 40e-6])
 def test_response_nears_the_ideal(lag):
     expected = ideal(TABLE, WN, ZETA) / (1 + 1j * TABLE * lag)
-    assert_allclose(make_drive(lag=lag).response(TABLE), expected, rtol=2e-4)
+    assert_allclose(make_drive(lag=lag).linear.response(TABLE), expected, rtol=2e-4)
 
 
 def test_row_of_the_uncompensated_is_that_of_the_spec():
     """spec/learning.md prints .020 .040 .061 .083; its ζ = 0.299 gives them to 4 %."""
-    left = np.abs(1.0 - make_drive().response(TABLE))
+    left = np.abs(1.0 - make_drive().linear.response(TABLE))
     assert_allclose(left, [0.0205, 0.0414, 0.0629, 0.0853], atol=2e-4)
     assert_allclose(left, [0.020, 0.040, 0.061, 0.083], rtol=0.04)
 
@@ -224,10 +224,10 @@ def test_creep_is_in_the_response():
     machine = make_drive(creep=0.05)
     frequency = 2 * np.pi * 5.0
     expected = 1 + 0.05 * sum(1 / (1 + 1j * frequency * tau) for tau in (0.01, 0.1, 1.0))
-    assert_allclose(machine.response(frequency) / make_drive().response(frequency), expected, rtol=1e-5)
+    assert_allclose(machine.linear.response(frequency) / make_drive().linear.response(frequency), expected, rtol=1e-5)
     set_point = 0.5 * STROKE * np.sin(frequency * np.arange(64_000 * 6) * STEP)
     measured = amplitude(drive(machine, set_point)[0], frequency, 12_800)
-    assert_allclose(measured, machine.response(frequency) * 0.5 * STROKE, rtol=1e-3)
+    assert_allclose(measured, machine.linear.response(frequency) * 0.5 * STROKE, rtol=1e-3)
 
 
 @given(cuts, st.sampled_from(list(PAIRS)), st.sampled_from([0.0, 40e-6]), st.sampled_from([0.0, 0.02]))
@@ -343,7 +343,7 @@ def test_compensated_sine_leaves_the_formula():
     vibration = 1e-6 * np.sin(frequency * np.arange(40 * period) * STEP)
     made = stage(use_command=False, compensates=["vibration"])
     left = vibration + advance(made, vibration)["position"]
-    expected = 1e-6 * (1 - made.drive.response(frequency))
+    expected = 1e-6 * (1 - made.drive.linear.response(frequency))
     assert_allclose(amplitude(left, frequency, period), expected, rtol=1e-8)
 
 
@@ -370,7 +370,7 @@ def test_default_drive_is_linear(values):
     command = 0.9 * STROKE * np.sin(2 * np.pi * np.arange(128_000) / 64_000)
     position = advance(made, command)["position"]
     assert_allclose(position, command, atol=1e-3 * STROKE)  # of which the lag of 41 µs makes a quarter
-    assert_allclose(made.responses()["fine/command"](TABLE), make_drive().response(TABLE))
+    assert_allclose(made.responses()["fine/command"](TABLE), make_drive().linear.response(TABLE))
 
 
 def test_drive_is_identified_from_its_own_signals():

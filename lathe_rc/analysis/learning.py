@@ -8,6 +8,7 @@ up to the grid's Nyquist limit. Q, Z and the interpolators are taken as they run
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,7 @@ import numpy.typing as npt
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.interpolation import cubic_response, derivative_responses
 from lathe_rc.control.q_filter import QFilter
+from lathe_rc.plants.linear import Constant
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -30,7 +32,7 @@ def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[floa
         operator: the factor at waves per revolution, shape (n,).
         highest: waves per revolution.
     """
-    waves = np.linspace(0.0, highest, _COARSE)
+    waves = _waves_up_to(highest)
     size = np.abs(operator(waves))
     if not np.isfinite(size).all():
         place = int(np.argmin(np.isfinite(size)))
@@ -39,9 +41,17 @@ def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[floa
     peaks = np.append(inner, (0, _COARSE - 1))
     peaks = peaks[np.argsort(size[peaks])[-_PEAKS:]]
     beside = highest / (_COARSE - 1)
-    near = np.linspace(waves[peaks] - beside, waves[peaks] + beside, _FINE, axis=1).ravel().clip(0.0, highest)
+    near = np.linspace(waves[peaks] - beside, waves[peaks] + beside, _FINE).T.ravel().clip(0.0, highest)
     fine = np.abs(operator(near))
     return float(fine.max()), float(near[np.argmax(fine)])
+
+
+@lru_cache(maxsize=64)
+def _waves_up_to(highest: float) -> Array:
+    """The waves per revolution at which the peaks are looked for."""
+    waves = np.linspace(0.0, highest, _COARSE)
+    waves.setflags(write=False)
+    return waves
 
 
 @dataclass(frozen=True)
@@ -72,19 +82,21 @@ class LearningLoop:
     variable_lead: bool
     step: float
 
-    def _correction(self, waves: Array, speed: float) -> Complex:
+    def _correction(self, waves: Array, speed: float) -> Array | Complex:
         """1/W0 with the interpolation of the memory, without the lead."""
         correction, radians = self.correction, 2 * np.pi * waves / self.grid
+        law = correction.law
+        if law is CorrectionLaw.NONE:
+            return cubic_response(radians)
         a1, a2 = correction.inverse
-        p, law = 1j * waves * speed, correction.law
+        p = 1j * waves * speed
         if law in (CorrectionLaw.SECOND_ORDER_INVERSE, CorrectionLaw.SECOND_ORDER_INVERSE_DYNAMIC):
             read, first, second = derivative_responses(radians)
             per_second = self.grid / (2 * np.pi) * speed
             return np.asarray(read + a1 * per_second * first + a2 * per_second**2 * second)
-        factor = np.ones_like(p)
         if law is CorrectionLaw.LEAD_LAG:
             factor = (1 + p * correction.lead) / (1 + p * correction.lag)
-        elif law is CorrectionLaw.EXACT:
+        else:
             angular = 1j * waves * self.nominal
             factor = (1 + a1 * p + a2 * p**2) / (1 + a1 * angular + a2 * angular**2)
         return np.asarray(cubic_response(radians) * factor)
@@ -94,7 +106,10 @@ class LearningLoop:
         frequency = waves * speed
         lead = self.lead_time * (speed if self.variable_lead else self.nominal) + self.constant_lead
         measured = cubic_response(frequency * self.step)
-        return np.asarray(self.drive(frequency) * np.exp(1j * waves * lead) * self._correction(waves, speed) * measured)
+        turned = np.zeros(waves.shape, np.complex128)
+        np.multiply(waves, lead, out=turned.imag)
+        np.exp(turned, out=turned)
+        return np.asarray(self.drive(frequency) * turned * self._correction(waves, speed) * measured)
 
     def operator(self, waves: Array, speed: float) -> Complex:
         """Q - γZ, the factor of a cycle, at ``waves`` per revolution, shape (n,)."""
@@ -104,10 +119,10 @@ class LearningLoop:
     def worst(self, speed: float) -> tuple[float, float]:
         """Supremum of the magnitude of Q - γZ at ``speed`` [rad/s] and the waves per revolution where it is.
 
-        Over all waves up to the Nyquist limits of grid and sampling.
+        Over all waves up to the Nyquist limits of grid and sampling. It is computed once for loops that are alike.
         """
-        highest = min(self.grid / 2, np.pi / (self.step * speed))
-        return supremum(lambda waves: self.operator(waves, speed), highest)
+        is_constant = isinstance(getattr(self.drive, "__self__", None), Constant)
+        return (_worst_of_alike if is_constant else _worst)(self, speed)
 
     def supremum(self, speed: float) -> float:
         """See `worst`."""
@@ -117,3 +132,12 @@ class LearningLoop:
         """δ/Xd = (1 - Q)/(γZ + 1 - Q), what is left after many cycles (paper 001, eq. 3), shape (n,)."""
         q = self.q.response(2 * np.pi * waves / self.grid)
         return np.asarray((1.0 - q) / (self.gain * self.corrected_drive(waves, speed) + 1.0 - q))
+
+
+def _worst(loop: LearningLoop, speed: float) -> tuple[float, float]:
+    """See `LearningLoop.worst`."""
+    highest = min(loop.grid / 2, np.pi / (loop.step * speed))
+    return supremum(lambda waves: loop.operator(waves, speed), highest)
+
+
+_worst_of_alike = lru_cache(maxsize=256)(_worst)

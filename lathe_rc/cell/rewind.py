@@ -10,6 +10,7 @@ import operator
 import types
 from collections.abc import Callable
 from functools import cached_property
+from itertools import compress
 from pathlib import PurePath
 from typing import Any
 
@@ -168,6 +169,6 @@ def _same(stage: Stage, table: NodeParameters) -> bool:
         return True
     if type(before) is not type(table):
         return False
-    ours = is_ours(type(stage).__module__)
     old, new = vars(before), vars(table)
-    return all(old[name] is value or (ours and name == "run_id") for name, value in new.items())
+    differing = [*compress(new, map(operator.is_not, map(old.get, new), new.values()))]
+    return not differing or (differing == ["run_id"] and is_ours(type(stage).__module__))

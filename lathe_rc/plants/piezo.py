@@ -12,6 +12,8 @@ within the stroke and the voltage within its range; samples where that cuts some
 Source: paper 001 (Wpk of eqs 6-9); parameters of spec/learning.md.
 """
 
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +22,7 @@ import numpy.typing as npt
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.hysteresis import LINEAR, Hysteresis, Law, advance, advance_along
-from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
+from lathe_rc.plants.linear import Constant, DiscretePlant, Discretisation, discretise, second_order
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -128,6 +130,29 @@ def _row(lag: DiscretePlant) -> Array:
     return np.array([lag.transition[0, 0], lag.weights[0, 0], lag.weights[0, 1]])
 
 
+@dataclass(frozen=True)
+class LinearStack:
+    """Amplifier and creep; the hysteresis is taken as linearised to a gain of 1.
+
+    Attributes:
+        amplifier: its lag, if any.
+        creep: its lags.
+        creep_gain: of each.
+    """
+
+    amplifier: DiscretePlant | None
+    creep: tuple[DiscretePlant, ...]
+    creep_gain: float
+
+    def response(self, frequency: npt.ArrayLike) -> Complex:
+        """Response of the extension to the set point at ``frequency`` [rad/s]."""
+        frequency = np.asarray(frequency, dtype=np.float64)
+        whole = np.ones(frequency.shape, dtype=np.complex128)
+        for lag in self.creep:
+            whole += self.creep_gain * lag.response(frequency)
+        return whole * self.amplifier.response(frequency) if self.amplifier else whole
+
+
 class Stack:
     """Amplifier and ceramics, up to the extension that a stack without load and mass would have.
 
@@ -145,6 +170,7 @@ class Stack:
     Attributes:
         table: its constants for `extend`.
         state: its memory for `extend`.
+        linear: what it is without hysteresis and limits.
         steepest: largest change of the extension in a sample, over that of the set point in the same sample.
 
     Raises:
@@ -164,10 +190,13 @@ class Stack:
         step: float,
         method: Discretisation,
     ) -> None:
-        self._amplifier = _lag(amplifier_lag, step, method) if amplifier_lag else None
-        self._creep = [_lag(time, step, method) for time in creep_times] if creep_per_decade else []
-        amplifier = _row(self._amplifier) if self._amplifier else np.array([0.0, 1.0, 0.0])
-        creep = np.array([_row(lag) for lag in self._creep]).reshape(-1, 3)
+        self.linear = LinearStack(
+            _lag(amplifier_lag, step, method) if amplifier_lag else None,
+            tuple(_lag(time, step, method) for time in creep_times) if creep_per_decade else (),
+            creep_per_decade,
+        )
+        amplifier = _row(self.linear.amplifier) if self.linear.amplifier else np.array([0.0, 1.0, 0.0])
+        creep = np.array([_row(lag) for lag in self.linear.creep]).reshape(-1, 3)
         none = np.empty(0)
         inverse_state = inverse.state.copy() if inverse else none
         forward_state = hysteresis.state.copy() if hysteresis else none
@@ -190,14 +219,6 @@ class Stack:
             * (hysteresis.steepest if hysteresis else 1.0)
             * (1.0 + creep_per_decade * creep[:, 1].sum())
         )
-
-    def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Amplifier and creep at ``frequency`` [rad/s]; the hysteresis is taken as linearised to a gain of 1."""
-        frequency = np.asarray(frequency, dtype=np.float64)
-        whole = np.ones(frequency.shape, dtype=np.complex128)
-        for lag in self._creep:
-            whole += self.table.creep_gain * lag.response(frequency)
-        return whole * self._amplifier.response(frequency) if self._amplifier else whole
 
 
 class FineTable(NamedTuple):
@@ -240,6 +261,26 @@ def advance_fine(drive: FineTable, set_point: Array, position: Array, velocity: 
     state[0], state[1], state[2] = x, v, before
 
 
+@dataclass(frozen=True)
+class LinearPiezo(Constant):
+    """Wpk of paper 001: the linearised drive, as its difference equations run.
+
+    Attributes:
+        stack: amplifier and ceramics.
+        plant: the resonance.
+    """
+
+    stack: LinearStack
+    plant: DiscretePlant
+
+    def response(self, frequency: npt.ArrayLike) -> Complex:
+        """Response of the position to the set point at ``frequency`` [rad/s]."""
+        return np.asarray(self.stack.response(frequency) * self.plant.response(frequency))
+
+
+_linear = lru_cache(maxsize=64)(LinearPiezo)
+
+
 class PiezoDrive:
     """The drive as a machine: set point in, motion and voltage out.
 
@@ -252,7 +293,7 @@ class PiezoDrive:
         method: discretisation, see `lathe_rc.plants.linear.discretise`.
 
     Attributes:
-        plant: the difference equation of the resonance.
+        linear: what it is without hysteresis and limits.
         table: for `advance_fine`.
     """
 
@@ -266,11 +307,11 @@ class PiezoDrive:
         step: float,
         method: Discretisation,
     ) -> None:
-        self.plant: DiscretePlant = discretise(*second_order(natural_frequency, damping), 0.0, step, method)
-        self._stack = stack
+        plant = discretise(*second_order(natural_frequency, damping), 0.0, step, method)
+        self.linear = _linear(stack.linear, plant)
         self.table = FineTable(
-            transition=self.plant.transition,
-            weights=self.plant.weights,
+            transition=plant.transition,
+            weights=plant.weights,
             stack=stack.table,
             memory=stack.state,
             full_voltage=full_voltage,
@@ -282,10 +323,6 @@ class PiezoDrive:
     def saturated(self) -> int:
         """Samples so far in which the set point or the voltage was cut off."""
         return int(self.table.saturated[0])
-
-    def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Wpk of paper 001 at ``frequency`` [rad/s]: linearised drive, as its difference equations run."""
-        return np.asarray(self._stack.response(frequency) * self.plant.response(frequency))
 
     def block(self, set_point: Array, position: Array, velocity: Array, voltage: Array) -> None:
         """Step through a block; arrays of shape (n,) [m, m, m/s, V]. At rest at 0 before the first."""

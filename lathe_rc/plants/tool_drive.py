@@ -312,7 +312,7 @@ class ToolDrive:
     def _with_feedback(self, alone: Complex, frequency: npt.ArrayLike) -> Complex:
         if self._piezo is None or not self._piezo.feedback:
             return alone
-        reaction = self._piezo.stack.response(frequency) * self._of(_CARRIAGE, frequency, command=False)
+        reaction = self._piezo.stack.linear.response(frequency) * self._of(_CARRIAGE, frequency, command=False)
         return np.asarray(alone / (1.0 + reaction))
 
     def coarse_response(self, frequency: npt.ArrayLike) -> Complex:
@@ -322,7 +322,7 @@ class ToolDrive:
     def fine_response(self, frequency: npt.ArrayLike) -> Complex:
         """Tool over the piezo's set point at ``frequency`` [rad/s], without limits and force."""
         assert self._piezo is not None, "there is one"
-        alone = self._piezo.stack.response(frequency) * self._of(_TOOL, frequency, command=False)
+        alone = self._piezo.stack.linear.response(frequency) * self._of(_TOOL, frequency, command=False)
         return self._with_feedback(alone, frequency)
 
 

@@ -89,7 +89,7 @@ class LearningController(Learner):
             bandwidth=parameters.identification_bandwidth,
             forgetting=parameters.identification_forgetting,
             step=parameters.step,
-            block=MAX_BLOCK,
+            block=MAX_BLOCK if parameters.identify else 0,
         )
         outputs = [Output("coarse/command", messages.COMMAND)]
         if parameters.publish_margin:

@@ -2,6 +2,7 @@
 """Parameters of the learning controller, and the pieces of its law that they describe."""
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Annotated, Literal, cast
 
 import numpy as np
@@ -25,6 +26,12 @@ Q_FILTERS: Registry[QFilter] = Registry(
     "lathe_rc.q_filters",
 )
 _CORRECTIONS = {law.name.lower(): law for law in CorrectionLaw}
+
+
+@lru_cache(maxsize=64)
+def _own_q(make: Callable[..., QFilter], *numbers: float) -> QFilter:
+    """One of our filters, which has no memory: those that are alike are one, and so are the loops with them."""
+    return make(*numbers)
 
 
 class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
@@ -119,12 +126,12 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         if self.q_filter == "fir":
             edge = 1.0 / (self.nominal_speed * per_point)
             with about(node, "q_pass", "q_stop", "q_ripple"):
-                return LowPass(self.q_pass * edge, self.q_stop * edge, self.q_ripple, self.cycle_points)
+                return _own_q(LowPass, self.q_pass * edge, self.q_stop * edge, self.q_ripple, self.cycle_points)
         make = cast("Callable[[float, int], QFilter]", Q_FILTERS[self.q_filter])
         width = self.q_time * self.nominal_speed * per_point
         if self.q_filter in Q_FILTERS.own:
             with about(node, "q_time"):
-                return make(width, self.cycle_points)
+                return _own_q(make, width, self.cycle_points)
         with about(node, "q_filter"), code_of_others(repr(self.q_filter)):
             made = make(width, self.cycle_points)
             check(made)

@@ -200,7 +200,7 @@ class PiezoActuator(Drive):
 
     def responses(self) -> Mapping[str, Response]:
         """See `Drive`."""
-        return {"fine/command": self.drive.response}
+        return {"fine/command": self.drive.linear.response}
 
     def finish(self, index: int) -> list[Sparse]:
         """See `Stage`."""
