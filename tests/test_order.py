@@ -105,7 +105,7 @@ RUNS = st.builds(
 
 
 @given(run=RUNS, data=st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_no_arrival_changes_the_bag(tmp_path_factory, run, data):
     """A bag is the same whoever is heard first, and whether blocks come as bytes or as arrays.
 
@@ -126,7 +126,7 @@ def test_no_arrival_changes_the_bag(tmp_path_factory, run, data):
 
 
 @given(run=RUNS, chunk=st.integers(1, 30))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_many_blocks_at_once_are_the_same_bag(tmp_path_factory, run, chunk):
     path = tmp_path_factory.mktemp("order") / "bag"
     writer, merger = run.begin(path)

@@ -54,10 +54,6 @@ def test_the_plot_is_as_wide_as_the_terminal_and_honours_no_color():
     assert COLOUR not in "".join(lines)
 
 
-def test_else_it_has_colours():
-    assert COLOUR in in_terminal(width=80)
-
-
 class Terminal(io.StringIO):
     def isatty(self):
         return True
@@ -65,9 +61,10 @@ class Terminal(io.StringIO):
 
 @pytest.mark.parametrize(("kind", "width", "drawn"), [("xterm", 80, True), ("dumb", 80, False), ("xterm", 30, False)])
 def test_a_terminal_that_cannot_show_it_gets_none(kind, width, drawn):
+    """Others get it in colours, unless nobody wants any."""
     console = Console(file=Terminal(), width=width, _environ={"TERM": kind})
     plot.show(run(), console)
-    assert (HEADING in console.file.getvalue()) == drawn
+    assert (HEADING in console.file.getvalue()) == (COLOUR in console.file.getvalue()) == drawn
 
 
 def test_neither_a_pipe_nor_json_has_it():

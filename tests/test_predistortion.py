@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from cells import cuts, in_blocks
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
@@ -104,6 +104,7 @@ def test_learning_converges_at_the_rate_of_the_formula(compliance, stiffness, ga
 
 
 @given(st.floats(0.7, 1.3), st.floats(0.3, 1.7))
+@settings(max_examples=30)
 def test_learning_converges_for_other_laws(exponent, gain):
     law, path = power(exponent, 150 / DEPTH**exponent), Predistortion(HEIGHTS, np.zeros(61))
     for _ in range(80):
