@@ -23,6 +23,7 @@ from lathe_rc.bag import reader
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.liveliness import this_host
+from lathe_rc.nodes.losses import LossWatch
 from lathe_rc.nodes.stage_node import StageNode
 
 WALK = [  # transition, whether it is possible, and where the node is then
@@ -220,6 +221,15 @@ def test_what_is_missing_is_told_now_and_then_until_it_is_there(tool):
     node._cell, node._ready = CellState.RUNNING, True
     node.tick(begun + 131.0)
     assert [event for event, _ in told].count("waits") == 5
+
+
+def test_who_stands_still_is_named_and_not_who_waits_for_it():
+    """Members tell how far they are when they pass a multiple of a quarter of the window, some a block later."""
+    told = {"/learning_controller": 17, "/tool": 17, "/recorder": 16}
+    watch = SimpleNamespace(_completed=told, _progress_step=16)
+    assert LossWatch._slowest.fget(watch) == "/learning_controller"
+    told["/recorder"] = 15
+    assert LossWatch._slowest.fget(watch) == "/recorder"
 
 
 def test_who_is_shut_down_in_the_middle_of_a_run_makes_the_cell_safe(manager, domain, tmp_path):

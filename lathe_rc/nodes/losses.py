@@ -49,7 +49,11 @@ class LossWatch(StageNode):
 
     @property
     def _slowest(self) -> str:
-        return min(self._completed, key=lambda name: self._completed[name], default="")
+        """The first of the members that have told of least: who waits for another one may have told of fewer blocks.
+
+        They tell when they pass a multiple of some blocks, and one that computes two at once tells of one more.
+        """
+        return min(self._completed, key=lambda name: self._completed[name] // self._progress_step, default="")
 
     @property
     def _least(self) -> int:
