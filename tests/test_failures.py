@@ -188,12 +188,14 @@ def test_without_the_harness_every_process_of_a_cell_that_lost_a_member_says_so_
     assert check(tmp_path / "bag").exit_code == 3, "what the tool published is held"
 
 
+#: Members are waited for as long as a time master: a busy machine keeps nobody silent for that.
+CAUTIOUS = [*RUN, "spindle_encoder.stall_reaction=safe", "spindle_encoder.stall_time=2.0"]
+
+
 def test_a_member_that_stalls_is_lost_if_the_cell_shall_not_wait(tmp_path):
-    # As long as a time master is waited for: a busy machine keeps nobody silent for that.
-    sets = [*RUN, "spindle_encoder.stall_reaction=safe", "spindle_encoder.stall_time=2.0"]
     killer = Killer("tool", signal.SIGSTOP)
     with pytest.raises(LatheError, match=r"^/tool fell silent: safe state from sample \d+ on$"):
-        harness.run(load(PISTON, sets), mode="processes", bag=tmp_path / "bag", watch=killer)
+        harness.run(load(PISTON, CAUTIOUS), mode="processes", bag=tmp_path / "bag", watch=killer)
     assert not check(tmp_path / "bag").wrong
     assert not alive(killer.pids["tool"])
 
@@ -202,7 +204,7 @@ def test_a_time_master_that_stalls_is_given_up_by_name_if_the_cell_shall_not_wai
     killer = Killer("spindle_encoder", signal.SIGSTOP)
     with pytest.raises(LatheError, match=r"^/spindle_encoder, the time master, has been silent for 2 s: no sample"):
         harness.run(
-            load(PISTON, [*RUN, "spindle_encoder.stall_reaction=safe"]),
+            load(PISTON, CAUTIOUS),
             mode="processes",
             bag=tmp_path / "bag",
             watch=killer,
@@ -212,8 +214,7 @@ def test_a_time_master_that_stalls_is_given_up_by_name_if_the_cell_shall_not_wai
 
 
 def test_a_time_master_that_was_given_up_and_comes_back_says_so_and_computes_no_more(tmp_path):
-    sets = [*RUN, "spindle_encoder.stall_reaction=safe"]
-    cell = harness.with_recorder(load(PISTON, sets), tmp_path / "bag", keep=True)
+    cell = harness.with_recorder(load(PISTON, CAUTIOUS), tmp_path / "bag", keep=True)
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
         processes.wait_for("cycle")
         os.kill(processes.pids["spindle_encoder"], signal.SIGSTOP)

@@ -10,7 +10,7 @@ from lathe_rc_msgs.msg import CellState, Member
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.liveliness import SILENCE
-from lathe_rc.nodes.shell import given_up, why_failed
+from lathe_rc.nodes.shell import GIVEN_UP, given_up, why_failed
 from lathe_rc.nodes.stage_node import StageNode
 
 _GONE = 0.2  # [s] for messages to be acknowledged, if who has died never will
@@ -49,9 +49,10 @@ class LossWatch(StageNode):
 
     @property
     def _slowest(self) -> str:
-        """The first of the members that have told of least: who waits for another one may have told of fewer blocks.
+        """The first of the members that are least far, as far as that is known.
 
-        They tell when they pass a multiple of some blocks, and one that computes two at once tells of one more.
+        They report blocks when they pass a multiple of some, and one that computes two at once reports one more: who
+        waits for another member may have reported less.
         """
         return min(self._completed, key=lambda name: self._completed[name] // self._progress_step, default="")
 
@@ -113,8 +114,12 @@ class LossWatch(StageNode):
                 self._lose(dict.fromkeys(lost, "fell silent"))
 
     def _forgive(self, passed: float) -> None:
-        """While it stood still itself, for so long [s], it could not hear anybody: that is nobody else's silence."""
+        """While it stood still itself, for so long [s], it could not hear anybody: that is nobody else's silence.
+
+        Those that have given it up meanwhile say so again and again: it waits for that before it does without anybody.
+        """
         if passed > SILENCE:
+            passed += GIVEN_UP if passed > GIVEN_UP else 0.0
             self._heard += passed
             self._members_moved = {name: moved + passed for name, moved in self._members_moved.items()}
             self.watch.silent = {name: since + passed for name, since in self.watch.silent.items()}

@@ -38,7 +38,8 @@ _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _REPEAT_PERIOD = 0.5  # [s] between announcements before the run, in the safe state, and after it has given up
 _LATCHED_DEPTH = 256
 _PATIENCE = 2.0  # [s] for others to acknowledge the last messages
-_GIVEN_UP = 2.0  # [s] of silence after which a time master is lost in a cell that does not wait
+GIVEN_UP = 2.0  #: [s] of silence after which a time master is lost in a cell that does not wait
+_LAST_ANSWER = 1.0  # [s] until who has asked for its shutdown has the answer: DDS does not say when
 _MOST_MEMBERS = 256  # announced names that are kept
 _TOLD_AFTER = (2.0, 8.0, 30.0)  # [s] of waiting until it is told what for; the last again and again
 
@@ -91,7 +92,7 @@ class CellNode(Listening):
         self.master: Member | None = None
         self._put_off: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals that came while deactivated
         self._told_unknown: set[str] = set()
-        self._tell_due = math.inf
+        self._tell_due = self._leave_due = math.inf
         self._tell_after: Iterator[float] = iter(())
         self._ready = self._safe = False
         self._without: set[str] = set()  # members that are lost
@@ -167,8 +168,7 @@ class CellNode(Listening):
         else:
             self.finish()
             self._clean_up()
-            self.done = True
-            self.reporter("done", self.get_name(), cpu_s=time.process_time())
+            self._leave_due = time.monotonic() + _LAST_ANSWER
         self.active = False
 
     def _endpoints(self) -> list[set[Any]]:
@@ -332,12 +332,12 @@ class CellNode(Listening):
         ended = name in self.watch.ended()
         if self.failure:
             # A master that comes back in between shall hear why there is nobody any more.
-            self.done = self.done or ended or silent > 2.0 * _GIVEN_UP
-        elif (ended or silent > _GIVEN_UP) and self.over:
+            self.done = self.done or ended or silent > 2.0 * GIVEN_UP
+        elif (ended or silent > GIVEN_UP) and self.over:
             self._leave([])
         elif ended:
             self.fail(LatheError(f"{name}, the time master, is lost: no sample follows"), cause="abandoned")
-        elif silent > _GIVEN_UP:
+        elif silent > GIVEN_UP:
             self.fail(LatheError(given_up(name)), cause="masterless")
 
     def _name_a_silent_master(self, name: str, now: float) -> None:
@@ -381,6 +381,8 @@ class CellNode(Listening):
     def tick(self, now: float) -> None:
         """Do what is due by the wall clock; nothing here touches a sample."""
         self.next_tick = now + _TICK if not self._ready else now + 0.1
+        if now >= self._leave_due:
+            self._leave([])
         if self._host:
             if not self._ready:
                 self.attempt(self._settle)
@@ -427,4 +429,4 @@ def why_failed(member: Member) -> str:
 
 def given_up(master: str) -> str:
     """The announcement of members that go on without a silent time master."""
-    return f"{master}, the time master, has been silent for {_GIVEN_UP:g} s: no sample follows"
+    return f"{master}, the time master, has been silent for {GIVEN_UP:g} s: no sample follows"
