@@ -32,7 +32,7 @@ _CORES = os.cpu_count() or 1
 
 def variations(name: str, count: int) -> Iterator[Scenario]:
     """Scenarios of a batch."""
-    base = loaded(name, _REVOLUTIONS, *OVERRIDES[name])
+    base = loaded(name, _REVOLUTIONS, *OVERRIDES[name]).named()  # as a sweep has it: cells need no run id of their own
     for k in range(count):
         values = {
             "learning_controller.lead_time": 1.425e-3 * (1.0 + 0.01 * k / count),

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 
 from lathe_rc.errors import InputError
 from lathe_rc.signals import profile_table
+from lathe_rc.signals.kept_table import kept
 from lathe_rc.signals.measured_profile import Measured, read_csv
 from lathe_rc.signals.profile import Harmonics, Piston, Polygon
 from lathe_rc.signals.profile_table import ProfileTable
@@ -282,3 +283,55 @@ def test_columns_in_another_unit_are_refused_with_a_guess(tmp_path, rows, said):
 
 def test_a_part_without_form_is_in_no_other_unit(tmp_path):
     assert not read_csv(write(tmp_path, HEAD + "0,0\n90,0\n180,0\n")).radius.any()
+
+
+# --- tables on the disk
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Where tables are kept."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    return tmp_path / "tables"
+
+
+def test_a_table_is_made_once_and_read_from_then_on(folder):
+    made = []
+
+    def table(content):
+        return kept(content, lambda: made.append(content) or np.array([[1.0 / 3.0], [len(made)]]))
+
+    first = table(b"one")
+    assert np.array_equal(table(b"one"), first)
+    assert table(b"two")[1] == 2.0
+    assert made == [b"one", b"two"]
+    (file, *_) = sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime)
+    assert len(list(folder.iterdir())) == 2
+    for damage in (b"", file.read_bytes()[:-30], file.read_bytes().replace(first.tobytes(), bytes(16))):
+        file.write_bytes(damage)
+        assert table(b"one")[1] == len(made)
+    assert made == [b"one", b"two", b"one", b"one", b"one"]
+
+
+def test_few_tables_are_kept_and_none_where_nothing_can_be_written(folder):
+    for number in range(40):
+        kept(b"%d" % number, lambda: np.zeros(1))
+    assert len(list(folder.iterdir())) == 32
+    for file in folder.iterdir():
+        file.unlink()
+    folder.rmdir()
+    folder.write_text("no folder")
+    assert kept(b"one", lambda: np.ones(1)) == 1.0
+
+
+def test_the_form_of_a_file_is_kept_with_its_bits_and_no_other(folder):
+    """A form that is computed varies with its parameters; a sweep would keep thousands."""
+    points = np.linspace(0.0, TURN, 7)[:-1]
+    for form, files in [(Piston(0.0, 0.0, 30e-6, 0.06, 0.0), 0), (Measured(points, np.zeros(1), points[None]), 1)]:
+        tables = []
+        for _ in range(2):
+            profile_table._table.cache_clear()  # as in another process
+            tables.append(profile_table.tabulated(form).table)
+        assert tables[0].tobytes() == tables[1].tobytes() == ProfileTable(form).table.tobytes()
+        assert not tables[1].flags.writeable
+        assert len(list(folder.glob("*"))) == files

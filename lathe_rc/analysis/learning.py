@@ -106,10 +106,7 @@ class LearningLoop:
         frequency = waves * speed
         lead = self.lead_time * (speed if self.variable_lead else self.nominal) + self.constant_lead
         measured = cubic_response(frequency * self.step)
-        turned = np.zeros(waves.shape, np.complex128)
-        np.multiply(waves, lead, out=turned.imag)
-        np.exp(turned, out=turned)
-        return np.asarray(self.drive(frequency) * turned * self._correction(waves, speed) * measured)
+        return np.asarray(self.drive(frequency) * np.exp(1j * waves * lead) * self._correction(waves, speed) * measured)
 
     def operator(self, waves: Array, speed: float) -> Complex:
         """Q - γZ, the factor of a cycle, at ``waves`` per revolution, shape (n,)."""

@@ -68,7 +68,8 @@ def run(scenarios: Iterable[Scenario], keep: Make[K_co], *, threads: int | None 
     """Run cells to their ends.
 
     Args:
-        scenarios: of the cells; each needs a number of revolutions. They are asked for as their turn comes.
+        scenarios: of the cells; each needs a number of revolutions. They are asked for as their turn comes; variations
+            of a `Scenario.named` are made in half the time.
         keep: what to keep of each: `Errors`, `partial(Topics, topics=...)`, or a keeper of one's own.
         threads: that compute; None: one for each core.
 

@@ -291,6 +291,8 @@ class RepetitiveController:
 
     def ended(self) -> list[Cycle]:
         """The cycles that have ended since the last call."""
+        if not self.table.whole[LOGGED]:
+            return []
         logged = self.table.log[: self.table.whole[LOGGED]].tolist()
         self.table.whole[LOGGED] = 0
         return [self._cycle_of(*row) for row in logged]

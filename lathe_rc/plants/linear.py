@@ -2,10 +2,8 @@
 """Linear drives behind a delay, discretised so that nothing of the delay is rounded away."""
 
 import math
-import operator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import dropwhile
 from typing import Literal
 
 import numpy as np
@@ -55,26 +53,8 @@ class DiscretePlant(Constant):
         matrices = np.repeat(self.transition[np.newaxis], 4, axis=0)
         matrices[1:, :, 0] -= self.weights.T
         eigenvalues = np.linalg.eigvals(matrices)
-        bottom, *tops = map(_with_roots, eigenvalues)
+        bottom, *tops = [np.asarray(np.poly(roots if roots.imag.any() else roots.real)) for roots in eigenvalues]
         return [top - bottom for top in tops], bottom
-
-
-def _with_roots(roots: Array | Complex) -> Array:
-    """Coefficients of the polynomial with the roots of a real one; `numpy.poly` looks twice whether they are."""
-    made = np.ones(1)
-    for root in roots if roots.imag.any() else roots.real:
-        made = np.convolve(made, np.array([1.0, -root]))
-    return made.real
-
-
-def _polynomial(coefficients: Array, z: Complex) -> Complex:
-    """The value at ``z``, shape (n,), as `numpy.polyval` gives it, without multiplying by leading zeros."""
-    leading, *others = dropwhile(operator.not_, coefficients.tolist()) if coefficients.any() else (0.0,)
-    value = np.full(z.shape, leading, np.complex128)
-    for each in others:
-        value *= z
-        value += each
-    return value
 
 
 @lru_cache(maxsize=64)
@@ -82,8 +62,8 @@ def _response(plant: DiscretePlant, content: bytes) -> Complex:
     """The response of the bytes of the frequencies: checks of cells that are alike ask for the same."""
     z, shifts = _shifts(content, plant.step, plant.delay)
     tops, bottom = plant._rational  # noqa: SLF001 - its own
-    below = _polynomial(bottom, z)
-    return np.asarray(sum(_polynomial(top, z) / below * shift for top, shift in zip(tops, shifts, strict=True)))
+    below = np.polyval(bottom, z)
+    return np.asarray(sum(np.polyval(top, z) / below * shift for top, shift in zip(tops, shifts, strict=True)))
 
 
 @lru_cache(maxsize=64)

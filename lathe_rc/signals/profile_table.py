@@ -6,14 +6,17 @@ derivatives for the feasibility check.
 """
 
 import pickle
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
 from lathe_rc.jit import inlined, kernel
+from lathe_rc.signals.kept_table import kept
+from lathe_rc.signals.measured_profile import Measured
 from lathe_rc.signals.profile import Profile
 
 Array = npt.NDArray[np.float64]
@@ -153,18 +156,20 @@ class _ByContent:
 
     def __init__(self, profile: Profile) -> None:
         self.profile = profile
-        self._content = pickle.dumps(profile)
+        self.content = pickle.dumps(profile)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ByContent) and self._content == other._content
+        return isinstance(other, _ByContent) and self.content == other.content
 
     def __hash__(self) -> int:
-        return hash(self._content)
+        return hash(self.content)
 
 
 @lru_cache(maxsize=8)
-def _table(profile: _ByContent) -> "ProfileTable":
-    return ProfileTable(profile.profile)
+def _table(given: _ByContent) -> "ProfileTable":
+    if isinstance(given.profile, Measured):  # a file: others vary with parameters, and a sweep would keep thousands
+        return ProfileTable(given.profile, made=partial(kept, given.content))
+    return ProfileTable(given.profile)
 
 
 def tabulated(profile: Profile) -> "ProfileTable":
@@ -178,26 +183,36 @@ class ProfileTable:
     Args:
         profile: the form.
         points: intervals of the periodic cubic spline per revolution, a power of two.
+        made: gives what a function makes, which it may have from before; None: the function is called.
 
     Attributes:
         heights: [m], shape (m,).
         table: polynomial coefficients of each interval, highest power first, shape (m, points, 4); not to be written.
     """
 
-    def __init__(self, profile: Profile, points: int = 4096) -> None:
-        angle = np.linspace(0.0, _TURN, points + 1)
+    def __init__(
+        self, profile: Profile, points: int = 4096, made: Callable[[Callable[[], Array]], Array] | None = None
+    ) -> None:
         self.heights = np.ascontiguousarray(profile.heights)
-        self.table = np.empty((self.heights.size, points, 4))
-        for row, height in zip(self.table, self.heights, strict=True):
-            values = profile.deviation(angle, float(height))
-            values[-1] = values[0]
-            spline = scipy.interpolate.CubicSpline(np.arange(points + 1.0), values, bc_type="periodic")
-            row[:] = spline.c.T
+        make = partial(_splines, profile, points)
+        self.table = made(make) if made else make()
         self.table.flags.writeable = False
 
     def demand(self, speed: float, acceleration: float, feed: float) -> Demand:
         """The profile's demand at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], ``feed`` in m/rev."""
         return _demand(self, speed, acceleration, feed)
+
+
+def _splines(profile: Profile, points: int) -> Array:
+    """See `ProfileTable.table`."""
+    angle = np.linspace(0.0, _TURN, points + 1)
+    table = np.empty((profile.heights.size, points, 4))
+    for row, height in zip(table, profile.heights, strict=True):
+        values = profile.deviation(angle, float(height))
+        values[-1] = values[0]
+        spline = scipy.interpolate.CubicSpline(np.arange(points + 1.0), values, bc_type="periodic")
+        row[:] = spline.c.T
+    return table
 
 
 @lru_cache(maxsize=8)

@@ -269,23 +269,23 @@ class LearningController(Learner):
                     self.correction, natural_frequency=found.natural_frequency, damping=found.damping
                 )
         start, self._cycle_start = self._cycle_start, cycle.sample_index
-        seconds = (cycle.sample_index - start) * self.shared.step
-        unheard = not self._asks and _STATUS in self.unheard  # a margin costs as much as a cycle of samples
-        status = {
-            "cycle": cycle.number,
-            "rms_error": cycle.rms,
-            "max_error": cycle.largest,
-            "contraction": cycle.contraction,
-            "stability_margin": np.nan
-            if unheard
-            else self._margins.at(self, 2 * np.pi * parameters.cycle_revolutions / seconds, self._model),
-            "learning": cycle.learning,
-            "joined": cycle.joined,
-            "model_natural_frequency": self._model.natural_frequency,
-            "model_damping": self._model.damping,
-            "model_residual": self._model.residual,
-        }
-        sparse = [Sparse(_STATUS, messages.LEARNING, cycle.sample_index, status)]
+        sparse: list[Sparse] = []
+        if self._asks or _STATUS not in self.unheard:  # a margin costs as much as a cycle of samples
+            seconds = (cycle.sample_index - start) * self.shared.step
+            speed = 2 * np.pi * parameters.cycle_revolutions / seconds
+            status = {
+                "cycle": cycle.number,
+                "rms_error": cycle.rms,
+                "max_error": cycle.largest,
+                "contraction": cycle.contraction,
+                "stability_margin": self._margins.at(self, speed, self._model),
+                "learning": cycle.learning,
+                "joined": cycle.joined,
+                "model_natural_frequency": self._model.natural_frequency,
+                "model_damping": self._model.damping,
+                "model_residual": self._model.residual,
+            }
+            sparse.append(Sparse(_STATUS, messages.LEARNING, cycle.sample_index, status))
         if cycle.joined and not self._joined:
             self._joined = True
             sparse.append(Sparse(f"{self.name}/events", messages.EVENT, cycle.sample_index, {"action": "joined"}))

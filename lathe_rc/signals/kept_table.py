@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables that take long to make, kept on the disk beside the compiled code.
+
+To load SciPy's interpolation takes a sixth of the time in which `lathe run` reaches its first block, and it is only
+needed to make the table of a form, the same one each time.
+"""
+
+import hashlib
+import tempfile
+import zipfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import llvmlite.binding
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from lathe_rc.jit import cache_folder
+
+Array = npt.NDArray[np.float64]
+
+_MOST = 32  # tables, the newest
+
+
+def kept(content: bytes, make: Callable[[], Array]) -> Array:
+    """The array that ``make`` makes of some content: read, if the same libraries have made it on such a processor.
+
+    A file that is damaged is made anew, and one that cannot be written is not kept.
+    """
+    made_by = f"{np.__version__} {scipy.__version__} {llvmlite.binding.get_host_cpu_name()}".encode()
+    path = cache_folder() / "tables" / f"{hashlib.sha256(made_by + content).hexdigest()}.npz"
+    with suppress(OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile), np.load(path) as found:
+        read: Array = found["table"]
+        return read
+    table = make()
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            whole = Path(folder, path.name)
+            np.savez(whole, table=table)
+            whole.replace(path)
+        for old in sorted(path.parent.glob("*.npz"), key=lambda file: file.stat().st_mtime)[:-_MOST]:
+            old.unlink(missing_ok=True)
+    return table
