@@ -6,17 +6,16 @@ needed to make the table of a form, the same one each time.
 """
 
 import hashlib
-import tempfile
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 
 import llvmlite.binding
 import numpy as np
 import numpy.typing as npt
 import scipy
 
+from lathe_rc.files import replacing
 from lathe_rc.jit import cache_folder
 
 Array = npt.NDArray[np.float64]
@@ -37,10 +36,8 @@ def kept(content: bytes, make: Callable[[], Array]) -> Array:
     table = make()
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            whole = Path(folder, path.name)
-            np.savez(whole, table=table)
-            whole.replace(path)
+        with replacing(path) as file:
+            np.savez(file, table=table)
         for old in sorted(path.parent.glob("*.npz"), key=lambda file: file.stat().st_mtime)[:-_MOST]:
             old.unlink(missing_ok=True)
     return table

@@ -18,11 +18,6 @@ from lathe_rc.signals.deviation_law import DeviationLaw, tabulated
 #: by name, those of other packages: ours are the parameters below
 SPEED_LAWS: Registry[DeviationLaw] = Registry("speed law", DeviationLaw, {}, "lathe_rc.speed_laws")
 
-_DEVIATIONS = (
-    "deviation_amplitude", "deviation_frequency", "deviation_phase", "tachogram_time", "tachogram_deviation",
-    "tachogram_file", "random_rms", "deviation_law",
-)  # fmt: skip
-
 
 class SpeedLawParameters(NodeParameters):
     """Deviations from the nominal speed; their sum is the law."""
@@ -61,8 +56,6 @@ class SpeedLawParameters(NodeParameters):
                 cannot be used, or more than one tachogram.
         """
         nominal = self.nominal_speed
-        if not any(getattr(self, name) for name in _DEVIATIONS):
-            return speed.constant(nominal)
         phase = self.deviation_phase or [0.0] * len(self.deviation_amplitude)
         with about(node, "deviation_amplitude", "deviation_frequency", "deviation_phase"):
             harmonic = speed.harmonic(
