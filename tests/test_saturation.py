@@ -60,17 +60,13 @@ def test_eq_15_tells_the_divergence():
     assert filtered.period_integral[-1] == pytest.approx(filtered.period_integral[0], rel=0.01)
 
 
-def test_filter_keeps_the_error_small_at_every_corner():
-    """The filter keeps the error below 1e-4 from period 100 on, at all 32 corners of the drive: at the worst to 400."""
-
-    def largest(drive, periods):
+@pytest.mark.parametrize("periods", [120, pytest.param(400, marks=pytest.mark.system)])
+def test_filter_keeps_the_error_small_at_every_corner(periods):
+    """The filter keeps the error below 1e-4 from period 100 on, at all 32 corners of the drive."""
+    for drive in corners():
         outcome = simulate(Case(periods=periods, step=COARSEST), drive)
+        assert outcome.period_max_error[99:].max() < 1e-4
         assert outcome.controller.saturated == 0
-        return outcome.period_max_error[99:].max()
-
-    errors = [largest(drive, 120) for drive in corners()]
-    assert max(errors) < 1e-4
-    assert largest(corners()[int(np.argmax(errors))], 400) < 1e-4
 
 
 def test_short_limit_with_and_without_anti_windup():
