@@ -12,7 +12,10 @@ _MODULES = {
         *("diagnostic_msgs", "domain_coordinator", "lathe_rc_msgs", "lifecycle_msgs", "rclpy", "rosgraph_msgs"),
         *("sensor_msgs", "std_msgs", "std_srvs"),
     ),
-    "sweep": (*("altair", "bokeh", "cmaes", "dask", "distributed", "filelock", "optuna", "simpleeval", "vl_convert"),),
+    "sweep": (
+        *("altair", "bokeh", "cmaes", "dask", "distributed", "filelock", "optuna", "simpleeval", "vl_convert"),
+        "xxhash",
+    ),
     "view": ("rerun", "rerun_bindings"),
 }
 _EXTRAS = {module: extra for extra, modules in _MODULES.items() for module in modules}

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lathe_rc import harness, messages
-from lathe_rc.analysis.learning import LearningLoop
+from lathe_rc.analysis.learning import LearningLoop, supremum
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 
@@ -60,6 +60,26 @@ def test_supremum_is_the_largest_over_all_waves():
     loop = learning_loop(lead_time=2e-3)
     waves = np.linspace(0.0, 512.0, 10_001)
     assert loop.supremum(NOMINAL) == pytest.approx(np.abs(loop.operator(waves, NOMINAL)).max(), rel=1e-4)
+
+
+@pytest.mark.parametrize("place", [0.0, 3.3, 256.25, 511.9, 512.0])
+def test_supremum_finds_a_peak_wherever_it_is(place):
+    """Beside two that are nearly as high, and between the points that are looked at first."""
+
+    def operator(waves):
+        peaks = [height / (1 + ((waves - at) / 2) ** 2) for height, at in ((0.99, 100), (1.0, place), (0.98, 400))]
+        return sum(peaks) + 0j
+
+    waves = np.linspace(0.0, 512.0, 100_001)
+    largest, at = supremum(operator, 512.0)
+    assert largest == pytest.approx(operator(waves).real.max(), rel=1e-4)
+    assert at == pytest.approx(place, abs=0.05)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_supremum_tells_where_a_factor_is_no_number(number):
+    largest, at = supremum(lambda waves: np.where((waves >= 300.0) & (waves < 301.0), number, 1.0), 512.0)
+    assert (np.isnan(largest), at) == (True, 300.0)
 
 
 def test_supremum_is_computed_once_for_loops_that_are_alike(monkeypatch):

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
 from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
-from lathe_rc.plants.linear import discretise, second_order
+from lathe_rc.plants.linear import DiscretePlant, discretise, second_order
 from lathe_rc.signals.noise import Sensor
 
 WN, ZETA, TAU = 1038.0, 0.804, 0.36e-3
@@ -73,6 +73,26 @@ def test_tustin_warps_the_frequency_and_interpolates_the_delay(samples):
     whole, part = divmod(samples, 1.0)
     delay = z**-whole * (1 - part + part / z)
     assert_allclose(plant.response(FREQUENCIES), delay / (1 + 2 * ZETA * p / WN + (p / WN) ** 2), rtol=1e-9)
+
+
+@given(st.integers(1, 6), st.integers(0, 5), st.integers(0, 1000))
+def test_response_solves_the_difference_equation(order, delay, seed):
+    """States that do not act on themselves among them: their row has no pivot of its own."""
+    random = np.random.default_rng(seed)
+    transition = random.normal(size=(order, order)) * random.choice([0.0, 0.3, 0.9], (order, order))
+    weights = random.normal(size=(order, 3))
+    z = np.exp(1j * FREQUENCIES * STEP)[:, None, None]
+    driven = weights[:, :1] + weights[:, 1:2] / z + weights[:, 2:] / z**2
+    position = np.linalg.solve(np.eye(order) - transition / z, driven)[:, 0, 0] * z[:, 0, 0] ** -delay
+    found = DiscretePlant(transition, weights, delay, 0.0, STEP).response(FREQUENCIES)
+    assert_allclose(found, position, rtol=0, atol=1e-9 * np.abs(position).max())
+
+
+def test_integrator_has_no_response_at_rest():
+    plant = discretise(np.zeros((1, 1)), np.ones(1), 0.0, STEP, "tustin")
+    at_rest, moving = plant.response([0.0, 100.0])
+    assert not np.isfinite(at_rest)
+    assert_allclose(moving, 1 / (2j / STEP * np.tan(100.0 * STEP / 2)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("method", ["foh", "tustin"])

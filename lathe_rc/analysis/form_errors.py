@@ -111,6 +111,12 @@ def _end(state: Array, row: Array) -> None:
     _close(row, state[_START], square, weight, max(state[_HIGH], held), min(state[_LOW], held))
 
 
+def _plain(samples: Array) -> Array:
+    """Samples as the kernel takes them."""
+    fits = samples.flags.carray and samples.dtype == np.float64
+    return samples if fits else np.require(samples, np.float64, ["C", "W"])
+
+
 class RunningErrors:
     """Form errors by revolution, of samples that come piece by piece.
 
@@ -133,7 +139,7 @@ class RunningErrors:
         Raises:
             InputError: a revolution has no sample.
         """
-        angle, error = (np.require(each, np.float64, ["C", "W"]) for each in (angle, error))
+        angle, error = _plain(angle), _plain(error)
         start, rows = 0, np.empty((_ROWS, 4))
         while start < angle.size:
             start, found = _add(self._state, rows, angle, error, start)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.interpolation import cubic_response, derivative_responses
 from lathe_rc.control.q_filter import QFilter
+from lathe_rc.jit import kernel
 from lathe_rc.plants.linear import Constant
 
 Array = npt.NDArray[np.float64]
@@ -33,17 +34,33 @@ def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[floa
         highest: waves per revolution.
     """
     waves = _waves_up_to(highest)
-    size = np.abs(operator(waves))
-    if not np.isfinite(size).all():
-        place = int(np.argmin(np.isfinite(size)))
-        return float("nan"), float(waves[place])
-    inner = np.flatnonzero((size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:])) + 1
-    peaks = np.append(inner, (0, _COARSE - 1))
-    peaks = peaks[np.argsort(size[peaks])[-_PEAKS:]]
-    beside = highest / (_COARSE - 1)
-    near = np.linspace(waves[peaks] - beside, waves[peaks] + beside, _FINE).T.ravel().clip(0.0, highest)
+    near = _near_peaks(waves, np.abs(operator(waves)))
+    if near.size == 1:
+        return float("nan"), float(near[0])
     fine = np.abs(operator(near))
     return float(fine.max()), float(near[np.argmax(fine)])
+
+
+@kernel
+def _near_peaks(waves: Array, size: Array) -> Array:
+    """Waves around the highest peaks of a size, the ends among them; one wave alone: there it is not finite."""
+    last = waves.size - 1
+    heights, places = np.full(_PEAKS, -np.inf), np.zeros(_PEAKS, np.int64)  # in rising order
+    for k in range(last + 1):
+        if not size[k] < np.inf:
+            return waves[k : k + 1].copy()
+        if k in (0, last) or (size[k] >= size[k - 1] and size[k] >= size[k + 1]):
+            below = 0
+            while below < _PEAKS and size[k] >= heights[below]:
+                if below:
+                    heights[below - 1], places[below - 1] = heights[below], places[below]
+                heights[below], places[below] = size[k], k
+                below += 1
+    near = np.empty(_PEAKS * _FINE)
+    for i in range(near.size):
+        wave = waves[places[i // _FINE]] + (2.0 * (i % _FINE) / (_FINE - 1) - 1.0) * waves[1]
+        near[i] = min(max(wave, 0.0), waves[last])
+    return near
 
 
 @lru_cache(maxsize=64)

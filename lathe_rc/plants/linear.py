@@ -3,12 +3,14 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 import scipy
+
+from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -42,35 +44,68 @@ class DiscretePlant(Constant):
         wanted = np.asarray(frequency, dtype=np.float64)
         return _response(self, wanted.tobytes()).reshape(wanted.shape)
 
-    @cached_property
-    def _rational(self) -> tuple[list[Array], Array]:
-        """Numerators of the three weights' ways to the position, and their denominator.
 
-        x[n] = Φ·x[n-1] + w·u[n] is z·(z·I - Φ)⁻¹·w; with c that takes the position from x, the rational function after
-        the z is (det(z·I - Φ + w·c) - det(z·I - Φ)) / det(z·I - Φ). That is `scipy.signal.ss2tf`, but a controller
-        asks for it in mid-run, and half a second to load that module is no time to stand still.
-        """
-        matrices = np.repeat(self.transition[np.newaxis], 4, axis=0)
-        matrices[1:, :, 0] -= self.weights.T
-        eigenvalues = np.linalg.eigvals(matrices)
-        bottom, *tops = [np.asarray(np.poly(roots if roots.imag.any() else roots.real)) for roots in eigenvalues]
-        return [top - bottom for top in tops], bottom
+@inlined
+def _square(number: complex) -> float:
+    return number.real * number.real + number.imag * number.imag
+
+
+@inlined
+def _quotient(above: complex, below: complex) -> complex:
+    """Not finite where ``below`` is 0."""
+    square = _square(below)
+    real = above.real * below.real + above.imag * below.imag
+    return complex(real / square, (above.imag * below.real - above.real * below.imag) / square)
+
+
+@kernel
+def _respond(transition: Array, weights: Array, back: Complex, late: Complex, into: Complex) -> None:
+    """Fill the position in x = (I - Φ/z)⁻¹·(w0 + w1/z + w2/z²)·z⁻ᵏ, shape (n,), by one elimination for each z.
+
+    Args:
+        transition: Φ, shape (m, m).
+        weights: w, shape (m, 3).
+        back: 1/z, shape (n,).
+        late: z⁻ᵏ, shape (n,).
+        into: filled.
+    """
+    order = weights.shape[0]
+    left, right = np.empty((order, order), np.complex128), np.empty(order, np.complex128)
+    for place in range(into.size):
+        step = back[place]
+        for i in range(order):
+            right[i] = weights[i, 0] + step * (weights[i, 1] + step * weights[i, 2])
+            for j in range(order):
+                left[i, j] = (1.0 if i == j else 0.0) - transition[i, j] * step
+        # From the last state up, so that the position is what remains.
+        for last in range(order - 1, 0, -1):
+            pivot = last
+            for i in range(last):
+                pivot = i if _square(left[i, last]) > _square(left[pivot, last]) else pivot
+            for j in range(last + 1):
+                left[pivot, j], left[last, j] = left[last, j], left[pivot, j]
+            right[pivot], right[last] = right[last], right[pivot]
+            for i in range(last):
+                ratio = _quotient(left[i, last], left[last, last])
+                right[i] -= ratio * right[last]
+                for j in range(last):
+                    left[i, j] -= ratio * left[last, j]
+        into[place] = _quotient(right[0], left[0, 0]) * late[place]
 
 
 @lru_cache(maxsize=64)
 def _response(plant: DiscretePlant, content: bytes) -> Complex:
     """The response of the bytes of the frequencies: checks of cells that are alike ask for the same."""
-    z, shifts = _shifts(content, plant.step, plant.delay)
-    tops, bottom = plant._rational  # noqa: SLF001 - its own
-    below = np.polyval(bottom, z)
-    return np.asarray(sum(np.polyval(top, z) / below * shift for top, shift in zip(tops, shifts, strict=True)))
+    back = _delayed(content, plant.step)
+    found = np.empty_like(back)
+    _respond(plant.transition, plant.weights, back, _delayed(content, plant.step * plant.delay), found)
+    return found
 
 
 @lru_cache(maxsize=64)
-def _shifts(content: bytes, step: float, delay: int) -> tuple[Complex, list[Complex]]:
-    """exp(jωT) of the bytes of the frequencies, and its powers that stand for the delays of the three weights."""
-    z = np.exp(1j * np.frombuffer(content) * step)
-    return z, [z ** (1.0 - lag - delay) for lag in range(3)]
+def _delayed(content: bytes, time: float) -> Complex:
+    """exp(-jω·time) of the bytes of the frequencies."""
+    return np.asarray(np.exp(-1j * time * np.frombuffer(content)))
 
 
 def _foh(a: Array, b: Array, step: float) -> tuple[Array, Array, Array]:

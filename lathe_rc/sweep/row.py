@@ -18,7 +18,6 @@
 | seed, version, digest | of the random parts; of lathe_rc; see `digest` |
 """
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -26,6 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import xxhash
 from numpy.typing import NDArray
 
 from lathe_rc import messages
@@ -138,7 +138,7 @@ class _Keeper(Errors):
         )
         self._measures = [(each, np.empty(samples)) for each in measures]
         self._turns = RunningErrors()  # a cell without a tool has no form error, but revolutions all the same
-        self._hash = hashlib.sha256()
+        self._hash = xxhash.xxh3_128()
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
@@ -163,14 +163,14 @@ class _Keeper(Errors):
     @property
     def digest(self) -> str | None:
         """See `digest`."""
-        return self._hash.hexdigest() if self._tool else _digest([kept for _, kept in self._measures])
+        return _told(self._hash) if self._tool else _digest([kept for _, kept in self._measures])
 
 
 def digest(recording: Recording, measures: Sequence[Measure]) -> str | None:
     """The digest in the row of a cell that was run again.
 
-    SHA-256 of all samples, little-endian, of the form error; of a cell without a tool, of what is measured. None where
-    there is neither.
+    XXH3 (128 bits) of all samples of the form error, little-endian; of a cell without a tool, of what is measured. None
+    where there is neither. It tells whether bits are equal, in a twentieth of the time that SHA-256 takes.
     """
     if messages.TOOL in (recording.types[topic] for topic in recording.dense):
         return _digest([recording.of_type(messages.TOOL)["error"]])
@@ -178,10 +178,14 @@ def digest(recording: Recording, measures: Sequence[Measure]) -> str | None:
 
 
 def _digest(kept: Sequence[Samples]) -> str | None:
-    found = hashlib.sha256()
+    found = xxhash.xxh3_128()
     for samples in kept:
         found.update(_bytes(samples))
-    return found.hexdigest() if kept else None
+    return _told(found) if kept else None
+
+
+def _told(found: xxhash.xxh3_128) -> str:
+    return f"xxh3:{found.hexdigest()}"
 
 
 def _bytes(samples: Samples) -> memoryview:
