@@ -48,7 +48,7 @@ def _near_peaks(waves: Array, size: Array) -> Array:
     heights, places = np.full(_PEAKS, -np.inf), np.zeros(_PEAKS, np.int64)  # in rising order
     for k in range(last + 1):
         if not size[k] < np.inf:
-            return waves[k : k + 1].copy()
+            return np.array([waves[k]])
         if k in (0, last) or (size[k] >= size[k - 1] and size[k] >= size[k + 1]):
             below = 0
             while below < _PEAKS and size[k] >= heights[below]:

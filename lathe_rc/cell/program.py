@@ -302,10 +302,11 @@ class Program:
                 self._tell(number, reached)
 
     def _compute(self, end: int, told: Integers) -> bool:
+        first = self.reached
         for number, stage in enumerate(self._stages):
             self.number = number
             with stage.named():
-                stage.prepare(self.reached, end - self.reached)
+                stage.prepare(first, end - first)
             self._plan[number, _DUE], self._turn[number] = stage.due
         base = self._tapes.history - self._tapes.begin
         plan, turn, fields, where = self._plan, self._turn, self._fields, self._where

@@ -9,9 +9,9 @@ the fixed time θ/Ω0, its Fig. 1a. The lead (`lead`), the zero-phase Q (`q_filt
 modules of their own.
 """
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -53,8 +53,7 @@ _ROOM = {"windows": (2, _LONGEST + 3), "ahead": (3, _LONGEST)}  # of the table, 
 LEARNING_DELAY = 3  #: samples from a measured error to its place in the memory: cubic interpolation looks ahead
 
 
-@dataclass(frozen=True)
-class Cycle:
+class Cycle(NamedTuple):
     """The result of one cycle, over the grid points of the memory."""
 
     number: int  #: from 1
@@ -298,7 +297,7 @@ class RepetitiveController:
         return [self._cycle_of(*row) for row in logged]
 
     def _cycle_of(self, sample: float, squares: float, largest: float, learning: float, joined: float) -> Cycle:
-        rms = float(np.sqrt(squares / self._cycle))
+        rms = math.sqrt(squares / self._cycle)
         contraction = rms / self._rms_before if self._rms_before > 0.0 else np.nan
         self._cycles += 1
         self._rms_before = rms

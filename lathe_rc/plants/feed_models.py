@@ -7,6 +7,7 @@ sampled        K/(p·(1 + T1·p)) behind a zero-order hold         (paper 003, e
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +45,12 @@ def dc_screw(velocity_gain: float, lags: Sequence[float], zero: float = 0.0) -> 
     Raises:
         InputError: a lag that is not positive.
     """
+    return _dc_screw(velocity_gain, tuple(lags), zero)
+
+
+@lru_cache(maxsize=64)
+def _dc_screw(velocity_gain: float, lags: tuple[float, ...], zero: float) -> TransferFunction:
+    """The same of lags that can be looked up: each variation of a cell asks for the models of its drives."""
     if not all(lag > 0.0 for lag in lags):
         raise InputError(f"lags of the feed drive = {list(lags)} s; allowed: above 0 (leave out what is not there)")
     bottom = np.array([1.0, 0.0])

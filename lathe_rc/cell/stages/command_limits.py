@@ -76,8 +76,9 @@ def limited(limits: LimiterTable, first: int, command: Samples) -> Samples:
 
 def remembered(flags: Samples, first: int, end: int) -> Samples:
     """Flags of the samples from ``first`` on and before ``end``, where that of sample n stands at n modulo the size."""
-    found: Samples = flags[np.arange(first, end) & (flags.size - 1)]
-    return found
+    begin = first & (flags.size - 1)
+    found = flags[begin : begin + end - first]
+    return found if found.size == end - first else np.concatenate((found, flags[: end - first - found.size]))
 
 
 class Clipping:
@@ -102,6 +103,8 @@ class Clipping:
         """The events of samples ``first`` on, of which some are ``clipped``, shape (n,)."""
         found: list[Sparse] = []
         start = 0
+        if not self._left and self._clipped == self._before and not clipped.any():
+            return found
         while start < clipped.size:
             stop = min(start + self._tell - (first + start) % self._tell, clipped.size)
             found += self._ends(first + start, clipped[start:stop])

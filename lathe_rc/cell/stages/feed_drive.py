@@ -2,6 +2,7 @@
 """Feed drive of a slide: cross or longitudinal."""
 
 from collections.abc import Mapping, Sequence
+from itertools import dropwhile
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -177,7 +178,7 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
             known |= {"gain": self.sampled_gain, "lag": self.sampled_lag}
         whole = self.transfer()
         for part in ("numerator", "denominator"):
-            known[f"transfer.{part}"] = np.trim_zeros(np.array(getattr(whole, part), float), "f").tolist()
+            known[f"transfer.{part}"] = [*map(float, dropwhile(lambda factor: factor == 0.0, getattr(whole, part)))]
         return {f"{self.axis}/command": known}
 
 

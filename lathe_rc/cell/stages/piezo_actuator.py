@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
+from functools import lru_cache
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -85,7 +86,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
             with named("bouc_wen_a", "bouc_wen_beta", "bouc_wen_gamma"):
                 return BoucWen(self.bouc_wen_a, self.bouc_wen_beta, self.bouc_wen_gamma)
         with named("play_thresholds", "play_weights", "play_proportional"):
-            return self._plays(self.play_thresholds, self.play_weights, self.play_proportional)
+            return _plays(tuple(self.play_thresholds), tuple(self.play_weights), self.play_proportional)
 
     def _identified(
         self, named: _Named, real: PrandtlIshlinskii | BoucWen | None
@@ -97,19 +98,11 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
                     raise InputError("empty; allowed: one for each of identified_thresholds")
             return real
         with named("identified_thresholds", "identified_weights", "identified_proportional"):
-            return self._plays(
-                self.identified_thresholds or self.play_thresholds,
-                self.identified_weights,
+            return _plays(
+                tuple(self.identified_thresholds or self.play_thresholds),
+                tuple(self.identified_weights),
                 self.identified_proportional or self.play_proportional,
             )
-
-    @staticmethod
-    def _plays(thresholds: list[float], weights: list[float], proportional: float) -> PrandtlIshlinskii:
-        return PrandtlIshlinskii(
-            np.array(thresholds) if thresholds else THRESHOLDS,
-            np.array(weights) if weights else WEIGHTS,
-            proportional,
-        )
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
         """See `NodeParameters`; the amplifier's lag is left out."""
@@ -143,6 +136,14 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
                 step=self.step,
                 method=self.discretisation,
             )
+
+
+@lru_cache(maxsize=64)
+def _plays(thresholds: tuple[float, ...], weights: tuple[float, ...], proportional: float) -> PrandtlIshlinskii:
+    """Weighted plays at rest, where they stay: a `Stack` has a state of its own."""
+    return PrandtlIshlinskii(
+        np.array(thresholds) if thresholds else THRESHOLDS, np.array(weights) if weights else WEIGHTS, proportional
+    )
 
 
 class Memory(NamedTuple):

@@ -2,6 +2,7 @@
 """The spindle's speed law as parameters: of the spindle that follows it, and of whoever knows it in advance."""
 
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
@@ -56,15 +57,9 @@ class SpeedLawParameters(NodeParameters):
                 cannot be used, or more than one tachogram.
         """
         nominal = self.nominal_speed
-        phase = self.deviation_phase or [0.0] * len(self.deviation_amplitude)
+        lines = self.deviation_amplitude, self.deviation_frequency, self.deviation_phase
         with about(node, "deviation_amplitude", "deviation_frequency", "deviation_phase"):
-            harmonic = speed.harmonic(
-                nominal,
-                np.array(self.deviation_amplitude),
-                np.array(self.deviation_frequency),
-                np.array(phase),
-                self.deviation_start,
-            )
+            harmonic = _harmonic(nominal, *map(tuple, lines), self.deviation_start)
         with about(node, "random_low", "random_high"):
             random = speed.band_limited_random(
                 nominal, self.random_rms, self.random_low, self.random_high, self.random_lines, self.seed
@@ -94,3 +89,12 @@ class SpeedLawParameters(NodeParameters):
                 deviation = rpm / self.nominal_rpm - 1.0
         with about(node, "tachogram_time", "tachogram_deviation"):
             return speed.tachogram(self.nominal_speed, time, deviation)
+
+
+@lru_cache(maxsize=64)
+def _harmonic(
+    nominal: float, amplitude: tuple[float, ...], frequency: tuple[float, ...], phase: tuple[float, ...], start: float
+) -> speed.SpeedLaw:
+    """The harmonic deviations, which all who know them in advance ask for."""
+    phases = np.array(phase) if phase else np.zeros(len(amplitude))
+    return speed.harmonic(nominal, np.array(amplitude), np.array(frequency), phases, start)
