@@ -36,7 +36,7 @@ class Offers(Mapping[str, V], Generic[V]):
 
     Args:
         what: one of them, in words.
-        own: ours.
+        own: ours, or where they stand, ``package.module:Class``: a module is imported when its class is asked for.
         group: of the entry points.
 
     Attributes:
@@ -44,7 +44,7 @@ class Offers(Mapping[str, V], Generic[V]):
         own: see above.
     """
 
-    def __init__(self, what: str, own: Mapping[str, V], group: str) -> None:
+    def __init__(self, what: str, own: Mapping[str, V | str], group: str) -> None:
         self._what, self.own, self.group = what, own, group
         self._found: dict[str, V] = {}
 
@@ -62,10 +62,11 @@ class Offers(Mapping[str, V], Generic[V]):
             KeyError: nobody offers it.
             InputError: it cannot be imported, or is none of these.
         """
-        if name in self.own:
-            return self.own[name]
+        own = self.own.get(name)
+        if own is not None and not isinstance(own, str):
+            return own
         if name not in self._found:
-            self._found[name] = self._checked(name, self._import(name))
+            self._found[name] = self._checked(name, self._import(own or name))
         return self._found[name]
 
     def _import(self, name: str) -> Any:
@@ -97,7 +98,7 @@ class Objects(Offers[V]):
         kind: their class.
     """
 
-    def __init__(self, what: str, kind: type[V], own: Mapping[str, V], group: str) -> None:
+    def __init__(self, what: str, kind: type[V], own: Mapping[str, V | str], group: str) -> None:
         super().__init__(what, own, group)
         self._kind = kind
 
@@ -115,7 +116,7 @@ class Registry(Offers[type[T]], Generic[T]):
         base: class that all of them derive from.
     """
 
-    def __init__(self, what: str, base: Any, own: Mapping[str, type[T]], group: str) -> None:
+    def __init__(self, what: str, base: Any, own: Mapping[str, type[T] | str], group: str) -> None:
         super().__init__(what, own, group)
         self._base = base
 

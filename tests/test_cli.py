@@ -16,6 +16,8 @@ from click.testing import CliRunner
 
 from lathe_rc import harness, loading
 from lathe_rc.cell.scenario import TABLES, load
+from lathe_rc.cell.stages import MASTERS, STAGES
+from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cli import main
 from lathe_rc.command_list import COMMANDS
 
@@ -370,6 +372,21 @@ def test_commands_are_listed_without_being_imported():
     light = {"cli", "command_list", "errors", "extras", "loading"}
     assert ours == {"lathe_rc", *(f"lathe_rc.{module}" for module in light)}
     assert not [line for line in text[text.index("Commands:") :] if line.endswith("...")]  # each summary fits
+
+
+def test_a_run_imports_the_stages_that_its_cell_has():
+    code = "import sys; from lathe_rc.cli import main; main(sys.argv[1:], standalone_mode=False); print(*sys.modules)"
+    words = [sys.executable, "-c", code, "run", "piston", "--revolutions", "1"]
+    *_, modules = subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
+    begin = "lathe_rc.cell.stages."
+    imported = {module.removeprefix(begin) for module in modules.split() if module.startswith(begin)}
+    assert imported >= {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "profile", "tool"}
+    assert not imported & {"compound_controller", "cutting_process", "feed_drive", "loaded_drive", "piezo_actuator"}
+
+
+def test_stages_are_where_their_names_say():
+    assert [STAGES[kind].kind for kind in STAGES.own] == [*STAGES.own]
+    assert tuple(kind for kind in STAGES.own if issubclass(STAGES[kind], TimeMaster)) == MASTERS
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lathe_rc.analysis.budget import Budget
-from lathe_rc.cell import budget as budgets
 from lathe_rc.cell.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -58,4 +57,6 @@ def budget(
         lead: 0.0 %
         feed: 16.9 %
     """
-    return budgets.budget(scenario, threads=threads, watch=watch)
+    from lathe_rc.cell import budget  # imports many stages
+
+    return budget.budget(scenario, threads=threads, watch=watch)

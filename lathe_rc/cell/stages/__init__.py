@@ -2,55 +2,37 @@
 """The stages of the cell: physics and control laws with their parameters and ports."""
 
 from lathe_rc.cell.stage import Stage
-from lathe_rc.cell.stages.compound_controller import CompoundController
-from lathe_rc.cell.stages.cutting_process import CuttingProcessStage
-from lathe_rc.cell.stages.decoupler import DecouplerStage
-from lathe_rc.cell.stages.disturbance_controller import DisturbanceController
-from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
-from lathe_rc.cell.stages.encoder_device import EncoderDevice
-from lathe_rc.cell.stages.feed_drive import FeedDriveStage
-from lathe_rc.cell.stages.force_controller import ForceController
-from lathe_rc.cell.stages.learning_controller import LearningController
-from lathe_rc.cell.stages.loaded_drive import LoadedDriveStage, LoadedSeriesDrive
-from lathe_rc.cell.stages.loaded_spindle import LoadedSpindleStage
-from lathe_rc.cell.stages.piezo_actuator import PiezoActuator
-from lathe_rc.cell.stages.position_controller import PositionController
-from lathe_rc.cell.stages.profile import ProfileStage
-from lathe_rc.cell.stages.resonant_controller import ResonantController
-from lathe_rc.cell.stages.series_drive import SeriesDriveStage
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
-from lathe_rc.cell.stages.supervisor import Supervisor
-from lathe_rc.cell.stages.time_master import TimeMaster
-from lathe_rc.cell.stages.tool import Tool
-from lathe_rc.cell.stages.vibration import Vibration
 from lathe_rc.extensions import Registry
 
-_OWN: tuple[type[Stage], ...] = (
-    SpindleEncoder,
-    EncoderDevice,
-    LoadedSpindleStage,
-    LearningController,
-    DisturbanceController,
-    CompoundController,
-    ResonantController,
-    ElectrodynamicActuator,
-    PiezoActuator,
-    SeriesDriveStage,
-    LoadedDriveStage,
-    LoadedSeriesDrive,
-    Vibration,
-    ProfileStage,
-    Tool,
-    FeedDriveStage,
-    CuttingProcessStage,
-    PositionController,
-    ForceController,
-    DecouplerStage,
-    Supervisor,
-)
+#: kinds of ours that give a cell its time
+MASTERS = ("spindle_encoder", "encoder_device", "loaded_spindle")
+
+# A module is imported when a cell has such a stage: all of them take as long as the samples of a hundred revolutions.
+_OWN = {
+    "spindle_encoder": "spindle_encoder:SpindleEncoder",
+    "encoder_device": "encoder_device:EncoderDevice",
+    "loaded_spindle": "loaded_spindle:LoadedSpindleStage",
+    "learning_controller": "learning_controller:LearningController",
+    "disturbance_controller": "disturbance_controller:DisturbanceController",
+    "compound_controller": "compound_controller:CompoundController",
+    "resonant_controller": "resonant_controller:ResonantController",
+    "electrodynamic_actuator": "electrodynamic_actuator:ElectrodynamicActuator",
+    "piezo_actuator": "piezo_actuator:PiezoActuator",
+    "series_drive": "series_drive:SeriesDriveStage",
+    "loaded_drive": "loaded_drive:LoadedDriveStage",
+    "loaded_series_drive": "loaded_drive:LoadedSeriesDrive",
+    "vibration": "vibration:Vibration",
+    "profile": "profile:ProfileStage",
+    "tool": "tool:Tool",
+    "feed_drive": "feed_drive:FeedDriveStage",
+    "cutting_process": "cutting_process:CuttingProcessStage",
+    "position_controller": "position_controller:PositionController",
+    "force_controller": "force_controller:ForceController",
+    "decoupler": "decoupler:DecouplerStage",
+    "supervisor": "supervisor:Supervisor",
+}
 
 #: by name, ours and those of other packages
-STAGES: Registry[Stage] = Registry("stage", Stage, {stage.kind: stage for stage in _OWN}, "lathe_rc.stages")
-
-#: kinds of ours that give a cell its time
-MASTERS = tuple(stage.kind for stage in _OWN if issubclass(stage, TimeMaster))
+STAGES: Registry[Stage] = Registry(
+    "stage", Stage, {kind: f"{__name__}.{place}" for kind, place in _OWN.items()}, "lathe_rc.stages"
+)
