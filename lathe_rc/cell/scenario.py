@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import cast
 
@@ -182,6 +183,11 @@ class Scenario:
         missing = {node: table for node, table in self.nodes.items() if node not in self.fingerprints}
         return _hash({**self.fingerprints, **{node: _fingerprint(table) for node, table in missing.items()}})
 
+    @cached_property
+    def _has_own_run_id(self) -> bool:
+        """Whether its run id is made of its content; otherwise somebody has given it."""
+        return self.shared.run_id == _identity(self.fingerprints)
+
     def parameter(self, target: str) -> Row:
         """The row of a parameter in its node's table.
 
@@ -255,7 +261,7 @@ class Scenario:
                 else:
                     found[name] = _absolute(kinds[each], name, value, Path())
         tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
-        given = "run_id" in values or self.shared.run_id != _identity(fingerprints)
+        given = "run_id" in values or not self._has_own_run_id
         for node, changed in changes.items():
             tables[node] = self.nodes[node].changed(node, changed)
         tables = models.resolved(tables)
@@ -273,7 +279,7 @@ class Scenario:
             given: what was given alone; read again, the rest takes its defaults, and models follow their drives.
         """
         tree = {}
-        left_out = {"run_id"} if given and self.shared.run_id == _identity(self.fingerprints) else None
+        left_out = {"run_id"} if given and self._has_own_run_id else None
         for name, table in self.nodes.items():
             kept = table.model_dump(exclude_unset=given, exclude=left_out)
             values = {key: _quoted(value) for key, value in kept.items() if value != []}
