@@ -20,7 +20,7 @@ _TURN = 2.0 * np.pi
 # The state: samples so far; turns at the last sample and at the one before, error of the last; number of the revolution
 # under way and index of its first sample; its sums: square and weight; its largest and smallest error.
 _SAMPLES, _TURNS, _BEFORE, _ERROR, _NUMBER, _START, _SQUARE, _WEIGHT, _HIGH, _LOW = range(10)
-_ROWS = 64  # complete revolutions that the kernel hands over at once
+_ROWS = 64  # complete revolutions that there is room for at first
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class RunningErrors:
     def __init__(self, first: int = 0) -> None:
         self._state = np.zeros(10)
         self._state[_NUMBER], self._state[_START] = first - 1, -1
-        self._rows: list[Array] = []
+        self._rows, self._filled = np.empty((_ROWS, 4)), 0
 
     def add(self, angle: Array, error: Array) -> None:
         """Take the next samples.
@@ -140,27 +140,29 @@ class RunningErrors:
             InputError: a revolution has no sample.
         """
         angle, error = _plain(angle), _plain(error)
-        start, rows = 0, np.empty((_ROWS, 4))
+        start = 0
         while start < angle.size:
-            start, found = _add(self._state, rows, angle, error, start)
+            start, found = _add(self._state, self._rows[self._filled :], angle, error, start)
             if found < 0:
                 raise InputError(
                     f"revolution {int(self._state[_NUMBER])} has no sample; allowed: an angle that increases by less "
                     "than a revolution from sample to sample"
                 )
-            self._rows.append(rows[:found].copy())
+            self._filled += found
+            if self._filled == len(self._rows):
+                self._rows = np.concatenate((self._rows, np.empty_like(self._rows)))
 
     def found(self) -> FormErrors:
         """Of all complete revolutions, if the run ends with the samples that have come."""
-        state, rows = self._state.copy(), [np.empty((0, 4)), *self._rows]
+        state, filled = self._state, self._filled
         if state[_SAMPLES] < 2.0:
             return FormErrors(np.empty(0), np.empty(0), np.empty(0), np.zeros(1, np.int64))
         end = state[_START] if state[_START] >= 0.0 else state[_SAMPLES]
         if end < state[_SAMPLES] and turns_at_end(state[_BEFORE], state[_TURNS]) > state[_NUMBER]:
-            row, end = np.empty((1, 4)), state[_SAMPLES]
-            _end(state, row[0])
-            rows.append(row)
-        start, rms, high, low = np.concatenate(rows).T
+            end = state[_SAMPLES]
+            _end(state, self._rows[filled])  # there is room; more samples would write over it
+            filled += 1
+        start, rms, high, low = self._rows[:filled].T.copy()
         return FormErrors(rms, np.maximum(high, -low), high - low, np.append(start, end).astype(np.int64))
 
 

@@ -143,9 +143,10 @@ class Engine:
             ]
             dense.update(zip(kept, outputs, strict=True))
             # Where a stage has failed, those before it have gone on.
-            said = self._program.said(number, end)
-            for message in stage.conclude(first, end, said, outputs, last=end == self.samples):
-                sparse.setdefault(remapped(stage.shared, message.topic), []).append(message)
+            said, last = self._program.said(number, end), end == self.samples
+            if said or last or stage.tells_joints:
+                for message in stage.conclude(first, end, said, outputs, last=last):
+                    sparse.setdefault(remapped(stage.shared, message.topic), []).append(message)
         for sink in sinks:
             sink.chunk(first, end - first, dense, sparse)
 

@@ -348,5 +348,8 @@ class Program:
 
     def said(self, number: int, end: int) -> list[Sparse]:
         """The stage's events since the last call, of the samples before ``end``."""
-        said, self._sparse[number] = self._sparse[number], []
+        said = self._sparse[number]
+        if not said:
+            return []
+        self._sparse[number] = []
         return [message for message in said if message.index < end]

@@ -143,8 +143,8 @@ class _Keeper(Errors):
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
         super().chunk(first, samples, dense, sparse)
-        for topic in self._events:
-            if any(message.values["action"].startswith(LIMITS) for message in sparse.get(topic, ())):
+        for topic, said in sparse.items():
+            if topic in self._events and any(message.values["action"].startswith(LIMITS) for message in said):
                 self.limited.add(topic.removesuffix("/events"))
         if self._tool:
             self._hash.update(_bytes(dense[self._tool]["error"]))
