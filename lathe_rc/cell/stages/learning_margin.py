@@ -36,7 +36,6 @@ class Margins:
 
     def __init__(self, parameters: LearningControllerParameters) -> None:
         self._parameters = parameters
-        self._speeds: list[float] = (parameters.nominal_speed / 40 * np.arange(20, 61)).tolist()
         self._models: dict[tuple[str, ...], Identified] = {}
         self._responses: dict[tuple[str, ...], Response] = {}
         self._suprema: dict[tuple[object, ...], float] = {}
@@ -77,12 +76,20 @@ class Margins:
 
     def at(self, stage: Loops, speed: float, model: Identified) -> float:
         """The margin at ``speed`` [rad/s], between tabulated speeds by interpolation."""
-        after = bisect_left(self._speeds, speed)
-        if not 0 < after < len(self._speeds):
+        speeds = _tabulated(self._parameters.nominal_speed)
+        after = bisect_left(speeds, speed)
+        if not 0 < after < len(speeds):
             return 1.0 - stage.loop(self._response(model)).supremum(speed)
-        below, above = self._speeds[after - 1], self._speeds[after]
+        below, above = speeds[after - 1], speeds[after]
         lower, upper = self._supremum(stage, below, model), self._supremum(stage, above, model)
         return 1.0 - ((upper - lower) / (above - below) * (speed - below) + lower)
+
+
+@lru_cache(maxsize=16)
+def _tabulated(nominal: float) -> list[float]:
+    """The speeds of the table [rad/s], from half of the nominal one up to one and a half times it."""
+    speeds: list[float] = (nominal / 40 * np.arange(20, 61)).tolist()
+    return speeds
 
 
 def _make_room(table: dict[Any, Any]) -> None:

@@ -60,14 +60,17 @@ class SpeedLawParameters(NodeParameters):
         lines = self.deviation_amplitude, self.deviation_frequency, self.deviation_phase
         with about(node, "deviation_amplitude", "deviation_frequency", "deviation_phase"):
             harmonic = _harmonic(nominal, *map(tuple, lines), self.deviation_start)
+        tachogram = self._tachogram(node)
+        law = harmonic + tachogram if tachogram else harmonic
+        if not self.random_rms:
+            return law
         with about(node, "random_low", "random_high"):
-            random = speed.band_limited_random(
+            return law + speed.band_limited_random(
                 nominal, self.random_rms, self.random_low, self.random_high, self.random_lines, self.seed
             )
-        return harmonic + self._tachogram(node) + random
 
-    def _tachogram(self, node: str) -> speed.SpeedLaw:
-        """The one of the lists, of the file, or of a law of others."""
+    def _tachogram(self, node: str) -> speed.SpeedLaw | None:
+        """The one of the lists, of the file, or of a law of others, if there is one."""
         lists = bool(self.tachogram_time or self.tachogram_deviation)
         given = {"deviation_law": self.deviation_law, "tachogram_file": self.tachogram_file, "tachogram_time": lists}
         named = [name for name, value in given.items() if value]
@@ -76,6 +79,8 @@ class SpeedLawParameters(NodeParameters):
                 f"{node}.{named[0]} = {given[named[0]]} beside {named[1]}; allowed: one of them, since each gives the "
                 "tachogram"
             )
+        if not named:
+            return None
         if self.deviation_law:
             with about(node, "deviation_law"), code_of_others(repr(self.deviation_law)):
                 make: Callable[..., DeviationLaw] = SPEED_LAWS[self.deviation_law]
