@@ -147,12 +147,13 @@ def test_who_listens_where_nobody_finds_it_is_found_again(tmp_path, monkeypatch)
 
 def test_an_event_that_was_asked_for_is_kept_when_a_state_of_before_is_written(ghost, domain, tmp_path):
     """Killed at once after it has promised to freeze its memory, a controller keeps its word, at the same sample."""
-    cell = load(CONFIG / "piston.yaml", [f"{OWN}.restart_file={tmp_path}/state", "spindle_encoder.revolutions=20.0"])
+    kept = [f"{OWN}.restart_file={tmp_path}/state", "spindle_encoder.revolutions=20.0"]
+    cell = load(CONFIG / "piston.yaml", [*kept, "spindle_encoder.speed_factor=0.5"])  # else it may end before DDS tells
     client = ghost.create_client(Schedule, f"/{OWN}/schedule")
     recorded = harness.with_recorder(cell, tmp_path / "bag", keep=True)
     with harness.Processes(recorded, [[name] for name in recorded.nodes], domain=domain) as processes:
-        processes.wait_for("cycle")
         assert client.wait_for_service(20.0)
+        processes.wait_for("cycle")
         future = client.call_async(Schedule.Request(action="freeze"))
         rclpy.spin_until_future_complete(ghost, future, timeout_sec=60.0)
         os.kill(processes.pids[OWN], signal.SIGKILL)
