@@ -11,6 +11,7 @@ import hashlib
 import importlib
 import importlib.metadata
 import os
+import pkgutil
 import sys
 import sysconfig
 import traceback
@@ -66,7 +67,7 @@ class Offers(Mapping[str, V], Generic[V]):
         if own is not None and not isinstance(own, str):
             return own
         if name not in self._found:
-            self._found[name] = self._checked(name, self._import(own or name))
+            self._found[name] = self._checked(name, pkgutil.resolve_name(own) if own else self._import(name))
         return self._found[name]
 
     def _import(self, name: str) -> Any:
