@@ -34,7 +34,7 @@ def uv(lists: Iterable[str], locks: Iterable[str]) -> list[str | Path]:
     """
     files = [word for name in lists for word in ("-r", REQUIREMENTS / name)]
     constraints = [word for name in locks for word in ("-c", REQUIREMENTS / name)]
-    target = ["--python", PYTHON, "--overrides", REQUIREMENTS / "overrides.txt"]
+    target: list[str | Path] = ["--python", PYTHON, "--overrides", REQUIREMENTS / "overrides.txt"]
     return [PYTHON.with_name("uv"), "pip", "install", "--compile-bytecode", *target, *files, *constraints]
 
 

@@ -6,7 +6,8 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable
 from importlib.metadata import Distribution, distributions
-from xml.etree import ElementTree
+from pathlib import Path
+from xml.etree import ElementTree as ET
 
 from workplace import NODE, VENV
 
@@ -32,10 +33,13 @@ def main() -> None:
     table((licence(installed[name]), name) for name in names)
     print("\n## npm\n")
     lock = json.loads((NODE / "package-lock.json").read_text(encoding="utf-8"))["packages"]
-    table((said.get("license", "not stated"), path.rpartition("node_modules/")[2]) for path, said in lock.items() if path)
+    lock.pop("")  # the list itself
+    table(
+        (said.get("license", "not stated"), path.rpartition("node_modules/")[2]) for path, said in lock.items() if path
+    )
 
 
-def site() -> list[object]:
+def site() -> list[Path]:
     """Return the folders of installed packages."""
     return sorted(VENV.glob("lib/python3.*/site-packages"))
 
@@ -44,10 +48,11 @@ def licence(found: Distribution) -> str:
     """Return the licence of a package: an SPDX expression, a classifier, a short text, or that of its package.xml."""
     said = found.metadata
     manifest = VENV / "share" / found.name.removeprefix("ros-").replace("-", "_") / "package.xml"
-    classifiers = [line.rpartition(" :: ")[2] for line in said.get_all("Classifier", []) if line.startswith("License")]
-    texts = [said.get("License-Expression", ""), "; ".join(classifiers), said.get("License", "")]
+    lines = [line for line in said.get_all("Classifier") or [] if line.startswith("License")]
+    classifiers = "; ".join(line.rpartition(" :: ")[2] for line in lines)
+    texts = [said["License-Expression"] or "", classifiers, said["License"] or ""]
     if manifest.is_file():
-        texts.append("; ".join(str(tag.text) for tag in ElementTree.parse(manifest).iter("license")))
+        texts.append("; ".join(str(tag.text) for tag in ET.parse(manifest).iter("license")))  # noqa: S314 - an installed file
     return next((text for text in texts if text and text != "UNKNOWN" and len(text) < LONGEST), "not stated")
 
 

@@ -138,8 +138,8 @@ class Recipe:
                 CONSTRAINTS.write_text("\n".join(constrain(locked, found)), encoding="utf-8")
                 self._install(step, "runtime.in", "build.in")
             else:
-                locked = (REQUIREMENTS / "python.lock").read_text(encoding="utf-8")
-                CONSTRAINTS.write_text(pinned("uv", locked), encoding="utf-8")
+                text = (REQUIREMENTS / "python.lock").read_text(encoding="utf-8")
+                CONSTRAINTS.write_text(pinned("uv", text), encoding="utf-8")
                 step.run(*installer.pip("-r", CONSTRAINTS), environ=build_environment(self._ros))
                 self._install(step, "ros.in", MESSAGES_LIST, "runtime.in", "build.in")
                 mend_cmake_paths(VENV, site_packages())
