@@ -18,7 +18,7 @@ from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from lathe_rc import harness, resources
+from lathe_rc import harness, resources, trust
 from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
@@ -35,6 +35,7 @@ ARGUMENTS = {
         "ROS 2 parameter file of the cell; NODE.PARAM:=VALUE, or PARAM:=VALUE if shared, replaces one of its values",
     ),
     "bag": ("", "folder to record to, which must not exist; empty: the scenario's, or bag_ and the run id"),
+    "allow_code": ("", "package of the current folder that the scenario names code of"),
     "namespace": ("/", "of the nodes; two cells in one domain need one each"),
 }  #: default and description
 OF_LAUNCH = {"emulate_tty", "launch-prefix", "launch-prefix-filter", "sigkill_timeout", "sigterm_timeout"}
@@ -58,6 +59,8 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         InputError: the scenario cannot work, the bag's folder exists, or there is no such argument.
     """
     refuse_unknown(given_to_this_file(context))
+    if package := LaunchConfiguration("allow_code").perform(context):
+        trust.allow(package)
     path = resources.find(Path(LaunchConfiguration("scenario").perform(context)))
     scenario = replaced(scenarios.load(path), context.launch_configurations.items())
     Cell(scenario.nodes).check()
@@ -77,7 +80,7 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             executable="container",
             exec_name=label(group),
             namespace=namespace,
-            arguments=[f"{name}:{complete.kind(name)}" for name in group],
+            arguments=[*trust.arguments(), *(f"{name}:{complete.kind(name)}" for name in group)],
             parameters=[file.name],
             ros_arguments=["--enclave", absolute(namespace, group[0])],
             output="screen",
