@@ -67,6 +67,8 @@ class Offers(Mapping[str, V], Generic[V]):
         own = self.own.get(name)
         if own is not None and not isinstance(own, str):
             return own
+        if not (own or self.permits(name)):
+            raise InputError(f"{self._what} {shown(name)!r}: {self.why_not(name)}")
         if name not in self._found:
             self._found[name] = self._checked(name, pkgutil.resolve_name(own) if own else self._import(name))
         return self._found[name]
@@ -74,8 +76,6 @@ class Offers(Mapping[str, V], Generic[V]):
     def _import(self, name: str) -> Any:
         module, colon, attribute = name.partition(":")
         if colon:
-            if not self.permits(name):
-                raise InputError(f"{self._what} {shown(name)!r}: {self.why_not(name)}")
             return _attribute(module, attribute, f"{self._what} {shown(name)!r}")
         point = _offered(self.group)[name]
         return _attribute(point.module, point.attr, f"{self._what} {name!r} of {_distribution(point.dist)}")

@@ -36,3 +36,8 @@ def find(path: Path) -> Path:
     if path.exists() or path.is_absolute():
         return path
     return next((folder / path for folder in config_folders() if (folder / path).exists()), path)
+
+
+def is_own(path: Path) -> bool:
+    """Whether a file is one of those that come with lathe_rc."""
+    return any(path.resolve().is_relative_to(folder.resolve()) for folder in config_folders())

@@ -19,7 +19,6 @@ from pathlib import Path
 from types import ModuleType
 
 from lathe_rc.errors import InputError, shown
-from lathe_rc.resources import config_folders, find
 
 OPTION = "--allow-code"
 REPLAYED = "lathe-replay-"  #: begins the name of a temporary folder with the files of a bag that is replayed
@@ -187,11 +186,9 @@ def may_announce(path: str) -> bool:
     """Whether the announcement of a member may name a file: as the user does, lathe_rc's own, or one of a replay."""
     if path in _calls[-1].named():
         return True
-    place = find(Path(path)).resolve()
-    replayed = [parent for parent in place.parents if parent.name.startswith(REPLAYED)]
-    return is_own_resource(place) or any(parent.parent == Path(tempfile.gettempdir()).resolve() for parent in replayed)
+    from lathe_rc import resources
 
-
-def is_own_resource(path: Path) -> bool:
-    """Whether a file is one of those that come with lathe_rc."""
-    return any(path.resolve().is_relative_to(folder.resolve()) for folder in config_folders())
+    place = resources.find(Path(path)).resolve()
+    temporary = Path(tempfile.gettempdir()).resolve()
+    replayed = any(each.parent == temporary and each.name.startswith(REPLAYED) for each in place.parents)
+    return replayed or resources.is_own(place)

@@ -2,12 +2,14 @@
 """Start every node of a scenario, the recorder included: ``ros2 launch lathe_rc cell.launch.py``.
 
 ``scenario`` names the ROS 2 parameter file, ``bag`` the folder to record to, ``namespace`` that of the nodes;
+``allow_code`` a package of the current folder that the scenario names code of;
 ``NODE.PARAM:=VALUE``, or ``PARAM:=VALUE`` for a shared parameter, replaces a value of the scenario. The run ends when
 its last block has been recorded; without a number of revolutions it goes on until Ctrl-C. A node that fails ends the
 others, and the launch fails.
 """
 
 import atexit
+import shutil
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -68,9 +70,9 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     bag = place(scenario, LaunchConfiguration("bag").perform(context))
     refuse_existing(bag)
     complete = harness.with_recorder(scenario, bag, keep=True)
-    with tempfile.NamedTemporaryFile("w", encoding="utf-8", prefix="lathe_", suffix=".yaml", delete=False) as file:
-        file.write(complete.to_yaml())
-    atexit.register(Path(file.name).unlink, missing_ok=True)
+    file = Path(tempfile.mkdtemp(prefix="lathe_")) / "scenario.yaml"
+    file.write_text(complete.to_yaml(), encoding="utf-8")
+    atexit.register(shutil.rmtree, file.parent, ignore_errors=True)
     groups = complete.processes()
     restartable = any(getattr(table, "restart_file", "") for table in complete.nodes.values())
     ends = Ends(len(groups), replaced=restartable)
@@ -81,7 +83,7 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             exec_name=label(group),
             namespace=namespace,
             arguments=[*trust.arguments(), *(f"{name}:{complete.kind(name)}" for name in group)],
-            parameters=[file.name],
+            parameters=[str(file)],
             ros_arguments=["--enclave", absolute(namespace, group[0])],
             output="screen",
             on_exit=ends,

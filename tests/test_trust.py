@@ -123,8 +123,8 @@ NAMED = [
     ("tool", "profile", "venv.__main__:x"),
 ]
 READERS = [
-    *(["resim"], ["resim", "--set", "tool.nose_radius=0.0"], ["resim", "--identify"], ["report", "--budget"]),
-    *(["report"], ["measure"], ["export", "--csv", "-o", "out"]),
+    *(["resim"], ["resim", "--set", "tool.nose_radius=0.0"], ["report", "--budget"], ["measure"]),
+    ["export", "--csv", "-o", "out"],
     *(["bag", "info"], ["bag", "check"], ["bag", "recover"], ["bag", "tachogram"]),
 ]
 
@@ -216,10 +216,9 @@ def test_a_controller_from_a_bag_is_data(received):
     assert not received.mark.exists()
 
 
-@pytest.mark.parametrize("name", ["{}:Tool", "tool:{}:Tool"])
-def test_a_node_imports_what_the_user_allows(received, name):
+def test_a_node_imports_what_the_user_allows(received):
     """Not even code that its command line names; and the parameter file of a bag is data."""
-    refused(lathe("node", name.format(received.module)), f"--allow-code {received.module}")
+    refused(lathe("node", f"tool:{received.module}:Tool"), f"--allow-code {received.module}")
     file = received.scenario(received.bag / "cell.yaml", "tool", profile=f"{received.module}:Tool")
     refused(lathe("node", "tool", "--ros-args", "--params-file", file), "code that no installed package offers")
     assert not received.mark.exists()
@@ -334,7 +333,7 @@ def test_a_scenario_that_lies_in_a_bag_names_files_in_it_alone(received, word, n
     (received.bag / "link.csv").symlink_to(received.secret)
     file = received.scenario(received.bag / "cell.yaml", node, **{parameter: value.format(received.secret)})
     words = ["run", file] if word == "run" else ["node", node, "--ros-args", "--params-file", file]
-    refused(lathe(*words), f"{node}.{parameter} = ", "a file outside of")
+    refused(lathe(*words), f"{node}.{parameter} = ", "a file outside of the bag")
     assert sorted(Path("..").resolve().iterdir()) == sorted([Path.cwd(), received.secret])
 
 

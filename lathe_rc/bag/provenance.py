@@ -17,7 +17,7 @@ from pathlib import Path
 from lathe_rc import __version__, trust
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.parameters import NodeParameters, Value
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario, kind_of
 from lathe_rc.cell.stages import STAGES
@@ -160,21 +160,40 @@ def changes(about: Mapping[str, str], scenario: Scenario) -> list[str]:
     return found
 
 
+def named_files(about: Mapping[str, str]) -> dict[str, str]:
+    """The files, by NODE.PARAM, that a bag's scenario names and the bag does not hold.
+
+    Raises:
+        InputError: the bag's scenario is no parameter file.
+    """
+    return {
+        f"{node}.{key}": str(value)
+        for node, values in _scenario(about).items()
+        for key, value in values.items()
+        if key.endswith("_file") and value and f"{FILE}{node}.{key}" not in about
+    }
+
+
 def strangers(about: Mapping[str, str]) -> list[str]:
     """Code that a bag's scenario names, and files that the bag does not hold; a line each, nothing is imported.
 
     Raises:
         InputError: the bag's scenario is no parameter file.
     """
-    found = []
-    for node, values in ros_yaml.parse(about[SCENARIO], f"{SCENARIO} of the bag").items() if SCENARIO in about else ():
-        for key, value in values.items():
-            for each in value if isinstance(value, list) else [value]:
-                if isinstance(each, str) and _CODE.fullmatch(each):
-                    found.append(f"{node}.{key} names code, {shown(each)}")
-            if key.endswith("_file") and value and f"{FILE}{node}.{key}" not in about:
-                found.append(f"{node}.{key} names a file that the bag does not hold, {shown(str(value))}")
-    return list(dict.fromkeys(found))
+    code = [
+        f"{node}.{key} names code, {shown(each)}"
+        for node, values in _scenario(about).items()
+        for key, value in values.items()
+        for each in (value if isinstance(value, list) else [value])
+        if isinstance(each, str) and _CODE.fullmatch(each)
+    ]
+    files = [f"{key} names a file that the bag does not hold, {shown(path)}" for key, path in named_files(about).items()]
+    return [*dict.fromkeys(code), *files]
+
+
+def _scenario(about: Mapping[str, str]) -> dict[str, dict[str, Value]]:
+    """Values of a bag's scenario by node and name; empty without one."""
+    return ros_yaml.parse(about[SCENARIO], f"{SCENARIO} of the bag") if SCENARIO in about else {}
 
 
 def held(about: Mapping[str, str]) -> dict[str, int]:
@@ -202,7 +221,7 @@ def tolerances(about: Mapping[str, str]) -> dict[str, float]:
         InputError: the bag's scenario is no parameter file.
     """
     found: dict[str, float] = {}
-    for node, values in ros_yaml.parse(about[SCENARIO], f"{SCENARIO} of the bag").items() if SCENARIO in about else ():
+    for node, values in _scenario(about).items():
         allowed, remap = values.get("tolerance", 0.0), values.get("remap", [])
         if str(values.get("stage") or node) == Tool.kind and isinstance(allowed, float) and 0.0 < allowed < math.inf:
             rules = [str(rule).partition(":=") for rule in remap] if isinstance(remap, list) else []

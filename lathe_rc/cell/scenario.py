@@ -17,7 +17,7 @@ from typing import cast
 
 import yaml
 
-from lathe_rc import files, trust
+from lathe_rc import files, resources, trust
 from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Value
 from lathe_rc.cell.recorder import KIND as RECORDER
@@ -393,24 +393,24 @@ def read(
             elif row is not None and row.is_file and isinstance(value, str) and value:
                 place = _stands_for(f"{name}.{key}", value, path.parent, copies)
                 values[key] = str(place)
-                if not (place.is_relative_to(folder.resolve()) or trust.is_own_resource(place)):
+                if not (place.is_relative_to(folder.resolve()) or resources.is_own(place)):
                     outside[name, key] = place
     for text in overrides:
         outside.pop(_override(text, nodes), None)
     for (name, key), place in outside.items():
-        what = f"a file outside of {folder}" if copies is None else "a file that the bag does not hold"
+        what = f"a file outside of the bag {folder}" if copies is None else "a file that the bag does not hold"
         raise InputError(f"{shown(f'{name}.{key} = {place}')}: {what}; allowed: --set {shown(name)}.{key}=FILE")
     return nodes
 
 
-_WRITTEN = ("memory_file", "restart_file")  # parameters whose files a run may make itself
+WRITTEN = ("memory_file", "restart_file")  #: parameters whose files a run may make itself
 
 
 def _stands_for(parameter: str, value: str, folder: Path, copies: Mapping[str, Path] | None) -> Path:
     """The file that stands for one that data names: its copy, a new one where a run makes it, or itself, resolved."""
     if copies is not None and parameter in copies:
         return copies[parameter].resolve()
-    if copies is not None and parameter.rpartition(".")[2] in _WRITTEN:
+    if copies is not None and parameter.rpartition(".")[2] in WRITTEN:
         return Path(tempfile.mkdtemp(dir=folder)).resolve() / "state"
     return (folder / value).resolve()
 

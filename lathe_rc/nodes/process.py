@@ -183,7 +183,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
     """
     for file in arguments.parameter_files(args):
         if trust.bag_around(file.parent) is not None:
-            scenarios.read(file)  # it is data, and refused if it names code or files elsewhere
+            scenarios.load(file)  # it is data, and refused if it names code or files elsewhere
     trust.user_names(cache(partial(arguments.texts, args)))
     faulthandler.enable()  # a crash of a library leaves where it happened in the log
     faulthandler.register(signal.SIGUSR1)  # and the harness can ask where a silent process is

@@ -91,11 +91,12 @@ def files_of(path: Path) -> list[Path]:
     """The files with the messages of a bag, by name: those of a folder, or the one that is named.
 
     Raises:
-        InputError: a link in the folder leads out of it.
+        InputError: a file that is read is a link that leads out of the folder.
     """
     found = [path] if path.is_file() else [*path.glob("*")]
     for file in found:
-        if file != path and file.is_symlink() and not file.resolve().is_relative_to(path.resolve()):
+        read = file.suffix in _KINDS or file.name in (_METADATA, "digests.json")
+        if read and file != path and not file.resolve().is_relative_to(path.resolve()):
             raise InputError(f"{file}: a link that leads out of the bag; allowed: the file itself in its place")
     return sorted(file for file in found if file.suffix in _KINDS and file.is_file())
 

@@ -185,7 +185,7 @@ def resimulate(
     with Source(path) as source, tempfile.TemporaryDirectory(prefix="lathe-resim-") as folder:
         _refuse_part(source)
         recorded = Recorded(source, topics or {})
-        original = None if scenario is not None else _of_bag(recorded, source, Path(folder))
+        original = None if scenario is not None else _of_bag(recorded, source, Path(folder), overrides)
         if scenario is not None:
             chosen = scenarios.load(resources.scenario(scenario), overrides)
         else:
@@ -245,15 +245,17 @@ def resimulate(
     )
 
 
-def _of_bag(recorded: Recorded, source: Source, folder: Path) -> Scenario:
-    """The bag's scenario.
+def _of_bag(recorded: Recorded, source: Source, folder: Path, overrides: Sequence[str]) -> Scenario:
+    """The bag's scenario, with the files that it does not hold as ``overrides`` name them.
 
     Raises:
         InputError: it has none; says what it has and what is asked for.
     """
     if provenance.SCENARIO not in source.about:
         raise InputError(f"{source.path}: {asked_for(recorded)}")
-    return provenance.scenario_of(source.about, folder)
+    lacks = {name for name in provenance.named_files(source.about) if not name.endswith(scenarios.WRITTEN)}
+    given = [text for text in overrides if text.partition("=")[0].strip() in lacks]
+    return provenance.scenario_of(source.about, folder, given)
 
 
 @contextmanager
