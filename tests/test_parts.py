@@ -538,7 +538,9 @@ def test_what_is_not_here_is_to_be_installed(recorded):
     """If the parts came from a distribution, that is what the refusal names."""
     about = told_by(recorded[0], {"distribution": "lathe-hann", "version": "0.3"})
     about[provenance.ORIGINS] = about[provenance.ORIGINS].replace("parts:Hann", "lathe_hann:Hann")
-    with pytest.raises(InputError, match=r"lathe_hann:Hann, and .*; allowed: install lathe-hann 0\.3, or --allow-code lathe_hann if "):
+    with pytest.raises(
+        InputError, match=r"lathe_hann:Hann, and .*; allowed: install lathe-hann 0\.3, or --allow-code lathe_hann if "
+    ):
         provenance.scenario_of(about, Path())
 
 

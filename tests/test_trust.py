@@ -14,7 +14,6 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import yaml
 from cells import scenario
@@ -23,6 +22,7 @@ from click.testing import CliRunner
 from lathe_rc import extensions, harness, trust
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
+from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cli import main
@@ -67,7 +67,9 @@ class Received:
         here.mkdir()
         os.chdir(here)
         shutil.copytree(bag, self.bag)
-        text = f"from pathlib import Path\nPath({str(self.mark)!r}).touch()\nfrom lathe_rc.cell.stages.tool import Tool\n"
+        text = (
+            f"from pathlib import Path\nPath({str(self.mark)!r}).touch()\nfrom lathe_rc.cell.stages.tool import Tool\n"
+        )
         for place in (here, self.bag):
             (place / f"{self.module}.py").write_text(text)
 
@@ -148,7 +150,9 @@ def test_no_command_that_reads_a_bag_imports_code(received):
     assert f"tool.stage names code, bag.{received.module}:Tool" in lathe("bag", "info", received.bag).stdout
 
 
-@pytest.mark.parametrize("key", ["lathe_rc.origins", "lathe_rc.file.tool.stage={0}:Tool #.x", "lathe_rc.file.tool.stage"])
+@pytest.mark.parametrize(
+    "key", ["lathe_rc.origins", "lathe_rc.file.tool.stage={0}:Tool #.x", "lathe_rc.file.tool.stage"]
+)
 def test_other_metadata_of_a_bag_names_no_code(received, key):
     """Neither where classes came from, nor the key of a copy, which once was read as --set."""
     code = f"{received.module}:Tool"
@@ -197,9 +201,14 @@ def test_a_scenario_that_lies_in_a_bag_is_data(received, words):
 def test_only_run_looks_for_code_in_the_current_folder(received, words):
     file = received.scenario(Path("cell.yaml"), "tool", stage=f"{received.module}:Tool")
     refused(lathe(*words, file), f"--allow-code {received.module}")
-    assert not received.mark.exists()
     assert lathe("run", file).exit_code == 0
     assert received.mark.exists()
+
+
+def test_a_scenario_beside_the_user_takes_the_place_of_none_of_ours(received):
+    received.scenario(Path("piston.yaml"), "tool", stage=f"{received.module}:Tool")
+    refused(lathe("run", "piston"), "piston: piston.yaml here, or ")
+    assert not received.mark.exists()
 
 
 def test_run_finds_no_code_in_a_bag_it_stands_in(received, monkeypatch):
@@ -374,18 +383,17 @@ def test_children_are_allowed_the_same():
         words = trust.arguments()
     with trust.call():
         assert trust.taken_from([*words, "tool", "--allow-code=third"]) == ["tool"]
-        assert [trust.is_allowed(name) for name in ("first.a", "second", "third", "fourth")] == [True, True, True, False]
+        assert [trust.is_allowed(name) for name in ("first.a", "second", "third", "fourth")] == [
+            True,
+            True,
+            True,
+            False,
+        ]
 
 
-def test_a_python_program_allows_what_its_own_scenarios_name(received):
-    """It has imported them from its own path; nothing is looked for in the current folder."""
+def test_a_python_program_looks_for_code_on_its_own_path_alone(received):
+    """Code that its own scenarios name is allowed; the current folder is not searched."""
     file = received.scenario(Path("cell.yaml"), "tool", stage=f"{received.module}:Tool")
     with pytest.raises(InputError, match="cannot be imported: ModuleNotFoundError"):
-        extensions_of(file)
-    assert np.all([not received.mark.exists(), not trust.is_allowed("nothing")])
-
-
-def extensions_of(file):
-    from lathe_rc.cell import scenario as scenarios
-
-    return scenarios.load(file)
+        scenarios.load(file)
+    assert not received.mark.exists()

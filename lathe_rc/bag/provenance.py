@@ -135,7 +135,9 @@ def _check_installed(about: Mapping[str, str]) -> None:
     for origin in origins(about):
         package = origin.name.partition(":")[0].partition(".")[0]
         if package not in sys.modules and (not package.isidentifier() or find_spec(package) is None):
-            allowed = f"install {origin.package or package}, or {trust.OPTION} {package} if it lies in the current folder"
+            allowed = (
+                f"install {origin.package or package}, or {trust.OPTION} {package} if it lies in the current folder"
+            )
             raise InputError(
                 f"{', '.join(origin.used)}: the bag was made with {origin.name}, and there is no module {package}; "
                 f"allowed: {allowed}"
@@ -187,7 +189,9 @@ def strangers(about: Mapping[str, str]) -> list[str]:
         for each in (value if isinstance(value, list) else [value])
         if isinstance(each, str) and _CODE.fullmatch(each)
     ]
-    files = [f"{key} names a file that the bag does not hold, {shown(path)}" for key, path in named_files(about).items()]
+    files = [
+        f"{key} names a file that the bag does not hold, {shown(path)}" for key, path in named_files(about).items()
+    ]
     return [*dict.fromkeys(code), *files]
 
 

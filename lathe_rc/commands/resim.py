@@ -20,7 +20,6 @@ from lathe_rc.bag.resimulation.bag_spindle import asked_for
 from lathe_rc.bag.resimulation.identify import Identified
 from lathe_rc.bag.resimulation.resim import Resimulation, resimulate
 from lathe_rc.commands import options
-from lathe_rc.commands import options
 from lathe_rc.errors import InputError
 
 _SHOWN = 10  # revolutions

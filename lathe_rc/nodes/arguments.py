@@ -137,5 +137,7 @@ def texts(words: Sequence[str]) -> set[str]:
         InputError: a file cannot be read.
     """
     values = [ros_yaml.parse_value(rule.value, f"-p {rule.text}") for rule in rules(words)]
-    values += [value for path in parameter_files(words) for own in ros_yaml.read(path).values() for value in own.values()]
+    values += [
+        value for path in parameter_files(words) for own in ros_yaml.read(path).values() for value in own.values()
+    ]
     return {value for value in values if isinstance(value, str)}

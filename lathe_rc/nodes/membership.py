@@ -153,7 +153,9 @@ class Membership(Lifecycle):
             refused = "" if missing else _refused(kind, values)
             if not missing and not refused:
                 return kind.read(name, values)
-            why = refused or f"its parameters do not say {missing[0]}" + (f" and {len(missing) - 1} others" if missing[1:] else "")
+            why = refused or f"its parameters do not say {missing[0]}" + (
+                f" and {len(missing) - 1} others" if missing[1:] else ""
+            )
         if name not in self._told_unknown:
             self._told_unknown.add(name)
             self.get_logger().info(f"{name}, stage {shown(repr(member.stage))}, is known by its topics alone: {why}")
@@ -255,9 +257,11 @@ def _refused(kind: type[NodeParameters], values: Mapping[str, object]) -> str:
     """Why the parameters that a member announces are not taken: they name code or files that it may not name."""
     for row in kind.rows().values():
         value = values[row.name]
-        for name in row.named.others(value) if row.named else ():
-            if not row.named.registry.permits(name):
-                return f"{row.name} = {shown(repr(name))}: {row.named.registry.why_not(name)}"
+        if row.named is not None:
+            registry = row.named.registry
+            for name in row.named.others(value):
+                if not registry.permits(name):
+                    return f"{row.name} = {shown(repr(name))}: {registry.why_not(name)}"
         if row.is_file and value and not trust.may_announce(str(value)):
             return f"{row.name} = {shown(repr(value))}: a file that no parameter file of this process names"
     return ""

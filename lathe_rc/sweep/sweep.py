@@ -150,7 +150,9 @@ def order_of(folder: Folder) -> Order:
     """The order that all jobs of a folder share."""
     scenario = folder.scenario
     text = scenario.to_yaml(given=True)
-    return Order(scenario.name, text, scenario.identity, folder.targets, folder.measures, folder.schema, trust.arguments())
+    return Order(
+        scenario.name, text, scenario.identity, folder.targets, folder.measures, folder.schema, trust.arguments()
+    )
 
 
 def keep(
