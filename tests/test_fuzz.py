@@ -370,10 +370,6 @@ def test_run_of_a_bag_writes_to_no_file_that_the_bag_names(tmp_path):
     [
         ({f"{provenance.FILE}tool.profile_file": "a"}, "is not base64"),
         ({f"{provenance.FILE}tool.profile_file": "\u00e9"}, "is not base64"),
-        ({f"{provenance.FILE}a=b.c": ""}, "'a' is not shared"),
-        ({f"{provenance.FILE}a\nb=c.d": ""}, r"'a\\nb' is not shared"),
-        ({f"{provenance.FILE}tool.a\nb=c: d: e.f": ""}, r"^--set tool\.a:1: not YAML"),
-        ({f"{provenance.FILE}tool.a\nb": ""}, r"^tool\.a: unknown parameter"),
         ({provenance.SCENARIO: "\ud800"}, "not a text file"),
     ],
 )

@@ -122,7 +122,7 @@ def command(arguments: Sequence[str]) -> list[str]:
         return ["-m", "benchmarks", *arguments]
     if arguments[:1] == ["python"]:
         return list(arguments[1:])
-    return ["-m", "lathe_rc", *arguments]
+    return [str(ROOT / "lathe_rc" / "__main__.py"), *arguments]  # not -m: the current folder is no place for code
 
 
 def change_to(python: Path) -> None:

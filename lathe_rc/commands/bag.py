@@ -63,6 +63,7 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
             "topics": topics,
             "about": dict(source.about),
             "contradictions": source.contradictions,
+            "strangers": provenance.strangers(source.about),
         }
     told["error_um"] = _metrics(path, types) if metrics else None
     if as_json:
@@ -78,6 +79,8 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
     console.print(table)
     for what in told["contradictions"]:
         click.echo(what, err=True)
+    for what in told["strangers"]:
+        console.print(Text(what))
     console.print(f"span: {span:.6g} s from {told['start_s']:.6g} s on")
     if told["error_um"]:
         first, last = told["error_um"]["first"], told["error_um"]["last"]
@@ -106,7 +109,8 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
 def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
     """Verify sequence, gaps, numbers, checksums and recorded digests.
 
-    Exit code 0: clean, 3: lossy, 1: wrong, 2: no bag, or one that cannot be read.
+    Exit code 0: clean, 3: lossy, 1: wrong, 2: no bag, or one that cannot be read. Code and files that it names and
+    does not hold get a line each.
     """
     found = check_bag(path)
     told = {
@@ -114,6 +118,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
         "clean": not found.exit_code,
         "wrong": found.wrong,
         "lost": found.lost,
+        "strangers": found.strangers,
         "messages": found.messages,
         "samples": found.samples,
         "digests_compared": found.compared,
@@ -122,7 +127,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(told))
     else:
-        for what in (*found.wrong, *found.lost):
+        for what in (*found.wrong, *found.lost, *found.strangers):
             click.echo(what)
         state = {0: "clean", 1: "wrong", _LOSSY: "lossy"}[found.exit_code]
         digests = f"{found.compared} digests as recorded" if found.compared else "no digests recorded"

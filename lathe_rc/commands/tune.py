@@ -67,6 +67,7 @@ _STEPS = 5  # of the history that are shown
 @click.option("--out", type=click.Path(path_type=Path), help="folder of the results; default: tune-SCENARIO")
 @options.scheduler
 @options.workers
+@options.allow_code
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def tune(
     scenario: str,

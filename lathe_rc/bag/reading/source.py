@@ -88,8 +88,16 @@ class Topic:
 
 
 def files_of(path: Path) -> list[Path]:
-    """The files with the messages of a bag, by name: those of a folder, or the one that is named."""
-    found = [path] if path.is_file() else path.glob("*")
+    """The files with the messages of a bag, by name: those of a folder, or the one that is named.
+
+    Raises:
+        InputError: a file that is read is a link that leads out of the folder.
+    """
+    found = [path] if path.is_file() else [*path.glob("*")]
+    for file in found:
+        read = file.suffix in _KINDS or file.name in (_METADATA, "digests.json")
+        if read and file != path and not file.resolve().is_relative_to(path.resolve()):
+            raise InputError(f"{file}: a link that leads out of the bag; allowed: the file itself in its place")
     return sorted(file for file in found if file.suffix in _KINDS and file.is_file())
 
 
@@ -208,10 +216,11 @@ class Source:
         """
         if not self.path.exists():
             raise ValueError("there is no such folder or file")
+        found = files_of(self.path)
         if self.path.is_dir():
             metadata = self.path / _METADATA
             if not metadata.exists():
-                lack = "" if files_of(self.path) else ", nor a .mcap or .db3 file"
+                lack = "" if found else ", nor a .mcap or .db3 file"
                 raise ValueError(f"no {_METADATA} in that folder{lack}")
             if metadata.stat().st_size > MOST_TEXT * 16:
                 raise InputError(f"{metadata}: {metadata.stat().st_size} B; allowed: up to {MOST_TEXT * 16}")
