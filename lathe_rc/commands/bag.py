@@ -136,7 +136,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
 @_JSON
 @click.pass_context
 def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: bool) -> None:
-    """Write what is whole of a broken bag to a new one; exit code 0: nothing is missing, 3: something is."""
+    """Copy what is whole of a broken bag to a new one; exit code 0: no message is missing, 3: some are."""
     target = output or path.with_name(f"{path.stem if path.is_file() else path.name}_recovered")
     found = recover_bag(path, target)
     told = {
@@ -144,6 +144,7 @@ def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: boo
         "output": str(target),
         "saved": found.saved,
         "skipped": found.skipped,
+        "missing": found.missing,
         "lost_bytes": found.lost_bytes,
         "damage": list(found.damage),
     }
