@@ -11,7 +11,8 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.bag import provenance
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading import sound_records
+from lathe_rc.bag.reading.source import Source, files_of
 from lathe_rc.bag.snapshot import first_sample, span_of
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.recording import Digester, SparseTopic
@@ -128,6 +129,8 @@ def check(path: Path) -> Findings:
             if said.count != counts[topic]:
                 findings.wrong.append(f"{topic}: {counts[topic]} messages, {said.count} by the index")
         findings.messages = sum(counts.values())
+    for file in files_of(path):
+        findings.wrong += sound_records.damage(file) if file.suffix == ".mcap" else []
     _ends(dense, findings, part=part is not None)
     if not dense and messages.CELL_STATE in types.values():
         findings.lost.append("no block: the cell of this bag did not begin")

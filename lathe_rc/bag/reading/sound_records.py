@@ -105,6 +105,7 @@ class SoundRecords:
         effort: what may be spent, given for records of a chunk; None: in proportion to the size.
 
     Attributes:
+        ended: whether the newest iteration has come behind the end of all data.
         data_wrong, summary_wrong: whether the checksum of all data, or of the summary, does not hold.
     """
 
@@ -113,8 +114,8 @@ class SoundRecords:
         self._effort = effort or _Effort(size)
         self._last = Opcode.FOOTER if effort is None else 0
         self._chunked = False
-        self._checked_from = size
-        self.data_wrong = self.summary_wrong = False
+        self._checked_from = self._summary = size
+        self.ended = self.data_wrong = self.summary_wrong = False
 
     def inside(self, record: Record) -> Iterator[tuple[int, bytes]]:
         """Opcode and content of each record of a chunk, or of the record itself if it is none."""
@@ -145,6 +146,7 @@ class SoundRecords:
             data_end = self._sound(end)[0]
         except ValueError:
             return  # the walk tells it
+        self._summary = start or self._size
         if start and crc:
             if self._sum(start, place + _FOOTER - 4) == crc:
                 self._checked_from = start
@@ -162,9 +164,17 @@ class SoundRecords:
             crc = crc32(self._at(place, min(_WINDOW, stop - place)), crc)
         return crc
 
+    def summary(self) -> Iterator[Record]:
+        """The sound records of the summary, once `check_sums` has found it."""
+        return self._walk(self._summary) if self._summary < self._size else iter(())
+
     def __iter__(self) -> Iterator[Record]:
         """The sound records in the order of the file."""
-        place, opcode, ended = 0, 0, False
+        return self._walk(0)
+
+    def _walk(self, place: int) -> Iterator[Record]:
+        opcode, before = 0, place
+        self.ended = False
         if self._last:
             self._effort = _Effort(self._size)
         while place < self._size:
@@ -175,21 +185,22 @@ class SoundRecords:
                 record, end = self._sound(place)
             except _UnsoundError as error:
                 self._chunked |= error.chunk
-                end = error.end or self._search(place + 1)
-                self.told(str(error), 0 if ended else end - place)
-                place = end
+                end = error.end or self._search(before + 1)
+                self.told(str(error), 0 if self.ended else max(0, end - place))
+                place = before = end
                 continue
             opcode = record.opcode
-            if opcode == Opcode.CHUNK:
-                self._chunked = True
-            ended = opcode == Opcode.DATA_END or (ended and opcode not in (Opcode.CHUNK, Opcode.MESSAGE))
+            self._chunked |= opcode in (Opcode.CHUNK, Opcode.CHUNK_INDEX)
+            self.ended = opcode == Opcode.DATA_END or (self.ended and opcode not in (Opcode.CHUNK, Opcode.MESSAGE))
+            # A record may lack bytes at its end and have taken them from the next one: that is looked for within it.
+            before = end if record.checked or opcode == Opcode.MESSAGE else place
             yield record
             place = end
         if self._last and opcode != self._last:
             self.told("ends without a footer", 0)
 
     def _at(self, place: int, length: int) -> bytes:
-        self._stream.seek(place)
+        self._stream.seek(max(place, 0))  # a file may be shorter than its last records
         return self._stream.read(length)
 
     def _sound(self, place: int) -> tuple[Record, int]:
@@ -266,17 +277,18 @@ class SoundRecords:
 
     def _search(self, place: int) -> int:
         """Where the next sound record stands; the size of the file if there is none."""
-        while place < self._size:
-            window = self._at(place, _WINDOW + _LONGEST_BEGIN)
-            self._effort.spend(_SEARCH * len(window))
+        length = _PAGE
+        while place < self._size and self._effort.left >= 0:
+            window = self._at(place, length + _LONGEST_BEGIN)
             for begin in _BEGINS.finditer(window):
-                if begin.start() >= _WINDOW:
+                if begin.start() >= length:
                     break
                 if not self._effort.spend(0):
                     return self._size
                 if self._is_anchor(place + begin.start()):
                     return place + begin.start()
-            place += _WINDOW
+            self._effort.spend(_SEARCH * len(window))
+            place, length = place + length, min(2 * length, _WINDOW)
         return self._size
 
     def _is_anchor(self, place: int) -> bool:

@@ -125,6 +125,7 @@ class Salvage:
     lossy: bool = False
     _described: int = 0  # characters of texts and definitions
     _counted: int | None = None  # messages by the file that is read
+    _ended: bool = True  # whether that file goes to its end
 
     def __post_init__(self) -> None:
         self._files = files_of(self.path)
@@ -170,7 +171,7 @@ class Salvage:
         read, complete = 0, True
         for file in self._files:
             lost, skipped, found = self.lost_bytes, self.skipped, 0
-            self._counted = None
+            self._counted, self._ended = None, True
             for message in self._file(file):
                 found += 1
                 if message.data.startswith(_ZSTD) and (packed or message.topic.encoding == "cdr"):
@@ -179,7 +180,7 @@ class Salvage:
                     yield message
             found += self.skipped - skipped
             read += found
-            complete &= self.lost_bytes == lost or self._counted == found
+            complete &= (self.lost_bytes == lost and self._ended) or self._counted == found
             self._miss(file.name, self._counted, found)
         told = self._metadata.get("message_count")
         self._miss("metadata.yaml", told if isinstance(told, int) else None, read)
@@ -263,24 +264,18 @@ class Salvage:
     # ---- MCAP ---------------------------------------------------------------------------------------
 
     def _mcap(self, file: Path) -> Iterator[Message]:
-        """Two passes: the only whole copy of a schema may stand behind the messages."""
-
         def told(why: str, lost: int) -> None:
             self._lose(file, why, lost)
 
         with file.open("rb") as stream:
             sound = SoundRecords(stream, file.stat().st_size, told)
             sound.check_sums()
-            sound.told = lambda _why, _lost: None
-            known = _Definitions(self, told)
+            known, unchecked = _Definitions(self, sound), 0
+            for record in () if sound.summary_wrong else sound.summary():
+                known.add(record.opcode, record.content, checked=record.checked)
             for record in sound:
                 if record.opcode == Opcode.STATISTICS and not sound.summary_wrong:
                     self._counted = Statistics.read(ReadDataStream(BytesIO(record.content))).message_count
-                for opcode, content in sound.inside(record):
-                    known.add(opcode, content, checked=record.checked)
-            sound.told = told
-            unchecked = 0
-            for record in sound:
                 for opcode, content in sound.inside(record):
                     if opcode == Opcode.MESSAGE:
                         if topic := known.topic_of(content):
@@ -288,15 +283,16 @@ class Salvage:
                             yield Message(topic, sequence, log_ns, publish_ns, content[_MESSAGE.size :])
                             unchecked += not record.checked
                     elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                        known.follow(opcode, content, checked=record.checked)
+                        known.add(opcode, content, checked=record.checked)
                     else:
-                        self._other(opcode, content, told)
+                        self._other(opcode, content, 0 if sound.ended else len(content), told)
             known.finish()
+            self._ended = sound.ended
             if unchecked and sound.data_wrong:
                 self._tell(f"{file.name}: {unchecked} messages have no checksum of their own; some may be wrong")
                 self.lossy = True
 
-    def _other(self, opcode: int, content: bytes, told: Told) -> None:
+    def _other(self, opcode: int, content: bytes, lost: int, told: Told) -> None:
         """Keep what is neither a message nor describes one."""
         try:
             if opcode == Opcode.METADATA:
@@ -307,10 +303,12 @@ class Salvage:
                     self.copied(opcode, content)
             elif opcode == Opcode.ATTACHMENT:
                 self.copied(opcode, content)
-            elif opcode == Opcode.CHUNK or opcode > Opcode.DATA_END:
-                raise ValueError("not copied")  # noqa: TRY301
+            elif opcode == Opcode.CHUNK:
+                raise ValueError("a chunk in the chunk")  # noqa: TRY301
+            elif opcode > Opcode.DATA_END:
+                raise ValueError("it is not copied")  # noqa: TRY301
         except ValueError as error:
-            told(f"record of kind {opcode}: {error}", len(content))
+            told(f"record of kind {opcode}: {error}", lost)
 
     # ---- SQLite -------------------------------------------------------------------------------------
 
@@ -384,15 +382,16 @@ class Salvage:
 class _Definitions:
     """Schemas and channels of an MCAP file, wherever they stand in it."""
 
-    def __init__(self, salvage: Salvage, told: Told) -> None:
-        self._salvage, self._told = salvage, told
+    def __init__(self, salvage: Salvage, sound: SoundRecords) -> None:
+        self._salvage, self._sound = salvage, sound
         self._known: dict[tuple[int, int], _Definition] = {}
         self._topics: dict[int, Topic | None] = {}
         self._lost: Counter[str] = Counter()  # messages by why they are not copied
         self._why: dict[int, str] = {}
+        self._searched = False
 
     def add(self, opcode: int, content: bytes, *, checked: bool) -> None:
-        """Take a record, if it is one of a schema or channel: the first of its number that a checksum vouches for."""
+        """Take a record, if it is one of a schema or channel; the last one counts that a checksum vouches for."""
         if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
             return
         key = opcode, int.from_bytes(content[:2], "little")
@@ -401,16 +400,24 @@ class _Definitions:
             self._known[key] = _Definition(content, checked or (before is not None and before.checked))
             return
         equals = checked == before.checked
-        self._told(f"{Opcode(opcode).name.lower()} {key[1]} is described in two ways", len(content) if equals else 0)
-        if checked and not before.checked:
-            self._known[key] = _Definition(content, checked)
-
-    def follow(self, opcode: int, content: bytes, *, checked: bool) -> None:
-        """Take a record that holds for the messages behind it: files may have been put one behind the other."""
-        key = opcode, int.from_bytes(content[:2], "little")
-        if checked and self._known.get(key) != (content, checked):
+        kind = Opcode(opcode).name.lower()
+        self._sound.told(f"{kind} {key[1]} is described in two ways", len(content) if equals else 0)
+        if checked or equals:
             self._known[key] = _Definition(content, checked)
             self._topics.clear()
+
+    def _find(self, opcode: int, number: int) -> bytes | None:
+        """The content of a record that may stand further behind, if everything ahead of it is damaged."""
+        key = opcode, number
+        if key not in self._known and not self._searched:
+            self._searched = True
+            told, self._sound.told = self._sound.told, lambda _why, _lost: None
+            for record in self._sound:
+                for kind, content in self._sound.inside(record):
+                    if (kind, int.from_bytes(content[:2], "little")) not in self._known:
+                        self.add(kind, content, checked=record.checked)
+            self._sound.told = told
+        return self._known[key].content if key in self._known else None
 
     def topic_of(self, message: bytes) -> Topic | None:
         """The topic of a message record; None if it cannot be copied."""
@@ -427,9 +434,10 @@ class _Definitions:
 
     def _topic(self, number: int) -> Topic | None:
         try:
-            if (Opcode.CHANNEL, number) not in self._known:
+            content = self._find(Opcode.CHANNEL, number)
+            if content is None:
                 raise ValueError(f"channel {number} is described nowhere")  # noqa: TRY301
-            return self._made(self._known[Opcode.CHANNEL, number].content)
+            return self._made(content)
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 - mcap raises whatever broken bytes lead to
@@ -439,12 +447,13 @@ class _Definitions:
     def _made(self, content: bytes) -> Topic:
         channel = Channel.read(ReadDataStream(BytesIO(content)))
         name, schema, kind = shown(channel.topic), None, _SCHEMALESS
-        found = self._known.get((Opcode.SCHEMA, channel.schema_id))
-        if found:
-            schema, kind = found.content, Schema.read(ReadDataStream(BytesIO(found.content))).name
-            precheck.check_name(kind)
-        elif channel.schema_id:
-            self._told(f"{name}: schema {channel.schema_id} is described nowhere", 0)
+        if channel.schema_id:
+            schema = self._find(Opcode.SCHEMA, channel.schema_id)
+            if schema is None:
+                self._sound.told(f"{name}: schema {channel.schema_id} is described nowhere", 0)
+            else:
+                kind = Schema.read(ReadDataStream(BytesIO(schema))).name
+                precheck.check_name(kind)
         self._salvage.count(len(content) + len(schema or b""))
         digest = channel.metadata.get("topic_type_hash", "")
         topic = Topic(channel.topic, kind, channel.message_encoding, (), digest, schema, content)
@@ -459,7 +468,7 @@ class _Definitions:
         self._salvage.skipped += self._lost.total()
         for why, count in self._lost.items():
             if why:
-                self._told(f"{why}: {count} messages of it are not copied", 0)
+                self._sound.told(f"{why}: {count} messages of it are not copied", 0)
 
 
 def _known(kind: str) -> tuple[str, str, str]:
