@@ -277,9 +277,9 @@ class Salvage:
                 if record.opcode == Opcode.STATISTICS and not sound.summary_wrong:
                     self._counted = Statistics.read(ReadDataStream(BytesIO(record.content))).message_count
                 for opcode, content in sound.inside(record):
-                    if opcode == Opcode.MESSAGE:
-                        if topic := known.topic_of(content):
-                            _, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content)
+                    if opcode == Opcode.MESSAGE and len(content) >= _MESSAGE.size:
+                        channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content)
+                        if topic := known.topics.get(channel) or known.topic_of(channel):
                             yield Message(topic, sequence, log_ns, publish_ns, content[_MESSAGE.size :])
                             unchecked += not record.checked
                     elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -303,8 +303,8 @@ class Salvage:
                     self.copied(opcode, content)
             elif opcode == Opcode.ATTACHMENT:
                 self.copied(opcode, content)
-            elif opcode == Opcode.CHUNK:
-                raise ValueError("a chunk in the chunk")  # noqa: TRY301
+            elif opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+                raise ValueError("a chunk in the chunk, or a message that is too short")  # noqa: TRY301
             elif opcode > Opcode.DATA_END:
                 raise ValueError("it is not copied")  # noqa: TRY301
         except ValueError as error:
@@ -385,7 +385,7 @@ class _Definitions:
     def __init__(self, salvage: Salvage, sound: SoundRecords) -> None:
         self._salvage, self._sound = salvage, sound
         self._known: dict[tuple[int, int], _Definition] = {}
-        self._topics: dict[int, Topic | None] = {}
+        self.topics: dict[int, Topic] = {}  #: by number of the channel, that have come
         self._lost: Counter[str] = Counter()  # messages by why they are not copied
         self._why: dict[int, str] = {}
         self._searched = False
@@ -404,7 +404,7 @@ class _Definitions:
         self._sound.told(f"{kind} {key[1]} is described in two ways", len(content) if equals else 0)
         if checked or equals:
             self._known[key] = _Definition(content, checked)
-            self._topics.clear()
+            self.topics.clear()
 
     def _find(self, opcode: int, number: int) -> bytes | None:
         """The content of a record that may stand further behind, if everything ahead of it is damaged."""
@@ -419,29 +419,21 @@ class _Definitions:
             self._sound.told = told
         return self._known[key].content if key in self._known else None
 
-    def topic_of(self, message: bytes) -> Topic | None:
-        """The topic of a message record; None if it cannot be copied."""
-        number = int.from_bytes(message[:2], "little")
-        if len(message) < _MESSAGE.size:
-            self._lost["record of a message that is too short"] += 1
-            return None
-        if number not in self._topics:
-            self._topics[number] = self._topic(number)
-        topic = self._topics[number]
-        if topic is None:
-            self._lost[self._why[number]] += 1
-        return topic
-
-    def _topic(self, number: int) -> Topic | None:
-        try:
-            content = self._find(Opcode.CHANNEL, number)
-            if content is None:
-                raise ValueError(f"channel {number} is described nowhere")  # noqa: TRY301
-            return self._made(content)
-        except MemoryError:
-            raise
-        except Exception as error:  # noqa: BLE001 - mcap raises whatever broken bytes lead to
-            self._why[number] = shown(error)
+    def topic_of(self, number: int) -> Topic | None:
+        """The topic of a message's channel; None if it cannot be copied."""
+        if number not in self._why:
+            try:
+                content = self._find(Opcode.CHANNEL, number)
+                if content is None:
+                    raise ValueError(f"channel {number} is described nowhere")  # noqa: TRY301
+                topic = self.topics[number] = self._made(content)
+            except MemoryError:
+                raise
+            except Exception as error:  # noqa: BLE001 - mcap raises whatever broken bytes lead to
+                self._why[number] = shown(error)
+            else:
+                return topic
+        self._lost[self._why[number]] += 1
         return None
 
     def _made(self, content: bytes) -> Topic:
@@ -462,13 +454,12 @@ class _Definitions:
     def finish(self) -> None:
         """Announce what has no message, and tell what is not copied."""
         for opcode, number in list(self._known):
-            if opcode == Opcode.CHANNEL and number not in self._topics:
-                self._topics[number] = self._topic(number)
-                self._lost[self._why.get(number, "")] += 0
+            new = opcode == Opcode.CHANNEL and number not in self.topics and number not in self._why
+            if new and self.topic_of(number) is None:
+                self._lost[self._why[number]] -= 1
         self._salvage.skipped += self._lost.total()
         for why, count in self._lost.items():
-            if why:
-                self._sound.told(f"{why}: {count} messages of it are not copied", 0)
+            self._sound.told(f"{why}: {count} messages of it are not copied", 0)
 
 
 def _known(kind: str) -> tuple[str, str, str]:

@@ -217,7 +217,7 @@ class McapFile:
 
     def _keep_room(self) -> None:
         """Hold as much of the disk as completing the file will take: then a full disk cannot make it unreadable."""
-        needed = _ROOM + _ROOM_PER_CHUNK * (len(self._chunks) + 1) + 2 * self._described
+        needed = _ROOM + _ROOM_PER_CHUNK * (len(self._chunks) + 1) + 4 * self._described
         if needed > self._kept:
             needed += _ROOM
             with self._reserve.open("ab") as stream:
@@ -356,14 +356,18 @@ class McapFile:
             )
         )
 
-    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Append texts that describe the file."""
-        self.copy_record(Opcode.METADATA, _encoded(Metadata(name=name, metadata=dict(values)))[_HEAD.size :])
+    def add_metadata(self, name: str, values: Mapping[str, str], *, last: bool = False) -> None:
+        """Append texts that describe the file; ``last``: in the room that has been kept for them."""
+        content = _encoded(Metadata(name=name, metadata=dict(values)))[_HEAD.size :]
+        self.copy_record(Opcode.METADATA, content, last=last)
 
-    def copy_record(self, opcode: int, content: bytes) -> None:
-        """Append an attachment or metadata as a record of another file has it."""
+    def copy_record(self, opcode: int, content: bytes, *, last: bool = False) -> None:
+        """Append an attachment or metadata as a record of another file has it; ``last``: see `add_metadata`."""
         self.flush()
         record, stream = _record(opcode, content), ReadDataStream(io.BytesIO(content))
+        if opcode == Opcode.METADATA and not last:  # metadata.yaml may repeat it, twice as long for its escapes
+            self._described += len(record)
+            self._keep_room()
         if opcode == Opcode.METADATA:
             name = Metadata.read(stream).name
             self._put(record)
@@ -387,7 +391,6 @@ class McapFile:
         """Write the summary and close the file."""
         try:
             self.flush()
-            self.free_room()
             self._put(_encoded(DataEnd(self._crc)))
             self._put(self._summary())
         finally:

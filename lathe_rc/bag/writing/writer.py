@@ -6,6 +6,7 @@ flush, which are what a crash promise needs; `lathe_rc.bag.writing.mcap_file` ha
 during which a cell that is being recorded would wait; libyaml takes some ms.
 """
 
+import shutil
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -142,7 +143,7 @@ class _McapStorage:
     def close(self, version: int, metadata: str) -> None:
         """Finish the file."""
         self.file.free_room()
-        self.file.add_metadata("rosbag2", {"serialized_metadata": metadata})
+        self.file.add_metadata("rosbag2", {"serialized_metadata": metadata}, last=True)
         self.file.finish()
 
 
@@ -212,7 +213,12 @@ class BagWriter:
         self._file = self._writer.mcap.file
         self._channels: dict[str, int] = {}
         self._copied: dict[bytes | None, int] = {}  # schemas
-        self.tell(about)
+        try:
+            self.tell(about)
+        except LatheError:
+            self.abort()
+            shutil.rmtree(path)
+            raise
 
     def tell(self, about: Mapping[str, str]) -> None:
         """Store texts: in the file at once, where they survive a crash, and in metadata.yaml at the end.
@@ -324,9 +330,8 @@ class BagWriter:
             raise self._full(error) from None
 
     def _full(self, error: OSError) -> LatheError:
-        return LatheError(
-            f"{self._writer.path}: cannot write ({error.strerror}); what was recorded before is readable: make room"
-        )
+        before = "" if self._file.first_ns is None else "what was recorded before is readable: "
+        return LatheError(f"{self._writer.path}: cannot write ({error.strerror}); {before}make room")
 
     def flush(self) -> None:
         """Hand what has been written so far to the operating system.
@@ -347,11 +352,20 @@ class BagWriter:
         """Finish the file and its metadata.
 
         Raises:
-            LatheError: the disk did not take the last messages; the bag is complete but for them.
+            LatheError: the disk did not take the last messages; the bag is complete but for them, or says so.
         """
         try:
             self._file.flush()
         except OSError as error:
             raise self._full(error) from None
         finally:
+            self._complete()
+
+    def _complete(self) -> None:
+        """Write index and metadata, for which the file has kept room."""
+        try:
             self._writer.close()
+        except OSError as error:
+            raise LatheError(
+                f"{self._writer.path}: cannot be completed ({error.strerror}); make room, then lathe bag recover it"
+            ) from None
