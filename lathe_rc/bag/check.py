@@ -35,6 +35,7 @@ class Findings:
         messages: all of them.
         samples: of the dense topics that are all of one length.
         first: where a snapshot begins; 0 of a whole run.
+        unread: topics that were not looked at, as they are not of ROS 2.
     """
 
     wrong: list[str] = field(default_factory=list)
@@ -44,6 +45,7 @@ class Findings:
     messages: int = 0
     samples: int = 0
     first: int = 0
+    unread: list[str] = field(default_factory=list)
 
     @property
     def exit_code(self) -> int:
@@ -118,6 +120,7 @@ def check(path: Path) -> Findings:
         sparse = {topic: SparseTopic() for topic, kind in types.items() if kind in messages.sparse_types()}
         counts = dict.fromkeys(types, 0)
         findings.wrong += source.contradictions
+        findings.unread = list(map(str, source.unread))
         for topic, log_ns, data in source.messages():
             counts[topic] += 1
             if topic in dense:

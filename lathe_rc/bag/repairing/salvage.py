@@ -21,7 +21,8 @@ from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
 from lathe_rc.bag.reading import precheck
-from lathe_rc.bag.reading.precheck import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record
+from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_TEXT, MOST_TOPICS
+from lathe_rc.bag.reading.precheck import read_record
 from lathe_rc.bag.reading.source import files_of
 from lathe_rc.bag.reading.unpacking import read_chunk, unpack, unpack_file, unpacked_size
 from lathe_rc.errors import InputError, LatheError, shown
