@@ -19,8 +19,8 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from lathe_rc.bag.reading.precheck import MOST_BYTES
-from lathe_rc.bag.reading.unpacking import read_chunk
+from lathe_rc.bag.reading.limits import MOST_BYTES
+from lathe_rc.bag.reading.unpacking import Budget, read_chunk
 
 Told = Callable[[str, int], None]  #: a damage, and the bytes in which messages may have stood
 
@@ -49,9 +49,8 @@ _PLAIN: dict[int, Any] = {
 _BEGINS = re.compile(rb"(?=[\x01-\x0f].{4}\0{4}|\x06.{28}\0{4}.{4}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd))", re.DOTALL)
 _LONGEST_BEGIN = 49  # of that [B]
 _WINDOW = 2**20  # of a file that is searched at once [B]
-_PAGE = 2**12  # effort is counted in pages that are unpacked [B]
-_SEARCH = 8  # searching a page takes so many times longer
-_EFFORT, _EFFORT_PER_PAGE = 2**20, 64  # how much may be spent on a file, and more for each of its pages
+_PAGE = 2**12  # that is searched; a place where a record may begin takes as long [B]
+_PAGES = 2**18  # that may be searched in vain, and as many more as the file has
 
 
 class Record(NamedTuple):
@@ -84,10 +83,11 @@ class _UnsoundError(ValueError):
 
 
 class _Effort:
-    """Work that may still be spent on a file."""
+    """Work that may still be spent on a file: bytes to unpack, and pages to search for records."""
 
     def __init__(self, size: int) -> None:
-        self.left = _EFFORT + _EFFORT_PER_PAGE * (size // _PAGE)
+        self.budget = Budget(size)
+        self.left = _PAGES + 2 * (size // _PAGE)
 
     def spend(self, size: int) -> bool:
         """Count ``size`` bytes and a little more; whether that was still allowed."""
@@ -254,10 +254,10 @@ class SoundRecords:
             raise _UnsoundError(f"chunk at byte {place}: its compression is none of zstd, lz4, none")
         start = begin + _CHUNK.size + length + 8
         said = start + int.from_bytes(self._at(start - 8, 8), "little")
-        if not self._effort.spend(min(size, MOST_BYTES)):
-            raise _UnsoundError(
-                f"chunk at byte {place}: the chunks up to here unpack to more than is allowed", chunk=True
-            )
+        try:
+            self._effort.budget.take(min(size, MOST_BYTES))
+        except ValueError as error:
+            raise _UnsoundError(f"chunk at byte {place}: {error}", chunk=True) from None
         why = f"cut off at byte {place}"
         for stop in dict.fromkeys((said, end)):
             if stop > self._size:
@@ -287,7 +287,7 @@ class SoundRecords:
                     return self._size
                 if self._is_anchor(place + begin.start()):
                     return place + begin.start()
-            self._effort.spend(_SEARCH * len(window))
+            self._effort.spend(len(window))
             place, length = place + length, min(2 * length, _WINDOW)
         return self._size
 

@@ -4,33 +4,30 @@
 Bytes are copied, not understood: schemas, channels and messages keep every byte but for their numbers.
 """
 
-import shutil
 import sqlite3
 import struct
 import tempfile
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema, Statistics
 from rosbags.interfaces import Qos
-from rosbags.rosbag2.metadata import parse_qos
 
 from lathe_rc import messages
-from lathe_rc.bag.reading import precheck
-from lathe_rc.bag.reading.precheck import MOST_BYTES, MOST_TEXT, MOST_TOPICS
+from lathe_rc.bag.reading import metadata, precheck, qos
+from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_METADATA, MOST_TEXT, MOST_TOPICS
 from lathe_rc.bag.reading.sound_records import SoundRecords, Told
 from lathe_rc.bag.reading.source import files_of
+from lathe_rc.bag.reading.sqlite_storage import connect, with_journal
 from lathe_rc.bag.reading.unpacking import unpack, unpack_file, unpacked_size
 from lathe_rc.bag.writing.mcap_file import channel_content, schema_content
 from lathe_rc.errors import InputError, shown
@@ -39,7 +36,6 @@ ROS2 = "ros2"  #: profile of the files of rosbag2
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message that is compressed by itself; CDR begins with a zero
-_MOST_DESCRIBED = 16 * MOST_TEXT  # texts and definitions that are kept [characters]
 _MOST_DAMAGE = 1000  # places that are told
 _SQLITE_PAGE = 4096  # bytes that are said to be lost where SQLite does not say
 _MOST_ID_BITS = 62  # of a row
@@ -86,12 +82,6 @@ class _Definition(NamedTuple):
     checked: bool
 
 
-@lru_cache(maxsize=8)
-def _profiles(text: str) -> tuple[Qos, ...]:
-    """QoS as YAML has it; most topics of a bag have the same, and to read it takes longer than a chunk of messages."""
-    return tuple(parse_qos(text))
-
-
 @dataclass
 class Salvage:
     """The readable rest of a bag; iterate over it to get each whole message.
@@ -134,25 +124,17 @@ class Salvage:
         self._metadata = self._read_metadata()
         self.profile = self._profile(self._files[0])
 
-    def _read_metadata(self) -> Mapping[str, Any]:
-        """What metadata.yaml says, as far as it can be read."""
-        file = self.path / "metadata.yaml"
-        if not file.is_file():
-            return {}
+    def _read_metadata(self) -> metadata.Metadata | None:
+        """The metadata of a folder, if they can be read."""
+        if not (self.path / metadata.NAME).exists():
+            return None
         try:
-            if file.stat().st_size > 16 * MOST_TEXT:
-                raise ValueError(f"more than {16 * MOST_TEXT} B")  # noqa: TRY301
-            text = file.read_text(encoding="utf-8")
-            precheck.check_yaml(text, file.name)
-            told = yaml.safe_load(text)["rosbag2_bagfile_information"]
-            custom = told.get("custom_data") or {}
-            self._describe({k: text for k, text in custom.items() if isinstance(k, str) and isinstance(text, str)})
-            return {str(key): value for key, value in told.items()}
-        except MemoryError:
-            raise
-        except Exception as error:  # noqa: BLE001 - YAML of any shape
-            self._tell(f"{file.name} cannot be used ({shown(error)})")
-            return {}
+            told = metadata.read(self.path)
+            self._describe(told.about)
+        except ValueError as error:
+            self._tell(shown(error))
+            return None
+        return told
 
     def _profile(self, file: Path) -> str:
         """The profile of an MCAP file."""
@@ -167,7 +149,7 @@ class Salvage:
 
     def __iter__(self) -> Iterator[Message]:
         """The whole messages in the order of the files."""
-        packed = str(self._metadata.get("compression_mode")).lower() == "message"
+        packed = self._metadata is not None and self._metadata.packed
         read, complete = 0, True
         for file in self._files:
             lost, skipped, found = self.lost_bytes, self.skipped, 0
@@ -182,8 +164,8 @@ class Salvage:
             read += found
             complete &= (self.lost_bytes == lost and self._ended) or self._counted == found
             self._miss(file.name, self._counted, found)
-        told = self._metadata.get("message_count")
-        self._miss("metadata.yaml", told if isinstance(told, int) else None, read)
+        told = sum(topic.count for topic in self._metadata.topics.values()) if self._metadata else None
+        self._miss(metadata.NAME, told, read)
         self.lossy |= bool(self.missing or self.skipped) or not (complete or told == read)
 
     def _miss(self, name: str, counted: int | None, read: int) -> None:
@@ -232,8 +214,8 @@ class Salvage:
         Raises:
             ValueError: it is too much.
         """
-        if self._described + length > _MOST_DESCRIBED:
-            raise ValueError(f"more than {_MOST_DESCRIBED} characters of texts and definitions")
+        if self._described + length > MOST_METADATA:
+            raise ValueError(f"more than {MOST_METADATA} characters of texts and definitions")
         self._described += length
 
     def _describe(self, about: Mapping[str, str]) -> None:
@@ -241,7 +223,7 @@ class Salvage:
         self.count(sum(map(len, [*about, *about.values()])))
         self.about |= about
 
-    def add(self, topic: Topic, qos: str) -> Topic:
+    def add(self, topic: Topic, offered: str) -> Topic:
         """Announce a topic; its quality of service is copied also where it is not understood.
 
         Raises:
@@ -249,13 +231,9 @@ class Salvage:
         """
         precheck.check_name(topic.name)
         try:
-            precheck.check_yaml(qos, "offered_qos_profiles")
-            topic = replace(topic, qos=_profiles(qos or "[]"))
-        except MemoryError:
-            raise
-        except Exception as error:  # noqa: BLE001 - YAML of any shape
-            why = f" ({shown(error)})" if isinstance(error, ValueError) else ""
-            self._tell(f"{topic.name}: its quality of service is copied, but not understood{why}")
+            topic = replace(topic, qos=qos.of_text(offered))
+        except ValueError as error:
+            self._tell(f"{topic.name}: quality of service that is copied, not understood ({shown(error)})")
         if len(self.topics) >= MOST_TOPICS and topic not in self.topics:
             raise ValueError(f"more than {MOST_TOPICS} topics")
         self.topics[topic] = None
@@ -313,8 +291,12 @@ class Salvage:
     # ---- SQLite -------------------------------------------------------------------------------------
 
     def _sqlite(self, file: Path) -> Iterator[Message]:
+        with tempfile.TemporaryDirectory(prefix="lathe-salvage-") as folder:
+            yield from self._database(file, Path(folder))
+
+    def _database(self, file: Path, folder: Path) -> Iterator[Message]:
         try:
-            with _database(file) as base:
+            with closing(connect(with_journal(file, folder))) as base:
                 with suppress(sqlite3.DatabaseError):  # of a broken page; the others are read below
                     precheck.check_tables(base)
                 topics, strange = self._sqlite_topics(file, base), 0
@@ -365,15 +347,15 @@ class Salvage:
         defined = {kind: (encoding, text) for kind, encoding, text in definitions}
         names = ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
         topics: dict[Any, Topic] = {}
-        for number, name, kind, encoding, qos, digest in _select(base, "topics", names):
+        for number, name, kind, encoding, offered, digest in _select(base, "topics", names):
             try:
                 precheck.check_name(kind)
                 how, text, known = _known(kind)
                 how, text = defined.get(kind, (how, text))
-                self.count(len(text) + len(qos))
-                said = {"offered_qos_profiles": qos, "topic_type_hash": digest or known}
+                self.count(len(text) + len(offered))
+                said = {"offered_qos_profiles": offered, "topic_type_hash": digest or known}
                 schema, channel = schema_content(kind, how, text.encode()), channel_content(name, encoding, said)
-                topics[number] = self.add(Topic(name, kind, encoding, (), digest or known, schema, channel), qos)
+                topics[number] = self.add(Topic(name, kind, encoding, (), digest or known, schema, channel), offered)
             except ValueError as error:
                 self._tell(f"{file.name}: {shown(name)}: {error}")
         return topics
@@ -468,21 +450,6 @@ def _known(kind: str) -> tuple[str, str, str]:
     if kind not in store.fielddefs:
         return "", "", ""
     return "ros2msg", store.generate_msgdef(kind, ros_version=2)[0], store.hash_rihs01(kind)
-
-
-@contextmanager
-def _database(file: Path) -> Iterator[sqlite3.Connection]:
-    """A database with what is left of it beside the file; in a copy then, for SQLite would write to it."""
-    left = [beside for end in ("-wal", "-journal") if (beside := file.with_name(file.name + end)).is_file()]
-    with tempfile.TemporaryDirectory(prefix="lathe-salvage-") as folder:
-        place = file.resolve()
-        if any(beside.stat().st_size for beside in left):
-            place = Path(folder) / file.name
-            for each in (file, *left):
-                shutil.copyfile(each, place.with_name(each.name))
-        options = "mode=ro&immutable=1" if place.parent != Path(folder) else "mode=rw"
-        with closing(sqlite3.connect(f"{place.as_uri()}?{options}", uri=True)) as base:
-            yield base
 
 
 def _select(base: sqlite3.Connection, table: str, columns: tuple[str, ...]) -> list[tuple[Any, ...]]:
