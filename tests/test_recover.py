@@ -228,7 +228,7 @@ def test_what_the_disk_does_not_take_is_told_with_the_chunk_or_flush(tmp_path, f
             told += 1
 
     why = r"bag: cannot write \(File too large\); what was recorded before is readable"
-    with files_up_to(2**16), pytest.raises(LatheError, match=why):
+    with files_up_to(2**19), pytest.raises(LatheError, match=why):
         fill()
     writer.write("/said", 2 * 10**9, bytes(1000))
     with pytest.raises(LatheError, match=why):
