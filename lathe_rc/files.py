@@ -33,7 +33,7 @@ def contents(path: Path, most: int = MOST) -> bytes:
     Raises:
         OSError: it cannot be read; EFBIG: it is longer than ``most`` bytes.
     """
-    with open(path, "rb", opener=_open_file) as stream:
+    with open(path, "rb", opener=open_file) as stream:
         found = stream.read(most + 1)
     if found is None:  # it would have had to wait
         raise OSError(errno.EINVAL, _NO_FILE)
@@ -42,7 +42,8 @@ def contents(path: Path, most: int = MOST) -> bytes:
     return found
 
 
-def _open_file(name: str, flags: int) -> int:
+def open_file(name: str, flags: int) -> int:
+    """An opener, for `open`, of files alone: a pipe or a device could keep a reader for ever."""
     number = os.open(name, flags | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(number).st_mode):
         os.close(number)

@@ -12,7 +12,7 @@ import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -37,6 +37,22 @@ _MOST = 2**30  # longest file of rows [B]
 
 
 @dataclass(frozen=True)
+class _Tuning:
+    """What is tuned; see `lathe_rc.sweep.tune`."""
+
+    targets: list[str]
+    free: dict[str, str | list[Value]]
+    goals: list[str]
+    subjects: list[str]
+    percentile: float
+    over: Space
+    sampler: str
+    seed: int
+    batch: int
+    formulas: bool
+
+
+@dataclass(frozen=True)
 class _Contents:
     """The content of a sweep.json; see `Folder`."""
 
@@ -45,7 +61,7 @@ class _Contents:
     identity: str
     measures: list[tuple[str, str, str]]
     spaces: list[Space]
-    tuning: dict[str, Any] | None = None
+    tuning: _Tuning | None = None
 
 
 class Folder:
@@ -80,7 +96,7 @@ class Folder:
             )
         self.measures = [Measure(*each) for each in told.measures]
         self.spaces = told.spaces
-        self.tuning: Mapping[str, Any] | None = told.tuning
+        self.tuning: Mapping[str, Any] | None = asdict(told.tuning) if told.tuning else None
 
     @staticmethod
     def begin(

@@ -29,6 +29,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from lathe_rc.cell.parameters import Value
 from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.files import open_file
 from lathe_rc.sweep import formulas
 from lathe_rc.sweep.aims import Score, aims
 from lathe_rc.sweep.folder import Folder, writing
@@ -70,11 +71,11 @@ class _Journal(JournalFileBackend):
         super().__init__(str(path), _Lock(path.with_suffix(".lock")))
         self.line = 0  #: number of the line that was read last
         if self._cut():
-            print(f"lathe: {path}: the last line is not whole: its trial is computed again", file=sys.stderr)
+            print(f"lathe: {path}: the last line is not whole: left out, and done again", file=sys.stderr)
 
     def _cut(self) -> bool:
         """Remove a line that a process was stopped in, or a full disk; by it the next line would be lost as well."""
-        with Path(self._file_path).open("rb+") as file:
+        with open(self._file_path, "rb+", opener=open_file) as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(size - 1, 0))
             if file.read() in (b"", b"\n"):
@@ -95,7 +96,7 @@ class _Journal(JournalFileBackend):
             InputError: a line is damaged.
         """
         starts = self._log_number_offset
-        with Path(self._file_path).open("rb") as file:
+        with open(self._file_path, "rb", opener=open_file) as file:
             file.seek(starts[log_number_from])
             for number, line in enumerate(file, log_number_from):
                 if not line.endswith(b"\n"):  # it is being written
@@ -135,7 +136,10 @@ def _opened(path: Path, goals: int) -> tuple[JournalStorage, optuna.Study]:
     Raises:
         InputError: it cannot be read.
     """
-    journal = _Journal(path)
+    try:
+        journal = _Journal(path)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or shown(error)}") from None
     try:
         storage = JournalStorage(journal)
         directions = [StudyDirection.MINIMIZE] * goals
