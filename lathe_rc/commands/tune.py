@@ -146,6 +146,9 @@ class _Watch(Watch):
 
     def __call__(self, event: Mapping[str, Any]) -> None:
         """Take an event of `lathe_rc.sweep.tune.run`."""
+        if event["event"] == "waiting":
+            self.describe("another program computes the last trials")
+            return
         if event["event"] != "told":
             self.told = event.get("trials", self.told)
             super().__call__(event)
