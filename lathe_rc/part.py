@@ -9,7 +9,7 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.analysis import profile_csv
-from lathe_rc.analysis.form_errors import RunningErrors, turns_before
+from lathe_rc.analysis.form_errors import RunningErrors, that_count, turns_before
 from lathe_rc.analysis.metrology import Lay, Measurement, evenly, lay, measure
 from lathe_rc.analysis.tolerance import Verdict, judge
 from lathe_rc.cell.parameters import remapped
@@ -168,7 +168,8 @@ class FirstAndLast:
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
         named = {full(topic): signals for topic, signals in dense.items()}
-        piece = np.stack([named[self._encoder]["angle_true"], named[self._tool]["error"]])
+        angle, error = named[self._encoder]["angle_true"], named[self._tool]["error"]
+        piece = np.stack([angle, error])[:, that_count(angle, error)]
         if not self._tail.size:
             self._before = turns_before(piece[0])
             self._start = 2.0 * np.pi * self._before

@@ -49,7 +49,10 @@ def test_lines_are_readings_whatever_parts_them():
     assert read(text) == [(1700000000000000001, 5.0), (1700000000000000002, 6.5), (3, -7.0), (4, 8.0)]
 
 
-@pytest.mark.parametrize("line", [b"5", b"1,2,3", b"a,b", b"1.5,2", b"1,--2", b"\xff\xfe,1", b"1,nan"])
+_LINES = [b"5", b"1,2,3", b"a,b", b"1.5,2", b"1,--2", b"\xff\xfe,1", b"1,nan", b"1,", b",2", b"1e999999999,2"]
+
+
+@pytest.mark.parametrize("line", [*_LINES, b"%d,2" % 2**63])
 def test_a_line_that_is_no_reading_is_refused_by_name(line):
     with pytest.raises(InputError, match=r"^line: '.*'; allowed: a time and a counter, as time_ns,counts$"):
         read(b"1,2\n" + line + b"\n")
@@ -125,6 +128,7 @@ def test_a_speed_that_a_terminal_has_not_is_refused():
     [
         ("# made by hand\ntime_ns,counts\n10,1\n\n20,2\n", [(10, 1.0), (20, 2.0)]),
         ("time_s, counts\n1700000000.000000001,1\n1.5,2\n", [(1700000000000000001, 1.0), (1_500_000_000, 2.0)]),
+        (f"\ufefftime_ns,counts\n{2**62},{2**62 + 1}\n", [(2**62, 2**62 + 1)]),
     ],
 )  # fmt: skip
 def test_a_file_says_its_unit_of_time_and_loses_no_nanosecond(tmp_path, text, found):
@@ -141,9 +145,10 @@ def test_a_file_with_another_header_or_line_is_refused(tmp_path):
     path.write_text("time,counts\n1,2\n")
     with pytest.raises(InputError, match="header 'time,counts'; allowed: time_ns,counts or time_s,counts"):
         CsvReader(path)
-    path.write_text("time_ns,counts\n1,2\n1,x\n")
-    with pytest.raises(InputError, match=r"counts.csv:3: '1,x'; allowed"):
-        list(CsvReader(path).read())
+    for row in ("1,x", "0,001;5;", "1e999999999,2"):
+        path.write_text(f"time_s,counts\n1,2\n{row}\n")
+        with pytest.raises(InputError, match=rf"counts.csv:3: '{row}'; allowed"):
+            list(CsvReader(path).read())
 
 
 # --- the angle
@@ -182,6 +187,34 @@ def test_a_counter_that_begins_anew_goes_on(inverted, wraps):
     size = plain.available
     difference = (wrapped.take(0, size) - plain.take(0, size)) / TURN
     assert_allclose(difference, difference[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("start", [2**62, 2**63 - 300, -(2**62), 2**53 - 5])
+@pytest.mark.parametrize("changed", [{}, {"inverted": True}, {"wraps": 2**16}, {"wraps": 3001}])
+def test_counts_far_from_0_keep_their_digits(start, changed):
+    """The angle is that of small counts, to the bit."""
+    sign, wraps = -1 if "inverted" in changed else 1, changed.get("wraps", 0)
+    near, far = (
+        filled_exactly([sign * (first + count) for count in range(0, 2100, 7)], wraps, changed)
+        for first in (start % COUNTS, start)
+    )
+    if not wraps:
+        assert np.array_equal(near, far)
+    assert_allclose(np.diff(near), np.diff(far), atol=1e-9)
+
+
+def filled_exactly(counts, wraps, changed):
+    """The angle by counts, a millisecond apart, that are no doubles."""
+    angle = counted(**changed)
+    for n, count in enumerate(counts):
+        angle.add(n * 1_000_000, count % wraps if wraps else count)
+    return angle.take(0, angle.available)
+
+
+@pytest.mark.parametrize("count", [np.nan, -np.inf, 1e20, 10**30, 10**250])
+def test_a_number_that_no_counter_has_is_an_error(count):
+    with pytest.raises(LatheError, match=r"^counter of .* at 0 ns; allowed: finite numbers up to 2\^64$"):
+        counted().add(0, count)
 
 
 def test_a_gap_is_an_error_that_names_the_time():

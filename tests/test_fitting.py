@@ -2,14 +2,17 @@
 """``lathe fit``: what is found in a measurement is what made it."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
+from lathe_rc.analysis import pid_tuning
 from lathe_rc.analysis.reduced_order import step_of
 from lathe_rc.cli import main
+from lathe_rc.commands import fit
 from lathe_rc.control.decoupler import PAPER
 from lathe_rc.plants.hysteresis import THRESHOLDS, WEIGHTS, PrandtlIshlinskii
 
@@ -63,6 +66,53 @@ def test_channel_of_paper_004_is_found_with_an_inverse_and_a_pid(step_file, tmp_
     assert found["loop"]["phase_margin_deg"] == pytest.approx(60.0, abs=0.1)
     assert found["loop"]["gain_margin"] is None or found["loop"]["gain_margin"] >= 3.0
     assert (tmp_path / "fit.png").stat().st_size > 10_000
+
+
+def decay(time):
+    return 1.0 - np.exp(-time / 0.02)
+
+
+def first_away(time):
+    """(1 - 0.01 p)/(1 + 0.02 p)^2: it turns away first."""
+    return 1.0 - np.exp(-time / 0.02) * (1.0 + 1.5 * time / 0.02)
+
+
+@pytest.mark.parametrize(
+    ("response", "step", "options", "lacking", "message"),
+    [
+        (decay, 5e-3, [], {"inverse"}, "inverse: response in steps of 0.005 s, lags from 0.001 s; .*--lag 0.005, or a"),
+        (decay, 5e-3, ["--lag", "5e-3"], set(), ""),
+        (decay, 1e-3, ["--lag", "5e-4"], {"inverse"}, "inverse: response in steps of 0.001 s, lags from 0.0005 s; al"),
+        (lambda t: t - 0.02 * decay(t), 1e-3, ["--integrator"], set(), ""),
+        (lambda t: 5.0 * t, 0.1, ["--integrator"], {"inverse"}, "inverse: response in steps of 0.1 s"),
+        (first_away, 1e-3, ["--poles", "2", "--zeros", "1"], {"inverse"}, "inverse of .*a zero that is not stable; all"),
+        (lambda t: -decay(t), 1e-3, [], {"pid", "loop"}, "tuning: no crossover from 5 to 500 rad/s has margins of 60"),
+        (decay, 1e-3, ["--gain-margin", "1e9"], {"pid", "loop"}, r"tuning: no crossover from .* of 60° and 1e\+09"),
+        (decay, 1e-3, ["--delay", "10"], {"pid", "loop"}, "tuning: no crossover from 5 to 500 rad/s has margins of"),
+        (lambda t: -decay(t), 0.005, [], {"inverse", "pid", "loop"}, "inverse: .* record[)]; tuning: no crossover from"),
+    ],
+)
+def test_a_model_without_an_inverse_or_a_pid_is_kept(tmp_path, monkeypatch, response, step, options, lacking, message):
+    """With the reason in one line, and exit code 1."""
+    monkeypatch.setattr(pid_tuning, "_TRIES", 4)
+    monkeypatch.setattr(fit, "_draw", lambda *_: None)
+    path, time = tmp_path / "step.csv", np.arange(60) * step
+    np.savetxt(path, np.stack((time, response(time)), axis=1), delimiter=",", header="time_s,response", comments="")
+    done = lathe("channel", path, "--poles", 1, *options, "--figure", tmp_path / "fit.svg", "--json")
+    found = json.loads(done.stdout)
+    assert found["model"]["rms"] < 1e-3 * np.abs(response(time)).max()
+    assert {name for name in ("inverse", "pid", "loop") if found[name] is None} == lacking
+    assert done.exit_code == (1 if lacking else 0)
+    assert len(done.stderr.splitlines()) == bool(lacking)
+    assert re.match(f"lathe: {path}: {message}" if lacking else "$", done.stderr)
+
+
+def test_a_model_alone_is_told_in_words(tmp_path, monkeypatch):
+    monkeypatch.setattr(pid_tuning, "_TRIES", 4)
+    path, time = tmp_path / "step.csv", np.arange(20) * 5e-3
+    np.savetxt(path, np.stack((time, -decay(time)), axis=1), delimiter=",", header="time_s,response", comments="")
+    done = lathe("channel", path, "--poles", 1, "--figure", tmp_path / "fit.svg")
+    assert [line[:9] for line in done.stdout.splitlines()] == ["model    ", "figure:  "]
 
 
 @pytest.mark.parametrize("kind", ["channel", "hysteresis"])

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_rc import cli, harness
 from lathe_rc.analysis import profile_csv
-from lathe_rc.analysis.form_errors import RunningErrors, form_errors
+from lathe_rc.analysis.form_errors import RunningErrors, form_errors, that_count
 from lathe_rc.analysis.metrology import (
     POINTS,
     evenly,
@@ -161,9 +161,32 @@ def test_very_short_run_has_nothing_to_measure(samples):
 
 def test_angle_of_an_encoder_is_refused():
     with pytest.raises(InputError, match="sample 500"):
-        evenly(np.maximum(steady(1), steady(1)[501] * (np.arange(1000) >= 500)), np.ones(1000))
+        evenly(steady(1) - 0.01 * (np.arange(1000) >= 501), np.ones(1000))
     with pytest.raises(InputError, match="2 points"):
         evenly(steady(1), np.ones(1000), 2)
+
+
+@pytest.mark.parametrize("stands", [[0], [1], [400], [998, 999], [0, 700, 701, 1500], list(range(0, 2000, 2))])
+@pytest.mark.parametrize("samples", [1, 3, 500])
+def test_a_standstill_leaves_no_trace_in_the_form(stands, samples):
+    """Nor does what the tool does meanwhile, before it leaves the place; the step after it is as short as it may be."""
+    angle = steady(2) + 1e-9
+    values = 10e-6 * np.sin(3 * angle)
+    repeats = np.ones(angle.size, int)
+    repeats[stands] += samples
+    standing, moved = np.repeat(angle, repeats), np.repeat(values, repeats)
+    last = np.cumsum(repeats) - 1
+    moved[np.setdiff1d(np.arange(moved.size), last)] += 1e-6
+    standing[last[stands]] += 1e-12
+    found, plain = (measure(a, e) for a, e in ((standing, moved), (angle, values)))
+    assert_allclose(found.profile, plain.profile, atol=5e-9)
+    assert_allclose(found.form.rms, plain.form.rms, rtol=1e-6)
+    kept = that_count(*(signal[:samples] for signal in (np.full(2000, 1.0), moved)))
+    assert moved[:samples][kept].max() == moved[:samples].max()
+
+
+def test_a_spindle_that_never_turns_has_nothing_to_measure():
+    assert measure(np.full(100, 0.5), np.ones(100)).form.rms.size == 0
 
 
 # --- undulations

@@ -5,14 +5,16 @@ import os
 
 import numpy as np
 import pytest
+from cells import scenario
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.signals import profile_table
 from lathe_rc.signals.kept_table import kept
-from lathe_rc.signals.measured_profile import Measured, read_csv
+from lathe_rc.signals.measured_profile import Measured, doubts, read_csv
 from lathe_rc.signals.profile import Harmonics, Piston, Polygon
 from lathe_rc.signals.profile_table import ProfileTable
 
@@ -185,6 +187,13 @@ def test_file_with_heights_in_any_order(tmp_path_factory, places):
     assert_allclose(form.radius, np.array([[0, 120, 240], [5, 125, 245]]) * 1e-6)
 
 
+def every(step, first, last, radius=100.0, height=None):
+    """Rows of an oval."""
+    place = "" if height is None else f"{height},"
+    angles = np.arange(first, last + step / 2, step)
+    return "".join(f"{a:g},{place}{radius * np.cos(np.deg2rad(2 * a)):.6g}\n" for a in angles)
+
+
 HEAD = "angle_deg,radius_um\n"
 TALL = "angle_deg,height_mm,radius_um\n"
 GOOD = "0,1\n90,2\n180,3\n"
@@ -207,8 +216,16 @@ GOOD = "0,1\n90,2\n180,3\n"
         (HEAD + GOOD + "270\n", ":5: 1 values; allowed: 2"),
         (HEAD + GOOD + "270,1,2\n", ":5: 3 values; allowed: 2"),
         (HEAD + GOOD + "90,2\n", ": angle 90° at height 0 mm appears more than once"),
-        (HEAD + GOOD + "360,1\n", ": angle 360°; allowed: 0 up to but not including 360"),
+        (HEAD + GOOD + "360.5,1\n", ": angle 360.5°; allowed: 0 up to 360, where 360 is 0 again"),
         (HEAD + GOOD + "-1,1\n", ": angle -1°; allowed"),
+        (HEAD + GOOD + "360,1.002\n", ": radius_um = 1 at 0° and 1.002 at 360°, height 0 mm; allowed: the same, or"),
+        (TALL + "0,5,1\n120,5,2\n240,5,3\n360,5,9\n", ": radius_um = 1 at 0° and 9 at 360°, height 5 mm; allowed"),
+        (TALL + "0,0,1\n120,0,2\n240,0,3\n120,5,2\n240,5,3\n", ": no point at angle 0°, height 5 mm"),
+        (HEAD + "360,1\n120,2\n240,3\n360,1\n", ": angle 0° at height 0 mm appears more than once"),
+        (HEAD + every(5, 0, 235), ": no point from 235° to 0°, while others are 5° apart; allowed: points all round, g"),
+        (HEAD + every(1, 30, 90), ": no point from 90° to 30°, while others are 1° apart"),
+        ("angle_deg;radius_um\n0;1\n", "radius_um (parted by commas, decimals with a point)"),
+        (HEAD + "0,1,5\n90,2\n", ":2: 3 values; allowed: 2, as in the header (decimals with a point)"),
         (TALL + "0,0,1\n90,0,1\n180,0,1\n0,5,1\n90,5,1\n", ": no point at angle 180°, height 5 mm"),
         (TALL + "0,0,1\n90,0,1\n180,0,1\n0,1e-9,1\n", ": heights 0 and 1e-09 mm are too close"),
         (HEAD + GOOD + "1e-320,1\n", ": angles 0 and 9.999888672e-321° are too close"),
@@ -279,6 +296,51 @@ def test_columns_in_another_unit_are_refused_with_a_guess(tmp_path, rows, said):
     with pytest.raises(InputError) as refused:
         read_csv(write(tmp_path, HEAD + rows))
     assert said in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        HEAD + every(5, 0, 355),
+        HEAD + every(5, 0, 360),
+        HEAD + every(5, 5, 360),
+        HEAD + "360,100.0004\n" + every(5, 0, 355),
+        TALL + "".join(every(5, 0, end, height=h) for h, end in ((0, 360), (10, 355), (20, 360))),
+        TALL + "".join(every(5, start, 360, height=h) for h, start in ((0, 5), (10, 0), (20, 5))),
+        "\ufeff" + HEAD + every(5, 0, 360) + "\n\n# the end",
+        '"angle_deg","radius_um"\r\n' + every(5, 0, 360).replace("\n", "\r\n"),
+    ],
+)
+def test_a_row_at_360_closes_the_turn(tmp_path, rows):
+    form = read_csv(write(tmp_path, rows))
+    assert_allclose(np.rad2deg(form.angle), np.arange(0, 360, 5))
+    assert_allclose(form.radius[:, 0], 100e-6)
+    assert doubts(form) == []
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        (HEAD + every(5, 0, 90) + every(5, 180, 355), "no point from 90° to 180°, 90° wide, while others are 5° apart"),
+        (HEAD + every(5, 50, 345), "no point from 345° to 50°, 65° wide, while others are 5° apart"),
+        (HEAD + every(1, 0, 200) + every(1, 216, 359), "no point from 200° to 216°, 16° wide, while others are 1°"),
+        (HEAD + every(5, 0, 355, 0.1), "radius_um goes from -0.1 to 0.1 µm; if these are millimetres, multiply by 1000"),
+        (HEAD + "0,49.8\n120,50.2\n240,50\n", "radius_um goes from 49.8 to 50.2 µm; if these are millimetres"),
+        (TALL + every(90, 0, 270, height=0) + every(90, 0, 270, height=0.06), "height_mm goes over 0.06 mm; if these"),
+        (HEAD + every(1, 0, 200) + every(1, 214, 359), ""),
+        (HEAD + "0,1\n90,2\n180,5\n", ""),
+        (HEAD + every(5, 0, 355, 1.1), ""),
+        (HEAD + every(45, 0, 315, 0.0), ""),
+    ],
+)
+def test_a_form_that_can_be_meant_but_seems_not_to_be_is_told(tmp_path, rows, said):
+    path = write(tmp_path, rows)
+    told = doubts(read_csv(path))
+    assert len(told) == bool(said)
+    assert said in " ".join(told)
+    cell = Cell(scenario(tool={"profile": "csv", "profile_file": str(path)}).nodes)
+    cell.check()
+    assert cell.warnings == [f"tool.profile_file = {path}: {line}" for line in told]
 
 
 def test_a_part_without_form_is_in_no_other_unit(tmp_path):

@@ -2,6 +2,7 @@
 """Tachograms: read from a file as speed law, and made from a recorded run."""
 
 import json
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -69,11 +70,20 @@ def test_the_file_s_content_is_part_of_the_run_s_identity(tmp_path):
     [
         ("time_s,rpm\n", "no row; allowed: one or more of time_s,rpm"),
         ("time,rpm\n0,1\n", "header 'time,rpm'; allowed: time_s,rpm"),
-        ("time_s,rpm\n-1,1000\n", "time_s = -1 in row 1; allowed: from 0 on, each later than the last"),
-        ("time_s,rpm\n0,1000\n1,1000\n1,900\n", "time_s = 1 in row 3; allowed: from 0 on, each later than the last"),
-        ("time_s,rpm\n0,1000\n0.5,0\n", "rpm = 0 at 0.5 s; allowed: above 0"),
+        ("time_s,rpm\n0,1000\n1,1000\n1,900\n", "row 3 is 0 s after the one before; allowed: times that rise"),
+        ("time_s,rpm\n5,1000\n4,900\n", "row 2 is -1 s after the one before; allowed: times that rise"),
+        ("time_s,rpm\n0,1000\n0.5,0\n", "rpm = 0 in row 2, 0.5 s after the first; allowed: above 0"),
+        ("time_s,rpm\n0,-1000\n", "rpm = -1000 in row 1, 0 s after the first; allowed: above 0"),
         ("time_s,rpm\n0,fast\n", "'fast' is not a number"),
         ("time_s,rpm\n0\n", "1 values; allowed: 2"),
+        ("time_s,rpm\n0,5,1000\n", ":2: 3 values; allowed: 2, as in the header (decimals with a point)"),
+        ("time_s;rpm\n0,0;1000\n", "'time_s;rpm'; allowed: time_s,rpm (parted by commas, decimals with a point)"),
+        ("time_s\trpm\n0\t1000\n", "allowed: time_s,rpm (parted by commas, decimals with a point)"),
+        ("time_s,rpm\n0,1000\n1,\n", ":3: '' is not a number"),
+        ("time_s,rpm\n0,16.7\n1,16.6\n", "rpm is 16.65 in the middle, with nominal_rpm = 1000, which looks like rev"),
+        ("time_s,rpm\n0,1\n1,15\n2,16\n3,17\n", "(multiply by 60, or set nominal_rpm = 15.5 if it is)"),
+        ("time_s,rpm\n0,104.72\n", "rpm is 104.7 in the middle, with nominal_rpm = 1000, which looks like rad/s; al"),
+        ("time_s,rpm\n0,6000\n", "looks like degrees per second; allowed: 1/min (multiply by 0.1667, or set nominal_r"),
     ],
 )
 def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
@@ -84,6 +94,46 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
     assert message in str(refused.value)
     assert str(path) in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "start", ["1700000000", "1700000000.000000125", "-3.5", "0.25", f"{2**52}", "1e9", "+86400.0", "3600e0", "1e-9", "7"]
+)
+def test_a_file_begins_at_its_first_row_whatever_its_clock_shows(tmp_path, start):
+    path, times = tmp_path / "speed.csv", ("0", "0.1000000001", "0.3")
+    rows = [f"{Decimal(start) + Decimal(time)},{rpm}" for time, rpm in zip(times, (1000, 1100, 900), strict=True)]
+    path.write_text("\n".join(["time_s,rpm", *rows]))
+    time, rpm = tachogram.read(path)
+    assert time.tolist() == [0.0, 0.1000000001, 0.3]
+    assert rpm.tolist() == [1000.0, 1100.0, 900.0]
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"revolutions": 4.9}, []),
+        (
+            {"revolutions": 9.0},
+            ["tachogram_file ends 0.3 s after its first row, the run at 0.56112 s: the spindle goes on at 900 rpm"],
+        ),
+        (
+            {"tachogram_file": "", "tachogram_time": [1.7e9, 1.7e9 + 1], "tachogram_deviation": [0.1, 0.2]},
+            [
+                "tachogram_time begins at 1700000000 s, after the end of the run at 0.10909 s: the spindle turns at "
+                "1100 rpm throughout; times count from the start of the run"
+            ],
+        ),
+        ({"tachogram_file": "", "tachogram_time": [0.05], "tachogram_deviation": [0.1]}, []),
+    ],
+)
+def test_a_tachogram_that_does_not_meet_the_run_is_told(tmp_path, changed, said):
+    """Before the start, and in the result."""
+    (tmp_path / "speed.csv").write_text(FILE.replace("\n0.", "\n7."))
+    events = []
+    changed = {"tachogram_file": str(tmp_path / "speed.csv"), "revolutions": 2.0, **changed}
+    result = harness.run(scenario(spindle_encoder=changed), watch=events.append)
+    assert result.summary()["warnings"] == [f"spindle_encoder.{line}" for line in said]
+    assert [event["message"] for event in events if event["event"] == "warning"] == result.warnings
 
 
 def test_a_file_beside_the_lists_is_refused(tmp_path):

@@ -60,6 +60,17 @@ def turns_at_end(before: float, last: float) -> int:
     return int(np.floor(last + min(2.0 * (last - before), 0.5)))
 
 
+def that_count(angle: Array, error: Array) -> npt.NDArray[np.intp] | slice:
+    """Samples of a piece of a run, shape (n,), that its form errors depend on.
+
+    Where the spindle stands still all along, that are the first, the last and those of the extremes: a standstill of
+    minutes takes no memory.
+    """
+    if angle.size < 5 or angle[0] != angle[-1]:
+        return slice(None)
+    return np.unique([0, np.argmin(error), np.argmax(error), angle.size - 1])
+
+
 @inlined
 def _close(row: Array, start: float, square: float, weight: float, high: float, low: float) -> None:
     """Hand over a revolution: first sample, RMS, largest and smallest error."""

@@ -21,6 +21,7 @@ from lathe_rc.errors import InputError
 Array = npt.NDArray[np.float64]
 
 POINTS = 4096  #: even angles in a revolution, about as many as the cell has samples at 1000 rpm
+_STANDSTILL = 1e-3  # of the largest step of the angle between samples
 _PER_MARK = 64  # places between revolutions
 _PER_UNDULATION = 7  # points that an undulation at the filter's cut-off needs
 
@@ -28,8 +29,11 @@ _PER_UNDULATION = 7  # points that an undulation at the filter's cut-off needs
 def evenly(angle: Array, values: Array, points: int = POINTS) -> Array:
     """Values of each complete revolution at the angles 0, 2π/points, …, by cubic splines.
 
+    Where the spindle stands still, the last sample counts: with that the tool leaves the place. With steps as
+    different as before and after a standstill a cubic spline overshoots; then one without overshoot takes its place.
+
     Args:
-        angle: true spindle angle [rad], increasing, shape (n,).
+        angle: true spindle angle [rad], not falling, shape (n,).
         values: of each sample, shape (n,).
         points: in a revolution.
 
@@ -38,22 +42,29 @@ def evenly(angle: Array, values: Array, points: int = POINTS) -> Array:
         the last revolution does, the last value is held.
 
     Raises:
-        InputError: the angle does not increase, or there are too few points.
+        InputError: the angle falls, or there are too few points.
     """
     if points < 3:
         raise InputError(f"{points} points in a revolution; allowed: 3 or more")
     if angle.size < 2:
         return np.empty((0, points))
-    if not np.all(np.diff(angle) > 0.0):
-        k = int(np.argmin(np.diff(angle) > 0.0))
+    steps = np.diff(angle)
+    if not np.all(steps >= 0.0):
+        k = int(np.argmin(steps >= 0.0))
         raise InputError(
-            f"the angle goes from {angle[k]:g} to {angle[k + 1]:g} rad at sample {k}; allowed: an increasing angle "
-            "(take the true one, not that of the encoder)"
+            f"the angle goes from {angle[k]:g} to {angle[k + 1]:g} rad at sample {k}; allowed: an angle that does not "
+            "fall (take the true one, not that of the encoder)"
         )
     turns = angle / (2.0 * np.pi)
     whole = max(turns_at_end(*turns[-2:]), 0)
+    if not whole:
+        return np.empty((0, points))
     at = np.arange(whole * points) / points
-    spline = scipy.interpolate.CubicSpline(turns, values)
+    if steps.min() > _STANDSTILL * steps.max():
+        spline = scipy.interpolate.CubicSpline(turns, values)
+    else:
+        leaves = np.append(np.diff(np.floor(angle / (_STANDSTILL * steps.max()))) > 0.0, True)
+        turns, spline = turns[leaves], scipy.interpolate.PchipInterpolator(turns[leaves], values[leaves])
     return np.asarray(spline(np.clip(at, turns[0], turns[-1]))).reshape(whole, points)
 
 
@@ -304,7 +315,7 @@ def measure(
     positive, material is missing.
 
     Args:
-        angle: true spindle angle [rad], increasing, shape (n,).
+        angle: true spindle angle [rad], not falling, shape (n,).
         error: form error [m], shape (n,).
         points: even angles in a revolution.
         highest: of the undulations [UPR].
@@ -312,7 +323,7 @@ def measure(
         roughness_cutoff: see `roughness` [UPR].
 
     Raises:
-        InputError: too few points for the undulations or for a cut-off, or an angle that does not increase.
+        InputError: too few points for the undulations or for a cut-off, or an angle that falls.
     """
     profile = -evenly(angle, error, points)
     return Measurement(

@@ -202,7 +202,7 @@ def fit_inverse(model: TransferFunction, measured: ChannelStep, *, least_lag: fl
     if measured.step > least_lag:
         raise InputError(
             f"inverse: response in steps of {measured.step:g} s, lags from {least_lag:g} s; "
-            "allowed: steps up to the least lag"
+            f"allowed: steps up to the least lag (--lag {measured.step:g}, or a finer record)"
         )
     start = inverse(model, least_lag)
     missing = len(model.denominator) - len(model.numerator)

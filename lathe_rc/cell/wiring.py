@@ -171,6 +171,7 @@ class Cell:
         unknown: see above.
         unchecked: what `check` could not check since it depends on them, or since a law or drive of others does not
             tell what is needed; one line each.
+        warnings: doubts about parameters that can be meant; `check` finds them, one line each.
         factors: largest factor of a cycle over all frequencies, sup|Q - γZ| of repetitive control, by learning node;
             below 1 the error of each cycle is smaller than that of the one before. `check` finds it.
         stages: by node name, in the order of the forward edges.
@@ -189,7 +190,7 @@ class Cell:
         *,
         stage: Callable[[str, NodeParameters], Stage] = new_stage,
     ) -> None:
-        self.unknown, self.unchecked = unknown or {}, list[str]()
+        self.unknown, self.unchecked, self.warnings = unknown or {}, list[str](), list[str]()
         self.factors: dict[str, float] = {}
         self._tables = nodes
         with extremes.refused(nodes):
@@ -289,6 +290,8 @@ class Cell:
 
     def _check(self) -> None:
         self.unchecked.clear()
+        seconds = (self.master.expected_samples or math.inf) * self.master.shared.step
+        self.warnings = [doubt for stage in self.stages.values() for doubt in stage.warnings(seconds)]
         self.factors.clear()
         low, high = self.master.speed_range()
         if low <= 0.0:

@@ -2,7 +2,7 @@
 """The command group ``lathe fit``: models from measurements, with the parameters to set."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ from rich.console import Console
 from lathe_rc.analysis import hysteresis_fit, pid_tuning, reduced_order
 from lathe_rc.bag import reader
 from lathe_rc.commands import picture
+from lathe_rc.control.decoupler import LAG
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.transfer import TransferFunction
 
 _POSITIVE = click.FloatRange(min=0, min_open=True)
@@ -65,18 +67,15 @@ def _coefficients(transfer: TransferFunction) -> dict[str, list[float]]:
     return {"numerator": list(map(float, transfer.numerator)), "denominator": list(map(float, transfer.denominator))}
 
 
-def _draw(path: Path, model: reduced_order.Fit, inverse: reduced_order.Fit) -> None:
+def _draw(path: Path, model: reduced_order.Fit, inverse: reduced_order.Fit | None) -> None:
     """Both stages of paper 004: the model over the measurement, and model and inverse in series over the step."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11.0, 3.6), layout="constrained")
-    for axes, found, title, wanted in zip(
-        figure.subplots(1, 2),
-        (model, inverse),
-        ("model", "channel and inverse in series"),
-        ("measured", "step"),
-        strict=True,
-    ):
+    stages = [(model, "model", "measured")]
+    if inverse:
+        stages.append((inverse, "channel and inverse in series", "step"))
+    figure = Figure(figsize=(5.5 * len(stages), 3.6), layout="constrained")
+    for axes, (found, title, wanted) in zip(figure.subplots(1, len(stages), squeeze=False)[0], stages, strict=True):
         axes.plot(found.time, found.wanted, color="#7f7f7f", lw=3.0, label=wanted)
         axes.plot(found.time, found.found, color="#c0392b", lw=1.2, label=title)
         axes.set(xlabel="time [s]", title=f"{title}: RMS {found.rms:.3g}")
@@ -94,6 +93,7 @@ def _draw(path: Path, model: reduced_order.Fit, inverse: reduced_order.Fit) -> N
 @click.option("--phase-margin", type=click.FloatRange(1, 89), default=60.0, show_default=True, help="of the PID [°]")
 @click.option("--gain-margin", type=click.FloatRange(min=1), default=3.0, show_default=True, help="of the PID [1]")
 @click.option("--delay", type=click.FloatRange(min=0), default=1e-3, show_default=True, help="in the loop [s]")
+@click.option("--lag", type=_POSITIVE, default=LAG, show_default=True, help="least lag of the inverse [s]")
 @click.option("--figure", type=click.Path(path_type=Path), default=Path("fit-channel.png"), show_default=True)
 @_json
 def channel(
@@ -103,6 +103,7 @@ def channel(
     phase_margin: float,
     gain_margin: float,
     delay: float,
+    lag: float,
     figure: Path,
     *,
     integrator: bool,
@@ -111,21 +112,45 @@ def channel(
 ) -> None:
     """Reduced-order model, realisable inverse, and the fastest PID with the margins asked for (docs/decoupling.md).
 
-    MEASURED is a CSV file with time_s,response: the response to a step of 1 at time 0, in even steps.
+    MEASURED is a CSV file with time_s,response: the response to a step of 1 at time 0, in even steps. A model without
+    an inverse or a PID is printed all the same, with the reason, and exit code 1.
     """
     given = reduced_order.read_csv(measured)
     model = reduced_order.fit(given, zeros=zeros, poles=poles, integrator=integrator, oscillating=not lags)
-    inverse = reduced_order.fit_inverse(model.transfer, given)
-    corners = np.abs(model.transfer.poles)
+    told: dict[str, Any] = {"model": _coefficients(model.transfer) | {"rms": model.rms}}
+    inverse: reduced_order.Fit | None = None
+    missing = []
+    try:
+        inverse = reduced_order.fit_inverse(model.transfer, given, least_lag=lag)
+        told["inverse"] = _coefficients(inverse.transfer) | {"rms": inverse.rms}
+    except InputError as error:
+        missing.append(str(error))
+    try:
+        told |= _tuned(model.transfer, np.radians(phase_margin), gain_margin, delay)
+    except InputError as error:
+        missing.append(str(error))
+    _draw(figure, model, inverse)
+    told["figure"] = str(figure)
+    if as_json:
+        click.echo(json.dumps({"inverse": None, "pid": None, "loop": None, **told, "missing": missing}))
+    else:
+        _show(told, delay)
+    if missing:
+        raise LatheError(f"{measured}: {'; '.join(missing)}")
+
+
+def _tuned(model: TransferFunction, phase_margin: float, gain_margin: float, delay: float) -> dict[str, Any]:
+    """The fastest PID with margins [rad] and [1] at a delay [s], and its loop.
+
+    Raises:
+        InputError: there is none.
+    """
+    corners = np.abs(model.poles)
     corners = corners[corners > 0.0]
     band = (float(corners.min()) / 10.0, float(corners.max()) * 10.0)
-    wanted = np.radians(phase_margin)
-    gains = pid_tuning.fastest(model.transfer, band=band, phase_margin=wanted, gain_margin=gain_margin, wait=delay)
-    loop = pid_tuning.evaluate(model.transfer, gains, delay)
-    _draw(figure, model, inverse)
-    told = {
-        "model": _coefficients(model.transfer) | {"rms": model.rms},
-        "inverse": _coefficients(inverse.transfer) | {"rms": inverse.rms},
+    gains = pid_tuning.fastest(model, band=band, phase_margin=phase_margin, gain_margin=gain_margin, wait=delay)
+    loop = pid_tuning.evaluate(model, gains, delay)
+    return {
         "pid": {
             "proportional": gains.proportional,
             "integral": gains.integral,
@@ -140,25 +165,26 @@ def channel(
             "phase_margin_deg": float(np.degrees(loop.phase_margin)),
             "crossover_rad_s": loop.phase_frequency,
         },
-        "figure": str(figure),
     }
-    if as_json:
-        click.echo(json.dumps(told))
-        return
+
+
+def _show(told: Mapping[str, Any], delay: float) -> None:
+    """Print all that has been found."""
     console = Console(highlight=False, soft_wrap=True)
 
-    def polynomials(transfer: TransferFunction) -> str:
-        return " / ".join(
-            "[" + ", ".join(f"{value:.5g}" for value in part) + "]"
-            for part in (transfer.numerator, transfer.denominator)
+    for name in ("model", "inverse"):
+        if found := told.get(name):
+            top, bottom = (
+                ", ".join(f"{value:.5g}" for value in found[part]) for part in ("numerator", "denominator")
+            )
+            console.print(f"{name:8} [{top}] / [{bottom}], RMS {found['rms']:.3g}", markup=False)
+    if "pid" in told:
+        loop = told["loop"]
+        console.print("pid      " + ", ".join(f"{name} {value:.5g}" for name, value in told["pid"].items()))
+        margin = "any" if loop["gain_margin"] is None else f"{loop['gain_margin']:.3g}"
+        console.print(
+            f"loop     rise {loop['rise_s']:.3g} s, settling {loop['settling_s']:.3g} s, "
+            f"overshoot {loop['overshoot_pct']:.3g} %, margins {margin} and {loop['phase_margin_deg']:.3g}° "
+            f"with a delay of {delay * 1e3:g} ms"
         )
-
-    for name, found in (("model", model), ("inverse", inverse)):
-        console.print(f"{name:8} {polynomials(found.transfer)}, RMS {found.rms:.3g}", markup=False)
-    console.print("pid      " + ", ".join(f"{name} {value:.5g}" for name, value in told["pid"].items()))  # type: ignore[attr-defined]
-    margin = f"{loop.gain_margin:.3g}" if np.isfinite(loop.gain_margin) else "any"
-    console.print(
-        f"loop     rise {loop.rise:.3g} s, settling {loop.settling:.3g} s, overshoot {100 * loop.overshoot:.3g} %, "
-        f"margins {margin} and {np.degrees(loop.phase_margin):.3g}° with a delay of {delay * 1e3:g} ms"
-    )
-    console.print(f"figure:  {figure}")
+    console.print(f"figure:  {told['figure']}")

@@ -41,6 +41,7 @@ class Result:
         refused: messages from outside the cell that the nodes refused, by sender.
         not_reached: events that the run was too short for, by node.
         unchecked: what the check before the start could not see, since laws or drives of others do not tell it.
+        warnings: doubts of the check before the start about parameters that can be meant.
         lateness: of the blocks; None if there was no pace to keep, as offline or with a ``speed_factor`` of 0.
 
     Example:
@@ -69,6 +70,7 @@ class Result:
     refused: Mapping[str, int] = field(default_factory=dict)
     not_reached: Mapping[str, Sequence[str]] = field(default_factory=dict)
     unchecked: Sequence[str] = ()
+    warnings: Sequence[str] = ()
     lateness: Lateness | None = None
 
     def __repr__(self) -> str:
@@ -178,6 +180,7 @@ class Result:
             ],
             "not_reached": {node: list(events) for node, events in self.not_reached.items()},
             "unchecked": list(self.unchecked),
+            "warnings": list(self.warnings),
             "error_um": {
                 "first": of(0),
                 "last": of(-1),

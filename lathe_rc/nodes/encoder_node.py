@@ -45,6 +45,8 @@ class EncoderNode(SpindleNode):
     stage: EncoderDevice
     _line: LineReader | None = None
     _listens = _lost = False
+    _overlooked = 0  # joint states that say nothing of the spindle
+    _other = ""  # the last of them
 
     def configure_part(self) -> None:
         """See `StageNode`."""
@@ -66,6 +68,8 @@ class EncoderNode(SpindleNode):
         """See `CellNode`."""
         counted = self.stage.counted
         told = {"newest reading [s]": round(counted.time, 6), "late readings": counted.late}
+        if self._overlooked:
+            told["joint states without the spindle"] = f"{self._overlooked}, the last {self._other}"
         return {**super().statistics(), **told} if self.stage.live else super().statistics()
 
     # ---- readings -----------------------------------------------------------------------------------
@@ -80,11 +84,12 @@ class EncoderNode(SpindleNode):
     @_losing_it()
     def _on_joints(self, joints: Any) -> None:
         where, name = self.topic(self._device.topic), self._device.joint
-        if name and name not in joints.name:
-            raise LatheError(f"{where}: no joint {name!r}; allowed: {', '.join(joints.name) or 'a joint with a name'}")
-        place = list(joints.name).index(name) if name else 0
-        if place >= len(joints.position):
-            raise LatheError(f"{where}: joint {place} of {len(joints.position)} positions; allowed: a position for it")
+        place = list(joints.name).index(name) if name in joints.name else 0
+        if (name and name not in joints.name) or place >= len(joints.position):
+            # Several nodes may share the topic, as those of a robot's grippers do.
+            self._overlooked += 1
+            self._other = f"of {', '.join(joints.name) or 'no joint'} with {len(joints.position)} positions"
+            return
         stamp = joints.header.stamp
         time_ns = stamp.sec * 10**9 + stamp.nanosec
         if not time_ns:
@@ -161,11 +166,15 @@ class EncoderNode(SpindleNode):
                 self.stage.end()
         silent, needed = time.monotonic() - self._came, np.inf if self._end is None else self._end
         if self._running and self.stage.available < needed and silent > self._device.max_silence:
-            nobody = self._line is None and not self._listens
+            topic, why = self.topic(self._device.topic), ""
+            if self._line is None and not self._listens:
+                why = f"; nobody publishes {topic}"
+            elif self._overlooked:
+                wanted = f"joint {self._device.joint!r}" if self._device.joint else "a first joint"
+                why = f"; {self._overlooked} messages on {topic} have no position of {wanted}, the last is {self._other}"
             raise LatheError(
                 f"{self.get_name()}: no counts for {silent:.3g} s, after {self.stage.counted.time:.6g} s; allowed: up "
-                f"to max_silence = {self._device.max_silence:g} s"
-                + (f"; nobody publishes {self.topic(self._device.topic)}" if nobody else "")
+                f"to max_silence = {self._device.max_silence:g} s{why}"
             )
 
     def fail(self, error: LatheError, *, cause: str = "error") -> None:

@@ -21,10 +21,12 @@ from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.signals.table import read_text
 
 Array = npt.NDArray[np.float64]
-Reading = tuple[int, float]  #: time [ns] and counter
+Reading = tuple[int, int | float]  #: time [ns] and counter; a whole one as int, for a double has 53 bits
 
 _READING = re.compile(r"\s*([-+]?[0-9.eE+-]+)\s*(?:[,;]|\s)\s*([-+]?[0-9.eE+-]+)\s*")
 _HEADERS = {"time_ns,counts": 1, "time_s,counts": 10**9}  # and nanoseconds in a unit of the first column
+_MOST_TIME = 2**63  # [ns]
+_MOST_COUNT = 2.0**64  # of any counter
 _LONGEST_LINE = 256
 _GOES_ON = 3600  # [s]
 _PIECE = 65536  # bytes that are read at once
@@ -50,11 +52,19 @@ class Reader(ABC):
         """
 
 
+def _count(text: str) -> int | float:
+    """A counter; an integer of so many digits that no counter has them is infinite, as a double."""
+    return int(text) if text.lstrip("+-").isdigit() and len(text) < _LONGEST_LINE else float(text)
+
+
 def _reading(text: str, unit: int, where: str) -> Reading:
     found = _READING.fullmatch(text)
     try:
         if found:
-            return int(found[1]) if unit == 1 else round(Decimal(found[1]) * unit), float(found[2])
+            seconds = Decimal(found[1])
+            if abs(seconds) * unit < _MOST_TIME:  # before 1e999999999 becomes an int
+                time_ns = int(found[1]) if unit == 1 else round(seconds * unit)
+                return time_ns, _count(found[2])
     except (ValueError, ArithmeticError):
         pass
     raise InputError(f"{where}: {shown(text)!r}; allowed: a time and a counter, as {next(iter(_HEADERS))}")
@@ -180,7 +190,7 @@ class CountedAngle:
         self, *, counts: int, step_ns: int, wraps: int, inverted: bool, max_reverse: float, max_gap: float
     ) -> None:
         self._counts, self._step_ns, self._wraps = counts, step_ns, wraps
-        self._sign, self._max_reverse, self._max_gap_ns = -1.0 if inverted else 1.0, max_reverse, round(max_gap * 1e9)
+        self._sign, self._max_reverse, self._max_gap_ns = -1 if inverted else 1, max_reverse, round(max_gap * 1e9)
         self._start_ns = 0
         self._newest: Reading | None = None
         self._turned = self._highest = 0.0  # [count]
@@ -204,14 +214,14 @@ class CountedAngle:
         """Samples that the readings reach to."""
         return 0 if self._newest is None else (self._newest[0] - self._start_ns) // self._step_ns + 1
 
-    def add(self, time_ns: int, count: float) -> None:
+    def add(self, time_ns: int, count: int | float) -> None:
         """Take a reading.
 
         Raises:
-            LatheError: the last one was too long ago, the counter has gone back, or the number is not finite.
+            LatheError: the last one was too long ago, the counter has gone back, or the number is none of a counter.
         """
-        if not np.isfinite(count):
-            raise LatheError(f"counter of {count} at {time_ns} ns; allowed: finite numbers")
+        if not abs(count) <= _MOST_COUNT:
+            raise LatheError(f"counter of {count:.6g} at {time_ns} ns; allowed: finite numbers up to 2^64")
         if self._newest is None:
             self._start_ns, self._newest = time_ns, (time_ns, count)
             self._turned = self._highest = float((count * self._sign) % self._counts)
@@ -226,9 +236,9 @@ class CountedAngle:
                 f"no counts from {self.time:.9g} to {self.time + since * 1e-9:.9g} s, for {since * 1e-6:.4g} ms; "
                 f"allowed: up to max_gap = {self._max_gap_ns * 1e-6:.4g} ms"
             )
-        moved = count - self._newest[1]
+        moved = count - self._newest[1]  # of integers, before anything is rounded
         if self._wraps:
-            moved = (moved + 0.5 * self._wraps) % self._wraps - 0.5 * self._wraps
+            moved = ((2 * moved + self._wraps) % (2 * self._wraps) - self._wraps) / 2
         self._newest = time_ns, count
         self._turned += moved * self._sign
         if (back := self._highest - self._turned) > self._max_reverse:

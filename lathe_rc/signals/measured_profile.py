@@ -17,6 +17,11 @@ Array = npt.NDArray[np.float64]
 _TURN = 2.0 * np.pi
 _HEADERS = (("angle_deg", "radius_um"), ("angle_deg", "height_mm", "radius_um"))
 _FLATTEST = 0.01  # [µm] peak to valley of a form: nobody turns less
+_MILLIMETRES = 2.0  # [µm] a form with less is perhaps in mm: few forms have 2 mm
+_METRES = 0.1  # [mm] heights over less are perhaps in m
+_WIDE, _WIDER = 3.0, 15.0  # of the median step, and [°]: more than both between two angles is a gap
+_WIDEST = 120.0  # [°] a gap wider than that is no form
+_SAME = 1e-3  # [µm] that the radius at 360° may be off the one at 0°
 _FARTHEST = 10_000.0  # [µm] that all of a form may be away from the middle
 _TURN_OF_RADIANS = 6.3  # [°] a column that spans no more is in another unit
 _CLOSEST = 1e-6  # [°, mm] between two points: closer ones are a slip, and their slope overflows
@@ -76,15 +81,64 @@ def _check_units(path: Path, angle_deg: Array, radius_um: Array) -> None:
         )
 
 
+def _gap(angle_deg: Array) -> tuple[float, float, float]:
+    """Start and width of the widest step between two angles of a turn, and the median step [°]."""
+    steps = np.diff(np.append(angle_deg, angle_deg[0] + 360.0))
+    place = int(np.argmax(steps))
+    return float(angle_deg[place]), float(steps[place]), float(np.median(steps))
+
+
+def _closed(path: Path, rows: Array) -> Array:
+    """Rows with their points at 360° left out, if the same are at 0°, or taken as those at 0°.
+
+    Raises:
+        InputError: the two differ.
+    """
+    start = {height: radius for angle, height, radius in rows.tolist() if angle == 0.0}
+    kept = []
+    for angle, height, radius in rows.tolist():
+        if angle != 360.0:
+            kept.append((angle, height, radius))
+        elif height not in start:
+            kept.append((0.0, height, radius))
+        elif abs(radius - start[height]) > _SAME:
+            raise InputError(
+                f"{path}: radius_um = {start[height]:.10g} at 0° and {radius:.10g} at 360°, height {height:g} mm; "
+                "allowed: the same, or one of the two rows"
+            )
+    return np.array(kept)
+
+
+def doubts(form: Measured) -> list[str]:
+    """Doubts about a form that can be meant, one line each: a gap in its angles, values as in another unit."""
+    said = []
+    start, width, median = _gap(np.rad2deg(form.angle))
+    if width > max(_WIDE * median, _WIDER):
+        said.append(
+            f"no point from {start:.5g}° to {(start + width) % 360.0:.5g}°, {width:.4g}° wide, while others are "
+            f"{median:.4g}° apart: a spline fills the gap"
+        )
+    low, high = form.radius.min() * 1e6, form.radius.max() * 1e6
+    if 0.0 < high - low < _MILLIMETRES:
+        said.append(
+            f"radius_um goes from {low:.4g} to {high:.4g} µm; if these are millimetres, multiply by 1000 (deviations "
+            "from the mean radius)"
+        )
+    along = float(np.ptp(form.heights)) * 1e3
+    if 0.0 < along < _METRES:
+        said.append(f"height_mm goes over {along:.4g} mm; if these are metres, multiply by 1000")
+    return said
+
+
 def read_csv(path: Path) -> Measured:
     """Read a profile from a CSV file.
 
     Columns ``angle_deg`` [°], optionally ``height_mm`` [mm], ``radius_um`` (radius deviation) [µm], in any
-    order of rows. Every height must have the same angles.
+    order of rows. Every height must have the same angles. A row at 360° may repeat the one at 0°.
 
     Raises:
-        InputError: the file is missing, malformed, in other units, holds a number that is not finite, or repeats an
-            angle.
+        InputError: the file is missing, malformed, in other units, holds a number that is not finite, repeats an
+            angle, or covers a part of the turn.
     """
     return _measured(read_text(path, "profile"), path)
 
@@ -97,15 +151,22 @@ def _measured(text: str, path: Path) -> Measured:
         raise InputError(f"{path}: no points; give at least three angles")
     if len(header) == 2:
         rows = np.insert(rows, 1, 0.0, axis=1)
+    wrong = rows[(rows[:, 0] < 0.0) | (rows[:, 0] > 360.0), 0]
+    if wrong.size:
+        raise InputError(f"{path}: angle {wrong[0]:.10g}°; allowed: 0 up to 360, where 360 is 0 again")
+    rows = _closed(path, rows)
     angle_deg, heights_mm = np.unique(rows[:, 0]), np.unique(rows[:, 1])
-    if angle_deg[0] < 0.0 or angle_deg[-1] >= 360.0:
-        wrong = angle_deg[0] if angle_deg[0] < 0.0 else angle_deg[-1]
-        raise InputError(f"{path}: angle {wrong:g}°; allowed: 0 up to but not including 360")
     if angle_deg.size < 3:
         raise InputError(f"{path}: {angle_deg.size} different angles; allowed: 3 or more")
     _check_units(path, angle_deg, rows[:, 2])
     _check_distances(path, "angles", "°", np.append(angle_deg, angle_deg[0] + 360.0))
     _check_distances(path, "heights", " mm", heights_mm)
+    start, width, median = _gap(angle_deg)
+    if width > max(_WIDE * median, _WIDEST):
+        raise InputError(
+            f"{path}: no point from {start:.5g}° to {(start + width) % 360.0:.5g}°, while others are {median:.4g}° "
+            f"apart; allowed: points all round, gaps up to {_WIDEST:g}°"
+        )
     radius = np.full((heights_mm.size, angle_deg.size), np.nan)
     at = np.searchsorted(heights_mm, rows[:, 1]), np.searchsorted(angle_deg, rows[:, 0])
     cells, counts = np.unique(np.stack(at), axis=1, return_counts=True)

@@ -5,6 +5,7 @@ import csv
 import errno
 import math
 from collections.abc import Sequence
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -42,22 +43,28 @@ def _number(text: str, path: Path, line: int) -> float:
     return number
 
 
-def read_table(path: Path, headers: Sequence[Sequence[str]], what: str) -> tuple[list[str], Array]:
+def read_table(
+    path: Path, headers: Sequence[Sequence[str]], what: str, *, since_first: bool = False
+) -> tuple[list[str], Array]:
     """Read a CSV file of numbers; see `parse_table`.
 
     Raises:
         InputError: the file is missing, far too large, malformed, or holds a number that is not finite.
     """
-    return parse_table(read_text(path, what), path, headers)
+    return parse_table(read_text(path, what), path, headers, since_first=since_first)
 
 
-def parse_table(text: str, path: Path, headers: Sequence[Sequence[str]]) -> tuple[list[str], Array]:
+def parse_table(
+    text: str, path: Path, headers: Sequence[Sequence[str]], *, since_first: bool = False
+) -> tuple[list[str], Array]:
     """Read CSV with numbers; empty lines and those that start with # are left out.
 
     Args:
         text: of the file.
         path: of the file, for messages.
         headers: the headers of which it must have one.
+        since_first: the first column is taken less its first value, before it is rounded to a double: seconds since
+            1970 leave a double 0.2 µs.
 
     Returns:
         The header and the rows, shape (n, columns).
@@ -75,10 +82,15 @@ def parse_table(text: str, path: Path, headers: Sequence[Sequence[str]]) -> tupl
     header = [name.strip() for name in rows[0][1]] if rows else []
     if header not in [list(known) for known in headers]:
         allowed = " or ".join(",".join(known) for known in headers)
-        raise InputError(f"{path}: header {','.join(header)!r}; allowed: {allowed}")
+        parted = " (parted by commas, decimals with a point)" if {";", "\t"} & set("".join(header)) else ""
+        raise InputError(f"{path}: header {','.join(header)!r}; allowed: {allowed}{parted}")
     numbers = []
     for n, row in rows[1:]:
         if len(row) != len(header):
-            raise InputError(f"{path}:{n}: {len(row)} values; allowed: {len(header)}, as in the header")
+            decimals = " (decimals with a point)" if len(row) > len(header) else ""
+            raise InputError(f"{path}:{n}: {len(row)} values; allowed: {len(header)}, as in the header{decimals}")
         numbers.append([_number(text, path, n) for text in row])
+    if since_first and numbers:
+        for line, (_, row) in zip(numbers, rows[1:], strict=True):
+            line[0] = float(Decimal(row[0]) - Decimal(rows[1][1][0]))
     return header, np.array(numbers).reshape(-1, len(header))

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tachograms: spindle speed over time as a CSV file with the columns time_s and rpm, linear between its rows."""
+"""Tachograms: spindle speed over time as a CSV file with the columns time_s and rpm, linear between its rows.
+
+Time 0 is at the first row, as that of counts is at the first reading: the clock of the file does not matter.
+"""
 
 from pathlib import Path
 
@@ -13,30 +16,57 @@ from lathe_rc.signals.table import read_table
 Array = npt.NDArray[np.float64]
 
 _COLUMNS = ("time_s", "rpm")
+_UNITS = {"revolutions per second (Hz)": 60.0, "rad/s": 30.0 / np.pi, "degrees per second": 1.0 / 6.0}  # in rpm
+_NEAR = 1.2  # a typical speed that is this near to the nominal one in another unit, and so far off in rpm, is in that
 _ROOM = 1e-6  # share of the tolerance that is kept for the rounding of the file
 _FIRST_LOOK = 256  # points that are looked at together; twice as many after each look that finds no end
 
 
 def read(path: Path) -> tuple[Array, Array]:
-    """Times [s] and speeds [1/min] of a file, shape (n,) each.
+    """Times after the first row [s] and speeds [1/min] of a file, shape (n,) each.
 
     Raises:
         InputError: the file is missing or malformed, times do not rise, or a speed is not above 0.
     """
-    _, rows = read_table(path, [_COLUMNS], "tachogram")
+    _, rows = read_table(path, [_COLUMNS], "tachogram", since_first=True)
     time, rpm = rows[:, 0].copy(), rows[:, 1].copy()
     if not time.size:
         raise InputError(f"{path}: no row; allowed: one or more of {','.join(_COLUMNS)}")
-    wrong = np.flatnonzero(np.diff(time, prepend=-np.inf) <= 0.0)
-    if time[0] < 0.0 or wrong.size:
-        place = 0 if time[0] < 0.0 else int(wrong[0])
+    wrong = np.flatnonzero(np.diff(time) <= 0.0)
+    if wrong.size:
+        place = int(wrong[0]) + 1
         raise InputError(
-            f"{path}: time_s = {time[place]:.10g} in row {place + 1}; allowed: from 0 on, each later than the last"
+            f"{path}: row {place + 1} is {time[place] - time[place - 1]:.10g} s after the one before; allowed: times "
+            "that rise"
         )
     slow = np.flatnonzero(rpm <= 0.0)
     if slow.size:
-        raise InputError(f"{path}: rpm = {rpm[slow[0]]:.10g} at {time[slow[0]]:.10g} s; allowed: above 0")
+        raise InputError(
+            f"{path}: rpm = {rpm[slow[0]]:.10g} in row {slow[0] + 1}, {time[slow[0]]:.10g} s after the first; allowed: "
+            "above 0 (an emulated spindle does not stand still: leave out the rows where this one does, or follow its "
+            "counts with an encoder_device)"
+        )
     return time, rpm
+
+
+def check_unit(path: Path, rpm: Array, nominal_rpm: float) -> None:
+    """Refuse speeds that are most likely not in 1/min.
+
+    Args:
+        path: of the file, for the message.
+        rpm: its speeds, shape (n,).
+        nominal_rpm: speed that they deviate from [1/min].
+
+    Raises:
+        InputError: the median is the nominal speed in another unit.
+    """
+    typical = float(np.median(rpm))
+    for unit, scale in _UNITS.items():
+        if 1.0 / _NEAR < typical * scale / nominal_rpm < _NEAR:
+            raise InputError(
+                f"{path}: rpm is {typical:.4g} in the middle, with nominal_rpm = {nominal_rpm:g}, which looks like "
+                f"{unit}; allowed: 1/min (multiply by {scale:.4g}, or set nominal_rpm = {typical:.4g} if it is)"
+            )
 
 
 def write(path: Path, time: Array, rpm: Array, comment: str) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc import part
+from lathe_rc.analysis.form_errors import that_count
 from lathe_rc.analysis.metrology import POINTS, Lay, Measurement, evenly, lay, measure
 from lathe_rc.analysis.tolerance import LAST, Judge, Verdict
 from lathe_rc.cell.stage import Sparse
@@ -81,10 +82,12 @@ class Form:
             if first and not self._angle.size and not self._done:
                 # A snapshot begins in the midst of a revolution.
                 self._done = int(np.ceil(dense[self._encoder]["angle_true"][0] / _TURN))
-            self._angle = np.concatenate([self._angle, dense[self._encoder]["angle_true"]])
-            self._error = np.concatenate([self._error, dense[self.tool]["error"]])
+            angle, tool = dense[self._encoder]["angle_true"], dense[self.tool]
+            kept = that_count(angle, tool["error"])
+            self._angle = np.concatenate([self._angle, angle[kept]])
+            self._error = np.concatenate([self._error, tool["error"][kept]])
             if self._nose_radius:
-                self._height = np.concatenate([self._height, dense[self.tool]["height"]])
+                self._height = np.concatenate([self._height, tool["height"][kept]])
             self._measure(_MARGIN)
 
     @property
@@ -124,8 +127,8 @@ class Form:
         step = np.diff(self._angle)
         if not all(np.isfinite(signal).all() for signal in (self._angle, self._error, self._height)):
             raise InputError("samples that are not finite")
-        if step.size and not (step.min() > 0.0 and step.max() < _TURN / 3):
-            raise InputError("the angle does not increase, or by more than a third of a turn in a sample")
+        if step.size and not (step.min() >= 0.0 and step.max() < _TURN / 3):
+            raise InputError("the angle falls, or rises by more than a third of a turn in a sample")
         if self._done == 0 and self._angle.size and not 0.0 <= self._angle[0] < _TURN:
             raise InputError(f"the angle begins at {self._angle[0]:g} rad; allowed: in the first turn")
         if self._angle.size > _LONGEST:

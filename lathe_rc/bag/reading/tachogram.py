@@ -26,12 +26,16 @@ class Made:
         samples: of the recording.
         largest: greatest distance of the file's lines from a recorded speed [1/min].
         field: of the encoder that the speed was taken from.
+        standstill: time at which the speed is 0, in all [s].
+        stands_from: first of these times after sample 0 [s]; None: the spindle turns throughout.
     """
 
     points: int
     samples: int
     largest: float
     field: str
+    standstill: float
+    stands_from: float | None
 
 
 def make(bag: Path, output: Path, tolerance: float, topic: str = "") -> Made:
@@ -58,17 +62,24 @@ def make(bag: Path, output: Path, tolerance: float, topic: str = "") -> Made:
                 speed = signals[field] * _RPM
                 yield step * np.arange(first, first + speed.size), speed
 
-        if spindle.speed[0] <= 0.0:
+        low, high = spindle.speed
+        if low < 0.0 or high == 0.0:
             raise InputError(
-                f"{bag}: {spindle.topic}: {field} falls to {spindle.speed[0] * _RPM:.4g} rpm; allowed: above 0"
+                f"{bag}: {spindle.topic}: {field} from {low * _RPM:.4g} to {high * _RPM:.4g} rpm; allowed: a spindle "
+                "that turns, and forward"
             )
         thinner = tachogram.Thinner(tolerance)
+        still, stands_from = 0, None
         for time, speed in pieces():
             thinner.add(time, speed)
+            stands = speed == 0.0
+            still += int(np.count_nonzero(stands))
+            if stands_from is None and still:
+                stands_from = float(time[np.argmax(stands)])
         time, rpm = thinner.finish()
         largest = max(float(np.abs(np.interp(t, time, rpm) - speed).max()) for t, speed in pieces())
     tachogram.write(output, time, rpm, f"{field} of {spindle.topic} in {bag.name}, within {tolerance:g} rpm")
-    return Made(time.size, spindle.samples, largest, field)
+    return Made(time.size, spindle.samples, largest, field, still * step, stands_from)
 
 
 def _chosen(source: Source, topic: str) -> str:

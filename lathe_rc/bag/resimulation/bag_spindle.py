@@ -63,13 +63,20 @@ class _PlayedSpindle(TimeMaster):
         self._made, self.law = made, made.law
         self._tape, self.samples, self._said = tape, samples, said
         self.place_triggers()
-        self.declare(outputs=made.outputs)
+        self.declare(outputs=made.outputs, tells=made.tells)  # its events stand in the recording
         self._ready = messages.allocate(messages.ENCODER, messages.MAX_BLOCK)
         self._span = np.zeros(2, np.int64)
 
     def speed_range(self) -> tuple[float, float]:
-        """Of the law, which the bag's scenario has; without one, as recorded [rad/s]."""
-        return self._said.speed if self._said else self._made.speed_range()
+        """Of the law, which the bag's scenario has; without one, as recorded [rad/s].
+
+        The checks cannot count on a spindle that stands still: they take the lowest speed of the scenario then.
+        """
+        made = self._made.speed_range()
+        if self._said is None:
+            return made
+        low, high = self._said.speed
+        return (low if low > 0.0 else min(made[0], high)), high
 
     def largest_acceleration(self) -> float:
         """Of the scenario's."""

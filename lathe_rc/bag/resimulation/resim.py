@@ -203,6 +203,7 @@ def resimulate(
         changed = original is None or chosen.nodes != original.nodes
         with _without_strangers(path, changed=changed):
             cell, compared, events = wire(chosen, original, recorded, source)
+        warnings += cell.warnings if changed else []
         for name, stage in cell.stages.items():
             for index, action in events.get(name, []):
                 stage.replay(action, index)

@@ -82,6 +82,10 @@ class ForceController(Stage):
             outputs=[Output("longitudinal/command", messages.SERVO)],
         )
 
+    def warnings(self, seconds: float) -> list[str]:
+        """See `Stage`."""
+        return [f"{self.name}.{doubt}" for doubt in self.trajectory.doubts(seconds)]
+
     @property
     def memory(self) -> Memory:
         """See `Stage`."""

@@ -17,7 +17,7 @@ from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
 from lathe_rc.plants.tool import equal
-from lathe_rc.signals.measured_profile import read_csv
+from lathe_rc.signals.measured_profile import Measured, doubts, read_csv
 from lathe_rc.signals.part_profile import PartProfile, checked
 from lathe_rc.signals.profile import Harmonics, Piston, Polygon, Profile
 from lathe_rc.signals.profile_table import deviation_along, height_along, tabulated
@@ -181,6 +181,7 @@ class Form:
         profile: table of what the drives have to follow: the form, or the path of a round tip.
         inputs: what it reads.
         table: for `evaluate`.
+        doubts: about the file of a form, one line each.
 
     Raises:
         InputError: see `FormParameters.form`; a form that the tip does not get into; or a slide that shall begin anew.
@@ -188,6 +189,8 @@ class Form:
 
     def __init__(self, node: str, parameters: FormParameters) -> None:
         form = parameters.form(node)
+        said = doubts(form) if isinstance(form, Measured) else []
+        self.doubts = [f"{node}.profile_file = {parameters.profile_file}: {doubt}" for doubt in said]
         self.surface = self.profile = path = tabulated(form)
         if parameters.tip_radius:
             with about(node, "tip_radius"):

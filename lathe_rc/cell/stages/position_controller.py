@@ -305,6 +305,10 @@ class PositionController(Stage):
         steps: dict[str, Step] = {"pid": pid_step, "sampled_link": link_step, "periodic_hyperstable": periodic_step}
         return steps[self.parameters.law]
 
+    def warnings(self, seconds: float) -> list[str]:
+        """See `Stage`."""
+        return [f"{self.name}.{doubt}" for doubt in self.trajectory.doubts(seconds)]
+
     @property
     def memory(self) -> PidMemory | LinkMemory | PeriodicMemory:
         """See `Stage`."""

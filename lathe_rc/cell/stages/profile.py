@@ -36,6 +36,10 @@ class ProfileStage(Stage):
             outputs=[Output("reference", messages.REFERENCE, Joint("reference"))],
         )
 
+    def warnings(self, seconds: float) -> list[str]:
+        """See `Stage`."""
+        return self.form.doubts
+
     @property
     def memory(self) -> FormTable:
         """See `Stage`."""

@@ -34,7 +34,8 @@ class SpeedLawParameters(NodeParameters):
         [], "deviation there relative to the nominal speed, held before the first and after the last", "1"
     )
     tachogram_file: str = parameter(
-        "", "CSV file with time_s,rpm instead of both: the speed itself, the other deviations add to it", path=True
+        "", "CSV file with time_s,rpm instead of both, from its first row on: the speed itself, the other deviations add to it",
+        path=True,
     )
     random_rms: Annotated[float, Ge(0)] = parameter(0.0, "random deviation: RMS relative to the nominal speed", "1")
     random_low: Annotated[float, Gt(0)] = parameter(1.0, "lower end of its band", "rad/s")
@@ -90,7 +91,8 @@ class SpeedLawParameters(NodeParameters):
         time, deviation = np.array(self.tachogram_time), np.array(self.tachogram_deviation)
         if self.tachogram_file:
             with about(node, "tachogram_file"):
-                time, rpm = tachogram.read(resources.find(Path(self.tachogram_file)))
+                time, rpm = tachogram.read(path := resources.find(Path(self.tachogram_file)))
+                tachogram.check_unit(path, rpm, self.nominal_rpm)
                 deviation = rpm / self.nominal_rpm - 1.0
         with about(node, "tachogram_time", "tachogram_deviation"):
             return speed.tachogram(self.nominal_speed, time, deviation)

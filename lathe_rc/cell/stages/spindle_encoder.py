@@ -18,6 +18,8 @@ from lathe_rc.jit import kernel
 from lathe_rc.signals.encoder import Encoder, EncoderTable, encode
 from lathe_rc.signals.encoder_errors import EncoderErrors
 
+_SHORT = 0.01  # share of a run by which its tachogram may end before it
+
 
 class SpindleEncoderParameters(TimeMasterParameters, SpeedLawParameters):
     """Speed law, encoder, and, for the time master of a cell, length and pace of the run."""
@@ -104,6 +106,24 @@ class SpindleEncoder(TimeMaster):
                 f"{self.name}.deviation_law_end = {parameters.deviation_law_end:g} s: the run takes {seconds:.5g} s; "
                 "allowed: not before its end"
             )
+
+    def warnings(self, seconds: float) -> list[str]:
+        """See `Stage`: a tachogram that does not meet the run."""
+        time, deviation, _ = self._law.tachogram
+        rpm, where = self.parameters.nominal_rpm * (1.0 + deviation), f"the run at {seconds:.5g} s"
+        if not np.isfinite(seconds):
+            where = "the run does not end"
+        if self.parameters.tachogram_file and time[-1] < (1.0 - _SHORT) * seconds:
+            return [
+                f"{self.name}.tachogram_file ends {time[-1]:.5g} s after its first row, {where}: the spindle goes on "
+                f"at {rpm[-1]:.5g} rpm"
+            ]
+        if self.parameters.tachogram_time and time[0] >= seconds:
+            return [
+                f"{self.name}.tachogram_time begins at {time[0]:.10g} s, after the end of the run at {seconds:.5g} s: "
+                f"the spindle turns at {rpm[0]:.5g} rpm throughout; times count from the start of the run"
+            ]
+        return []
 
     def sample_at(self, angle: float) -> int:
         """See `TimeMaster`."""
