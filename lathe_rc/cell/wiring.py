@@ -171,6 +171,7 @@ class Cell:
         unknown: see above.
         unchecked: what `check` could not check since it depends on them, or since a law or drive of others does not
             tell what is needed; one line each.
+        warnings: what makes the form worse than the laws can do, and its cure; one line each. `check` finds them.
         factors: largest factor of a cycle over all frequencies, sup|Q - γZ| of repetitive control, by learning node;
             below 1 the error of each cycle is smaller than that of the one before. `check` finds it.
         stages: by node name, in the order of the forward edges.
@@ -190,6 +191,7 @@ class Cell:
         stage: Callable[[str, NodeParameters], Stage] = new_stage,
     ) -> None:
         self.unknown, self.unchecked = unknown or {}, list[str]()
+        self.warnings: list[str] = []
         self.factors: dict[str, float] = {}
         self._tables = nodes
         with extremes.refused(nodes):
@@ -289,6 +291,7 @@ class Cell:
 
     def _check(self) -> None:
         self.unchecked.clear()
+        self.warnings.clear()
         self.factors.clear()
         low, high = self.master.speed_range()
         if low <= 0.0:
@@ -320,6 +323,13 @@ class Cell:
             if isinstance(stage, Learner):
                 self._check_delay(stage, high)
                 self._check_convergence(stage, stage.checked_speeds(low, high))
+                self.warnings += stage.warnings(low, high, self.master.parameters.counts_per_revolution)
+
+    @property
+    def margins(self) -> dict[str, float | None]:
+        """Stability margin of each learning controller, 1 less its factor of a cycle; None if that is not known."""
+        learners = (name for name, stage in self.stages.items() if isinstance(stage, Learner))
+        return {name: 1.0 - self.factors[name] if name in self.factors else None for name in learners}
 
     def learned(self, stage: Learner) -> list[tuple[Response, str]]:
         """Responses and names of the drives that a channel commands."""

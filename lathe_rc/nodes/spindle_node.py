@@ -96,6 +96,8 @@ class SpindleNode(LossWatch):
             cell.check()
             for what in cell.unchecked:
                 self.get_logger().warning(f"not checked: {what}")
+            for what in cell.warnings:
+                self.get_logger().warning(what)
             self._begin(cell)
 
     def _begin(self, cell: Cell | None = None) -> None:

@@ -67,6 +67,15 @@ class Learner(Stage):
         """The parameters that decide whether learning converges, in words."""
         return "its parameters"
 
+    def warnings(self, low: float, high: float, counts: int) -> list[str]:
+        """What makes the form worse than the law can do, and its cure, one line each; nothing is refused for it.
+
+        Args:
+            low, high: speeds between which the spindle turns [rad/s].
+            counts: of its encoder per revolution; 0: an ideal one.
+        """
+        return []
+
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int | None:
         """Longest feedback delay [sample] that the cycle leaves.
 
