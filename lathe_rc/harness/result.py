@@ -41,7 +41,10 @@ class Result:
         refused: messages from outside the cell that the nodes refused, by sender.
         not_reached: events that the run was too short for, by node.
         unchecked: what the check before the start could not see, since laws or drives of others do not tell it.
-        warnings: doubts of the check before the start about parameters that can be meant.
+        warnings: doubts about parameters that can be meant, and what makes the form worse than the laws can do, with
+            its cure, as the check before the start found them.
+        margins: stability margin by learning controller, 1 less the largest factor of a cycle over all frequencies
+            and speeds (sup|Q - γZ| of repetitive control) [1]; None of a law that tells no factor.
         lateness: of the blocks; None if there was no pace to keep, as offline or with a ``speed_factor`` of 0.
 
     Example:
@@ -71,6 +74,7 @@ class Result:
     not_reached: Mapping[str, Sequence[str]] = field(default_factory=dict)
     unchecked: Sequence[str] = ()
     warnings: Sequence[str] = ()
+    margins: Mapping[str, float | None] = field(default_factory=dict)
     lateness: Lateness | None = None
 
     def __repr__(self) -> str:
@@ -181,6 +185,7 @@ class Result:
             "not_reached": {node: list(events) for node, events in self.not_reached.items()},
             "unchecked": list(self.unchecked),
             "warnings": list(self.warnings),
+            "stability_margin": dict(self.margins),
             "error_um": {
                 "first": of(0),
                 "last": of(-1),

@@ -77,16 +77,15 @@ def run(
     cell = Cell(scenario.nodes)
     cell.check()
     check_room(cell)
-    for what in cell.unchecked:
-        watch({"event": "unchecked", "node": cell.master.name, "message": what})
-    for what in cell.warnings:
-        watch({"event": "warning", "node": cell.master.name, "message": what})
+    for event, told in (("unchecked", cell.unchecked), ("warning", cell.warnings)):
+        for what in told:
+            watch({"event": event, "node": cell.master.name, "message": what})
     if bag is not None:
         from lathe_rc.bag.writing.writer import refuse_existing
 
         refuse_existing(bag)
     result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace), start)
-    result = replace(result, unchecked=cell.unchecked, warnings=cell.warnings)
+    result = replace(result, unchecked=cell.unchecked, warnings=cell.warnings, margins=cell.margins)
     if result.bag is not None:
         from lathe_rc.bag.check import write_digests
 
