@@ -15,7 +15,7 @@ from pathlib import Path
 from lathe_rc import __version__, extensions
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.parameters import NodeParameters, Value
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario, kind_of
 from lathe_rc.cell.stages import STAGES
@@ -178,14 +178,19 @@ def namespace(about: Mapping[str, str]) -> str:
     return next((topic.removesuffix("/cell_state") for topic in topics if topic.endswith("/cell_state")), "")
 
 
-def tolerances(about: Mapping[str, str]) -> dict[str, float]:
-    """Tolerance [m] by relative topic of each tool that has one, as the scenario of a bag says; empty if there is none.
+def values_of(about: Mapping[str, str]) -> dict[str, dict[str, Value]]:
+    """Values by node and parameter as the scenario of a bag says, none of them checked; empty if the bag has none.
 
     Raises:
         InputError: the bag's scenario is no parameter file.
     """
+    return ros_yaml.parse(about[SCENARIO], f"{SCENARIO} of the bag") if SCENARIO in about else {}
+
+
+def tolerances(nodes: Mapping[str, Mapping[str, Value]]) -> dict[str, float]:
+    """Tolerance [m] by relative topic of each tool that has one, by what `values_of` found."""
     found: dict[str, float] = {}
-    for node, values in ros_yaml.parse(about[SCENARIO], f"{SCENARIO} of the bag").items() if SCENARIO in about else ():
+    for node, values in nodes.items():
         allowed, remap = values.get("tolerance", 0.0), values.get("remap", [])
         if str(values.get("stage") or node) == Tool.kind and isinstance(allowed, float) and 0.0 < allowed < math.inf:
             rules = [str(rule).partition(":=") for rule in remap] if isinstance(remap, list) else []
