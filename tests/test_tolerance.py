@@ -87,7 +87,7 @@ def test_a_form_error_that_does_not_go_on_rising_does_not_grow(largest):
 
 
 def test_a_form_error_in_proportion_to_time_grows_but_does_not_diverge():
-    found = growth(np.concatenate([LEARNS, 1.0 + 0.1 * np.arange(60)]) * 1e-6)
+    found = growth(np.concatenate([LEARNS, np.full(5, 1.0), 1.0 + 0.1 * np.arange(60)]) * 1e-6)
     assert not found.diverges
     assert found.told() == "form error grows from revolution 10 on: 2 µm before, 6.9 µm at the end"
 
@@ -173,7 +173,8 @@ def test_terminal_json_and_report_say_alike_that_a_run_diverges_though_it_is_in_
     found = json.loads(lathe(*run, "--json").stdout)["growth_um"]
     assert found["diverges"]
     assert f" {found['from_revolution']} on: {found['before']:.4g} µm before, {found['last']:.4g} µm at" in line
-    assert lathe("report", tmp_path / "bag", "-o", tmp_path / "page.html").exit_code == 0
+    done = lathe("report", tmp_path / "bag", "-o", tmp_path / "page.html")
+    assert done.exit_code == 0, done.output
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert '<section class="verdict bad"' in text
     assert f'<p class="said">F{line[1:]}. In tolerance (±300 µm) from revolution ' in text
@@ -205,7 +206,8 @@ def test_a_report_begins_with_it(turned, tmp_path, name, said):
 
 def test_a_report_shows_the_budget_if_it_is_asked_for(turned, tmp_path):
     page = tmp_path / "page.html"
-    assert lathe("report", turned["kept"], "--budget", "-o", page).exit_code == 0
+    done = lathe("report", turned["kept"], "--budget", "-o", page)
+    assert done.exit_code == 0, done.output
     section = page.read_text(encoding="utf-8").partition(">What the form error is made of</h2>")[2]
     rows = re.findall(r'<tr><td class="text">([^<]*)</td><td>([^<]*)</td>', section.partition("<h2")[0])
     assert [name for name, _ in rows] == ["Q floor", "rest", "interactions", "form error"]
