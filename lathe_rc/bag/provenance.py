@@ -170,7 +170,7 @@ def named_files(about: Mapping[str, str]) -> dict[str, str]:
     """
     return {
         f"{node}.{key}": str(value)
-        for node, values in _scenario(about).items()
+        for node, values in values_of(about).items()
         for key, value in values.items()
         if key.endswith("_file") and value and f"{FILE}{node}.{key}" not in about
     }
@@ -184,7 +184,7 @@ def strangers(about: Mapping[str, str]) -> list[str]:
     """
     code = [
         f"{node}.{key} names code, {shown(each)}"
-        for node, values in _scenario(about).items()
+        for node, values in values_of(about).items()
         for key, value in values.items()
         for each in (value if isinstance(value, list) else [value])
         if isinstance(each, str) and _CODE.fullmatch(each)
@@ -193,11 +193,6 @@ def strangers(about: Mapping[str, str]) -> list[str]:
         f"{key} names a file that the bag does not hold, {shown(path)}" for key, path in named_files(about).items()
     ]
     return [*dict.fromkeys(code), *files]
-
-
-def _scenario(about: Mapping[str, str]) -> dict[str, dict[str, Value]]:
-    """Values of a bag's scenario by node and name; empty without one."""
-    return ros_yaml.parse(about[SCENARIO], f"{SCENARIO} of the bag") if SCENARIO in about else {}
 
 
 def held(about: Mapping[str, str]) -> dict[str, int]:
@@ -218,14 +213,19 @@ def namespace(about: Mapping[str, str]) -> str:
     return next((topic.removesuffix("/cell_state") for topic in topics if topic.endswith("/cell_state")), "")
 
 
-def tolerances(about: Mapping[str, str]) -> dict[str, float]:
-    """Tolerance [m] by relative topic of each tool that has one, as the scenario of a bag says; empty if there is none.
+def values_of(about: Mapping[str, str]) -> dict[str, dict[str, Value]]:
+    """Values by node and parameter as the scenario of a bag says, none of them checked; empty if the bag has none.
 
     Raises:
         InputError: the bag's scenario is no parameter file.
     """
+    return ros_yaml.parse(about[SCENARIO], f"{SCENARIO} of the bag") if SCENARIO in about else {}
+
+
+def tolerances(nodes: Mapping[str, Mapping[str, Value]]) -> dict[str, float]:
+    """Tolerance [m] by relative topic of each tool that has one, by what `values_of` found."""
     found: dict[str, float] = {}
-    for node, values in _scenario(about).items():
+    for node, values in nodes.items():
         allowed, remap = values.get("tolerance", 0.0), values.get("remap", [])
         if str(values.get("stage") or node) == Tool.kind and isinstance(allowed, float) and 0.0 < allowed < math.inf:
             rules = [str(rule).partition(":=") for rule in remap] if isinstance(remap, list) else []

@@ -58,6 +58,13 @@ _SOMEWHERE: Mapping[str, Mapping[type[NodeParameters], Mapping[str, Value]]] = {
         VibrationParameters: {"random_rms": 0.0, "line_amplitude": [], "line_frequency": [], "line_phase": []}
     },
 }
+#: Of these causes, those that make one revolution differ from the next.
+_CHANGING = {
+    "noise": _ANYWHERE["noise"],
+    "quantisation": _ANYWHERE["quantisation"],
+    "vibration": _SOMEWHERE["vibration"][VibrationParameters],
+}
+_CONSTANT = ("harmonics", "polygon")  # profiles that are the same all along the part
 _SPEED = [name for name in SpeedLawParameters.model_fields if name not in NodeParameters.model_fields]
 
 
@@ -212,6 +219,30 @@ def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
                 return {}
             off |= {f"{stage.name}.{name}": value for name, value in flat.items()}
     return {"Q floor": Cause(off)}
+
+
+def changing(nodes: Mapping[str, Mapping[str, Value]]) -> list[str]:
+    """Name the causes in a scenario's values that make one revolution differ from the next, but for speed and cut.
+
+    Args:
+        nodes: all values by node and parameter, none of them checked; empty lists may be left out.
+    """
+    found = [
+        name
+        for name, off in _CHANGING.items()
+        if any(
+            values.get(f"{prefix}{each}", none) != none
+            for values in nodes.values()
+            for prefix in _PREFIXES
+            for each, none in off.items()
+        )
+    ]
+    fed = any(
+        values.get("profile", _CONSTANT[0]) not in _CONSTANT
+        and (values.get("feed", 0.0) != 0.0 or values.get("height_from") == "slide")
+        for values in nodes.values()
+    )
+    return [*found, *(["feed"] if fed else [])]
 
 
 def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[str, str]]:

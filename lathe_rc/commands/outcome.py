@@ -48,11 +48,11 @@ def _events(result: harness.Result) -> RichTable:
 
 
 def facts(result: harness.Result) -> list[str]:
-    """Whether the part is in tolerance, what was sent and lost, how fast, and who was refused."""
+    """Whether the form error grows, whether the part is in tolerance, what was sent and lost, how fast, and who was refused."""
     refused = [f"{count} messages refused from {sender}" for sender, count in result.refused.items()]
     surface = result.surface
     return [
-        *([result.verdict.told()] if result.verdict else []),
+        *(each.told() for each in (result.growth, result.verdict) if each),
         *_margins(result),
         *([part.along_in_words(surface) if isinstance(surface, Lay) else surface] if surface else []),
         f"{result.blocks} blocks sent, {result.dropped} lost; {result.errors.rms.size} revolutions",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from lathe_rc import part
 from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.metrology import Lay, Measurement
-from lathe_rc.analysis.tolerance import Verdict
+from lathe_rc.analysis.tolerance import Growth, Verdict
 from lathe_rc.cell.durations import Lateness
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
@@ -138,6 +138,11 @@ class Result:
         """Whether the part is in tolerance; None if the scenario's tool has no ``tolerance``."""
         return part.verdict(self.scenario, self.recording)
 
+    @property
+    def growth(self) -> Growth | None:
+        """The growth of a form error that diverges, or grows otherwise; None if it does not."""
+        return part.error_growth(self.recording)
+
     @cached_property
     def surface(self) -> Lay | str | None:
         """The surface along the part, or why there is none; None: the scenario has no tool with a `nose_radius`."""
@@ -162,7 +167,7 @@ class Result:
 
     def summary(self) -> dict[str, object]:
         """The output of ``lathe run --json``."""
-        errors, step, verdict = self.errors, self.scenario.shared.step, self.verdict
+        errors, step, verdict, growth = self.errors, self.scenario.shared.step, self.verdict, self.growth
 
         def of(revolution: int) -> dict[str, Any] | None:
             return part.numbers(self.part, revolution) if errors.rms.size else None
@@ -194,6 +199,7 @@ class Result:
                 "per_revolution_ront": (self.part.roundness.peak_to_valley * 1e6).tolist() if errors.rms.size else [],
             },
             "tolerance_um": verdict.summary() if verdict else None,
+            "growth_um": growth.summary() if growth else None,
             "along_um": part.along(self.surface) if isinstance(self.surface, Lay) else self.surface,
             "bag": str(self.bag) if self.bag else None,
             "snapshots": [str(path) for path in self.snapshots],

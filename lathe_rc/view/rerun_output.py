@@ -92,12 +92,12 @@ def viewer(kind: Kind, port: int = PORT) -> Viewer:
         InputError: a window without a display.
     """
     data = _free_port()
+    options = ["--bind", _HOST, "--port", str(data)]  # by itself, Rerun listens on all interfaces
     if kind == "serve":
         page = f"http://{_HOST}:{port}/?url={quote(f'rerun+http://{_HOST}:{data}/proxy', safe='')}"
-        options = ["--serve-web", "--bind", _HOST, "--web-viewer-port", str(port), "--port", str(data)]
-        return Viewer(options, data, f"{page}  (Ctrl-C ends it)")
+        return Viewer([*options, "--serve-web", "--web-viewer-port", str(port)], data, f"{page}  (Ctrl-C ends it)")
     if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
-        return Viewer(["--port", str(data)], data, "the view opens in a window; close it to go on")
+        return Viewer(options, data, "the view opens in a window; close it to go on")
     raise InputError("no display for a window; use -o FILE.rrd or --web")
 
 
