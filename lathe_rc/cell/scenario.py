@@ -257,12 +257,12 @@ class Scenario:
             node, name = _target(whole, kinds, target)
             for each in [node] if node != _EVERYONE else self.nodes:
                 found = changes.setdefault(each, {})
-                value = _of_user(kinds[each], name, value, Path())
+                given_value = _of_user(kinds[each], name, value, Path())
                 if element is not None:
                     before = found.get(name, getattr(self.nodes[each], name, None))
-                    found[name] = _with_element(target, before, element, value)
+                    found[name] = _with_element(target, before, element, given_value)
                 else:
-                    found[name] = value
+                    found[name] = given_value
         tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
         given = "run_id" in values or not self._has_own_run_id
         for node, changed in changes.items():
