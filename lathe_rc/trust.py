@@ -74,9 +74,13 @@ _finder = _CurrentFolder()
 
 
 @contextlib.contextmanager
-def call() -> Iterator[None]:
-    """Begin a call of a command: nothing is allowed yet, and what gets allowed is so until its end."""
-    _calls.append(_Call())
+def call(*, own: bool = False) -> Iterator[None]:
+    """Begin a call of a command: nothing is allowed yet, and what gets allowed is so until its end.
+
+    Args:
+        own: as in a Python program, packages that scenarios of the user's own name are allowed.
+    """
+    _calls.append(_Call(own=own))
     try:
         yield
     finally:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start every node of a scenario, the recorder included: ``ros2 launch lathe_rc cell.launch.py``.
 
-``scenario`` names the ROS 2 parameter file, ``bag`` the folder to record to, ``namespace`` that of the nodes;
+``scenario`` names the ROS 2 parameter file, ``bag`` the folder to record to, ``namespace`` that of the nodes,
 ``allow_code`` a package of the current folder that the scenario names code of;
 ``NODE.PARAM:=VALUE``, or ``PARAM:=VALUE`` for a shared parameter, replaces a value of the scenario. The run ends when
 its last block has been recorded; without a number of revolutions it goes on until Ctrl-C. A node that fails ends the
@@ -37,8 +37,8 @@ ARGUMENTS = {
         "ROS 2 parameter file of the cell; NODE.PARAM:=VALUE, or PARAM:=VALUE if shared, replaces one of its values",
     ),
     "bag": ("", "folder to record to, which must not exist; empty: the scenario's, or bag_ and the run id"),
-    "allow_code": ("", "package of the current folder that the scenario names code of"),
     "namespace": ("/", "of the nodes; two cells in one domain need one each"),
+    "allow_code": ("", "package of the current folder that the scenario names code of"),
 }  #: default and description
 OF_LAUNCH = {"emulate_tty", "launch-prefix", "launch-prefix-filter", "sigkill_timeout", "sigterm_timeout"}
 PATIENCE = 30.0  # [s] for a cell that has lost a member to end by itself
