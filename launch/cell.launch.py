@@ -20,7 +20,7 @@ from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from lathe_rc import harness, resources, trust
+from lathe_rc import allowed_code, harness, resources
 from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
@@ -62,7 +62,7 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """
     refuse_unknown(given_to_this_file(context))
     if package := LaunchConfiguration("allow_code").perform(context):
-        trust.allow(package)
+        allowed_code.allow(package)
     path = resources.find(Path(LaunchConfiguration("scenario").perform(context)))
     scenario = replaced(scenarios.load(path), context.launch_configurations.items())
     Cell(scenario.nodes).check()
@@ -82,7 +82,7 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             executable="container",
             exec_name=label(group),
             namespace=namespace,
-            arguments=[*trust.arguments(), *(f"{name}:{complete.kind(name)}" for name in group)],
+            arguments=[*allowed_code.arguments(), *(f"{name}:{complete.kind(name)}" for name in group)],
             parameters=[str(file)],
             ros_arguments=["--enclave", absolute(namespace, group[0])],
             output="screen",

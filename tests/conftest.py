@@ -11,7 +11,7 @@ import rclpy
 from hypothesis import HealthCheck, settings
 
 import slow_tests
-from lathe_rc import harness, trust
+from lathe_rc import allowed_code, harness
 from lathe_rc.nodes import dds
 
 # The same examples on every machine; --hypothesis-profile=explore looks for new ones.
@@ -50,7 +50,7 @@ def pytest_collection_modifyitems(config, items):
 @pytest.fixture(autouse=True, scope="module")
 def program():
     """Each module is a program of its own, which allows code for itself."""
-    with trust.call(own=True):
+    with allowed_code.call(own=True):
         yield
 
 

@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc import extensions, harness, messages, trust
+from lathe_rc import allowed_code, extensions, harness, messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.resimulation.resim import resimulate
@@ -60,7 +60,7 @@ NAMED = ["spindle_encoder.deviation_law", "learning_controller.q_filter", "tool.
 @pytest.fixture(autouse=True, scope="module")
 def allowed(program):
     for package in ("parts", __name__, "nowhere", "test_wiring"):
-        trust.allow(package)
+        allowed_code.allow(package)
 
 
 def cell(shared=None, **nodes):

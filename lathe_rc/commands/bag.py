@@ -63,7 +63,7 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
             "topics": topics,
             "about": dict(source.about),
             "contradictions": source.contradictions,
-            "strangers": provenance.strangers(source.about),
+            "foreign": provenance.foreign(source.about),
         }
     told["error_um"] = _metrics(path, types) if metrics else None
     if as_json:
@@ -79,7 +79,7 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
     console.print(table)
     for what in told["contradictions"]:
         click.echo(what, err=True)
-    for what in told["strangers"]:
+    for what in told["foreign"]:
         console.print(Text(what))
     console.print(f"span: {span:.6g} s from {told['start_s']:.6g} s on")
     if told["error_um"]:
@@ -118,7 +118,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
         "clean": not found.exit_code,
         "wrong": found.wrong,
         "lost": found.lost,
-        "strangers": found.strangers,
+        "foreign": found.foreign,
         "messages": found.messages,
         "samples": found.samples,
         "digests_compared": found.compared,
@@ -127,7 +127,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(told))
     else:
-        for what in (*found.wrong, *found.lost, *found.strangers):
+        for what in (*found.wrong, *found.lost, *found.foreign):
             click.echo(what)
         state = {0: "clean", 1: "wrong", _LOSSY: "lossy"}[found.exit_code]
         digests = f"{found.compared} digests as recorded" if found.compared else "no digests recorded"

@@ -19,7 +19,7 @@ import yaml
 from cells import scenario
 from click.testing import CliRunner
 
-from lathe_rc import extensions, harness, trust
+from lathe_rc import allowed_code, extensions, harness
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell import scenario as scenarios
@@ -245,8 +245,8 @@ def test_metadata_in_the_current_folder_is_no_installed_package(received):
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: trap\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(f"[lathe_rc.stages]\ntrap_stage = {received.module}:Tool\n")
     extensions._offered_along.cache_clear()
-    with trust.call():
-        trust.allow("another")
+    with allowed_code.call():
+        allowed_code.allow("another")
         assert "trap_stage" not in STAGES
         assert not STAGES.permits(f"{received.module}:Tool")
 
@@ -284,7 +284,7 @@ def test_a_member_that_announces_code_or_files_is_known_by_its_topics_alone(rece
     """The recorder would keep such a file in its bag, the time master read it."""
     told = json.loads(json.dumps(value).replace("{0}", received.module).replace("{1}", str(received.secret)))
     node = Hearing(stage.replace("{0}", received.module), **{parameter: told})
-    with trust.call():
+    with allowed_code.call():
         assert node._table("/it") is None
     assert "is known by its topics alone" in node.said[0]
     assert not received.mark.exists()
@@ -292,8 +292,8 @@ def test_a_member_that_announces_code_or_files_is_known_by_its_topics_alone(rece
 
 def test_a_member_may_announce_the_files_that_the_user_names(received):
     node = Hearing("tool", profile_file=str(received.secret))
-    with trust.call():
-        trust.user_names(lambda: {str(received.secret)})
+    with allowed_code.call():
+        allowed_code.user_names(lambda: {str(received.secret)})
         assert node._table("/it").profile_file == str(received.secret)
 
 
@@ -381,22 +381,22 @@ def test_files_of_the_current_folder_take_the_place_of_no_module(received, start
     ]
     environment = dict(os.environ)
     if start == "child":
-        with trust.call():
-            trust.allow(received.module)
-            words = [*trust.interpreter("lathe_rc.nodes.container"), *trust.arguments(), "--help"]
+        with allowed_code.call():
+            allowed_code.allow(received.module)
+            words = [*allowed_code.interpreter("lathe_rc.nodes.container"), *allowed_code.arguments(), "--help"]
             environment["PYTHONPATH"] = extensions.search_path()
     done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
     assert (done.returncode, received.mark.exists()) == (0, False), done.stderr
 
 
 def test_children_are_allowed_the_same():
-    with trust.call():
+    with allowed_code.call():
         for package in ("second", "first"):
-            trust.allow(package)
-        words = trust.arguments()
-    with trust.call():
-        assert trust.taken_from([*words, "tool", "--allow-code=third"]) == ["tool"]
-        assert [trust.is_allowed(name) for name in ("first.a", "second", "third", "fourth")] == [
+            allowed_code.allow(package)
+        words = allowed_code.arguments()
+    with allowed_code.call():
+        assert allowed_code.taken_from([*words, "tool", "--allow-code=third"]) == ["tool"]
+        assert [allowed_code.is_allowed(name) for name in ("first.a", "second", "third", "fourth")] == [
             True,
             True,
             True,
