@@ -135,10 +135,10 @@ def _check_installed(about: Mapping[str, str]) -> None:
     for origin in origins(about):
         package = origin.name.partition(":")[0].partition(".")[0]
         if package not in sys.modules and (not package.isidentifier() or find_spec(package) is None):
-            allowed = f"install {origin.package or package}, or {allowed_code.OPTION} {package} if it lies in the current folder"
             raise InputError(
                 f"{', '.join(origin.used)}: the bag was made with {origin.name}, and there is no module {package}; "
-                f"allowed: {allowed}"
+                f"allowed: install {origin.package or package}, or {allowed_code.OPTION} {package} if it lies in the "
+                "current folder"
             )
 
 
@@ -175,11 +175,11 @@ def named_files(about: Mapping[str, str]) -> dict[str, str]:
 
 
 def foreign(about: Mapping[str, str]) -> list[str]:
-    """Code that a bag's scenario names, and files that the bag does not hold; a line each, nothing is imported.
-
-    Raises:
-        InputError: the bag's scenario is no parameter file.
-    """
+    """Code that a bag's scenario names, and files that the bag does not hold; a line each, nothing is imported."""
+    try:
+        files = named_files(about)
+    except InputError as error:
+        return [str(error)]  # such a bag can be read, but not simulated again
     code = [
         f"{node}.{key} names code, {shown(each)}"
         for node, values in _scenario(about).items()
@@ -187,10 +187,8 @@ def foreign(about: Mapping[str, str]) -> list[str]:
         for each in (value if isinstance(value, list) else [value])
         if isinstance(each, str) and _CODE.fullmatch(each)
     ]
-    files = [
-        f"{key} names a file that the bag does not hold, {shown(path)}" for key, path in named_files(about).items()
-    ]
-    return [*dict.fromkeys(code), *files]
+    lacking = [f"{key} names a file that the bag does not hold, {shown(path)}" for key, path in files.items()]
+    return [*dict.fromkeys(code), *lacking]
 
 
 def _scenario(about: Mapping[str, str]) -> dict[str, dict[str, Value]]:
