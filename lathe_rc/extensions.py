@@ -2,7 +2,8 @@
 """Extensions of the cell from other packages: classes by name, ours and theirs.
 
 A class is named by a name of ours, by a name that an installed package offers as an entry point, or by where it
-stands, ``package.module:Class``, if an entry point offers that or the user has allowed the package: `lathe_rc.allowed_code`.
+stands, ``package.module:Class``, if an entry point offers that or the user has allowed the package, see
+`lathe_rc.allowed_code`.
 """
 
 import ast

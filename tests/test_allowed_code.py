@@ -164,6 +164,16 @@ def test_other_metadata_of_a_bag_names_no_code(received, key):
     assert not received.mark.exists()
 
 
+def test_a_bag_whose_scenario_is_none_is_still_read(received):
+    file = received.bag / "metadata.yaml"
+    whole = yaml.safe_load(file.read_text())
+    whole["rosbag2_bagfile_information"]["custom_data"][provenance.SCENARIO] = "- no nodes"
+    file.write_text(yaml.safe_dump(whole))
+    for word in ("info", "check"):
+        found = lathe("bag", word, received.bag)
+        assert (found.exit_code, "no nodes; allowed" in found.stdout) == (0, True), found.output
+
+
 def test_code_that_is_allowed_for_this_call_runs_from_the_current_folder(received):
     """The user's word lets it in, once."""
     received.change("tool", stage=f"{received.module}:Tool")
