@@ -2,7 +2,8 @@
 """Extensions of the cell from other packages: classes by name, ours and theirs.
 
 A class is named by a name of ours, by a name that an installed package offers as an entry point, or by where it
-stands, ``package.module:Class``, if an entry point offers that or the user has allowed the package: `lathe_rc.trust`.
+stands, ``package.module:Class``, if an entry point offers that or the user has allowed the package, see
+`lathe_rc.allowed_code`.
 """
 
 import ast
@@ -23,7 +24,7 @@ from typing import Any, Generic, TypeVar
 
 from pydantic_core import core_schema
 
-from lathe_rc import trust
+from lathe_rc import allowed_code
 from lathe_rc.errors import InputError, LatheError, shown
 
 T = TypeVar("T")
@@ -83,14 +84,14 @@ class Offers(Mapping[str, V], Generic[V]):
     def permits(self, name: str) -> bool:
         """Whether a name may be looked up: data cannot name code that is neither offered nor allowed."""
         module, colon, _ = name.partition(":")
-        if not colon or trust.is_allowed(module):
+        if not colon or allowed_code.is_allowed(module):
             return True
         return any(f"{point.module}:{point.attr}" == name for point in _offered(self.group).values())
 
     def why_not(self, name: str) -> str:
         """Why a name may not be looked up, and what to do."""
         package = shown(name.partition(":")[0].partition(".")[0])
-        return f"code that no installed package offers; allowed: install {package}, or {trust.OPTION} {package}"
+        return f"code that no installed package offers; allowed: install {package}, or {allowed_code.OPTION} {package}"
 
     @abstractmethod
     def _checked(self, name: str, found: Any) -> V:
@@ -175,12 +176,14 @@ def code_of_others(what: str) -> Iterator[None]:
 
 def _attribute(module: str, attribute: str, what: str) -> Any:
     try:
-        with trust.importing(module):
+        with allowed_code.importing(module):
             found = importlib.import_module(module)
     except Exception as error:  # whatever a module of others does when it is imported
         told = f"{what} cannot be imported: {type(error).__name__}: {shown(error)}"
         if isinstance(error, ModuleNotFoundError) and error.name == module.partition(".")[0]:
-            told += f"; allowed: install it, or {trust.OPTION} {shown(error.name)} if it lies in the current folder"
+            told += (
+                f"; allowed: install it, or {allowed_code.OPTION} {shown(error.name)} if it lies in the current folder"
+            )
         raise InputError(told) from error
     for part in attribute.split("."):
         if not hasattr(found, part):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start every node of a scenario, the recorder included: ``ros2 launch lathe_rc cell.launch.py``.
 
-``scenario`` names the ROS 2 parameter file, ``bag`` the folder to record to, ``namespace`` that of the nodes;
+``scenario`` names the ROS 2 parameter file, ``bag`` the folder to record to, ``namespace`` that of the nodes,
 ``allow_code`` a package of the current folder that the scenario names code of;
 ``NODE.PARAM:=VALUE``, or ``PARAM:=VALUE`` for a shared parameter, replaces a value of the scenario. The run ends when
 its last block has been recorded; without a number of revolutions it goes on until Ctrl-C. A node that fails ends the
@@ -20,7 +20,7 @@ from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from lathe_rc import harness, resources, trust
+from lathe_rc import allowed_code, harness, resources
 from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
@@ -37,8 +37,8 @@ ARGUMENTS = {
         "ROS 2 parameter file of the cell; NODE.PARAM:=VALUE, or PARAM:=VALUE if shared, replaces one of its values",
     ),
     "bag": ("", "folder to record to, which must not exist; empty: the scenario's, or bag_ and the run id"),
-    "allow_code": ("", "package of the current folder that the scenario names code of"),
     "namespace": ("/", "of the nodes; two cells in one domain need one each"),
+    "allow_code": ("", "package of the current folder that the scenario names code of"),
 }  #: default and description
 OF_LAUNCH = {"emulate_tty", "launch-prefix", "launch-prefix-filter", "sigkill_timeout", "sigterm_timeout"}
 PATIENCE = 30.0  # [s] for a cell that has lost a member to end by itself
@@ -62,7 +62,7 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """
     refuse_unknown(given_to_this_file(context))
     if package := LaunchConfiguration("allow_code").perform(context):
-        trust.allow(package)
+        allowed_code.allow(package)
     path = resources.find(Path(LaunchConfiguration("scenario").perform(context)))
     scenario = replaced(scenarios.load(path), context.launch_configurations.items())
     Cell(scenario.nodes).check()
@@ -82,7 +82,7 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             executable="container",
             exec_name=label(group),
             namespace=namespace,
-            arguments=[*trust.arguments(), *(f"{name}:{complete.kind(name)}" for name in group)],
+            arguments=[*allowed_code.arguments(), *(f"{name}:{complete.kind(name)}" for name in group)],
             parameters=[str(file)],
             ros_arguments=["--enclave", absolute(namespace, group[0])],
             output="screen",

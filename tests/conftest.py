@@ -11,7 +11,7 @@ import rclpy
 from hypothesis import HealthCheck, settings
 
 import slow_tests
-from lathe_rc import harness
+from lathe_rc import allowed_code, harness
 from lathe_rc.nodes import dds
 
 # The same examples on every machine; --hypothesis-profile=explore looks for new ones.
@@ -45,6 +45,13 @@ def pytest_collection_modifyitems(config, items):
     if hasattr(config, "workerinput"):
         shares = slow_tests.shares()
         items.sort(key=lambda item: -shares.get(item.path.stem, 0.0))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def program():
+    """Each module is a program of its own, which allows code for itself."""
+    with allowed_code.call(own=True):
+        yield
 
 
 @pytest.fixture

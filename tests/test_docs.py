@@ -362,7 +362,7 @@ class TestLaunch:
         [
             (
                 "revolutions",
-                "no launch argument 'revolutions'; allowed: scenario, bag, namespace, NODE.PARAM .*nominal_rpm",
+                "no launch argument 'revolutions'; allowed: scenario, bag, namespace, allow_code, NODE.* .*nominal_rpm",
             ),
             ("spindle.revolutions", "no node 'spindle' in the scenario; did you mean spindle_encoder?"),
             ("spindle_encoder.revolution", "spindle_encoder.revolution: unknown parameter; did you mean revolutions"),

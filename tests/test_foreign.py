@@ -172,8 +172,8 @@ DRIVE = "electrodynamic_actuator"
         (DRIVE, "{}", "its parameters do not say sample_rate and [0-9]+ others"),
         ("my_drive", KNOWN.model_dump_json(), "there is no such stage here"),
         ("", "{}", "there is no such stage here"),
-        ("nobody.has:Drive", "{}", "stage 'nobody.has:Drive' cannot be imported: ModuleNotFoundError: .*"),
-        ("os:getpid", "{}", "stage 'os:getpid' is .*; allowed: a class that derives from .*"),
+        ("nobody.has:Drive", "{}", "stage 'nobody.has:Drive': code that no installed package offers; allowed: .*"),
+        ("os:getpid", "{}", "stage 'os:getpid': code that no installed package offers; allowed: .*"),
     ],
 )
 def test_a_member_is_known_if_its_stage_and_all_its_parameters_are(ghost, capfd, stage, parameters, why):

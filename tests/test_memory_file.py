@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Saved memories: round trip, what a crash leaves, and files that nobody should trust."""
+"""Saved memories: round trip, what a crash leaves, and files that nobody should allowed_code."""
 
 import contextlib
 import os

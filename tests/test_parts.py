@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc import extensions, harness, messages, trust
+from lathe_rc import allowed_code, extensions, harness, messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.resimulation.resim import resimulate
@@ -42,9 +42,6 @@ sys.path.append(str(FIGURES))
 
 import parts  # noqa: E402 - it stands beside the page that explains it
 
-for package in ("parts", __name__, "nowhere", "test_wiring"):
-    trust.allow(package)
-
 PARTS = {
     "spindle_encoder": {"deviation_law": "parts:Chirp", "deviation_values": [0.1, 10.0, 60.0, 0.2]},
     "learning_controller": {"q_filter": "parts:Hann", "reaction_delay": 2048},
@@ -58,6 +55,12 @@ PARTS = {
     },
 }
 NAMED = ["spindle_encoder.deviation_law", "learning_controller.q_filter", "tool.profile", "supervisor.monitors"]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def allowed(program):
+    for package in ("parts", __name__, "nowhere", "test_wiring"):
+        allowed_code.allow(package)
 
 
 def cell(shared=None, **nodes):

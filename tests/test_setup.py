@@ -572,7 +572,8 @@ def test_command_gets_the_users_arguments_and_directory(copy, tmp_path):
     command = [copy / "lathe", "run", "a b", "--json"]
     clean = {"PATH": os.environ["PATH"], "LATHE_PYTHON": workplace.BASE_PYTHON}
     result = subprocess.run(command, env=clean, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert result.stdout.splitlines() == [str(tmp_path), str(copy / "lathe_rc" / "__main__.py"), "run", "a b", "--json", "yes"]
+    program = str(copy / "lathe_rc" / "__main__.py")
+    assert result.stdout.splitlines() == [str(tmp_path), program, "run", "a b", "--json", "yes"]
     assert result.stderr == ""
     command = [copy / "lathe", "python", "my program.py", "--help"]
     result = subprocess.run(command, env=clean, cwd=tmp_path, capture_output=True, text=True, check=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from cells import NODES, announced, run, scenario
 
-from lathe_rc import harness, messages
+from lathe_rc import allowed_code, harness, messages
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.stage import Input, Output, Stage
@@ -35,6 +35,11 @@ class Repeater(Stage):
 
 
 REPEATER = "test_wiring:Repeater"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def allowed(program):
+    allowed_code.allow("test_wiring")
 
 
 def refusal(shared=None, **nodes):

@@ -34,7 +34,7 @@ class Findings:
         lost: what should be there: gaps, topics that end early.
         digests: of each signal topic, as `lathe_rc.cell.recording` makes them; empty if something is lost.
         compared: topics whose digest was recorded and is the same.
-        strangers: code and files that the bag names and does not hold.
+        foreign: code and files that the bag names and does not hold.
         messages: all of them.
         samples: of the dense topics that are all of one length.
         first: where a snapshot begins; 0 of a whole run.
@@ -45,7 +45,7 @@ class Findings:
     lost: list[str] = field(default_factory=list)
     digests: dict[str, str] = field(default_factory=dict)
     compared: int = 0
-    strangers: list[str] = field(default_factory=list)
+    foreign: list[str] = field(default_factory=list)
     messages: int = 0
     samples: int = 0
     first: int = 0
@@ -141,7 +141,7 @@ def check(path: Path) -> Findings:
         sparse = {t: _Sparse(t, k, findings) for t, k in types.items() if k in messages.sparse_types()}
         counts = dict.fromkeys(types, 0)
         findings.wrong += source.contradictions
-        findings.strangers = provenance.strangers(source.about)
+        findings.foreign = provenance.foreign(source.about)
         findings.unread = list(map(str, source.unread))
         for topic, log_ns, data in source.messages():
             counts[topic] += 1

@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
-from lathe_rc import __version__, trust
+from lathe_rc import __version__, allowed_code
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import NodeParameters, Value
@@ -135,12 +135,10 @@ def _check_installed(about: Mapping[str, str]) -> None:
     for origin in origins(about):
         package = origin.name.partition(":")[0].partition(".")[0]
         if package not in sys.modules and (not package.isidentifier() or find_spec(package) is None):
-            allowed = (
-                f"install {origin.package or package}, or {trust.OPTION} {package} if it lies in the current folder"
-            )
             raise InputError(
                 f"{', '.join(origin.used)}: the bag was made with {origin.name}, and there is no module {package}; "
-                f"allowed: {allowed}"
+                f"allowed: install {origin.package or package}, or {allowed_code.OPTION} {package} if it lies in the "
+                "current folder"
             )
 
 
@@ -176,12 +174,12 @@ def named_files(about: Mapping[str, str]) -> dict[str, str]:
     }
 
 
-def strangers(about: Mapping[str, str]) -> list[str]:
-    """Code that a bag's scenario names, and files that the bag does not hold; a line each, nothing is imported.
-
-    Raises:
-        InputError: the bag's scenario is no parameter file.
-    """
+def foreign(about: Mapping[str, str]) -> list[str]:
+    """Code that a bag's scenario names, and files that the bag does not hold; a line each, nothing is imported."""
+    try:
+        files = named_files(about)
+    except InputError as error:
+        return [str(error)]  # such a bag can be read, but not simulated again
     code = [
         f"{node}.{key} names code, {shown(each)}"
         for node, values in values_of(about).items()
@@ -189,10 +187,8 @@ def strangers(about: Mapping[str, str]) -> list[str]:
         for each in (value if isinstance(value, list) else [value])
         if isinstance(each, str) and _CODE.fullmatch(each)
     ]
-    files = [
-        f"{key} names a file that the bag does not hold, {shown(path)}" for key, path in named_files(about).items()
-    ]
-    return [*dict.fromkeys(code), *files]
+    lacking = [f"{key} names a file that the bag does not hold, {shown(path)}" for key, path in files.items()]
+    return [*dict.fromkeys(code), *lacking]
 
 
 def held(about: Mapping[str, str]) -> dict[str, int]:
@@ -247,7 +243,7 @@ def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str]
     """The scenario that a bag was made with.
 
     Its files are written to ``folder``, which must last as long as it. The scenario of a bag is data: it names no
-    others, and no code that is not allowed (`lathe_rc.trust`).
+    others, and no code that is not allowed (`lathe_rc.allowed_code`).
 
     Raises:
         InputError: the bag has none, or one that is not allowed, or that this version does not accept.

@@ -15,7 +15,7 @@ import threading
 from collections import deque
 from collections.abc import Iterable, Iterator
 
-from lathe_rc import trust
+from lathe_rc import allowed_code
 from lathe_rc.cell import native
 from lathe_rc.cell.program import compile_loop
 from lathe_rc.cell.scenario import TABLES, kind_of
@@ -73,7 +73,7 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
 def _start() -> "subprocess.Popen[str]":
     """Start a process that compiles the steps of the stages that its input names."""
     environment = os.environ | {"PYTHONPATH": search_path()}
-    command = [*trust.interpreter(__name__), *trust.arguments()]
+    command = [*allowed_code.interpreter(__name__), *allowed_code.arguments()]
     return subprocess.Popen(command, stdin=-1, stdout=-1, text=True, env=environment)
 
 
@@ -96,7 +96,7 @@ def _have_compiled(
 
 def main() -> None:
     """Compile what each line of the standard input names."""
-    trust.taken_from(sys.argv[1:])
+    allowed_code.taken_from(sys.argv[1:])
     for line in sys.stdin:
         name, kind, values = json.loads(line)
         stage = STAGES[kind](name, TABLES[kind].read(name, values))

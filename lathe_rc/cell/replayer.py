@@ -8,6 +8,7 @@ from annotated_types import Ge
 from lathe_rc.cell.parameters import Table, parameter
 
 KIND = "replayer"
+FILES = "lathe-replay-"  #: begins the name of the temporary folder with the files of the bag
 
 
 class ReplayerParameters(Table):

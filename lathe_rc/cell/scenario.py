@@ -17,7 +17,7 @@ from typing import cast
 
 import yaml
 
-from lathe_rc import files, resources, trust
+from lathe_rc import allowed_code, files, resources
 from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Value
 from lathe_rc.cell.recorder import KIND as RECORDER
@@ -257,12 +257,12 @@ class Scenario:
             node, name = _target(whole, kinds, target)
             for each in [node] if node != _EVERYONE else self.nodes:
                 found = changes.setdefault(each, {})
-                value = _of_user(kinds[each], name, value, Path())
+                given_value = _of_user(kinds[each], name, value, Path())
                 if element is not None:
                     before = found.get(name, getattr(self.nodes[each], name, None))
-                    found[name] = _with_element(target, before, element, value)
+                    found[name] = _with_element(target, before, element, given_value)
                 else:
-                    found[name] = value
+                    found[name] = given_value
         tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
         given = "run_id" in values or not self._has_own_run_id
         for node, changed in changes.items():
@@ -354,7 +354,7 @@ def _of_user(kind: str, name: str, value: Value, folder: Path) -> Value:
     row = TABLES[kind].rows().get(name)
     if name == "stage" or (row is not None and row.named is not None):
         for each in value if isinstance(value, list) else [value]:
-            trust.allow_named(each)
+            allowed_code.allow_named(each)
     if row is None or not row.is_path or not isinstance(value, str) or not value:
         return value
     return str((folder / value).resolve())
@@ -377,14 +377,14 @@ def read(
     Raises:
         InputError: the file is none, or it is data and names code that is not allowed, or files elsewhere.
     """
-    folder = path.parent if copies is not None else trust.bag_around(path.parent)
+    folder = path.parent if copies is not None else allowed_code.bag_around(path.parent)
     nodes = ros_yaml.read(path)
     outside: dict[tuple[str, str], Path] = {}
     for name, values in nodes.items():
         if name == _EVERYONE:
             continue
         if folder is None:
-            trust.allow_named(values.get("stage"))
+            allowed_code.allow_named(values.get("stage"))
         kind = kind_of(name, values.get("stage") or stages.get(name))
         for key, value in values.items():
             row = TABLES[kind].rows().get(key)
@@ -476,7 +476,7 @@ def load(
         complete: what the file leaves out has its default, as in those of `Scenario.to_yaml`; otherwise models of
             drives that are not given are those of the drives, see `lathe_rc.cell.models`.
         copies: of the files of a bag's scenario, by NODE.PARAM, all in the folder of ``path``; it is data then, and
-            names no others. None: it is the user's own, unless it lies in a bag (`lathe_rc.trust`).
+            names no others. None: it is the user's own, unless it lies in a bag (`lathe_rc.allowed_code`).
 
     Raises:
         InputError: one line for the first thing that is wrong.

@@ -71,7 +71,7 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> Non
             "unread": [asdict(each) for each in source.unread],
             "about": dict(source.about),
             "contradictions": source.contradictions,
-            "strangers": provenance.strangers(source.about),
+            "foreign": provenance.foreign(source.about),
             "damage": source.damage,
         }
     told["error_um"] = _metrics(path, types) if metrics and not source.damage else None
@@ -90,7 +90,7 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> Non
         console.print(Text(f"not read: {each}"))
     for what in (*told["contradictions"], *told["damage"]):
         click.echo(what, err=True)
-    for what in told["strangers"]:
+    for what in told["foreign"]:
         console.print(Text(what))
     console.print(f"span: {span:.6g} s from {told['start'] or format(told['start_s'], '.6g') + ' s'} on")
     if told["error_um"]:
@@ -137,7 +137,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
         "clean": not found.exit_code,
         "wrong": found.wrong,
         "lost": found.lost,
-        "strangers": found.strangers,
+        "foreign": found.foreign,
         "unread": found.unread,
         "messages": found.messages,
         "samples": found.samples,
@@ -147,7 +147,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(told))
     else:
-        for what in (*found.wrong, *found.lost, *found.strangers, *(f"not read: {each}" for each in found.unread)):
+        for what in (*found.wrong, *found.lost, *found.foreign, *(f"not read: {each}" for each in found.unread)):
             click.echo(what)
         state = {0: "clean", 1: "wrong", _LOSSY: "lossy"}[found.exit_code]
         digests = f"{found.compared} digests as recorded" if found.compared else "no digests recorded"

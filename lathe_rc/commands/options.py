@@ -5,10 +5,10 @@ from collections.abc import Iterable
 
 import click
 
-from lathe_rc import trust
+from lathe_rc import allowed_code
 
 allow_code = click.option(
-    trust.OPTION,
+    allowed_code.OPTION,
     multiple=True,
     metavar="PACKAGE",
     is_eager=True,
@@ -20,7 +20,7 @@ allow_code = click.option(
 
 def _allow(packages: Iterable[str]) -> None:
     for package in packages:
-        trust.allow(package)
+        allowed_code.allow(package)
 
 
 overrides = click.option(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lathe_rc import starting, trust
+from lathe_rc import allowed_code, starting
 from lathe_rc.commands import options
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def run(
     as_json: bool,
 ) -> None:
     """Run a SCENARIO, a ROS 2 parameter file, to its end."""
-    trust.allow_own_code()
+    allowed_code.allow_own_code()
     if mode != "offline" and start != "spawn":
         starting.server().preload({})  # it imports while this process does
     from lathe_rc.commands import running

@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
-from lathe_rc import trust
+from lathe_rc import allowed_code
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Table
 from lathe_rc.errors import InputError, LatheError
@@ -97,7 +97,7 @@ def executable(name: str, table: type[Table], run: Callable[[list[str]], int]) -
     """
 
     def work() -> int:
-        words = trust.taken_from(sys.argv[1:])
+        words = allowed_code.taken_from(sys.argv[1:])
         return 0 if help_or_refusal(f"ros2 run lathe_rc {name}", name, table, words) else run(words)
 
     exit_with(work)

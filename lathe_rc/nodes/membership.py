@@ -6,16 +6,19 @@ The time master names the members; each announces who it is and how far it has c
 
 import json
 import os
+import tempfile
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from lathe_rc_msgs.msg import CellState, Member
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
-from lathe_rc import messages, trust
+from lathe_rc import allowed_code, messages, resources
 from lathe_rc.cell.parameters import NodeParameters, remapped
+from lathe_rc.cell.replayer import FILES
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wiring import Unknown
@@ -262,9 +265,18 @@ def _refused(kind: type[NodeParameters], values: Mapping[str, object]) -> str:
             for name in row.named.others(value):
                 if not registry.permits(name):
                     return f"{row.name} = {shown(repr(name))}: {registry.why_not(name)}"
-        if row.is_file and value and not trust.may_announce(str(value)):
+        if row.is_file and value and not _may_announce(str(value)):
             return f"{row.name} = {shown(repr(value))}: a file that no parameter file of this process names"
     return ""
+
+
+def _may_announce(path: str) -> bool:
+    """Whether a member may name a file: as the user does, one that comes with lathe_rc, or one of a bag's replay."""
+    if allowed_code.is_named(path):
+        return True
+    place, temporary = resources.find(Path(path)).resolve(), Path(tempfile.gettempdir()).resolve()
+    replayed = any(each.parent == temporary and each.name.startswith(FILES) for each in place.parents)
+    return replayed or resources.is_own(place)
 
 
 def _names(endpoints: list[Any]) -> set[str]:

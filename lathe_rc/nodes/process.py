@@ -22,7 +22,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 from rclpy.type_support import check_for_type_support
 
-from lathe_rc import trust
+from lathe_rc import allowed_code
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import names_others
 from lathe_rc.cell.recorder import KIND as RECORDER
@@ -182,9 +182,9 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
         InputError: a parameter file lies in a bag, and names code that is not allowed or files elsewhere.
     """
     for file in arguments.parameter_files(args):
-        if trust.bag_around(file.parent) is not None:
+        if allowed_code.bag_around(file.parent) is not None:
             scenarios.load(file)  # it is data, and refused if it names code or files elsewhere
-    trust.user_names(cache(partial(arguments.texts, args)))
+    allowed_code.user_names(cache(partial(arguments.texts, args)))
     faulthandler.enable()  # a crash of a library leaves where it happened in the log
     faulthandler.register(signal.SIGUSR1)  # and the harness can ask where a silent process is
     _tune(members[0][0])
@@ -248,7 +248,7 @@ def split(words: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:
     Raises:
         InputError: there are none, or something else stands before ``--ros-args``.
     """
-    named, rest = arguments.split(trust.taken_from(words))
+    named, rest = arguments.split(allowed_code.taken_from(words))
     for text in named or [""]:
         if not text or text.startswith("-") or ":=" in text:
             raise InputError(f"no node {text!r}; allowed: {TABLES.allowed()}, or NAME:STAGE; then {arguments.ROS} ...")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import distributed
 import pyarrow as pa
 
-from lathe_rc import trust
+from lathe_rc import allowed_code
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario, content
@@ -151,7 +151,7 @@ def order_of(folder: Folder) -> Order:
     scenario = folder.scenario
     text = scenario.to_yaml(given=True)
     return Order(
-        scenario.name, text, scenario.identity, folder.targets, folder.measures, folder.schema, trust.arguments()
+        scenario.name, text, scenario.identity, folder.targets, folder.measures, folder.schema, allowed_code.arguments()
     )
 
 

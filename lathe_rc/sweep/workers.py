@@ -23,7 +23,7 @@ import distributed
 import pyarrow as pa
 from distributed.scheduler import KilledWorker
 
-from lathe_rc import trust
+from lathe_rc import allowed_code
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.batch import Bench
 from lathe_rc.cell.parameters import Value
@@ -74,7 +74,7 @@ class Order(NamedTuple):
         targets: columns of what differs.
         measures: what is measured.
         schema: of the rows.
-        code: options that let a worker import packages for it, see `lathe_rc.trust`.
+        code: options that let a worker import packages for it, see `lathe_rc.allowed_code`.
     """
 
     name: str
@@ -115,7 +115,7 @@ def _scenario(name: str, text: str, identity: str) -> Scenario:
 def compute(share: Share) -> pa.Table:
     """The rows of some cells; a task of Dask."""
     order = share.order
-    trust.taken_from(order.code)
+    allowed_code.taken_from(order.code)
     base, bench = _scenario(order.name, order.text, order.identity), Bench()
     rows = [
         {"cell": job.number, "key": job.key, **row.compute(base, job.values, order.targets, order.measures, bench)}

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote, urlsplit
 
-from lathe_rc import extras, trust
+from lathe_rc import allowed_code, extras
 from lathe_rc.cell.rerun_bridge import PORT, Kind
 from lathe_rc.errors import InputError, LatheError
 
@@ -67,7 +67,7 @@ class Viewer:
     def start(self, *files: Path) -> "subprocess.Popen[bytes]":
         """Start it, with files to show; it gets no Ctrl-C of its own."""
         return subprocess.Popen(
-            [*trust.interpreter("rerun"), *self.options, *map(str, files)],
+            [*allowed_code.interpreter("rerun"), *self.options, *map(str, files)],
             env=os.environ | {"RUST_LOG": "error"},
             stdout=sys.stderr,
             start_new_session=True,

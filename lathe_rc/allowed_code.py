@@ -10,7 +10,6 @@ Here is the list of packages, one for a call of a command; its child processes a
 
 import contextlib
 import sys
-import tempfile
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.abc import MetaPathFinder
@@ -21,7 +20,6 @@ from types import ModuleType
 from lathe_rc.errors import InputError, shown
 
 OPTION = "--allow-code"
-REPLAYED = "lathe-replay-"  #: begins the name of a temporary folder with the files of a bag that is replayed
 
 _STORAGES = {".mcap", ".db3"}
 _METADATA, _HEAD = "metadata.yaml", b"rosbag2_bagfile_information"
@@ -74,9 +72,13 @@ _finder = _CurrentFolder()
 
 
 @contextlib.contextmanager
-def call() -> Iterator[None]:
-    """Begin a call of a command: nothing is allowed yet, and what gets allowed is so until its end."""
-    _calls.append(_Call())
+def call(*, own: bool = False) -> Iterator[None]:
+    """Begin a call of a command: nothing is allowed yet, and what gets allowed is so until its end.
+
+    Args:
+        own: as in a Python program, packages that scenarios of the user's own name are allowed.
+    """
+    _calls.append(_Call(own=own))
     try:
         yield
     finally:
@@ -182,13 +184,6 @@ def user_names(texts: Callable[[], Collection[str]]) -> None:
     _calls[-1].named = texts
 
 
-def may_announce(path: str) -> bool:
-    """Whether the announcement of a member may name a file: as the user does, lathe_rc's own, or one of a replay."""
-    if path in _calls[-1].named():
-        return True
-    from lathe_rc import resources
-
-    place = resources.find(Path(path)).resolve()
-    temporary = Path(tempfile.gettempdir()).resolve()
-    replayed = any(each.parent == temporary and each.name.startswith(REPLAYED) for each in place.parents)
-    return replayed or resources.is_own(place)
+def is_named(path: str) -> bool:
+    """Whether the user names a file, see `user_names`."""
+    return path in _calls[-1].named()
