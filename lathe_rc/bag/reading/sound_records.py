@@ -178,11 +178,12 @@ class SoundRecords:
         if self._last:
             self._effort = _Effort(self._size)
         while place < self._size:
-            if self._at(place, len(MCAP0_MAGIC)) == MCAP0_MAGIC:
+            head = self._at(place, _HEAD.size)
+            if head.startswith(MCAP0_MAGIC):
                 place += len(MCAP0_MAGIC)
                 continue
             try:
-                record, end = self._sound(place)
+                record, end = self._sound(place, head)
             except _UnsoundError as error:
                 self._chunked |= error.chunk
                 end = error.end or self._search(before + 1)
@@ -203,13 +204,13 @@ class SoundRecords:
         self._stream.seek(max(place, 0))  # a file may be shorter than its last records
         return self._stream.read(length)
 
-    def _sound(self, place: int) -> tuple[Record, int]:
-        """The record at a place, and the place behind it.
+    def _sound(self, place: int, head: bytes | None = None) -> tuple[Record, int]:
+        """The record at a place, where ``head`` stands, and the place behind it.
 
         Raises:
             _UnsoundError: it is not sound.
         """
-        head = self._at(place, _HEAD.size)
+        head = self._at(place, _HEAD.size) if head is None else head
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, self._size)
         end = place + _HEAD.size + length
         if opcode == Opcode.CHUNK:
@@ -238,7 +239,7 @@ class SoundRecords:
     def _begins(self, place: int) -> bool:
         """Whether the file ends at a place, or a record may begin."""
         head = self._at(place, _HEAD.size)
-        if place == self._size or head == MCAP0_MAGIC:
+        if place == self._size or head.startswith(MCAP0_MAGIC):
             return True
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
         return bool(0 < opcode <= Opcode.DATA_END and place + _HEAD.size + length <= self._size)
