@@ -424,6 +424,8 @@ class McapFile:
         start = place = self._offset
         offsets = []
         for opcode, data in groups.items():
+            if not data:
+                continue
             offsets.append(SummaryOffset(group_opcode=opcode, group_start=place, group_length=len(data)))
             place += len(data)
         summary = b"".join(groups.values()) + _encoded(*offsets)
