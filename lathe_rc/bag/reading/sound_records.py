@@ -337,7 +337,7 @@ def _as_written(opcode: int, content: bytes) -> bool:
 
 
 def damage(file: Path) -> list[str]:
-    """What is wrong with the records of an MCAP file, one line each."""
+    """Damaged records of an MCAP file, one line each."""
     found: list[str] = []
     with file.open("rb") as stream:
         sound = SoundRecords(stream, file.stat().st_size, lambda why, _: found.append(f"{file.name}: {why}"))
