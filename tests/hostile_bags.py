@@ -260,7 +260,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "measure": ("measure", "BAG"),
     "export": ("export", "BAG", "-o", "OUT/tables"),
     "report": ("report", "BAG", "-o", "OUT/page.html"),
-    "view": ("view", "BAG", "--save", "OUT/bag.rrd"),
+    "view": ("view", "BAG", "-o", "OUT/bag.rrd"),
     "resim": ("resim", "BAG", "-o", "OUT/again"),
     "replay": ("replay", "BAG", "--rate", "0"),
 }  #: those that take a bag

@@ -32,6 +32,7 @@ from lathe_rc.errors import shown
 _MAGIC = len(MCAP0_MAGIC)
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _FOOTER = 29 + _MAGIC  # [B] at the end of a file
+_FOOTER_HEAD = _RECORD.pack(Opcode.FOOTER, _FOOTER - _MAGIC - _RECORD.size)
 _CHECKED = 25  # [B] of the footer that the summary's checksum covers
 _INDEX = struct.Struct("<QQQQI")  # of a chunk: first and last time, start, length, bytes of places by channel
 _PLACE = np.dtype([("channel", "<u2"), ("place", "<u8")])
@@ -160,10 +161,10 @@ class _Mcap:
             return False
         read_record(stream, end)  # the header, which other readers need
         stream.seek(end)
-        footer = read_record(stream, self._size - _MAGIC)
-        if footer is None or footer[0] != Opcode.FOOTER or stream.read() != MCAP0_MAGIC:
+        footer = stream.read(_FOOTER)
+        if not footer.startswith(_FOOTER_HEAD) or not footer.endswith(MCAP0_MAGIC):
             return False
-        ends = Footer.read(ReadDataStream(BytesIO(footer[1])))
+        ends = Footer.read(ReadDataStream(BytesIO(footer[_RECORD.size :])))
         start = ends.summary_start
         if not _MAGIC <= start < end:
             return False
