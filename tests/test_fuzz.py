@@ -311,8 +311,8 @@ LAUGHS = b"a: &a [x, x]\n" + b"".join(b"%c: &%c [*%c, *%c]\n" % (n, n, n - 1, n 
     [
         (lambda m: LAUGHS + m, "YAML aliases"),
         (lambda m: m + b"\nx: " + b"[" * 200_000, "nested deeper"),
-        (lambda m: b"null", "no rosbag2_bagfile_information"),
-        (lambda m: b"[]", "no rosbag2_bagfile_information"),
+        (lambda _: b"null", "no rosbag2_bagfile_information"),
+        (lambda _: b"[]", "no rosbag2_bagfile_information"),
         (lambda m: m.replace(b"relative_file_paths", b"files"), "no relative_file_paths"),
         (lambda m: m + b"\n" * 2**24, "allowed: up to 16777216 B"),
         (lambda m: named(m, b'"/wh\\nere"'), "allowed: up to 1024 characters that print"),

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-import numpy.typing as npt
 from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
@@ -150,7 +149,7 @@ class _Mcap:
 
     # ---- index --------------------------------------------------------------------------------------
 
-    def read_summary(self, stream: BinaryIO) -> bool:
+    def read_summary(self, stream: BinaryIO) -> bool:  # noqa: PLR0911 - one for each thing that may lack
         """Read the summary; whether it has all that is needed.
 
         Raises:
@@ -171,8 +170,7 @@ class _Mcap:
         if ends.summary_crc and ends.summary_crc != _checksum(stream, start, end + _CHECKED):
             self.storage.remarks.append(f"{self._path.name}: the checksum of its summary is wrong: read without it")
             return False
-        statistics = self._indexed_records(stream, start, end)
-        spans = self.storage.spans
+        statistics, spans = self._indexed_records(stream, start, end), self.storage.spans
         if statistics is None or statistics.chunk_count != len(spans) or bool(statistics.message_count) != bool(spans):
             return False
         counts = statistics.channel_message_counts
@@ -214,12 +212,10 @@ class _Mcap:
         (name,) = struct.unpack_from("<I", content, _INDEX.size + places + 8)
         packed, size = struct.unpack_from("<QQ", content, _INDEX.size + places + 12 + name)
         if start < _MAGIC or start + length > end or max(length, size) > MOST_BYTES or packed > length:
-            raise ValueError(f"the index has a chunk of {length} B ({size} unpacked) at byte {start}: none can be there")
+            raise ValueError(f"the index has a chunk of {length} B ({size} unpacked) at byte {start}: none can be")
         self._budget.take(size)
         channels = np.frombuffer(content, _PLACE, places // _PLACE.itemsize, _INDEX.size)["channel"]
-        return _Records(
-            first_ns, last_ns, size, frozenset(channels.tolist()), self._path, start, length, in_chunk=True
-        )
+        return _Records(first_ns, last_ns, size, frozenset(channels.tolist()), self._path, start, length, in_chunk=True)
 
     # ---- the whole file -----------------------------------------------------------------------------
 

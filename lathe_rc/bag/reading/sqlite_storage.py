@@ -64,7 +64,7 @@ class _Table(Span):
                 # An index that is broken may give other rows than were asked for.
                 sound = number in topics and isinstance(log_ns, int) and log_ns >= 0 and isinstance(data, bytes)
                 if not sound:
-                    raise ValueError(f"message of topic {str(number)[:20]} at {str(log_ns)[:20]!r}: not what was asked for")
+                    raise ValueError(f"message of topic {str(number)[:20]} at {str(log_ns)[:20]} ns, or too long")
                 budget.take(len(data), 1)
                 yield Batch(data, topics, np.array([[number, log_ns, 0, len(data)]], np.uint64))
 
@@ -93,8 +93,8 @@ def _read_topics(base: sqlite3.Connection, storage: Storage) -> None:
     for number, name, kind, encoding, qos in rows.fetchmany(MOST_TOPICS + 1):
         if not isinstance(number, int) or not 0 <= number <= _LAST:
             raise ValueError(f"topic {str(number)[:80]!r}; allowed: whole numbers from 0 on")
-        texts = [text if isinstance(text, str) else "" for text in (name, kind, encoding, qos)]
-        storage.announce(number, Channel(*texts[:3]), texts[3])
+        topic, msgtype, form, profiles = (text if isinstance(text, str) else "" for text in (name, kind, encoding, qos))
+        storage.announce(number, Channel(topic, msgtype, form), profiles)
 
 
 def _count(base: sqlite3.Connection, storage: Storage) -> tuple[int, int]:
