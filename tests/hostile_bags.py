@@ -12,6 +12,7 @@ import shutil
 import signal
 import sqlite3
 import struct
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from hashlib import sha256
 from pathlib import Path
@@ -24,7 +25,6 @@ import lz4.frame
 import yaml
 import zstandard
 from click.testing import CliRunner
-from fuzz_targets import CUT
 from mcap.records import ChunkIndex, Statistics
 from mcap.writer import CompressionType, IndexType, Writer
 
@@ -34,16 +34,24 @@ MEMORY = 2**30  #: that a command may take beyond what the process has [B]
 LONGEST = 30  #: of CPU time [s]
 STRING = b"\0\1\0\0\2\0\0\0x\0"
 NAMES = (
-    *("/", "/tool/", "/../../x", "//", "/a b", "relative", "~/x", "/1a", "/é", "/{node}", "/" + "x" * 1024, "/\u202eelif"),
-    *("", "/a\nb", "/\x1b[2J", "/clock", "/tool", "/encoder", "/tool/joint_states", "/cell_state", "/.", "/a/b/c/d/e/f"),
+    *("/", "/tool/", "/../../x", "//", "/a b", "relative", "~/x", "/1a", "/é", "/{node}", "/" + "x" * 1024),
+    *("", "/\u202eelif", "/a\nb", "/\x1b[2J", "/clock", "/tool", "/encoder", "/tool/joint_states", "/cell_state"),
+    *("/.", "/a/b/c/d/e/f"),
 )  # fmt: skip
 TYPES = (
-    *("std_msgs/msg/String", "std_msgs/String", "x", "", "a/msg/B", "lathe_rc_msgs/msg/ToolBlock", "../msg/x", "os/msg/system"),
-    *("lathe_rc_msgs/msg/EncoderBlock", "lathe_rc_msgs/msg/Event", "x" * 1025, "std_msgs/srv/String", "std_msgs/msg/"),
+    *("std_msgs/msg/String", "std_msgs/String", "x", "", "a/msg/B", "lathe_rc_msgs/msg/ToolBlock", "../msg/x"),
+    *("os/msg/system", "lathe_rc_msgs/msg/EncoderBlock", "lathe_rc_msgs/msg/Event", "x" * 1025),
+    *("std_msgs/srv/String", "std_msgs/msg/"),
 )  # fmt: skip
+QOS = (
+    *("", "[]", "{}", "- {reliability: 1}", "a: b: c", "&a [*a]", "[" * 50, "- 5\n- durability: true\n", "x" * 9999),
+    *("- depth: 1e9\n  history: keep_all", "reliability: reliable", "? [a]", "- !!python/name:os.system x"),
+)  # fmt: skip
+DEFINITIONS = (b"string data", b"", b"\xff", b"x" * 10**5, b"uint8[] data", bytes(range(256)))
 ODD: Sequence[Any] = (
-    *(None, [], {}, "", "null", 0, -1, 2**63, 2**64, 10**30, 1.5, float("nan"), True, "2001-99-99", "x" * 5000, [None]),
-    *([[]], {"a": None}, "../../etc/passwd", "/dev/zero", "/", "..", ".", "bag.mcap", ["bag.mcap"] * 5000, "cdr", "json"),
+    *(None, [], {}, "", "null", 0, -1, 2**63, 2**64, 10**30, 1.5, float("nan"), True, "2001-99-99", "x" * 5000),
+    *([None], [[]], {"a": None}, "../../etc/passwd", "/dev/zero", "/", "..", ".", "bag.mcap", ["bag.mcap"] * 5000),
+    *("cdr", "json"),
 )  # fmt: skip
 
 
@@ -72,26 +80,29 @@ def _bomb(folder: Path, random: Random) -> Path:
             (b"lz4", lz4.frame.compress(b"") * 10**5),
         )
     )
-    chunk = struct.pack("<QQQII", 10**18, 10**18, declared, 0, len(name)) + name + struct.pack("<Q", len(packed)) + packed
-    return _assemble(folder, [(6, chunk)] * count, indexed=random.random() < 0.5, sizes=(declared, len(packed)), random=random)
+    head = struct.pack("<QQQII", 10**18, 10**18, declared, 0, len(name)) + name
+    chunks = [(6, head + struct.pack("<Q", len(packed)) + packed)] * count
+    return _assemble(folder, chunks, random, (declared, len(packed)) if random.random() < 0.5 else ())
 
 
-def _assemble(folder: Path, records: Sequence[tuple[int, bytes]], *, indexed: bool, sizes: Any, random: Random) -> Path:
+def _assemble(folder: Path, records: Sequence[tuple[int, bytes]], random: Random, sizes: Sequence[int]) -> Path:
+    """An MCAP file, with an index if there are ``sizes`` for it."""
     string = b"std_msgs/msg/String"
     schema = struct.pack("<HI", 1, len(string)) + string + struct.pack("<I7sI11s", 7, b"ros2msg", 11, b"string data")
     channel = struct.pack("<HHI2sI3sI", 1, 1, 2, b"/t", 3, b"cdr", 0)
     data, index = b"\x89MCAP0\r\n" + _record(1, struct.pack("<I4sI", 4, b"ros2", 0)), b""
     head = [(3, schema), (4, channel)]
     for opcode, content in (*head, *records):
-        if opcode == 6:
+        if opcode == 6 and sizes:
             place = struct.pack("<QQQQIQ", 10**18, 10**18, len(data), len(content) + 9, 0, 0)
             index += _record(8, place + struct.pack("<I4sQQ", 4, b"zstd", sizes[1], sizes[0]))
         data += _record(opcode, content)
     count = len(records)
-    statistics = struct.pack("<QHIIIIQQI", 5, 1, 1, 0, 0, count, 10**18, 10**18, 10) + struct.pack("<HQ", 1, random.choice((5, 2**63)))
-    summary = b"".join(_record(*each) for each in head) + index + _record(11, statistics) if indexed else b""
+    counts = struct.pack("<HQ", 1, random.choice((5, 2**63)))
+    statistics = struct.pack("<QHIIIIQQI", 5, 1, 1, 0, 0, count, 10**18, 10**18, 10) + counts
+    summary = b"".join(_record(*each) for each in head) + index + _record(11, statistics) if sizes else b""
     path = folder / "bag.mcap"
-    path.write_bytes(data + summary + _record(2, struct.pack("<QQI", len(data) if indexed else 0, 0, 0)) + data[:8])
+    path.write_bytes(data + summary + _record(2, struct.pack("<QQI", len(data) if sizes else 0, 0, 0)) + data[:8])
     return path
 
 
@@ -104,21 +115,20 @@ def _written(folder: Path, random: Random) -> Path:
     path = folder / "bag.mcap"
     types = random.choice((IndexType.ALL, IndexType.NONE, IndexType.CHUNK, IndexType.MESSAGE))
     compression = random.choice(list(CompressionType))
-    options = {"use_chunking": random.random() < 0.7, "use_statistics": random.random() < 0.8}
+    options: dict[str, Any] = {"use_chunking": random.random() < 0.7, "use_statistics": random.random() < 0.8}
+    options |= {"index_types": types, "compression": compression, "chunk_size": random.choice((1, 500, 10**6))}
     options |= {"use_summary_offsets": random.random() < 0.5, "repeat_channels": random.random() < 0.8}
     with path.open("wb") as stream:
-        writer = Writer(stream, index_types=types, compression=compression, chunk_size=random.choice((1, 500, 10**6)), **options)
+        writer = Writer(stream, **options)
         writer.start(profile=random.choice(("ros2", "", "ros1", "x" * 1000)))
         channels = []
         for _ in range(random.choice((0, 1, 3, 3, 3, 100, 5000))):
-            definition = random.choice((b"string data", b"", b"\xff", b"x" * 10**5, b"uint8[] data", random.randbytes(20)))
             encoding = random.choice(("ros2msg", "ros2msg", "ros2idl", "jsonschema", ""))
-            schema = writer.register_schema(random.choice(TYPES), encoding, definition)
-            qos = random.choice(("", "[]", "{}", "- {reliability: 1}", "a: b: c", "&a [*a]", "[" * 50, "- 5\n- durability: true\n", "x" * 9999))
+            schema = writer.register_schema(random.choice(TYPES), encoding, random.choice(DEFINITIONS))
             kind = random.choice(("cdr", "cdr", "cdr", "json", "", "ros1"))
             name = random.choice((*NAMES, "/good")) + random.choice(("", str(len(channels))))
             number = random.choice((schema, schema, 0, 77))
-            channels.append(writer.register_channel(name, kind, number, {"offered_qos_profiles": qos}))
+            channels.append(writer.register_channel(name, kind, number, {"offered_qos_profiles": random.choice(QOS)}))
         for number in range(random.choice((0, 5, 300)) if channels else 0):
             log_ns = random.choice((10**18 + number, 10**18 + number, 0, 2**63, 2**64 - 1, 10**18 - number * 10**9))
             data = random.choice((STRING, STRING, b"", random.randbytes(50), b"\0\1\0\0" + b"\xff" * 60))
@@ -142,8 +152,8 @@ def _index(folder: Path, random: Random) -> Path:
         for _ in range(random.choice((1, 3))):
             target: Any = random.choice([*indexes, statistics])
             name = random.choice([name for name, value in vars(target).items() if isinstance(value, int)])
-            most = 2**32 - 1 if isinstance(target, Statistics) and "time" not in name and name != "message_count" else 2**64 - 1
-            most = 2**16 - 1 if name == "schema_count" else most
+            small = isinstance(target, Statistics) and name.endswith("_count") and name != "message_count"
+            most = 2 ** (16 if name == "schema_count" else 32 if small else 64) - 1
             setattr(target, name, min(random.choice((*mutate.NUMBERS, getattr(target, name) + 1)), most))
         writer.finish()
     return path
@@ -204,9 +214,9 @@ def _database(folder: Path, random: Random) -> Path:
         "UPDATE topics SET serialization_format = 'json'", "UPDATE topics SET name = '/../../x'",
         "CREATE VIEW v AS SELECT 1", "CREATE TRIGGER t AFTER INSERT ON topics BEGIN SELECT 1; END",
         "UPDATE messages SET data = zeroblob(268435456) WHERE id = 1", "UPDATE messages SET data = zeroblob(1000000)",
-        "INSERT INTO topics SELECT id + 10000 * abs(random() % 9999), name, type, serialization_format, offered_qos_profiles, '' FROM topics",
-        "UPDATE messages SET timestamp = 9223372036854775807 WHERE id % 2", "ALTER TABLE messages RENAME COLUMN id TO number",
-        "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT 200000) INSERT INTO messages SELECT NULL, 1, i, x'' FROM n",
+        "UPDATE messages SET timestamp = 9223372036854775807 WHERE id % 2",
+        "ALTER TABLE messages RENAME COLUMN id TO number", "UPDATE topics SET id = id + 100000",
+        "INSERT INTO messages SELECT NULL, 1, a.id * 600 + b.id, x'' FROM messages a, messages b, topics, topics, topics",
     )  # fmt: skip
     with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(path)) as base:
         for _ in range(random.choice((0, 1, 2))):
@@ -258,9 +268,9 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "recover": ("bag", "recover", "BAG", "-o", "OUT/new"),
     "tachogram": ("bag", "tachogram", "BAG", "-o", "OUT/speed.csv"),
     "measure": ("measure", "BAG"),
-    "export": ("export", "BAG", "-o", "OUT/tables"),
+    "export": ("export", "BAG", "--csv", "-o", "OUT/tables"),
     "report": ("report", "BAG", "-o", "OUT/page.html"),
-    "view": ("view", "BAG", "--save", "OUT/bag.rrd"),
+    "view": ("view", "BAG", "-o", "OUT/bag.rrd"),
     "resim": ("resim", "BAG", "-o", "OUT/again"),
     "replay": ("replay", "BAG", "--rate", "0"),
 }  #: those that take a bag
@@ -299,6 +309,11 @@ def _seal(folder: Path) -> dict[str, str]:
     return found
 
 
+def words(command: str, bag: Path, out: Path) -> list[str]:
+    """The command line."""
+    return [word.replace("BAG", str(bag)).replace("OUT", str(out)) for word in COMMANDS[command]]
+
+
 def attack(box: Path, bag: Path, command: str) -> tuple[int, str]:
     """Exit code and output of a command, called in ``box``.
 
@@ -310,18 +325,15 @@ def attack(box: Path, bag: Path, command: str) -> tuple[int, str]:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
     before = _seal(bag.parent)
-    words = [word.replace("BAG", str(bag)).replace("OUT", str(out)) for word in COMMANDS[command]]
-    was, old = Path.cwd(), os.environ.get("TMPDIR")
-    import tempfile
-
+    was, before_it = Path.cwd(), tempfile.tempdir
     os.chdir(here)
     tempfile.tempdir = str(temporary)
     try:
         with limits():
-            done = CliRunner().invoke(main, words)
+            done = CliRunner().invoke(main, words(command, bag, out))
     finally:
         os.chdir(was)
-        tempfile.tempdir = old
+        tempfile.tempdir = before_it
     if done.exception and not isinstance(done.exception, SystemExit):
         raise HarmError(f"{command}: {type(done.exception).__name__}: {done.exception}") from done.exception
     if done.exit_code not in (0, 1, 2, 3) or "not enough memory" in done.output:

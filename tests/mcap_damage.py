@@ -118,7 +118,7 @@ Saved = tuple[str, bytes, int, bytes]  #: topic, schema, log time and bytes of a
 
 
 def saved_of(file: Path, data: bytes) -> tuple[Salvage, list[Saved]]:
-    """What is saved of a file with these bytes."""
+    """Salvage of a file with these bytes, and the messages that it saves."""
     file.write_bytes(data)
     salvage = Salvage(file)
     return salvage, [(m.topic.name, (m.topic.schema or b"")[2:], m.log_ns, m.data) for m in salvage]

@@ -21,7 +21,7 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.check import check
 from lathe_rc.bag.reading import precheck
-from lathe_rc.bag.reading.precheck import MOST_BYTES
+from lathe_rc.bag.reading.limits import MOST_BYTES
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import Feeder
 from lathe_rc.bag.reading.unpacking import unpack
@@ -127,8 +127,20 @@ def channel(qos, number=1):
     return record(4, struct.pack("<HH", number, 1) + text(b"/t") + text(b"cdr") + text(pairs))
 
 
+def channels(count, qos):
+    return b"".join(channel(qos, number) for number in range(count))
+
+
+EMPTY = record(5, struct.pack("<HIQQ", 1, 0, 5, 5))
 SCHEMA = record(3, struct.pack("<H", 1) + text(b"std_msgs/msg/String") + text(b"ros2msg") + text(b"string data\n"))
-STATISTICS = record(11, bytes(42) + text(b""))
+
+
+def statistics(chunks=0):
+    counts = struct.pack("<QHIIIIQQ", chunks, 1, 1, 0, 0, chunks, 0, 1)
+    return record(11, counts + text(b""))
+
+
+STATISTICS = statistics()
 HEADER = record(1, text(b"ros2") + text(b""))
 ENDLESS = b"a: &a [{x: 1}]\n" + b"".join(b"%c: &%c {<<: [*%c, *%c]}\n" % (n, n, n - 1, n - 1) for n in range(98, 122))
 
@@ -162,30 +174,46 @@ FIRST = len(MCAP0_MAGIC + HEADER)
         (chunk(packed=b"x" * 20), b"", "chunk at byte"),
         (b"", SCHEMA + STATISTICS + struct.pack("<BQ", 13, 2**63), "cut off at byte"),
         (b"", SCHEMA + STATISTICS + struct.pack("<BQ", 13, 2**32), "cut off at byte"),
-        (b"", SCHEMA + STATISTICS + channel(ENDLESS), "YAML aliases"),
-        (SCHEMA + channel(ENDLESS), b"", "YAML aliases"),
-        (chunk(SCHEMA + channel(ENDLESS)), b"", "YAML aliases"),
-        (b"", SCHEMA + STATISTICS + channel(b"[" * 100_000), "nested deeper"),
-        (b"", SCHEMA + STATISTICS + channel(b"a: b: c"), "not YAML"),
-        (b"", SCHEMA + STATISTICS + channel(b"x" * 2000) * 600, "characters of quality of service"),
-        (b"", SCHEMA + STATISTICS + channel(b"") * 5000, "more than 4096 topics"),
-        (b"", SCHEMA + STATISTICS + chunk_index(2**63, 100), "not where one can be"),
-        (chunk(), SCHEMA + STATISTICS + 2 * chunk_index(FIRST, len(chunk())), "not where one can be"),
-        (chunk(), SCHEMA + STATISTICS + chunk_index(FIRST, len(chunk()), size=2**40), "not where one can be"),
-        (chunk(), SCHEMA + STATISTICS + chunk_index(FIRST, len(chunk()), packed=2**62), "not where one can be|B in it"),
+        (b"", SCHEMA + STATISTICS + channels(600, b"x" * 2000), "characters of quality of service"),
+        (b"", SCHEMA + STATISTICS + channels(5000, b""), "more than 4096 topics"),
+        (b"", SCHEMA + STATISTICS + 1000 * SCHEMA + record(11, bytes(2**20 + 1)), "statistics of 1048577 B"),
+        (b"", SCHEMA + STATISTICS + chunk_index(2**63, 100), "none can be there"),
+        (chunk(), SCHEMA + STATISTICS + 2 * chunk_index(FIRST, len(chunk())), "two chunks at byte"),
+        (chunk(), SCHEMA + STATISTICS + chunk_index(FIRST, len(chunk()), size=2**40), "none can be there"),
+        (chunk(), SCHEMA + STATISTICS + chunk_index(FIRST, len(chunk()), packed=2**62), "none can be there"),
         (
             3 * chunk(),
-            SCHEMA
-            + STATISTICS
-            + b"".join(chunk_index(FIRST + k * len(chunk()), len(chunk()), size=2**28) for k in range(3)),
+            (SCHEMA + statistics(3) + channel(b""))
+            + b"".join(chunk_index(FIRST + k * len(chunk()), len(chunk()), size=2**26) for k in range(3)),
             "chunks of the same time",
         ),
+        (chunk(packed=zstandard.compress(b"") * 10_000, size=0), b"", "B that unpack to 0; no compression does"),
+        (
+            40 * chunk(),
+            (SCHEMA + statistics(40) + channel(b""))
+            + b"".join(chunk_index(FIRST + k * len(chunk()), len(chunk()), size=MOST_BYTES) for k in range(40)),
+            "unpacks to more than 1024 times its size",
+        ),
+        (chunk(EMPTY * (2**20 + 10000)), b"", "a message for each of its bytes"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_index_that_would_cost_memory_or_time_is_refused(tmp_path, data, summary, said):
+def test_index_that_would_cost_memory_or_time_is_refused(tmp_path, monkeypatch, data, summary, said):
+    monkeypatch.setattr("lathe_rc.bag.reading.source.MOST_OPEN", 2**27)
     with refused(said):
         check(mcap(tmp_path / "bad.mcap", data, summary))
+
+
+@pytest.mark.parametrize("qos", [ENDLESS, b"[" * 100_000, b"a: b: c", b"? [a]"])
+@pytest.mark.parametrize("place", ["index", "file", "chunk"])
+def test_quality_of_service_that_cannot_be_read_costs_no_message(tmp_path, qos, place):
+    announced = SCHEMA + channel(qos)
+    summary = announced + STATISTICS if place == "index" else b""
+    data = {"index": b"", "file": announced + EMPTY, "chunk": chunk(announced + EMPTY)}[place]
+    with Source(mcap(tmp_path / "odd.mcap", data, summary)) as source:
+        assert sum(1 for _ in source.messages()) == (place != "index")
+        assert source.topics["/t"].qos == ()
+        assert "/t: quality of service that cannot be read (offered_qos_profiles: " in source.contradictions[0]
 
 
 @pytest.mark.parametrize("length", [2**33, 2**56])
@@ -261,6 +289,10 @@ def folder(path, *, change=lambda metadata: metadata, seed=0):
     return path
 
 
+def seed_with(word):
+    return next(k for k, seed in enumerate(TARGETS["folder"].seeds()) if word in seed)
+
+
 def named(metadata, name):
     return re.sub(rb'"?/where"?', lambda _: name, metadata)
 
@@ -273,7 +305,10 @@ LAUGHS = b"a: &a [x, x]\n" + b"".join(b"%c: &%c [*%c, *%c]\n" % (n, n, n - 1, n 
     [
         (lambda m: LAUGHS + m, "YAML aliases"),
         (lambda m: m + b"\nx: " + b"[" * 200_000, "nested deeper"),
-        (lambda m: named(m, b"5"), "name '5'"),
+        (lambda _: b"null", "no rosbag2_bagfile_information"),
+        (lambda _: b"[]", "no rosbag2_bagfile_information"),
+        (lambda m: m.replace(b"relative_file_paths", b"files"), "no relative_file_paths"),
+        (lambda m: m + b"\n" * 2**24, "allowed: up to 16777216 B"),
         (lambda m: named(m, b'"/wh\\nere"'), "allowed: up to 1024 characters that print"),
         (lambda m: named(m, b'""'), "name ''"),
         (lambda m: m.replace(b"20", b"many"), "'many' where a whole number belongs"),
@@ -286,14 +321,18 @@ def test_metadata_that_nobody_can_use_are_refused(tmp_path, change, said):
         check(folder(tmp_path / "bag", change=change))
 
 
-def test_pipe_in_a_folder_is_refused_unread(tmp_path):
-    os.mkfifo(folder(tmp_path / "bag") / "more.mcap")
-    with pytest.raises(InputError, match="no file"):
+@pytest.mark.parametrize("name", ["metadata.yaml", "digests.json", "bag.mcap"])
+@pytest.mark.parametrize("target", ["", "/dev/zero"])
+def test_what_is_no_file_is_refused_unread(tmp_path, name, target):
+    place = folder(tmp_path / "bag", seed=seed_with(b"digest")) / name
+    place.unlink()
+    place.symlink_to(target) if target else os.mkfifo(place)
+    with refused("not a file|no file|there is no such file"):
         check(tmp_path / "bag")
 
 
 def database(path, *statements):
-    bag = folder(path, seed=next(k for k, seed in enumerate(TARGETS["folder"].seeds()) if b"SQLite format" in seed))
+    bag = folder(path, seed=seed_with(b"SQLite format"))
     with sqlite3.connect(bag / "bag.db3") as base:
         for statement in statements:
             base.execute(statement)
@@ -314,7 +353,7 @@ COUNTING = """CREATE VIEW message_definitions AS
         ),
         (("ALTER TABLE topics ADD COLUMN x GENERATED ALWAYS AS (zeroblob(1000000000))",), "table 'topics'"),
         (("CREATE VIRTUAL TABLE x USING fts5(y)",), "table 'x'"),
-        (("UPDATE messages SET data = zeroblob(268435457) WHERE id = 1",), "a message of 268435457 B"),
+        (("UPDATE messages SET data = zeroblob(134217729) WHERE id = 1",), "a message of 134217729 B"),
     ],
 )
 def test_database_that_answers_more_than_it_holds_is_refused(tmp_path, statements, said):
@@ -328,8 +367,8 @@ def test_database_that_answers_more_than_it_holds_is_refused(tmp_path, statement
 
 def test_file_that_is_packed_twice_or_behind_what_zstd_skips_is_looked_at(tmp_path):
     skipped = b"\x50\x2a\x4d\x18" + struct.pack("<I", 4) + b"skip"
-    inside = mcap(tmp_path / "bad.mcap", b"", SCHEMA + STATISTICS + channel(ENDLESS)).read_bytes()
-    for content, said in ((skipped + zstandard.compress(inside), "YAML aliases"), (zstandard.compress(BOMB), "twice")):
+    inside = mcap(tmp_path / "bad.mcap", b"", SCHEMA + STATISTICS + chunk_index(2**63, 100)).read_bytes()
+    for content, said in ((skipped + zstandard.compress(inside), "none can be"), (zstandard.compress(BOMB), "twice")):
         (tmp_path / "x.mcap").write_bytes(content)
         with pytest.raises(InputError, match=said):
             Source(tmp_path / "x.mcap")

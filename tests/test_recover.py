@@ -26,7 +26,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from lathe_rc import harness, messages
 from lathe_rc.bag.check import check
-from lathe_rc.bag.reading.precheck import MOST_BYTES
+from lathe_rc.bag.reading.limits import MOST_BYTES
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.repairing.recover import recover
 from lathe_rc.bag.repairing.salvage import Salvage
@@ -306,12 +306,14 @@ def unreadable(path, make):
         if make == "empty folder":
             path.mkdir()
         return path
-    strange_bag(path, StoragePlugin.MCAP if "MCAP" in make else StoragePlugin.SQLITE3, CompressionMode.NONE)
+    plugin = StoragePlugin.MCAP if "MCAP" in make else StoragePlugin.SQLITE3
+    strange_bag(path, plugin, CompressionMode.NONE, 6000 if "page" in make else 600)
     file, metadata = next(file for file in path.iterdir() if file.suffix != ".yaml"), path / "metadata.yaml"
-    if "no metadata" in make:
-        metadata.unlink()
-    elif "cut" in make:
+    if "cut" in make:
         file.write_bytes(file.read_bytes()[:20000])
+    elif "page" in make:
+        whole = file.read_bytes()
+        file.write_bytes(whole[:200_704] + bytes(4096) + whole[204_800:])
     elif "broken metadata" in make:
         metadata.write_text("}")
     return file if "alone" in make else path
@@ -322,23 +324,40 @@ def unreadable(path, make):
     [
         ("nothing there", "(there is no such folder or file)"),
         ("empty folder", "(no metadata.yaml in that folder, nor a .mcap or .db3 file)"),
-        ("SQLite, no metadata", f"(no metadata.yaml in that folder){HINT}"),
-        ("MCAP, no metadata", f"(no metadata.yaml in that folder){HINT}"),
         ("SQLite, broken metadata", f"(metadata.yaml: not YAML in line 1){HINT}"),
-        ("MCAP, cut", f"(bag.mcap: cut off at byte 43){HINT}"),
-        ("SQLite, cut", f"(database disk image is malformed){HINT}"),
-        ("SQLite, cut, alone", f"(database disk image is malformed){HINT}"),
+        ("MCAP, cut", "(bag.mcap: cut off at byte 43)"),
+        ("SQLite, cut", "(bag.db3: database disk image is malformed)"),
+        ("SQLite, lost page, alone", f"(bag.db3: database disk image is malformed){HINT}"),
     ],
 )
 def test_what_cannot_be_read_is_the_same_fault_for_all_with_a_hint_where_recover_helps(tmp_path, make, said):
+    """And `info` tells what can be read."""
     bag = unreadable(tmp_path / "bag", make)
     for command in (("bag", "info"), ("bag", "check"), ("measure",)):
         refused = lathe(*command, bag)
+        if command == ("bag", "info") and HINT in said:
+            assert refused.exit_code == 3
+            assert refused.stderr.splitlines()[-1] == said.removesuffix(HINT)[1:-1]
+            assert "/where │ Point  │" in refused.stdout
+            continue
         assert refused.stderr.startswith(f"lathe: {bag}: not a readable bag (")
         assert refused.stderr.endswith(f"{said}\n")
         assert refused.exit_code == 2
-    recovered = lathe("bag", "recover", bag, "-o", tmp_path / "new")
-    assert recovered.exit_code == (2 if HINT not in said else 3 if "cut" in make else 0), recovered.stderr
+    recovered = lathe("bag", "recover", bag, "-o", tmp_path / "new", "--json")
+    saved = json.loads(recovered.stdout)["saved"] if recovered.exit_code != 2 else 0
+    assert bool(saved) == (HINT in said), recovered.stderr
+    assert recovered.exit_code == (2 if "there" in said or "folder" in said else 0 if "metadata" in make else 3)
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_folder_without_metadata_is_read_and_called_wrong(tmp_path, plugin):
+    sent = strange_bag(tmp_path / "bag", plugin, CompressionMode.NONE)
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    with Source(tmp_path / "bag") as source:
+        assert list(source.messages()) == sent
+    checked = lathe("bag", "check", tmp_path / "bag")
+    assert checked.exit_code == 1
+    assert checked.stdout.startswith("no metadata.yaml in that folder: bag.")
 
 
 def records_of(path):
@@ -467,8 +486,9 @@ def test_a_file_that_unpacks_to_more_than_allowed_is_refused(tmp_path, monkeypat
     path = tmp_path / "bag"
     strange_bag(path, StoragePlugin.SQLITE3, CompressionMode.FILE)
     Source(path).__exit__(None, None, None)
-    monkeypatch.setattr("lathe_rc.bag.reading.unpacking.MOST_UNPACKED", 1000)
-    with pytest.raises(InputError, match="unpacks to more than 1000 B"):
+    monkeypatch.setattr("lathe_rc.bag.reading.unpacking.MOST_SMALL", 0)
+    monkeypatch.setattr("lathe_rc.bag.reading.unpacking.EXPANSION", 1)
+    with pytest.raises(InputError, match="unpacks to more than 1 times its size"):
         Source(path)
 
 

@@ -94,7 +94,8 @@ class Replayer:
         if _CLOCK in self._topics:
             raise InputError(f"{KIND}.topics: {_CLOCK} is the replayer's own and tells the log times of the bag")
         if len(self._topics) > MOST_SENT:
-            raise InputError(f"{parameters.bag}: {len(self._topics)} topics; allowed: up to {MOST_SENT}, named by --topics")
+            count = len(self._topics)
+            raise InputError(f"{parameters.bag}: {count} topics; allowed: up to {MOST_SENT}, named by --topics")
         start, end, span_ns = parameters.start, parameters.end, source.last_ns - source.first_ns
         if round(start * 1e9) > span_ns or 0.0 < end <= start:
             raise InputError(
@@ -105,7 +106,7 @@ class Replayer:
         self._stop_ns = source.first_ns + round(end * 1e9) if end else source.last_ns + 1
         if min(self._stop_ns - 1, source.last_ns) >= _CLOCK_END:
             raise InputError(
-                f"{parameters.bag}: log times up to {source.last_ns} ns; {_CLOCK} ends in 2038; --end leaves later ones out"
+                f"{parameters.bag}: log times up to {source.last_ns} ns; {_CLOCK} ends in 2038; leave them out by end"
             )
         self._classes = {topic: self._class(topic) for topic in sorted(self._topics)}
         self.paused = False
@@ -169,11 +170,14 @@ class Replayer:
     def _publish(self, node: Node, topic: str) -> None:
         recorded = self._source.topics[topic].qos
         if _mixed(recorded):
-            self._node.get_logger().warning(f"{topic}: its publishers offered different QoS; it is sent reliable and volatile")
+            self._node.get_logger().warning(
+                f"{topic}: its publishers offered different QoS; sent reliable and volatile"
+            )
         try:
             self._publishers[topic] = node.create_publisher(self._classes[topic], topic, _qos(recorded))
         except InvalidTopicNameException as error:
-            raise InputError(f"{topic}: no name of a topic in ROS ({shown(error)}); name others with --topics") from None
+            reason = shown(error).removeprefix("Invalid topic name: ").rstrip(":")
+            raise InputError(f"{topic}: no name in ROS ({reason}); name others with --topics") from None
         self._waiting[topic] = 0
 
     def _join(self) -> None:
@@ -288,7 +292,7 @@ class Replayer:
             if (wait := due - time.monotonic()) > _LONG:
                 offset = (log_ns - self._source.first_ns) * 1e-9
                 self._node.get_logger().warning(
-                    f"{topic}: the next message comes in {_span(wait)}, {offset:.9g} s after the first; --start passes over it"
+                    f"{topic}: the next message comes in {_span(wait)}; start = {offset:.9g} begins with it"
                 )
             began += self._wait_until(due)
             if log_ns != told:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-import numpy.typing as npt
 from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
@@ -32,6 +31,7 @@ from lathe_rc.errors import shown
 _MAGIC = len(MCAP0_MAGIC)
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _FOOTER = 29 + _MAGIC  # [B] at the end of a file
+_FOOTER_HEAD = _RECORD.pack(Opcode.FOOTER, _FOOTER - _MAGIC - _RECORD.size)
 _CHECKED = 25  # [B] of the footer that the summary's checksum covers
 _INDEX = struct.Struct("<QQQQI")  # of a chunk: first and last time, start, length, bytes of places by channel
 _PLACE = np.dtype([("channel", "<u2"), ("place", "<u8")])
@@ -149,7 +149,7 @@ class _Mcap:
 
     # ---- index --------------------------------------------------------------------------------------
 
-    def read_summary(self, stream: BinaryIO) -> bool:
+    def read_summary(self, stream: BinaryIO) -> bool:  # noqa: PLR0911 - one for each thing that may lack
         """Read the summary; whether it has all that is needed.
 
         Raises:
@@ -160,18 +160,17 @@ class _Mcap:
             return False
         read_record(stream, end)  # the header, which other readers need
         stream.seek(end)
-        footer = read_record(stream, self._size - _MAGIC)
-        if footer is None or footer[0] != Opcode.FOOTER or stream.read() != MCAP0_MAGIC:
+        footer = stream.read(_FOOTER)
+        if not footer.startswith(_FOOTER_HEAD) or not footer.endswith(MCAP0_MAGIC):
             return False
-        ends = Footer.read(ReadDataStream(BytesIO(footer[1])))
+        ends = Footer.read(ReadDataStream(BytesIO(footer[_RECORD.size :])))
         start = ends.summary_start
         if not _MAGIC <= start < end:
             return False
         if ends.summary_crc and ends.summary_crc != _checksum(stream, start, end + _CHECKED):
             self.storage.remarks.append(f"{self._path.name}: the checksum of its summary is wrong: read without it")
             return False
-        statistics = self._indexed_records(stream, start, end)
-        spans = self.storage.spans
+        statistics, spans = self._indexed_records(stream, start, end), self.storage.spans
         if statistics is None or statistics.chunk_count != len(spans) or bool(statistics.message_count) != bool(spans):
             return False
         counts = statistics.channel_message_counts
@@ -213,12 +212,10 @@ class _Mcap:
         (name,) = struct.unpack_from("<I", content, _INDEX.size + places + 8)
         packed, size = struct.unpack_from("<QQ", content, _INDEX.size + places + 12 + name)
         if start < _MAGIC or start + length > end or max(length, size) > MOST_BYTES or packed > length:
-            raise ValueError(f"the index has a chunk of {length} B ({size} unpacked) at byte {start}: none can be there")
+            raise ValueError(f"the index has a chunk of {length} B ({size} unpacked) at byte {start}: none can be")
         self._budget.take(size)
         channels = np.frombuffer(content, _PLACE, places // _PLACE.itemsize, _INDEX.size)["channel"]
-        return _Records(
-            first_ns, last_ns, size, frozenset(channels.tolist()), self._path, start, length, in_chunk=True
-        )
+        return _Records(first_ns, last_ns, size, frozenset(channels.tolist()), self._path, start, length, in_chunk=True)
 
     # ---- the whole file -----------------------------------------------------------------------------
 

@@ -64,21 +64,22 @@ def read(folder: Path) -> Metadata:
     files = tuple(dict.fromkeys(names))
     if len(files) > MOST_FILES or not all(files):
         raise ValueError(f"{NAME}: relative_file_paths are not up to {MOST_FILES} names of files")
-    mode = str(bag.get("compression_mode", "")).lower()
-    if mode not in ("", "none", "file", "message") or (mode in ("file", "message") and bag.get("compression_format") != "zstd"):
-        raise ValueError(f"{NAME}: compression {str(bag.get('compression_format'))[:64]!r} by {mode[:64]!r}; allowed: zstd")
+    mode, form = (str(bag.get(key, "")) for key in ("compression_mode", "compression_format"))
+    if mode.lower() not in ("", "none") and (mode.lower() not in ("file", "message") or form != "zstd"):
+        raise ValueError(f"{NAME}: compression {form[:64]!r} by {mode[:64]!r}; allowed: zstd, by file or message")
     span = None
     if _number(_of(bag, "message_count", str)):
         first = _number(_of(_of(bag, "starting_time", dict), "nanoseconds_since_epoch", str))
         span = first, first + _number(_of(_of(bag, "duration", dict), "nanoseconds", str))
     custom = bag.get("custom_data")
+    texts = custom.items() if isinstance(custom, dict) else ()
     return Metadata(
         files,
         len(files) < len(names),
-        mode == "message",
+        mode.lower() == "message",
         span,
         _topics(_of(bag, "topics_with_message_count", list)),
-        {key[:256]: text[:MOST_TEXT] for key, text in custom.items() if isinstance(text, str)} if isinstance(custom, dict) else {},
+        {key[:256]: text[:MOST_TEXT] for key, text in texts if isinstance(text, str)},
     )
 
 

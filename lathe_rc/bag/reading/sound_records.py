@@ -9,6 +9,7 @@ them, and there must be no chunk in the file: an index of one whose kind is dama
 import re
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -89,6 +90,17 @@ class _Effort:
         self.budget = Budget(size)
         self.left = _PAGES + 2 * (size // _PAGE)
 
+    def take_message(self, place: int) -> None:
+        """Count a message that stands outside of a chunk.
+
+        Raises:
+            _UnsoundError: there are more than is allowed.
+        """
+        try:
+            self.budget.take(0, 1)
+        except ValueError as error:
+            raise _UnsoundError(f"message at byte {place}: {error}") from None
+
     def spend(self, size: int) -> bool:
         """Count ``size`` bytes and a little more; whether that was still allowed."""
         self.left -= 1 + size // _PAGE
@@ -126,8 +138,9 @@ class SoundRecords:
             sound = SoundRecords(BytesIO(record.content), len(record.content), self.told, self._effort)
             yield from ((inner.opcode, inner.content) for inner in sound)
             return
-        whole, place = record.content, 0
+        whole, place, count = record.content, 0, 0
         while place < len(whole):
+            count += 1
             begin = place + _HEAD.size
             opcode, length = _HEAD.unpack_from(whole, place) if begin <= len(whole) else (0, len(whole))
             if begin + length > len(whole):
@@ -135,6 +148,8 @@ class SoundRecords:
                 return
             place = begin + length
             yield opcode, whole[begin:place]
+        with suppress(ValueError):  # the next chunk tells it
+            self._effort.budget.take(0, count)
 
     def check_sums(self) -> None:
         """Look at the checksums of data and summary, which stand at the end of a file that is complete."""
@@ -178,11 +193,12 @@ class SoundRecords:
         if self._last:
             self._effort = _Effort(self._size)
         while place < self._size:
-            if self._at(place, len(MCAP0_MAGIC)) == MCAP0_MAGIC:
+            head = self._at(place, _HEAD.size)
+            if head.startswith(MCAP0_MAGIC):
                 place += len(MCAP0_MAGIC)
                 continue
             try:
-                record, end = self._sound(place)
+                record, end = self._sound(place, head)
             except _UnsoundError as error:
                 self._chunked |= error.chunk
                 end = error.end or self._search(before + 1)
@@ -203,13 +219,13 @@ class SoundRecords:
         self._stream.seek(max(place, 0))  # a file may be shorter than its last records
         return self._stream.read(length)
 
-    def _sound(self, place: int) -> tuple[Record, int]:
-        """The record at a place, and the place behind it.
+    def _sound(self, place: int, head: bytes | None = None) -> tuple[Record, int]:
+        """The record at a place, where ``head`` stands, and the place behind it.
 
         Raises:
             _UnsoundError: it is not sound.
         """
-        head = self._at(place, _HEAD.size)
+        head = self._at(place, _HEAD.size) if head is None else head
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, self._size)
         end = place + _HEAD.size + length
         if opcode == Opcode.CHUNK:
@@ -221,13 +237,14 @@ class SoundRecords:
         content = self._at(place + _HEAD.size, length)
         if opcode == Opcode.MESSAGE:
             sound = length >= _BEFORE_DATA and not self._chunked and self._begins(end)
+            self._effort.take_message(place)
         elif opcode >= _PRIVATE:
             sound = self._begins(end)
         elif opcode == Opcode.MESSAGE_INDEX:
             pairs = _INDEX.unpack_from(content)[1] if length >= _INDEX.size else -1
             sound = pairs == length - _INDEX.size and pairs % 16 == 0
         else:
-            sound = _as_written(opcode, content)
+            sound = self._effort.spend(0) and _as_written(opcode, content)
         if opcode == Opcode.FOOTER:
             sound = sound and self._at(end, len(MCAP0_MAGIC)) == MCAP0_MAGIC
         if not sound:
@@ -238,7 +255,7 @@ class SoundRecords:
     def _begins(self, place: int) -> bool:
         """Whether the file ends at a place, or a record may begin."""
         head = self._at(place, _HEAD.size)
-        if place == self._size or head == MCAP0_MAGIC:
+        if place == self._size or head.startswith(MCAP0_MAGIC):
             return True
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
         return bool(0 < opcode <= Opcode.DATA_END and place + _HEAD.size + length <= self._size)
@@ -320,7 +337,7 @@ def _as_written(opcode: int, content: bytes) -> bool:
 
 
 def damage(file: Path) -> list[str]:
-    """What is wrong with the records of an MCAP file, one line each."""
+    """Damaged records of an MCAP file, one line each."""
     found: list[str] = []
     with file.open("rb") as stream:
         sound = SoundRecords(stream, file.stat().st_size, lambda why, _: found.append(f"{file.name}: {why}"))

@@ -235,7 +235,8 @@ class Source:
                 self.topics[topic] = Topic(said.type, said.qos, 0)
             count = (known.count if known else 0) + unread.get(topic, 0)
             wrong += [(f"{said.count} messages of {topic}", count)] if said.count != count else []
-        wrong += [(f"0 messages of {topic}", said.count) for topic, said in self.topics.items() if topic not in told.topics]
+        untold = self.topics.keys() - told.topics.keys()
+        wrong += [(f"0 messages of {topic}", self.topics[topic].count) for topic in sorted(untold)]
         self.contradictions += [f"{metadata.NAME} says {said}; the files: {found}" for said, found in wrong]
 
     def __enter__(self) -> "Source":
@@ -309,7 +310,9 @@ class Source:
         try:
             for group in _overlapping(reads):
                 found = _merged(group, start, stop, budget)
-                yield from chain.from_iterable(self._unpacked(each, budget) for each in found) if self._packed else found
+                if self._packed:
+                    found = chain.from_iterable(self._unpacked(each, budget) for each in found)
+                yield from found
         except _WRONG as error:
             hint = _RECOVER if any(map(_readable, reads)) else ""
             raise InputError(f"{self.path}: broken ({_reason(error)}){hint}") from None

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """SQLite files as rosbag2 writes them, read without a change to them or to anything beside them."""
 
+import contextlib
 import json
 import shutil
 import sqlite3
 from collections.abc import Iterator, Mapping
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from lathe_rc.bag.reading.limits import MOST_TOPICS
+from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_TOPICS
 from lathe_rc.bag.reading.precheck import check_tables
 from lathe_rc.bag.reading.storage import Batch, Channel, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget
@@ -37,7 +37,7 @@ def with_journal(path: Path, folder: Path) -> Path:
     copy = folder / path.name
     shutil.copyfile(path, copy)
     shutil.copyfile(log, folder / log.name)
-    with closing(sqlite3.connect(copy)) as base:
+    with contextlib.closing(sqlite3.connect(copy)) as base:
         base.execute("PRAGMA journal_mode=DELETE").fetchall()
     return copy
 
@@ -55,14 +55,16 @@ class _Table(Span):
 
     def read(self, topics: Mapping[int, str], start_ns: int, stop_ns: int, budget: Budget) -> Iterator[Batch]:
         """See `Span`."""
-        query = """SELECT topic_id, timestamp, data FROM messages
+        query = """SELECT topic_id, timestamp, CASE WHEN length(data) <= ? THEN data END FROM messages
             WHERE topic_id IN (SELECT value FROM json_each(?)) AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"""
-        with closing(connect(self.path)) as base:
+        with contextlib.closing(connect(self.path)) as base:
             for number, log_ns, data in base.execute(
-                query, (json.dumps(list(topics)), max(start_ns, 0), min(stop_ns - 1, _LAST))
+                query, (MOST_BYTES, json.dumps(list(topics)), max(start_ns, 0), min(stop_ns - 1, _LAST))
             ):
-                if not isinstance(log_ns, int) or not isinstance(data, bytes):
-                    raise ValueError(f"message of {topics[number]} at {str(log_ns)[:40]!r}: no time or no bytes")  # noqa: TRY004 - the file's fault
+                # An index that is broken may give other rows than were asked for.
+                sound = number in topics and isinstance(log_ns, int) and log_ns >= 0 and isinstance(data, bytes)
+                if not sound:
+                    raise ValueError(f"message of topic {str(number)[:20]} at {str(log_ns)[:20]} ns, or too long")
                 budget.take(len(data), 1)
                 yield Batch(data, topics, np.array([[number, log_ns, 0, len(data)]], np.uint64))
 
@@ -71,14 +73,15 @@ def open_sqlite(path: Path) -> Storage:
     """The topics of a database, and one span with its messages."""
     storage = Storage()
     try:
-        with closing(connect(path)) as base:
+        with contextlib.closing(connect(path)) as base:
             check_tables(base)
             _read_topics(base, storage)
             first, last = _count(base, storage)
     except _WRONG as error:
-        storage.damage.append(f"{path.name}: {shown(error)}")
-        return storage
-    storage.first_ns, storage.last_ns = max(first, 0), max(last, 0)
+        storage.damage.append(shown(error))
+        first = last = 0
+    storage.damage = [f"{path.name}: {what}" for what in storage.damage]
+    storage.first_ns, storage.last_ns = first, last
     storage.spans.append(_Table(storage.first_ns, storage.last_ns, 0, frozenset(storage.channels), path))
     return storage
 
@@ -90,22 +93,36 @@ def _read_topics(base: sqlite3.Connection, storage: Storage) -> None:
     for number, name, kind, encoding, qos in rows.fetchmany(MOST_TOPICS + 1):
         if not isinstance(number, int) or not 0 <= number <= _LAST:
             raise ValueError(f"topic {str(number)[:80]!r}; allowed: whole numbers from 0 on")
-        texts = [text if isinstance(text, str) else "" for text in (name, kind, encoding, qos)]
-        storage.announce(number, Channel(*texts[:3]), texts[3])
+        topic, msgtype, form, profiles = (text if isinstance(text, str) else "" for text in (name, kind, encoding, qos))
+        storage.announce(number, Channel(topic, msgtype, form), profiles)
 
 
 def _count(base: sqlite3.Connection, storage: Storage) -> tuple[int, int]:
     """Count the messages of each topic; returns the first and the last log time."""
     query = "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id"
-    counts = base.execute(query).fetchmany(2 * MOST_TOPICS)
-    lost = 0
+    try:
+        counts = base.execute(query).fetchmany(2 * MOST_TOPICS)
+    except sqlite3.DatabaseError as error:
+        storage.damage.append(shown(error))
+        counts = _count_rows(base)
+    lost, times = 0, []
     for number, count, first, last in counts:
-        if not isinstance(first, int) or not isinstance(last, int) or first < 0:
-            raise ValueError(f"log time {str(first)[:40]!r}; allowed: whole numbers from 0 on")
-        if number in storage.channels:
+        if number in storage.channels and isinstance(first, int) and isinstance(last, int) and first >= 0:
             storage.channels[number].count = count
+            times += [first, last]
         else:
             lost += count
     if lost:
-        storage.damage.append(f"{lost} messages of topics that it does not list")
-    return min((row[2] for row in counts), default=0), max((row[3] for row in counts), default=0)
+        storage.damage.append(f"{lost} messages of no topic that it lists, or without a log time from 0 on")
+    return min(times, default=0), max(times, default=0)
+
+
+def _count_rows(base: sqlite3.Connection) -> list[tuple[int, int, int, int]]:
+    """The counts up to where the database is broken."""
+    times: dict[int, list[int]] = {}
+    with contextlib.suppress(sqlite3.DatabaseError):
+        for number, log_ns in base.execute("SELECT topic_id, timestamp FROM messages"):
+            if isinstance(number, int) and isinstance(log_ns, int):
+                count, first, last = times.setdefault(number, [0, log_ns, log_ns])
+                times[number] = [count + 1, min(first, log_ns), max(last, log_ns)]
+    return [(number, *three) for number, three in times.items()]  # type: ignore[misc]

@@ -9,7 +9,7 @@ from rosbags.interfaces import Qos
 
 from lathe_rc.bag.reading import qos
 from lathe_rc.bag.reading.chunk_messages import Places
-from lathe_rc.bag.reading.limits import MOST_TOPICS
+from lathe_rc.bag.reading.limits import MOST_TEXT, MOST_TOPICS
 from lathe_rc.bag.reading.precheck import check_name
 from lathe_rc.bag.reading.unpacking import Budget
 
@@ -122,6 +122,7 @@ class Storage:
     last_ns: int = 0
     damage: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+    _offered: int = 0  # characters of quality of service
 
     def announce(self, number: int, channel: Channel, offered: str) -> None:
         """Take a channel and its quality of service.
@@ -132,6 +133,9 @@ class Storage:
         check_name(channel.topic)
         if channel.type:
             check_name(channel.type)
+        self._offered += len(offered)
+        if self._offered > MOST_TEXT:
+            raise ValueError(f"more than {MOST_TEXT} characters of quality of service")
         try:
             channel.qos = qos.of_text(offered)
         except ValueError as error:

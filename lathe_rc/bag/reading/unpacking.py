@@ -12,6 +12,7 @@ from isal.isal_zlib import crc32
 from lathe_rc.bag.reading.limits import EXPANSION, MOST_BYTES, MOST_SMALL, MOST_SMALL_MESSAGES
 from lathe_rc.errors import shown
 
+_OVERHEAD = 2**16  # of compression, beyond 1/128 of what does not shrink [B]
 _PIECE = 2**20  # of a file that is unpacked [B]
 _CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
 
@@ -48,6 +49,8 @@ def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
     """
     if not 0 <= size <= MOST_BYTES:
         raise ValueError(f"{size} B when unpacked; allowed: up to {MOST_BYTES}")
+    if compression and len(data) > size + size // 128 + _OVERHEAD:  # a million empty frames take a second to read
+        raise ValueError(f"{len(data)} B that unpack to {size}; no compression does")
     try:
         if compression == "zstd":
             unpacker = zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True)

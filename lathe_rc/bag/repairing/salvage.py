@@ -2,12 +2,13 @@
 """Every message that is whole in a bag that is not: cut off, or broken in places.
 
 Bytes are copied, not understood: schemas, channels and messages keep every byte but for their numbers.
+
+Longer than 400 lines: MCAP and SQLite files fill the same description of a bag, and each needs the other's limits.
 """
 
 import sqlite3
 import struct
 import tempfile
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
@@ -22,13 +23,13 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema, Statistics
 from rosbags.interfaces import Qos
 
-from lathe_rc import messages
 from lathe_rc.bag.reading import metadata, precheck, qos
-from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_METADATA, MOST_TEXT, MOST_TOPICS
+from lathe_rc.bag.reading.limits import MOST_METADATA, MOST_TEXT, MOST_TOPICS
 from lathe_rc.bag.reading.sound_records import SoundRecords, Told
 from lathe_rc.bag.reading.source import files_of
 from lathe_rc.bag.reading.sqlite_storage import connect, with_journal
 from lathe_rc.bag.reading.unpacking import unpack, unpack_file, unpacked_size
+from lathe_rc.bag.repairing.damaged_database import known_definition, readable_rows, select
 from lathe_rc.bag.writing.mcap_file import channel_content, schema_content
 from lathe_rc.errors import InputError, shown
 
@@ -37,8 +38,6 @@ ROS2 = "ros2"  #: profile of the files of rosbag2
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message that is compressed by itself; CDR begins with a zero
 _MOST_DAMAGE = 1000  # places that are told
-_SQLITE_PAGE = 4096  # bytes that are said to be lost where SQLite does not say
-_MOST_ID_BITS = 62  # of a row
 _SCHEMALESS = "__schemaless__"  # type of messages without a schema, as rosbags calls it
 
 
@@ -300,7 +299,7 @@ class Salvage:
                 with suppress(sqlite3.DatabaseError):  # of a broken page; the others are read below
                     precheck.check_tables(base)
                 topics, strange = self._sqlite_topics(file, base), 0
-                for number, log_ns, data in self._sqlite_rows(file, base):
+                for number, log_ns, data in readable_rows(base, lambda why, lost: self._lose(file, why, lost)):
                     topic = topics.get(number)
                     if topic and isinstance(log_ns, int) and log_ns >= 0 and isinstance(data, bytes):
                         yield Message(topic, 0, log_ns, log_ns, data)
@@ -312,45 +311,16 @@ class Salvage:
         except (sqlite3.Error, ValueError) as error:
             self._lose(file, str(error), file.stat().st_size)
 
-    def _sqlite_rows(self, file: Path, base: sqlite3.Connection) -> Iterator[tuple[Any, Any, Any]]:
-        """Topic, time and bytes of the messages on all pages that are whole; no bytes if there are too many."""
-        query = (
-            f"SELECT id, topic_id, timestamp, CASE WHEN length(data) <= {MOST_BYTES} THEN data END"  # noqa: S608 - a constant
-            " FROM messages WHERE id >= ? ORDER BY id"
-        )
-        first = 0
-
-        def readable(step: int) -> bool:
-            try:
-                base.execute(f"{query} LIMIT 1", (first + step,)).fetchone()
-            except sqlite3.DatabaseError:
-                return False
-            return True
-
-        while True:
-            try:
-                for number, *row in base.execute(query, (first,)):
-                    yield row[0], row[1], row[2]
-                    first = number + 1
-            except sqlite3.DatabaseError as error:
-                self._lose(file, f"from message {first} on: {error}", _SQLITE_PAGE)
-            else:
-                return
-            step = next((2**k for k in range(_MOST_ID_BITS) if readable(2**k)), None)
-            if step is None:
-                return
-            first += bisect_left(range(step), 1, lo=step // 2, key=readable)
-
     def _sqlite_topics(self, file: Path, base: sqlite3.Connection) -> dict[Any, Topic]:
         """Topics by number."""
-        definitions = _select(base, "message_definitions", ("topic_type", "encoding", "encoded_message_definition"))
+        definitions = select(base, "message_definitions", ("topic_type", "encoding", "encoded_message_definition"))
         defined = {kind: (encoding, text) for kind, encoding, text in definitions}
         names = ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
         topics: dict[Any, Topic] = {}
-        for number, name, kind, encoding, offered, digest in _select(base, "topics", names):
+        for number, name, kind, encoding, offered, digest in select(base, "topics", names):
             try:
                 precheck.check_name(kind)
-                how, text, known = _known(kind)
+                how, text, known = known_definition(kind)
                 how, text = defined.get(kind, (how, text))
                 self.count(len(text) + len(offered))
                 said = {"offered_qos_profiles": offered, "topic_type_hash": digest or known}
@@ -442,21 +412,3 @@ class _Definitions:
         self._salvage.skipped += self._lost.total()
         for why, count in self._lost.items():
             self._sound.told(f"{why}: {count} messages of it are not copied", 0)
-
-
-def _known(kind: str) -> tuple[str, str, str]:
-    """Encoding, text and hash of a type's definition, empty if this package does not have it."""
-    store = messages.store()
-    if kind not in store.fielddefs:
-        return "", "", ""
-    return "ros2msg", store.generate_msgdef(kind, ros_version=2)[0], store.hash_rihs01(kind)
-
-
-def _select(base: sqlite3.Connection, table: str, columns: tuple[str, ...]) -> list[tuple[Any, ...]]:
-    """Rows of a table as texts, but for a number in the first column; bags of older ROS lack columns and tables."""
-    there = {row[1] for row in base.execute(f"PRAGMA table_info({table})")}
-    if columns[0] not in there:
-        return []
-    listed = ", ".join(name if name in there else "''" for name in columns)
-    rows = base.execute(f"SELECT {listed} FROM {table}").fetchmany(MOST_TOPICS)  # noqa: S608 - of constants
-    return [(first, *(text if isinstance(text, str) else "" for text in rest)) for first, *rest in rows]

@@ -5,6 +5,8 @@ The records are those of the mcap library; its own writer takes 14 µs for a mes
 needs for a block. Here a message costs a header and two appends, a row of
 blocks one append, and the rest of the work is done once a chunk.
 
+Longer than 400 lines: a chunk, its index and the summary hold the same numbers.
+
 Schemas and channels stand again at the beginning of chunks 2, 3, 5, 9, 17 and so on: a damaged chunk takes no other
 with it, also in a file that was cut off before its summary.
 """
@@ -424,6 +426,8 @@ class McapFile:
         start = place = self._offset
         offsets = []
         for opcode, data in groups.items():
+            if not data:
+                continue
             offsets.append(SummaryOffset(group_opcode=opcode, group_start=place, group_length=len(data)))
             place += len(data)
         summary = b"".join(groups.values()) + _encoded(*offsets)
