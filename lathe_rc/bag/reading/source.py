@@ -6,6 +6,7 @@ Nothing in a bag is trusted: what it says of sizes is checked before anything of
 """
 
 import heapq
+import os
 import sqlite3
 import struct
 import tempfile
@@ -81,6 +82,11 @@ def files_of(path: Path) -> list[Path]:
     """The files with the messages of a bag, by name: those of a folder, or the one that is named."""
     found = [path] if path.is_file() else path.glob("*")
     return sorted(file for file in found if file.suffix in _KINDS and file.is_file())
+
+
+def name_of(path: Path) -> str:
+    """Name of a bag for files that are made of it, of ``.`` and ``..`` too."""
+    return Path(os.path.abspath(path)).name  # noqa: PTH100 - resolve() fails where links go round
 
 
 class Source:
