@@ -216,7 +216,7 @@ def _database(folder: Path, random: Random) -> Path:
         "UPDATE messages SET data = zeroblob(268435456) WHERE id = 1", "UPDATE messages SET data = zeroblob(1000000)",
         "UPDATE messages SET timestamp = 9223372036854775807 WHERE id % 2",
         "ALTER TABLE messages RENAME COLUMN id TO number", "UPDATE topics SET id = id + 100000",
-        "INSERT INTO messages SELECT NULL, 1, a.id * 600 + b.id, x'' FROM messages a, messages b, topics, topics, topics",
+        "INSERT INTO messages SELECT NULL, 1, a.id * 600 + b.id, x'' FROM messages a, messages b, messages c",
     )  # fmt: skip
     with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(path)) as base:
         for _ in range(random.choice((0, 1, 2))):

@@ -17,7 +17,7 @@ from lathe_rc import messages, part
 from lathe_rc.bag import provenance
 from lathe_rc.bag.check import check as check_bag
 from lathe_rc.bag.reading import stream
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import Source, name_of
 from lathe_rc.bag.reading.tachogram import make as make_tachogram
 from lathe_rc.bag.repairing.recover import recover as recover_bag
 
@@ -197,7 +197,7 @@ def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: boo
 @_JSON
 def tachogram(path: Path, output: Path | None, tolerance: float, topic: str, *, as_json: bool) -> None:
     """Write the recorded spindle speed as a CSV file for tachogram_file, with as few rows as the tolerance allows."""
-    target = output or Path(f"{path.resolve().name.removesuffix('.mcap')}-tachogram.csv")
+    target = output or Path(f"{name_of(path).removesuffix('.mcap')}-tachogram.csv")
     made = make_tachogram(path, target, tolerance, topic)
     if as_json:
         click.echo(json.dumps({"bag": str(path), "output": str(target), **asdict(made)}))

@@ -25,9 +25,10 @@ def export(bag: Path, kinds: tuple[str, ...], output: Path | None, topics: tuple
     if len(kinds) != 1:
         raise InputError(f"{len(kinds)} formats; allowed: one of --csv, --parquet and --npz")
     from lathe_rc.bag.exporting import export as exporting
+    from lathe_rc.bag.reading.source import name_of
 
     (kind,) = kinds
-    name = bag.resolve().name.removesuffix(".mcap")
+    name = name_of(bag).removesuffix(".mcap")
     place = output or Path(f"{name}.npz" if kind == "npz" else f"{name}-{kind}")
     wanted = [topic.strip() for text in topics for topic in text.split(",") if topic.strip()]
     done = exporting.export(bag, place, kind, wanted)

@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 
+from lathe_rc.bag.reading.source import name_of
 from lathe_rc.cell.rerun_bridge import PORT, RATE, Kind
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.view.rerun_bag import write
@@ -18,7 +19,7 @@ from lathe_rc.view.rerun_output import Viewer, end, require, viewer
 def _show(bag: Path, rate: float, shown: Viewer) -> None:
     """Show a bag with Rerun's own program until it ends."""
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / f"{bag.resolve().name}.rrd"
+        file = Path(folder) / f"{name_of(bag)}.rrd"
         write(bag, file, rate=rate)
         click.echo(shown.said)
         with shown.start(file) as process:

@@ -22,6 +22,7 @@ from lathe_rc import __version__, messages
 from lathe_rc.analysis.budget import TOLD, Budget
 from lathe_rc.analysis.metrology import Lay
 from lathe_rc.bag.provenance import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS, origins, scenario_of
+from lathe_rc.bag.reading.source import name_of
 from lathe_rc.cell.budget import budget
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place, replacing
@@ -429,7 +430,7 @@ def write(bag: Path, page: Path, *, with_budget: bool = False) -> Gathered:
     told = gather(bag)
     found = _budgeted(told) if with_budget else None
     command = shlex.join(["lathe", "report", str(bag), *(["--budget"] if with_budget else []), "-o", str(page)])
-    text = render(told, bag.resolve().name, command, found)
+    text = render(told, name_of(bag), command, found)
     try:
         with replacing(page) as file:
             file.write(text.encode("utf-8", "replace"))

@@ -10,7 +10,7 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.bag.reading import stream
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import Source, name_of
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.rerun_bridge import RATE
 from lathe_rc.errors import InputError, LatheError, shown
@@ -113,7 +113,7 @@ def write(bag: Path, output: Path, *, rate: float = RATE) -> int:
 
     if not output.parent.is_dir():
         raise InputError(f"{output}: there is no folder {output.parent}")
-    recording = rr.RecordingStream("lathe_rc", recording_id=bag.resolve().name)
+    recording = rr.RecordingStream("lathe_rc", recording_id=name_of(bag))
     beside = output.with_name(f".{output.name}.{os.getpid()}")
     try:
         try:

@@ -8,7 +8,7 @@ hostile file costs some hundred megabytes of memory, and time as a bag of its si
 MOST_BYTES = 2**27  #: longest record, chunk or message: above images and point clouds; a reader holds some at once [B]
 MOST_OPEN = 2**28  #: unpacked, of the chunks that overlap in time: all of them are in memory at once [B]
 MOST_TOPICS = 4096  #: topics of a bag
-MOST_SENT = 1000  #: topics that one replayer sends: each costs DDS some 200 kB, and 4000 of them its life
+MOST_SENT = 1000  #: topics that one replayer sends: every node discovers each; thousands take DDS minutes, or its life
 MOST_TEXT = 2**20  #: longest text in the metadata, and all quality of service together [B]
 MOST_METADATA = 16 * MOST_TEXT  #: length of metadata.yaml, which has a scenario's files in it [B]
 MOST_FILES = 4096  #: files of a folder

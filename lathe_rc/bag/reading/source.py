@@ -6,6 +6,7 @@ Nothing in a bag is trusted: what it says of sizes is checked before anything of
 """
 
 import heapq
+import os
 import sqlite3
 import struct
 import tempfile
@@ -88,6 +89,11 @@ def files_of(path: Path) -> list[Path]:
         if file != path and not file.resolve().is_relative_to(path.resolve()):
             raise InputError(f"{file}: a link that leads out of the bag; allowed: the file itself in its place")
     return sorted(file for file in found if file.suffix in _KINDS and file.is_file())
+
+
+def name_of(path: Path) -> str:
+    """Name of a bag for files that are made of it, of ``.`` and ``..`` too."""
+    return Path(os.path.abspath(path)).name  # noqa: PTH100 - resolve() fails where links go round
 
 
 class Source:
