@@ -45,6 +45,7 @@ _KERNELS = (
     "bag/resimulation/bag_spindle.py",
     "bag/reading/chunk_messages.py",
     "safety/*.py",
+    "cell/ahead.py",
     "cell/native.py",
     "cell/program.py",
     "cell/stages/*.py",
