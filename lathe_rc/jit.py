@@ -8,12 +8,12 @@ damaged one is removed and made anew. A cache that cannot be written stops no ru
 """
 
 import contextlib
-import errno
 import hashlib
 import io
 import os
 import pickle
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -32,6 +32,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _MOST = 2**30  # longest file of the cache [B]
+_ROOM = 2**22  # that the code of a cell takes, about [B]
 _PACKAGE = Path(__file__).parent
 _KERNELS = (
     "arrays.py",
@@ -44,6 +45,7 @@ _KERNELS = (
     "bag/resimulation/bag_spindle.py",
     "bag/reading/chunk_messages.py",
     "safety/*.py",
+    "cell/ahead.py",
     "cell/native.py",
     "cell/program.py",
     "cell/stages/*.py",
@@ -82,11 +84,13 @@ def read_kept(path: Path) -> memoryview | None:
     """The content of a file of the cache; None: it is not there, or damaged, which is said, and it is removed."""
     try:
         return unsealed(contents(path, _MOST))
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
-    except (OSError, DamagedError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        print(f"lathe: {path}: damaged ({reason}): thrown away, and made anew", file=sys.stderr)
+    except OSError as error:
+        say_not_kept(str(error.strerror))
+        return None
+    except DamagedError as error:
+        print(f"lathe: {path}: damaged ({error}): thrown away, and made anew", file=sys.stderr)
         with contextlib.suppress(OSError):
             path.unlink()
         return None
@@ -103,15 +107,16 @@ def say_not_kept(reason: str) -> None:
 
 
 def can_keep() -> bool:
-    """Whether compiled code can be kept; if not, say so."""
-    folder, reason = cache_folder(), errno.EROFS
+    """Whether compiled code can be kept: the folder can be written, and there is room; if not, say so."""
+    folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(_ROOM))
     except OSError as error:
-        reason = error.errno or reason
-    if not (known := os.access(folder, os.W_OK)):
-        say_not_kept(os.strerror(reason))
-    return known
+        say_not_kept(str(error.strerror))
+        return False
+    return True
 
 
 class _Place(_CacheLocator):

@@ -23,7 +23,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
 
-from lathe_rc import harness, messages
+from lathe_rc import files, harness, messages
 from lathe_rc.analysis import hysteresis_fit, reduced_order, step_fit
 from lathe_rc.bag import check, provenance, reader
 from lathe_rc.bag.reading.source import Source
@@ -114,7 +114,7 @@ def _scenarios() -> list[bytes]:
 def _state(data: bytes) -> None:
     with _folder() as folder, refusals():
         path = folder / "state"
-        path.write_bytes(data)
+        path.write_bytes(files.sealed(data))
         path.chmod(0o600)
         cell = _kept()
         state_file.load(path, cell.stages["learning_controller"].shared, {"stage": cell.stages["learning_controller"]})

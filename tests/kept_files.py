@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """One file of every kind that lathe_rc writes and reads again, and damage to it."""
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet
 
 from lathe_rc import completing, jit
 from lathe_rc.cell import program, scenario, state_file
@@ -73,13 +75,20 @@ def tuned(path: Path, trials: int = 8) -> Folder:
     return folder
 
 
+def parquet(columns: dict[str, list[Any]]) -> bytes:
+    """A file of rows."""
+    content = io.BytesIO()
+    pyarrow.parquet.write_table(pa.table(columns), content)
+    return content.getvalue()
+
+
 def _rows(folder: Path) -> Kept:
-    path = swept(folder).path
+    path = swept(folder / "sweep").path
     return Kept(path / "rows" / "000000.parquet", lambda: Folder(path).table().to_pylist())
 
 
 def _sweep(folder: Path) -> Kept:
-    path = swept(folder).path
+    path = swept(folder / "sweep").path
 
     def read() -> object:
         found = Folder(path)
@@ -89,24 +98,22 @@ def _sweep(folder: Path) -> Kept:
 
 
 def _scenario(folder: Path) -> Kept:
-    path = swept(folder).path
+    path = swept(folder / "sweep").path
     return Kept(path / "scenario.yaml", lambda: Folder(path).scenario)
 
 
 def _journal(folder: Path) -> Kept:
-    path = tuned(folder).path
+    path = tuned(folder / "tuning").path
     return Kept(path / "trials.log", lambda: [tuple(trial) for trial in tune.load(path).trials])
 
 
 def _memory(folder: Path) -> Kept:
-    folder.mkdir()
     path = folder / "memory.npz"
     memory_file.save(path, np.random.default_rng(1).standard_normal(128), 128)
     return Kept(path, lambda: memory_file.load(path, 128, 128).tobytes())
 
 
 def _state(folder: Path) -> Kept:
-    folder.mkdir()
     path, cell = folder / "state", load()
     stage = Cell(cell.nodes).stages[OWN]
     state_file.save(path, state_file.dump({"stage": stage}), state_file.dump({"events": [("reset", 3)]}))
@@ -146,6 +153,7 @@ def _compiled(suffix: str) -> Callable[[Path], Kept]:
     return made
 
 
+CACHED = ("table of a form", "index of compiled code", "compiled code")
 KINDS: dict[str, Callable[[Path], Kept]] = {
     "rows of a sweep": _rows,
     "sweep.json": _sweep,
@@ -196,11 +204,12 @@ def flip(kept: Kept, bits: int, said: Callable[[], str]) -> int:
     return noticed
 
 
-def prepare(monkeypatch: Any, folder: Path) -> None:
-    """A cache of its own, tunings without workers, and few words to complete."""
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder / "cache"))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "home"))
+def made(kind: str, monkeypatch: Any, folder: Path) -> Kept:
+    """A file of a kind, in a cache of its own if it is part of one; tunings have no workers, and few words complete."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
     monkeypatch.setattr(study, "rows", computed)
-    monkeypatch.setattr(
-        completing, "look", lambda: {"commands": {"run": {"params": ["--set"]}}, "nodes": {"tool": ["form"]}}
-    )
+    words = {"commands": {"run": {"params": ["--set"]}}, "nodes": {"tool": ["form"]}}
+    monkeypatch.setattr(completing, "look", lambda: words)
+    if kind in CACHED:
+        monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder))
+    return KINDS[kind](folder)

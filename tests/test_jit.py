@@ -4,11 +4,12 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import lathe_rc
 from lathe_rc import jit
-from lathe_rc.cell import ahead
+from lathe_rc.cell import ahead, program
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.errors import LatheError
@@ -25,9 +26,25 @@ def test_the_cache_knows_every_file_with_a_kernel():
     assert len(with_kernels) > 30
 
 
-def test_a_process_that_cannot_compile_is_an_error(monkeypatch):
-    monkeypatch.setattr(ahead.native, "compiled", set)
+@pytest.fixture
+def stage():
+    return STAGES["profile"]("form", TABLES["profile"].read("form", {"stage": "profile"}))
+
+
+def test_a_process_that_cannot_compile_is_an_error(stage, monkeypatch):
+    monkeypatch.setattr(ahead.native, "is_kept", lambda _: False)
     monkeypatch.setattr(ahead.sys, "executable", "/bin/false")
-    stage = STAGES["profile"]("form", TABLES["profile"].read("form", {"stage": "profile"}))
     with pytest.raises(LatheError, match="a process that compiles"):
         list(ahead.compile_ahead([stage]))
+
+
+def test_a_cache_that_cannot_be_written_is_said_once_and_stops_nothing(stage, monkeypatch, capsys):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/none")
+    jit.say_not_kept.cache_clear()
+    passes = jit.kernel(program._passes.py_func)
+    assert passes(np.arange(9.0), 4.0)
+    assert not passes(np.arange(9.0), 9.0)
+    assert list(ahead.compile_ahead([stage])) == []  # each process compiles for itself
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "compiled code cannot be kept (Not a directory), so that each process compiles it for itself" in told

@@ -242,5 +242,5 @@ def _module(name: str, text: str, memory: Placed) -> ModuleType:
     module = ModuleType(f"lathe_rc_steps.{name}")
     vars(module)["MEMORY"] = memory
     sys.modules[module.__name__] = module
-    exec(compile(text, f"{name}.py", "exec"), vars(module))  # noqa: S102 - written here
+    exec(compile(text, f"/lathe_rc_steps/{name}.py", "exec"), vars(module))  # noqa: S102 - written here
     return module
