@@ -171,7 +171,7 @@ class Cell:
         unknown: see above.
         unchecked: what `check` could not check since it depends on them, or since a law or drive of others does not
             tell what is needed; one line each.
-        warnings: doubts about parameters that can be meant; `check` finds them, one line each.
+        warnings: what makes the form worse than the laws can do, and its cure; one line each. `check` finds them.
         factors: largest factor of a cycle over all frequencies, sup|Q - γZ| of repetitive control, by learning node;
             below 1 the error of each cycle is smaller than that of the one before. `check` finds it.
         stages: by node name, in the order of the forward edges.
@@ -190,7 +190,8 @@ class Cell:
         *,
         stage: Callable[[str, NodeParameters], Stage] = new_stage,
     ) -> None:
-        self.unknown, self.unchecked, self.warnings = unknown or {}, list[str](), list[str]()
+        self.unknown, self.unchecked = unknown or {}, list[str]()
+        self.warnings: list[str] = []
         self.factors: dict[str, float] = {}
         self._tables = nodes
         with extremes.refused(nodes):
@@ -290,8 +291,7 @@ class Cell:
 
     def _check(self) -> None:
         self.unchecked.clear()
-        seconds = (self.master.expected_samples or math.inf) * self.master.shared.step
-        self.warnings = [doubt for stage in self.stages.values() for doubt in stage.warnings(seconds)]
+        self.warnings.clear()
         self.factors.clear()
         low, high = self.master.speed_range()
         if low <= 0.0:
@@ -303,7 +303,9 @@ class Cell:
                 f"{self.master.name}.nominal_rpm and its deviations: a revolution takes {samples:.3g} samples at "
                 f"{high:.4g} rad/s; allowed: {_LEAST_SAMPLES} or more (turn slower, or raise sample_rate)"
             )
+        seconds = (self.master.expected_samples or math.inf) * self.master.shared.step
         for stage in self.stages.values():
+            self.warnings += stage.doubts(seconds)
             for port in stage.inputs:
                 if 0 < port.delay < stage.shared.block_size:
                     raise InputError(

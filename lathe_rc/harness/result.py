@@ -41,7 +41,7 @@ class Result:
         refused: messages from outside the cell that the nodes refused, by sender.
         not_reached: events that the run was too short for, by node.
         unchecked: what the check before the start could not see, since laws or drives of others do not tell it.
-        warnings: doubts of the check before the start about parameters that can be meant.
+        warnings: what makes the form worse than the laws can do, and its cure, as the check before the start found it.
         lateness: of the blocks; None if there was no pace to keep, as offline or with a ``speed_factor`` of 0.
 
     Example:

@@ -77,10 +77,9 @@ def run(
     cell = Cell(scenario.nodes)
     cell.check()
     check_room(cell)
-    for what in cell.unchecked:
-        watch({"event": "unchecked", "node": cell.master.name, "message": what})
-    for what in cell.warnings:
-        watch({"event": "warning", "node": cell.master.name, "message": what})
+    for event, told in (("unchecked", cell.unchecked), ("warning", cell.warnings)):
+        for what in told:
+            watch({"event": event, "node": cell.master.name, "message": what})
     if bag is not None:
         from lathe_rc.bag.writing.writer import refuse_existing
 
