@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m lathe_rc``: the command line."""
+"""``python -m lathe_rc``: the command line; ``./lathe`` runs this file."""
+
+import sys
+
+if __name__ == "__main__" and not getattr(sys.flags, "safe_path", sys.flags.isolated):
+    del sys.path[0]  # the current folder, or the one of this file: data in it is no code
 
 import gc
 

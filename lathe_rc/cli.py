@@ -13,7 +13,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from lathe_rc import __version__, extras
+from lathe_rc import __version__, extras, trust
 from lathe_rc.command_list import COMMANDS, imported
 from lathe_rc.errors import LatheError, shown
 
@@ -52,7 +52,7 @@ class Group(click.Group):
             if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="replace")  # where an encoding has no µ
         try:
-            with extras.named():
+            with extras.named(), trust.call():
                 return super().invoke(ctx)
         except LatheError as error:
             click.echo(f"lathe: {error}", err=True)

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands of ``lathe`` by name, with their summaries; the module of one is imported when it is asked for."""
 
-from typing import cast
-
-import click
+from typing import TYPE_CHECKING, cast
 
 from lathe_rc.loading import load
+
+if TYPE_CHECKING:  # the first ./lathe --help lists the commands before any package is installed
+    import click
 
 COMMANDS = {
     "bag": "Ask bags what is in them; check and recover them; take a tachogram out.",
@@ -33,7 +34,7 @@ COMMANDS = {
 _BESIDES = {"container": "node"}  # commands in the module of another one
 
 
-def imported(name: str) -> click.Command:
+def imported(name: str) -> "click.Command":
     """A command with its module."""
     module = load(f"lathe_rc.commands.{_BESIDES.get(name, name)}")
     return cast("click.Command", getattr(module, name))

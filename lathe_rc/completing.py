@@ -46,7 +46,7 @@ def known() -> Mapping[str, Any]:
     """From the file, which is made anew if need be; where it cannot be written, it is made each time."""
     file = platformdirs.user_cache_path("lathe_rc") / f"completion-{_stamp()}.json"
     with contextlib.suppress(OSError, ValueError):
-        kept: Mapping[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        kept: Mapping[str, Any] = json.loads(bytes(files.unsealed(files.contents(file))))
         return kept
     found = look()
     with contextlib.suppress(OSError):
@@ -54,7 +54,7 @@ def known() -> Mapping[str, Any]:
         for old in file.parent.glob("completion-*.json"):
             old.unlink(missing_ok=True)
         with files.replacing(file) as new:
-            new.write(json.dumps(found).encode())
+            new.write(files.sealed(json.dumps(found).encode()))
     return found
 
 

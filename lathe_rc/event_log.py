@@ -10,6 +10,16 @@ from lathe_rc.safety.state_machine import Reaction, State
 
 _STATES, _REACTIONS = {int(s): s.name.lower() for s in State}, {int(r): r.name.lower() for r in Reaction}
 
+#: Of each monitor: the unit of what it finds, by how much that is to be multiplied; those of others have their own.
+UNITS = {
+    "speed": ("rad/s", 1.0),
+    "acceleration": ("rad/s²", 1.0),
+    "index_pulses": ("rad", 1.0),
+    "effort": ("A or V", 1.0),
+    "force": ("N", 1.0),
+    "force_low": ("N", 1.0),
+    **dict.fromkeys(("error", "following", "stroke", "slide"), ("µm", 1e6)),
+}
 LOGGED = (messages.EVENT, messages.SAFETY_STATUS)  #: types of messages that say so
 
 
@@ -42,5 +52,7 @@ def text(message: Sparse) -> str:
     if message.type == messages.EVENT:
         return str(values["action"])
     state, reaction = _STATES.get(values["state"], "?"), _REACTIONS.get(values["reaction"], "?")
-    found = f" {values['value']:.4g}, limit {values['limit']:.4g}" if values["limit"] else ""
+    unit, scale = UNITS.get(values["monitor"], ("", 1.0))
+    sizes = [f"{values[name] * scale:.4g} {unit}".rstrip() for name in ("value", "limit")]
+    found = f" {sizes[0]}, limit {sizes[1]}" if values["limit"] else ""
     return f"{values['monitor']} {values['subject']}{found}: {state}, {reaction}"

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Extensions of the cell from other packages: classes by name, ours and theirs.
 
-A class is named by a name of ours, by a name that an installed package offers as an entry point, or, without any
-installation, by where it stands: ``package.module:Class``. A module is looked for where Python looks for it, and then
-in the current folder.
+A class is named by a name of ours, by a name that an installed package offers as an entry point, or by where it
+stands, ``package.module:Class``, if an entry point offers that or the user has allowed the package: `lathe_rc.trust`.
 """
 
 import ast
@@ -24,6 +23,7 @@ from typing import Any, Generic, TypeVar
 
 from pydantic_core import core_schema
 
+from lathe_rc import trust
 from lathe_rc.errors import InputError, LatheError, shown
 
 T = TypeVar("T")
@@ -33,7 +33,8 @@ V = TypeVar("V")
 class Offers(Mapping[str, V], Generic[V]):
     """The classes of one sort, ours and those of other packages, by name.
 
-    Iteration gives our names and those that installed packages offer; any ``package.module:Name`` is found as well.
+    Iteration gives our names and those that installed packages offer; ``package.module:Name`` is found as well where
+    `permits` says so.
 
     Args:
         what: one of them, in words.
@@ -61,11 +62,13 @@ class Offers(Mapping[str, V], Generic[V]):
 
         Raises:
             KeyError: nobody offers it.
-            InputError: it cannot be imported, or is none of these.
+            InputError: it may not or cannot be imported, or is none of these.
         """
         own = self.own.get(name)
         if own is not None and not isinstance(own, str):
             return own
+        if not (own or self.permits(name)):
+            raise InputError(f"{self._what} {shown(name)!r}: {self.why_not(name)}")
         if name not in self._found:
             self._found[name] = self._checked(name, pkgutil.resolve_name(own) if own else self._import(name))
         return self._found[name]
@@ -76,6 +79,18 @@ class Offers(Mapping[str, V], Generic[V]):
             return _attribute(module, attribute, f"{self._what} {shown(name)!r}")
         point = _offered(self.group)[name]
         return _attribute(point.module, point.attr, f"{self._what} {name!r} of {_distribution(point.dist)}")
+
+    def permits(self, name: str) -> bool:
+        """Whether a name may be looked up: data cannot name code that is neither offered nor allowed."""
+        module, colon, _ = name.partition(":")
+        if not colon or trust.is_allowed(module):
+            return True
+        return any(f"{point.module}:{point.attr}" == name for point in _offered(self.group).values())
+
+    def why_not(self, name: str) -> str:
+        """Why a name may not be looked up, and what to do."""
+        package = shown(name.partition(":")[0].partition(".")[0])
+        return f"code that no installed package offers; allowed: install {package}, or {trust.OPTION} {package}"
 
     @abstractmethod
     def _checked(self, name: str, found: Any) -> V:
@@ -138,20 +153,6 @@ class Registry(Offers[type[T]], Generic[T]):
         return {"class": f"{module}:{self[name].__qualname__}", **origin(module)}
 
 
-def find(name: str, what: str) -> Any:
-    """The object at ``package.module:Name``.
-
-    Args:
-        name: see above.
-        what: in words, for errors.
-
-    Raises:
-        InputError: it cannot be imported.
-    """
-    module, _, attribute = name.partition(":")
-    return _attribute(module, attribute, what)
-
-
 @contextmanager
 def code_of_others(what: str) -> Iterator[None]:
     """Make one line of whatever code of others raises.
@@ -173,13 +174,14 @@ def code_of_others(what: str) -> Iterator[None]:
 
 
 def _attribute(module: str, attribute: str, what: str) -> Any:
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.append(here)
     try:
-        found = importlib.import_module(module)
+        with trust.importing(module):
+            found = importlib.import_module(module)
     except Exception as error:  # whatever a module of others does when it is imported
-        raise InputError(f"{what} cannot be imported: {type(error).__name__}: {shown(error)}") from error
+        told = f"{what} cannot be imported: {type(error).__name__}: {shown(error)}"
+        if isinstance(error, ModuleNotFoundError) and error.name == module.partition(".")[0]:
+            told += f"; allowed: install it, or {trust.OPTION} {shown(error.name)} if it lies in the current folder"
+        raise InputError(told) from error
     for part in attribute.split("."):
         if not hasattr(found, part):
             raise InputError(f"{what}: {module} has no {attribute!r}")

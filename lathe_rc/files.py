@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are read whole, if they are none too large, and written whole or not at all."""
+"""Bounded reads, writes that are whole or not at all, and checksums of files that lathe_rc reads again.
+
+A checksum stands inside its file, so that both are written at once: at the end, or where the writer of a format has
+left `ROOM` for it, in a text that other programs read as any other.
+"""
 
 import contextlib
 import errno
+import hashlib
 import os
 import stat
 import tempfile
@@ -14,6 +19,12 @@ from lathe_rc.errors import InputError
 
 MOST = 2**26  #: longest file that is read whole [B]
 _NO_FILE = "not a file"
+_MARK, _DIGITS = b"lathe_rc checksum ", 32
+ROOM = _MARK + _DIGITS * b"0"  #: for a checksum
+
+
+class DamagedError(ValueError):
+    """A file has another content than the one that its checksum was made of."""
 
 
 def contents(path: Path, most: int = MOST) -> bytes:
@@ -22,7 +33,7 @@ def contents(path: Path, most: int = MOST) -> bytes:
     Raises:
         OSError: it cannot be read; EFBIG: it is longer than ``most`` bytes.
     """
-    with open(path, "rb", opener=_open_file) as stream:
+    with open(path, "rb", opener=open_file) as stream:
         found = stream.read(most + 1)
     if found is None:  # it would have had to wait
         raise OSError(errno.EINVAL, _NO_FILE)
@@ -31,12 +42,46 @@ def contents(path: Path, most: int = MOST) -> bytes:
     return found
 
 
-def _open_file(name: str, flags: int) -> int:
+def open_file(name: str, flags: int) -> int:
+    """An opener, for `open`, of files alone: a pipe or a device could keep a reader for ever."""
     number = os.open(name, flags | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(number).st_mode):
         os.close(number)
         raise OSError(errno.EINVAL, _NO_FILE)
     return number
+
+
+def sealed(content: bytes) -> bytes:
+    """The content of a file with its checksum in the last `ROOM`; without one, at the end."""
+    place = content.rfind(ROOM)
+    head, tail = (content, b"") if place < 0 else (content[:place], content[place + len(ROOM) :])
+    return head + _MARK + _checksum(head, tail) + tail
+
+
+def unsealed(content: bytes, *, needed: bool = True) -> memoryview:
+    """The content of a file that `sealed` has made, up to its checksum.
+
+    Args:
+        content: see above.
+        needed: whether it must have a checksum: files of older versions have none.
+
+    Raises:
+        DamagedError: it is not as it was written, or there is no checksum.
+    """
+    view, place = memoryview(content), content.rfind(_MARK)
+    if place < 0 and not needed:
+        return view
+    if place < 0:
+        raise DamagedError("it has no checksum")
+    if content[place + len(_MARK) : place + len(ROOM)] != _checksum(view[:place], view[place + len(ROOM) :]):
+        raise DamagedError("its checksum is that of another content")
+    return view[:place]
+
+
+def _checksum(head: bytes | memoryview, tail: bytes | memoryview) -> bytes:
+    found = hashlib.sha256(head)
+    found.update(tail)
+    return found.hexdigest()[:_DIGITS].encode()
 
 
 def check_place(option: str, path: Path) -> None:

@@ -1,20 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compilation of inner loops: one decorator, one place for its settings, one cache."""
+# mypy: allow-untyped-calls
+"""Compilation of inner loops: one decorator, one place for its settings, one cache.
 
+Numba keeps compiled code in two sorts of files: an index of the signatures of a kernel, and the code for each. It
+trusts both: a flipped bit is a wrong number, or the end of the process. So each of our files has a checksum, and a
+damaged one is removed and made anew. A cache that cannot be written stops no run.
+"""
+
+import contextlib
+import errno
 import hashlib
+import io
 import os
-from collections.abc import Callable
+import pickle
+import sys
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
-from typing import ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 import platformdirs
+from numba import types
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, _CacheLocator
+from numba.core.ccallback import CFunc
 
 from lathe_rc.extensions import is_ours
+from lathe_rc.files import DamagedError, contents, sealed, unsealed
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
+_MOST = 2**30  # longest file of the cache [B]
 _PACKAGE = Path(__file__).parent
 _KERNELS = (
     "arrays.py",
@@ -42,15 +59,131 @@ def _source_hash() -> str:
     return digest.hexdigest()[:16]
 
 
-if "NUMBA_CACHE_DIR" not in os.environ:
-    # Numba looks for changes in the file of a kernel, not in those of the kernels that it calls: a cache
-    # shared between versions of the source would go on using old arithmetic. So each version has its own.
-    setattr(numba.config, "CACHE_DIR", str(platformdirs.user_cache_path("lathe_rc") / _source_hash()))  # noqa: B010 - the module makes its names at run time
+_SOURCES = _source_hash()
 
 
 def cache_folder() -> Path:
-    """Where compiled code is kept."""
-    return Path(os.environ.get("NUMBA_CACHE_DIR") or getattr(numba.config, "CACHE_DIR"))  # noqa: B009 - see above
+    """The folder of compiled code.
+
+    Numba looks for changes in the file of a kernel, not in those of the kernels that it calls: a cache shared between
+    versions of the source would go on using old arithmetic. So each version has its own.
+    """
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or platformdirs.user_cache_path("lathe_rc")) / _SOURCES
+
+
+if "NUMBA_CACHE_DIR" not in os.environ:
+    setattr(numba.config, "CACHE_DIR", str(cache_folder()))  # noqa: B010 - for kernels of other packages; the module makes its names at run time
+
+
+# ---- the cache -----------------------------------------------------------------------------------------------------
+
+
+def read_kept(path: Path) -> memoryview | None:
+    """The content of a file of the cache; None: it is not there, or damaged, which is said, and it is removed."""
+    try:
+        return unsealed(contents(path, _MOST))
+    except FileNotFoundError:
+        return None
+    except (OSError, DamagedError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        print(f"lathe: {path}: damaged ({reason}): thrown away, and made anew", file=sys.stderr)
+        with contextlib.suppress(OSError):
+            path.unlink()
+        return None
+
+
+@cache
+def say_not_kept(reason: str) -> None:
+    """Say, once in a process, that compiled code is not kept."""
+    print(
+        f"lathe: {cache_folder()}: compiled code cannot be kept ({reason}), so that each process compiles it for "
+        "itself; NUMBA_CACHE_DIR in the environment names another folder",
+        file=sys.stderr,
+    )
+
+
+def can_keep() -> bool:
+    """Whether compiled code can be kept; if not, say so."""
+    folder, reason = cache_folder(), errno.EROFS
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.errno or reason
+    if not (known := os.access(folder, os.W_OK)):
+        say_not_kept(os.strerror(reason))
+    return known
+
+
+class _Place(_CacheLocator):
+    """The folder of a kernel, which need not be there, nor writable; the kernel needs no source file."""
+
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        self._py_file = file  # Numba names it in its warnings
+        self._line = function.__code__.co_firstlineno
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "_Place":
+        return cls(py_func, py_file)
+
+    def get_cache_path(self) -> str:
+        return str(cache_folder() / self.get_suitable_cache_subpath(self._py_file))
+
+    def get_source_stamp(self) -> str:
+        return _SOURCES
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+
+class _Implementation(CompileResultCacheImpl):
+    _locator_classes = [_Place]  # noqa: RUF012 - as Numba has it
+
+
+class _Files(IndexDataCacheFile):
+    """The files of a kernel."""
+
+    @contextlib.contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[io.BytesIO]:
+        content = io.BytesIO()
+        yield content
+        with super()._open_for_write(filepath) as file:
+            file.write(sealed(content.getvalue()))
+
+    def _load_index(self) -> Any:
+        return {} if read_kept(Path(self._index_path)) is None else super()._load_index()
+
+    def _load_data(self, name: str) -> Any:
+        content = read_kept(Path(self._data_path(name)))
+        return None if content is None else pickle.loads(content)  # noqa: S301 - as Numba does
+
+
+class _Cache(FunctionCache):
+    """The cache of a kernel."""
+
+    _impl_class = _Implementation
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file = _Files(self.cache_path, self._impl.filename_base, _SOURCES)
+
+    def save_overload(self, sig: object, data: object) -> None:
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            say_not_kept(str(error.strerror))
+
+
+# ---- kernels -------------------------------------------------------------------------------------------------------
+
+
+def _kept(compiled: Any, function: Callable[..., Any]) -> Any:
+    compiled._cache = _Cache(function)  # noqa: SLF001 - Numba's own would be unchecked
+    return compiled
+
+
+def _compiled(function: Callable[..., Any], **options: Any) -> Any:
+    compiled = numba.njit(error_model="numpy", **options)(function)
+    return _kept(compiled, function) if is_ours(function.__module__) else compiled
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -60,8 +193,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     same bits whatever the length of the block. Division by zero gives inf or NaN as in NumPy. Other threads have the
     interpreter meanwhile.
     """
-    compiled = numba.njit(cache=is_ours(function.__module__), error_model="numpy", nogil=True)(function)
-    return cast("Callable[P, R]", compiled)
+    return cast("Callable[P, R]", _compiled(function, nogil=True))
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
@@ -69,5 +201,12 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
 
     For what is called once a sample: to hand over an array costs as much as ten operations.
     """
-    compiled = numba.njit(cache=is_ours(function.__module__), error_model="numpy", forceinline=True)(function)
-    return cast("Callable[P, R]", compiled)
+    return cast("Callable[P, R]", _compiled(function, forceinline=True))
+
+
+def entry(function: Callable[..., int]) -> Any:
+    """Compile a function of six addresses and whole numbers that returns one; other kernels `call` its ``address``."""
+    signature = (types.int64,) * 6, types.int64
+    compiled = _kept(CFunc(function, signature, locals={}, options={"error_model": "numpy"}), function)
+    compiled.compile()
+    return compiled

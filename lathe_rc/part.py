@@ -11,7 +11,7 @@ from lathe_rc import messages
 from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.form_errors import RunningErrors, that_count, turns_before
 from lathe_rc.analysis.metrology import Lay, Measurement, evenly, lay, measure
-from lathe_rc.analysis.tolerance import Verdict, judge
+from lathe_rc.analysis.tolerance import Growth, Verdict, growth, judge
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
@@ -56,8 +56,18 @@ def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
     topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
     for of, allowed in tolerances(scenario).items():
         if topic.endswith(f"/{of}"):
-            return judge(recording.errors.largest, allowed)
+            return judge(recording.errors.largest, allowed, _turns_before(recording))
     return None
+
+
+def error_growth(recording: Recording) -> Growth | None:
+    """The growth of the form error of a run; see `lathe_rc.analysis.tolerance.growth`."""
+    return growth(recording.errors.largest, _turns_before(recording))
+
+
+def _turns_before(recording: Recording) -> int:
+    """Revolutions before the first of the form errors."""
+    return recording.turns_before if recording.errors.rms.size else 0
 
 
 def surface(recording: Recording, found: Measurement, nose_radius: float) -> Lay:

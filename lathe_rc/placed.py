@@ -18,7 +18,6 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Any, TypeVar
 
-import numba
 import numpy as np
 import numpy.typing as npt
 from llvmlite import ir
@@ -395,6 +394,4 @@ octets: Any = _array_of(types.uint8)  #: the same of uint8
 word: Any = intrinsic(_word)  #: (table, number): the whole number that stands in a table
 ports: Any = intrinsic(_ports)  #: (table, count, size): the `Ports` whose addresses stand in a table
 store: Any = intrinsic(_store)  #: (address, value): write a whole number
-call: Any = intrinsic(_call)  #: (address, six whole numbers): call an `entry`
-#: decorates a function of six addresses and whole numbers that returns one, whose ``address`` others can call
-entry: Any = numba.cfunc(types.int64(*[types.int64] * 6), cache=True, error_model="numpy")
+call: Any = intrinsic(_call)  #: (address, six whole numbers): call an `lathe_rc.jit.entry`

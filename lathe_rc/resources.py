@@ -20,10 +20,14 @@ def scenario(path: Path) -> Path:
     """The file of a scenario: `find` of ``path``, or of the same name with ``.yaml``.
 
     Raises:
-        InputError: there is none; says which have names like that.
+        InputError: there is none; says which have names like that. Or a name is that of one in the current folder and
+            of one that comes with lathe_rc.
     """
     if not path.exists() and not path.suffix:
         path = path.with_suffix(".yaml")
+        ours = next((folder / path for folder in config_folders() if (folder / path).exists()), None)
+        if path.exists() and ours and not path.samefile(ours):
+            raise InputError(f"{path.stem}: {path} here, or {ours}; name the file, with its ending")
     found, folders = find(path), config_folders()
     if found.exists() or path.name != str(path) or not folders:
         return found  # who reads it says what is wrong
@@ -36,3 +40,8 @@ def find(path: Path) -> Path:
     if path.exists() or path.is_absolute():
         return path
     return next((folder / path for folder in config_folders() if (folder / path).exists()), path)
+
+
+def is_own(path: Path) -> bool:
+    """Whether a file is one of those that come with lathe_rc."""
+    return any(path.resolve().is_relative_to(folder.resolve()) for folder in config_folders())

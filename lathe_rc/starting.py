@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from lathe_rc import extras
+from lathe_rc import extras, trust
 from lathe_rc.errors import LatheError
 
 Start = Literal["fork", "spawn"]  #: of a process: as a copy of one that has imported everything, or from nothing
@@ -95,7 +95,7 @@ class ForkServer:
         self._line, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "lathe_rc.nodes.fork_server", str(theirs.fileno())],
+                [*trust.interpreter("lathe_rc.nodes.fork_server"), str(theirs.fileno())],
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,

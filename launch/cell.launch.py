@@ -2,12 +2,14 @@
 """Start every node of a scenario, the recorder included: ``ros2 launch lathe_rc cell.launch.py``.
 
 ``scenario`` names the ROS 2 parameter file, ``bag`` the folder to record to, ``namespace`` that of the nodes;
+``allow_code`` a package of the current folder that the scenario names code of;
 ``NODE.PARAM:=VALUE``, or ``PARAM:=VALUE`` for a shared parameter, replaces a value of the scenario. The run ends when
 its last block has been recorded; without a number of revolutions it goes on until Ctrl-C. A node that fails ends the
 others, and the launch fails.
 """
 
 import atexit
+import shutil
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -18,7 +20,7 @@ from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from lathe_rc import harness, resources
+from lathe_rc import harness, resources, trust
 from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
@@ -35,6 +37,7 @@ ARGUMENTS = {
         "ROS 2 parameter file of the cell; NODE.PARAM:=VALUE, or PARAM:=VALUE if shared, replaces one of its values",
     ),
     "bag": ("", "folder to record to, which must not exist; empty: the scenario's, or bag_ and the run id"),
+    "allow_code": ("", "package of the current folder that the scenario names code of"),
     "namespace": ("/", "of the nodes; two cells in one domain need one each"),
 }  #: default and description
 OF_LAUNCH = {"emulate_tty", "launch-prefix", "launch-prefix-filter", "sigkill_timeout", "sigterm_timeout"}
@@ -58,6 +61,8 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         InputError: the scenario cannot work, the bag's folder exists, or there is no such argument.
     """
     refuse_unknown(given_to_this_file(context))
+    if package := LaunchConfiguration("allow_code").perform(context):
+        trust.allow(package)
     path = resources.find(Path(LaunchConfiguration("scenario").perform(context)))
     scenario = replaced(scenarios.load(path), context.launch_configurations.items())
     Cell(scenario.nodes).check()
@@ -65,9 +70,9 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     bag = place(scenario, LaunchConfiguration("bag").perform(context))
     refuse_existing(bag)
     complete = harness.with_recorder(scenario, bag, keep=True)
-    with tempfile.NamedTemporaryFile("w", encoding="utf-8", prefix="lathe_", suffix=".yaml", delete=False) as file:
-        file.write(complete.to_yaml())
-    atexit.register(Path(file.name).unlink, missing_ok=True)
+    file = Path(tempfile.mkdtemp(prefix="lathe_")) / "scenario.yaml"
+    file.write_text(complete.to_yaml(), encoding="utf-8")
+    atexit.register(shutil.rmtree, file.parent, ignore_errors=True)
     groups = complete.processes()
     restartable = any(getattr(table, "restart_file", "") for table in complete.nodes.values())
     ends = Ends(len(groups), replaced=restartable)
@@ -77,8 +82,8 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             executable="container",
             exec_name=label(group),
             namespace=namespace,
-            arguments=[f"{name}:{complete.kind(name)}" for name in group],
-            parameters=[file.name],
+            arguments=[*trust.arguments(), *(f"{name}:{complete.kind(name)}" for name in group)],
+            parameters=[str(file)],
             ros_arguments=["--enclave", absolute(namespace, group[0])],
             output="screen",
             on_exit=ends,

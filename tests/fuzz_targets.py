@@ -357,29 +357,6 @@ def _text_of_folder(data: bytes, random: Random) -> bytes:
 # ---- what a bag says of itself --------------------------------------------------------------------------
 
 
-def _definitions(data: bytes) -> None:
-    """Message definitions, of which rosbags makes code."""
-    kind, digest, definition = [*data.decode(errors="replace").split("\n", 2), "", ""][:3]
-    with _folder() as folder, refusals():
-        writer = BagWriter(folder / "bag", compression="none", chunk_size=8192, about={})
-        try:
-            if writer.copy_topic("/fuzz", kind, [_QOS], definition=definition, digest=digest):
-                writer.write("/fuzz", 1, b"\0\1\0\0")
-        finally:
-            writer.close()
-        _read_bag(folder / "bag" / "bag.mcap")
-
-
-@functools.cache
-def _definition_seeds() -> list[bytes]:
-    rows = (
-        "my_msgs/msg/Mine\n\nint32 X=5\nstring NAME='none'\nfloat64[3] values\nstring<=7 text\nHeader header\n",
-        "my_msgs/msg/Mine\n\nOther[] others\nbool[<=4] flags true\n" + "=" * 80 + "\nMSG: my_msgs/Other\nuint8 class\n",
-        "std_msgs/msg/String\nRIHS01_00\nstring data\n",
-    )
-    return [row.encode() for row in rows]
-
-
 def _abouts(data: bytes) -> None:
     """Texts of a bag: the scenario, then key and text of each file."""
     first, *others = [part.decode(errors="replace") for part in data.split(CUT)]
@@ -487,7 +464,6 @@ TARGETS: Mapping[str, Target] = {
     "state": Target(_state, _states, (mutate.some_bytes,)),
     "mcap": Target(_mcap, _mcaps, (mutate.some_records, mutate.some_records, mutate.some_bytes)),
     "folder": Target(_folders, _folder_seeds, (_storage, _text_of_folder, mutate.some_bytes)),
-    "definitions": Target(_definitions, _definition_seeds, (mutate.some_lines,)),
     "about": Target(_abouts, _about_seeds, (mutate.some_lines,)),
     "page": Target(_pages, _page_seeds, (mutate.some_lines,), slow=True),
     "report": Target(_reports, _mcaps, (mutate.some_records,), slow=True),

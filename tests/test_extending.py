@@ -268,7 +268,7 @@ def test_the_law_on_the_page_runs(begin):
 
 def test_the_reference_of_a_stage_of_others_is_printed(begin):
     begin("law", "my_law")
-    told = lathe("reference", "my_law:MyLaw")
+    told = lathe("reference", "my_law:MyLaw", "--allow-code", "my_law")
     assert told.exit_code == 0
     assert told.stdout.startswith("## my_law:MyLaw")
     assert "| `lead_time` | double | `0.001425` |" in told.stdout

@@ -231,7 +231,7 @@ def test_messages_that_never_meet_their_blocks_are_not_kept_for_ever():
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (chunk(chunk(SCHEMA)), "chunk in the chunk"),
+        (chunk(chunk(SCHEMA)), "a chunk in the chunk"),
         (SCHEMA + channel(ENDLESS), "YAML aliases"),
         (SCHEMA + channel(b"a: b: c"), "not YAML"),
         (record(3, struct.pack("<H", 1) + text(b"a\nb") + text(b"") + text(b"")) + channel(b""), "name 'a.nb'"),
@@ -246,16 +246,10 @@ def test_what_would_cost_memory_is_not_saved_either(tmp_path, data, said):
 
 
 def test_damage_is_counted_beyond_what_is_told(tmp_path):
-    salvage = Salvage(mcap(tmp_path / "bad.mcap", 3000 * record(5, b"")))
+    salvage = Salvage(mcap(tmp_path / "bad.mcap", 3000 * (record(5, b"") + SCHEMA + SCHEMA)))
     assert list(salvage) == []
     assert len(salvage.damage) == 1000
-
-
-def test_topic_whose_definition_is_no_text_is_lost_with_its_messages(tmp_path):
-    """It was announced by then: recovery asked for what was not there."""
-    broken = record(3, struct.pack("<H", 1) + text(b"std_msgs/msg/String") + text(b"ros2msg") + text(b"\xff"))
-    salvage = Salvage(mcap(tmp_path / "bad.mcap", broken + channel(b"") + record(5, struct.pack("<HIQQ", 1, 0, 5, 5))))
-    assert [topic for topic, _, _ in salvage if topic not in salvage.topics] == []
+    assert salvage.lost_bytes == 3000 * len(record(5, b""))
 
 
 # ---- the folder around a bag
@@ -370,34 +364,12 @@ def test_run_of_a_bag_writes_to_no_file_that_the_bag_names(tmp_path):
     [
         ({f"{provenance.FILE}tool.profile_file": "a"}, "is not base64"),
         ({f"{provenance.FILE}tool.profile_file": "\u00e9"}, "is not base64"),
-        ({f"{provenance.FILE}a=b.c": ""}, "'a' is not shared"),
-        ({f"{provenance.FILE}a\nb=c.d": ""}, r"'a\\nb' is not shared"),
-        ({f"{provenance.FILE}tool.a\nb=c: d: e.f": ""}, r"^--set tool\.a:1: not YAML"),
-        ({f"{provenance.FILE}tool.a\nb": ""}, r"^tool\.a: unknown parameter"),
         ({provenance.SCENARIO: "\ud800"}, "not a text file"),
     ],
 )
 def test_texts_that_are_no_scenario_are_refused(tmp_path, about, said):
     with refused(said):
         provenance.scenario_of({provenance.SCENARIO: "tool: {ros__parameters: {seed: 1}}", **about}, tmp_path)
-
-
-@pytest.mark.parametrize(
-    "definition",
-    [
-        "float64 X=1e999\n",
-        "uint8 class\nuint8 class_\n",
-        'int32 A=\'"""); import os; os.abort()\'\n',
-        "string X=\"'''+__import__('os').abort()+'''\"\n",
-        "uint8[" + "9" * 5000 + "] x\n",
-        "MSG: a/b\n" + "=" * 80 + "\nMSG: 1/2\nuint8 x\n",
-        "a/b/c/D[] d\n" * 50,
-        "\0",
-    ],
-)
-def test_definitions_make_no_code_run(definition):
-    for kind in ("my_msgs/msg/Mine", "1", "", "a b/msg/C\nuint8 x", "x" * 2000):
-        TARGETS["definitions"].read(f"{kind}\n\n{definition}".encode())
 
 
 @pytest.mark.parametrize(

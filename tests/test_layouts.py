@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layouts for PlotJuggler and Foxglove name what a recording of their demo holds, with numbers in it."""
+"""The layouts for PlotJuggler and Foxglove name what a recording of their demo holds, with numbers in it, and as it was."""
 
 import json
 import math
@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import numpy as np
 import pytest
 
 from lathe_rc import harness, messages
@@ -16,6 +17,7 @@ from lathe_rc.cell.scenario import load
 ROOT = Path(__file__).parents[1]
 LAYOUTS = ROOT / "config" / "layouts"
 DEMOS = ("piston", "two_channel")
+_SAMPLE = re.compile(r"(\w+)\[(-?\d+)\]")
 _STATUS = re.compile(r'status\[:\]\{name=="(.*)"\}\.values\[:\]\{key=="(.*)"\}\.value')
 
 
@@ -37,9 +39,14 @@ def numbers(values):
     return [float(value) for value in values if math.isfinite(float(value))]
 
 
-def of_joint(recorded, topic, joint, field):
-    states = recorded[topic]
-    return numbers(getattr(state, field)[list(state.name).index(joint)] for state in states)
+def of_samples(recorded, topic, field, place):
+    """Of every block the sample at its end, by either name; lines between them follow the signal."""
+    blocks = [np.asarray(getattr(message, field)) for message in recorded[topic]]
+    assert place in (-1, blocks[0].size - 1)
+    signal, ends = np.concatenate(blocks), np.cumsum([block.size for block in blocks]) - 1
+    drawn = np.interp(np.arange(signal.size), ends, signal[ends])[ends[0] :]
+    assert np.std(drawn - signal[ends[0] :]) <= 0.1 * np.std(signal), f"{topic}.{field} is drawn too rarely"
+    return numbers(signal[ends])
 
 
 def of_status(recorded, hardware, name, key):
@@ -58,10 +65,10 @@ def plotjuggler(recorded, curve):
     if curve.startswith("/diagnostics/"):
         hardware, name, key = re.fullmatch(r"/diagnostics/(\w+)/(/\w+)/(.*)", curve).groups()
         return of_status(recorded, hardware, name, key)
-    if "/joint_states/" in curve:
-        topic, joint, field = curve.rsplit("/", 2)
-        return of_joint(recorded, topic, joint, field)
-    return of_field(recorded, *curve.rsplit("/", 1))
+    topic, field = curve.rsplit("/", 1)
+    if sample := _SAMPLE.fullmatch(field):
+        return of_samples(recorded, topic, sample[1], int(sample[2]))
+    return of_field(recorded, topic, field)
 
 
 def foxglove(recorded, path):
@@ -69,8 +76,8 @@ def foxglove(recorded, path):
     topic, _, rest = path.partition(".")
     if status := _STATUS.fullmatch(rest):
         return of_status(recorded, None, *status.groups())
-    if rest.endswith("[0]"):
-        return numbers(getattr(state, rest[:-3])[0] for state in recorded[topic])
+    if sample := _SAMPLE.fullmatch(rest):
+        return of_samples(recorded, topic, sample[1], int(sample[2]))
     return of_field(recorded, topic, rest)
 
 
@@ -95,8 +102,8 @@ def test_foxglove_draws_only_what_is_recorded(demo):
     assert sorted(leaves(layout["layout"])) == sorted(panels)
     paths = [path["value"] for panel in panels.values() for path in panel.get("paths", [])]
     assert [path for path in paths if not foxglove(recorded, path)] == []
-    joints = {path.partition(".")[0] for path in paths if "joint_states" in path}
-    assert joints == {topic for topic in recorded if topic.endswith("/joint_states")}
+    drives = {path.partition(".")[0] for path in paths if "/state." in path}
+    assert drives == {topic for topic in recorded if topic.endswith("/state")}
     assert {panel["topicToRender"] for panel in panels.values() if "topicToRender" in panel} <= set(recorded)
 
 

@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc import extensions, harness, messages
+from lathe_rc import extensions, harness, messages, trust
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.resimulation.resim import resimulate
@@ -41,6 +41,9 @@ FIGURES = DOCS.with_name("figures")
 sys.path.append(str(FIGURES))
 
 import parts  # noqa: E402 - it stands beside the page that explains it
+
+for package in ("parts", __name__, "nowhere", "test_wiring"):
+    trust.allow(package)
 
 PARTS = {
     "spindle_encoder": {"deviation_law": "parts:Chirp", "deviation_values": [0.1, 10.0, 60.0, 0.2]},
@@ -440,9 +443,9 @@ def test_studies_of_others_are_listed_with_their_distribution(installed):
     assert "lathe-hann 0.3" in lathe("study", "--help").stdout
 
 
-@pytest.mark.parametrize("name", ["passed", "parts:STUDY"])
-def test_a_study_of_others_runs(installed, tmp_path, name):
-    found = lathe("study", name, "--set", "widths=2", "--figure", tmp_path / "a.png", "--json")
+@pytest.mark.parametrize("words", [["passed"], ["--allow-code", "parts", "parts:STUDY"]])
+def test_a_study_of_others_runs(installed, tmp_path, words):
+    found = lathe("study", *words, "--set", "widths=2", "--figure", tmp_path / "a.png", "--json")
     assert found.exit_code == 0, found.stderr
     assert json.loads(found.stdout) == {
         "widths": [2.0],
@@ -460,7 +463,7 @@ def test_a_study_of_others_runs(installed, tmp_path, name):
     ],
 )
 def test_what_is_no_study_is_refused_in_one_line(name, says):
-    refused = lathe("study", name)
+    refused = lathe("study", "--allow-code", "parts", "--allow-code", "nowhere", name)
     assert refused.exit_code == 2
     assert says in refused.stderr
     assert refused.stderr.count("\n") == 1
@@ -518,9 +521,8 @@ def test_a_bag_is_read_where_its_parts_are_not_installed(recorded, tmp_path):
     codes, digests = json.loads(ended.stdout)
     assert (codes, digests) == ([0, 0, 0, 2], result.digest)
     assert ended.stderr == (
-        "lathe: spindle_encoder.deviation_law: the bag was made with parts:Chirp, and it cannot be imported: "
-        "ModuleNotFoundError: No module named 'parts'; allowed: put parts where Python looks for it (the current "
-        "folder, or PYTHONPATH)\n"
+        "lathe: spindle_encoder.deviation_law: the bag was made with parts:Chirp, and there is no module parts; "
+        "allowed: install parts, or --allow-code parts if it lies in the current folder\n"
     )
 
 
@@ -536,7 +538,9 @@ def test_what_is_not_here_is_to_be_installed(recorded):
     """If the parts came from a distribution, that is what the refusal names."""
     about = told_by(recorded[0], {"distribution": "lathe-hann", "version": "0.3"})
     about[provenance.ORIGINS] = about[provenance.ORIGINS].replace("parts:Hann", "lathe_hann:Hann")
-    with pytest.raises(InputError, match=r"lathe_hann:Hann, and .*; allowed: install lathe-hann 0\.3$"):
+    with pytest.raises(
+        InputError, match=r"lathe_hann:Hann, and .*; allowed: install lathe-hann 0\.3, or --allow-code lathe_hann if "
+    ):
         provenance.scenario_of(about, Path())
 
 
@@ -549,16 +553,16 @@ def test_what_is_not_here_is_to_be_installed(recorded):
 )
 def test_a_re_simulation_with_other_parts_than_the_bag_s_warns(recorded, origin, says):
     path, _ = recorded
-    assert provenance.changes(told_by(path, {})) == []
+    assert provenance.changes(told_by(path, {}), cell()) == []
     expected = says.format(here=extensions.source_hash("parts")[:12])
-    assert provenance.changes(told_by(path, origin)) == [
+    assert provenance.changes(told_by(path, origin), cell()) == [
         f"parts:{name} {expected}" for name in ("Chirp", "Hann", "Lobes", "Drift")
     ]
 
 
 def test_the_command_warns_on_the_standard_error(recorded, monkeypatch):
-    monkeypatch.setattr(provenance, "changes", lambda _: ["parts:Hann has another source"])
-    found = lathe("resim", recorded[0], "--json")
+    monkeypatch.setattr(provenance, "changes", lambda *_: ["parts:Hann has another source"])
+    found = lathe("resim", recorded[0], "--json", "--allow-code", "parts")
     assert found.stderr == "lathe: warning: parts:Hann has another source\n"
     assert json.loads(found.stdout)["equal"]
 

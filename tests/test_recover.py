@@ -5,6 +5,7 @@ import json
 import shutil
 import sqlite3
 import struct
+from random import Random
 
 import numpy as np
 import pytest
@@ -12,6 +13,12 @@ import yaml
 import zstandard
 from cells import files_up_to, scenario
 from click.testing import CliRunner
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer as McapWriter
+from mcap_damage import PER_CHUNK, check_damage, chunks_of, flips, saved_of, small_bag, structured
+from mcap_damage import records_of as record_places
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
@@ -221,7 +228,7 @@ def test_what_the_disk_does_not_take_is_told_with_the_chunk_or_flush(tmp_path, f
             told += 1
 
     why = r"bag: cannot write \(File too large\); what was recorded before is readable"
-    with files_up_to(2**16), pytest.raises(LatheError, match=why):
+    with files_up_to(2**19), pytest.raises(LatheError, match=why):
         fill()
     writer.write("/said", 2 * 10**9, bytes(1000))
     with pytest.raises(LatheError, match=why):
@@ -331,28 +338,86 @@ def test_what_cannot_be_read_is_the_same_fault_for_all_with_a_hint_where_recover
         assert refused.stderr.endswith(f"{said}\n")
         assert refused.exit_code == 2
     recovered = lathe("bag", "recover", bag, "-o", tmp_path / "new")
-    assert recovered.exit_code == (2 if HINT not in said else 3 if "MCAP, cut" in make else 0), recovered.stderr
+    assert recovered.exit_code == (2 if HINT not in said else 3 if "cut" in make else 0), recovered.stderr
 
 
-def reserialized(path, plugin):
-    """A bag with a topic that is not serialized as ROS does by default."""
-    sent = strange_bag(path, plugin, CompressionMode.NONE)
-    if plugin == StoragePlugin.SQLITE3:
-        with sqlite3.connect(next(path.glob("*.db3"))) as database:
-            database.execute("UPDATE topics SET serialization_format = 'xdr' WHERE name = '/said'")
-    else:
-        file = mcap_of(path)
-        file.write_bytes(file.read_bytes().replace(b"/said\x03\0\0\0cdr", b"/said\x03\0\0\0xdr"))
-    return [message for message in sent if message[0] != "/said"]
+def records_of(path):
+    """Profile, channels with their schemas, messages, metadata and attachments of an MCAP file, by another library."""
+    profile, schemas, channels, messages, others = "", {0: None}, {}, [], []
+    for record in StreamReader(path.open("rb"), validate_crcs=True).records:
+        match record:
+            case Header():
+                profile = record.profile
+            case Schema():
+                schemas[record.id] = (record.name, record.encoding, record.data)
+            case Channel():
+                metadata = tuple(record.metadata.items())
+                channels[record.id] = (record.topic, record.message_encoding, metadata, schemas[record.schema_id])
+            case Message():
+                times = record.log_time, record.publish_time
+                messages.append((channels[record.channel_id], record.sequence, *times, record.data))
+            case Attachment() | Metadata() if not getattr(record, "name", "").startswith(("rosbag2", "lathe_rc")):
+                others.append(record)
+    return profile, set(channels.values()), messages, others
+
+
+QOS = "- history: keep_last\n  depth: 10\n"
+KINDS = {
+    "CRLF": ("my_msgs/msg/Odd", "ros2msg", b"int32 A=1\r\nint32 x\r\n", "cdr", {}),
+    "CRLF, hash": ("my_msgs/msg/Odd", "ros2msg", b"int32 x\r\n", "cdr", {"topic_type_hash": "RIHS01_" + "0" * 64}),
+    "wstring": ("my_msgs/msg/Odd", "ros2msg", b"wstring w\nint32 x\n", "cdr", {}),
+    "IDL, hash": ("my_msgs/msg/I", "ros2idl", b"module my_msgs {};", "cdr", {"topic_type_hash": "RIHS01_" + "1" * 64}),
+    "OMG IDL, no package": ("Cfg", "omgidl", b"struct Cfg { long x; };", "cdr", {}),
+    "no definition": ("my_msgs/msg/Odd", "", b"", "cdr", {}),
+    "empty definition": ("my_msgs/msg/Odd", "ros2msg", b"", "cdr", {}),
+    "no text": ("my_msgs/msg/Odd", "ros2msg", b"\xff\0", "cdr", {}),
+    "code": ("my_msgs/msg/Odd", "ros2msg", b"string X=\"'''+__import__('os').abort()+'''\"\n", "cdr", {}),
+    "JSON": ("Odo", "jsonschema", b'{"type": "object"}', "json", {}),
+    "protobuf": ("foxglove.Log", "protobuf", b"\n\x03abc", "protobuf", {}),
+    "ROS 1": ("std_msgs/String", "ros1msg", b"string data\n", "ros1", {"md5sum": "99", "latching": "1"}),
+    "no schema": (None, "json", {}),
+    "no schema, CDR": (None, "cdr", {}),
+    "partial QoS": ("std_msgs/msg/String", "ros2msg", b"string data\n", "cdr", {"offered_qos_profiles": QOS}),
+    "map as QoS": ("std_msgs/msg/String", "ros2msg", b"string data\n", "cdr", {"offered_qos_profiles": "depth: 1"}),
+    "no QoS": ("std_msgs/msg/String", "ros2msg", b"string data\n", "cdr", {"offered_qos_profiles": "a: b: c"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("profile", ["ros2", "ros1", ""])
+def test_copies_what_it_need_not_understand(tmp_path, profile):
+    """Schemas, channels, message encodings, sequence numbers, both times, attachments and metadata: to the byte."""
+    file = tmp_path / "foreign.mcap"
+    with file.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start(profile, "another library")
+        writer.add_attachment(create_time=1, log_time=2, name="calibration", media_type="text/csv", data=b"1,2\n")
+        writer.add_metadata("vehicle", {"serial": "\xb5 7"})
+        for number, (name, kind) in enumerate(KINDS.items()):
+            *schema, encoding, metadata = kind
+            known = writer.register_schema(*schema) if schema != [None] else 0
+            for topic in (f"/topic{number}", "/shared"):
+                channel = writer.register_channel(topic, encoding, known, metadata | {"kind": name})
+                writer.add_message(channel, 10**9 + number, name.encode(), 10**9 - number, sequence=number)
+        writer.finish()
+    found = recover(file, tmp_path / "new")
+    assert (found.saved, found.lossy) == (2 * len(KINDS), False)
+    assert records_of(mcap_of(tmp_path / "new")) == records_of(file)
+    assert recover(tmp_path / "new", tmp_path / "again").saved == found.saved
 
 
 @pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-def test_what_is_serialized_in_another_way_is_not_said_to_be_cdr(tmp_path, plugin):
-    others = reserialized(tmp_path / "bag", plugin)
-    found = lathe("bag", "recover", tmp_path / "bag", "-o", tmp_path / "new")
-    assert "/said: serialization format 'xdr' is not known\n400 messages saved, 200 skipped" in found.stdout
-    assert found.exit_code == 3
-    assert read_by_others(tmp_path / "new") == others
+def test_another_serialization_is_copied_under_its_own_name(tmp_path, plugin):
+    sent = strange_bag(tmp_path / "bag", plugin, CompressionMode.NONE)
+    if plugin == StoragePlugin.SQLITE3:
+        with sqlite3.connect(next((tmp_path / "bag").glob("*.db3"))) as database:
+            database.execute("UPDATE topics SET serialization_format = 'xdr' WHERE name = '/said'")
+    else:
+        file = mcap_of(tmp_path / "bag")
+        file.write_bytes(file.read_bytes().replace(b"/said\x03\0\0\0cdr", b"/said\x03\0\0\0xdr"))
+    assert lathe("bag", "recover", tmp_path / "bag", "-o", tmp_path / "new").exit_code == 0
+    _, channels, copied, _ = records_of(mcap_of(tmp_path / "new"))
+    assert {channel[:2] for channel in channels} == {("/said", "xdr"), ("/where", "cdr")}
+    assert [(channel[0], log_ns, data) for channel, _, log_ns, _, data in copied] == sent
 
 
 @pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
@@ -416,3 +481,125 @@ def test_a_bag_of_a_cell_that_did_not_begin_is_not_clean(tmp_path):
     result = lathe("bag", "check", path)
     assert result.exit_code == LossyRunError.exit_code, result.output
     assert "no block: the cell of this bag did not begin" in result.output
+
+
+# --- damage and what is left
+
+
+@pytest.mark.parametrize("kind", [flips, structured])
+def test_damage_costs_no_more_than_the_chunks_that_it_hits(tmp_path, kind):
+    """A flipped bit anywhere; wrong lengths, kinds, checksums; holes, cuts. tests/system does more of them."""
+    data = small_bag(tmp_path / "bag")
+    _, whole = saved_of(tmp_path / "bad.mcap", data)
+    for damaged in kind(data, 48, Random(5)):  # noqa: S311
+        check_damage(tmp_path / "bad.mcap", whole, damaged)
+
+
+def test_schemas_and_channels_stand_in_several_chunks(tmp_path):
+    """So one flipped byte in the first costs its messages alone, though nothing came behind the last chunk."""
+    data = small_bag(tmp_path / "bag")
+    chunks = chunks_of(data)
+    _, whole = saved_of(tmp_path / "bad.mcap", data)
+    for last in (1, 2, 9):
+        cut = bytearray(data[: chunks[last][1]])
+        cut[chunks[0][1] - 9] ^= 1
+        salvage, saved = saved_of(tmp_path / "bad.mcap", bytes(cut))
+        assert saved == whole[PER_CHUNK : PER_CHUNK * (last + 1)]
+        assert salvage.lossy
+
+
+@pytest.mark.parametrize("opcode", [Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX, Opcode.METADATA])
+def test_a_damaged_index_is_not_clean_and_costs_no_message(tmp_path, opcode):
+    data = small_bag(tmp_path / "bag")
+    begin = next(begin for found, begin, _ in record_places(data) if found == opcode)
+    mcap_of(tmp_path / "bag").write_bytes(data[: begin + 2] + bytes([data[begin + 2] ^ 4]) + data[begin + 3 :])
+    assert lathe("bag", "check", tmp_path / "bag").exit_code in (1, 2)
+    found = lathe("bag", "recover", tmp_path / "bag", "-o", tmp_path / "new", "--json")
+    assert found.exit_code == 0
+    assert json.loads(found.stdout)["saved"] == 10 * PER_CHUNK
+
+
+@pytest.mark.parametrize("place", ["metadata.yaml", "bag.mcap"])
+def test_fewer_messages_than_are_counted_is_lossy(tmp_path, place):
+    """Each of the two counts is enough, also if every record is sound."""
+    data = small_bag(tmp_path / "bag")
+    begin, end = chunks_of(data)[3]
+    mcap_of(tmp_path / "bag").write_bytes(data[:begin] + data[end:])
+    path = tmp_path / "bag" if place == "metadata.yaml" else mcap_of(tmp_path / "bag")
+    if place == "metadata.yaml":
+        mcap_of(tmp_path / "bag").write_bytes((data[:begin] + data[end:])[: -len(data) // 10])
+    found = lathe("bag", "recover", path, "-o", tmp_path / "new", "--json")
+    told = json.loads(found.stdout)
+    assert (found.exit_code, told["saved"], told["missing"]) == (3, 9 * PER_CHUNK, PER_CHUNK)
+    assert f"{place} counts 400 messages, 40 more than there are" in told["damage"]
+
+
+def test_messages_outside_of_chunks_are_found_again(tmp_path):
+    """Without a checksum of their own; that of the file tells that one may be wrong."""
+    file = tmp_path / "plain.mcap"
+    with file.open("wb") as stream:
+        writer = McapWriter(stream, use_chunking=False, enable_data_crcs=True)
+        writer.start("ros2", "")
+        channel = writer.register_channel("/x", "json", writer.register_schema("x", "jsonschema", b"{}"))
+        for number in range(100):
+            writer.add_message(channel, number, b"%020d" % number, number)
+        writer.finish()
+    data = file.read_bytes()
+    _, whole = saved_of(file, data)
+    begin = [begin for opcode, begin, _ in record_places(data) if opcode == Opcode.MESSAGE][50]
+    for place, left in ((begin, 99), (begin + 1, 99), (begin + 5, 98), (begin + 40, 100)):
+        salvage, saved = saved_of(file, data[:place] + bytes([data[place] ^ 8]) + data[place + 1 :])
+        assert len(saved) == left
+        assert left == 100 or set(saved) < set(whole)
+        assert salvage.lossy
+        assert f"{file.name}: {left} messages have no checksum of their own; some may be wrong" in salvage.damage
+
+
+def test_write_ahead_log_is_part_of_a_database(tmp_path):
+    """The recorder was killed: some messages are in bag.db3-wal alone. Neither file is touched."""
+    sent = strange_bag(tmp_path / "strange", StoragePlugin.SQLITE3, CompressionMode.NONE)
+    (tmp_path / "killed").mkdir()
+    base = sqlite3.connect(next((tmp_path / "strange").glob("*.db3")))
+    base.execute("PRAGMA journal_mode=WAL")
+    base.execute("UPDATE messages SET timestamp = timestamp + 5")
+    base.execute("DELETE FROM messages WHERE id > 500")
+    base.commit()
+    for file in (tmp_path / "strange").glob("*.db3*"):
+        shutil.copy(file, tmp_path / "killed")
+    base.close()
+    before = {file.name: file.read_bytes() for file in (tmp_path / "killed").iterdir()}
+    assert recover(tmp_path / "killed", tmp_path / "new").saved == 500
+    assert read_by_others(tmp_path / "new") == [(topic, stamp + 5, data) for topic, stamp, data in sent[:500]]
+    assert {file.name: file.read_bytes() for file in (tmp_path / "killed").iterdir()} == before
+
+
+def test_a_broken_page_of_a_database_costs_its_messages(tmp_path):
+    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE)
+    file = next((tmp_path / "bag").glob("*.db3"))
+    data = bytearray(file.read_bytes())
+    page = data.index(b"word 300") // 4096 * 4096
+    data[page : page + 100] = bytes(100)
+    file.write_bytes(data)
+    found = recover(tmp_path / "bag", tmp_path / "new")
+    assert found.lossy
+    assert found.missing == len(sent) - found.saved < 120
+    assert set(read_by_others(tmp_path / "new")) < set(sent)
+
+
+def test_rows_that_are_no_messages_are_told(tmp_path):
+    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE)
+    with sqlite3.connect(next((tmp_path / "bag").glob("*.db3"))) as base:
+        base.execute("UPDATE messages SET topic_id = 77 WHERE id = 1")
+        base.execute("UPDATE messages SET timestamp = -1 WHERE id = 2")
+        base.execute("UPDATE messages SET data = 'text' WHERE id = 3")
+    found = recover(tmp_path / "bag", tmp_path / "new")
+    assert (found.saved, found.skipped, found.lossy) == (len(sent) - 3, 3, True)
+
+
+def test_a_full_disk_leaves_no_half_of_a_bag(tmp_path):
+    strange_bag(tmp_path / "bag", StoragePlugin.MCAP, CompressionMode.NONE, count=20_000)
+    with files_up_to(2**16):
+        refused = lathe("bag", "recover", tmp_path / "bag", "-o", tmp_path / "new")
+    assert (refused.exit_code, refused.stderr.count("\n")) == (1, 1)
+    assert "cannot write (File too large)" in refused.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["bag"]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from lathe_rc_msgs.msg import Progress
 from lathe_rc_msgs.srv import Schedule
 
-from lathe_rc import harness
+from lathe_rc import files, harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check as check_bag
 from lathe_rc.cell import state_file
@@ -234,7 +234,7 @@ def named(module, name, *arguments):
 )
 def test_what_is_no_state_is_refused(data, tmp_path):
     path = tmp_path / "state"
-    path.write_bytes(data)
+    path.write_bytes(files.sealed(data))
     path.chmod(0o600)
     with pytest.raises(LatheError, match=f"^{path}: not a state of this node") as refusal:
         loaded(path)
@@ -243,7 +243,7 @@ def test_what_is_no_state_is_refused(data, tmp_path):
 
 def test_a_state_from_elsewhere_runs_no_code(tmp_path):
     path, made = tmp_path / "state", tmp_path / "made"
-    path.write_bytes(pickle.dumps({"stage": Call(os.mkdir, str(made))}))
+    path.write_bytes(files.sealed(pickle.dumps({"stage": Call(os.mkdir, str(made))})))
     path.chmod(0o600)
     with pytest.raises(LatheError, match=r"not a state of this node \(UnpicklingError: posix.mkdir\)"):
         loaded(path)
@@ -253,7 +253,7 @@ def test_a_state_from_elsewhere_runs_no_code(tmp_path):
 def test_an_array_takes_no_more_than_its_bytes(tmp_path):
     path = tmp_path / "state"
     pickled = state_file.dump({"stage": np.zeros(8)}).replace(b"<f8", b"|O8")
-    path.write_bytes(pickled)
+    path.write_bytes(files.sealed(pickled))
     path.chmod(0o600)
     with pytest.raises(LatheError, match="not a state of this node"):
         loaded(path)

@@ -119,6 +119,24 @@ def test_machine_without_wheels(monkeypatch):
         preconditions.check(None)
 
 
+@pytest.mark.parametrize(
+    ("words", "shown"),
+    [
+        (["--help"], "Usage: ./lathe COMMAND"),
+        (["run", "-h"], "Usage: ./lathe COMMAND"),
+        (["test", "--help"], "--system"),
+        (["setup", "--help"], "[sweep]"),
+        (["docs", "--help"], "--archive"),
+    ],
+)
+def test_help_sets_nothing_up(copy, words, shown):
+    (copy / "lathe_rc").symlink_to(CHECKOUT / "lathe_rc")
+    result = lathe(copy, *words)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert shown in result.stdout
+    assert not (copy / ".lathe").exists()
+
+
 # --- a sourced ROS 2
 
 
@@ -351,6 +369,15 @@ def test_every_package_of_every_list_is_in_a_lock():
         assert {recipe.normal(line) for line in wanted if line and not line.startswith("#")} <= locked, name
 
 
+@pytest.mark.parametrize("name", ["ros.lock", "python.lock"])
+def test_a_lock_has_hashes_of_every_package(name):
+    text = (workplace.REQUIREMENTS / name).read_text()
+    packages = [line.partition("==")[0] for line in text.splitlines() if line[0].isalnum()]
+    assert packages
+    for package in packages:
+        assert "--hash=sha256:" in recipe.pinned(package, text), package
+
+
 # --- steps
 
 
@@ -545,7 +572,7 @@ def test_command_gets_the_users_arguments_and_directory(copy, tmp_path):
     command = [copy / "lathe", "run", "a b", "--json"]
     clean = {"PATH": os.environ["PATH"], "LATHE_PYTHON": workplace.BASE_PYTHON}
     result = subprocess.run(command, env=clean, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert result.stdout.splitlines() == [str(tmp_path), "-m", "lathe_rc", "run", "a b", "--json", "yes"]
+    assert result.stdout.splitlines() == [str(tmp_path), str(copy / "lathe_rc" / "__main__.py"), "run", "a b", "--json", "yes"]
     assert result.stderr == ""
     command = [copy / "lathe", "python", "my program.py", "--help"]
     result = subprocess.run(command, env=clean, cwd=tmp_path, capture_output=True, text=True, check=True)

@@ -7,8 +7,11 @@ from pathlib import Path
 
 import distributed
 import numpy as np
+import optuna
 import pytest
 from click.testing import CliRunner
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
 
 from lathe_rc import cli, harness, resources
 from lathe_rc.analysis.pid_tuning import evaluate
@@ -17,12 +20,13 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.commands import sweep as command
 from lathe_rc.control.decoupler import PAPER
 from lathe_rc.control.pid import PidGains
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import InputError
 from lathe_rc.sweep import formulas, history, row, sweep, tune
 from lathe_rc.sweep.aims import aims
 from lathe_rc.sweep.free import Free, frees
 from lathe_rc.sweep.space import Space
 from lathe_rc.sweep.study import Study
+from lathe_rc.sweep.tuned import Tuning
 
 LEAD, Q = "learning_controller.lead_time", "learning_controller.q_time"
 FREE = {LEAD: "0.8e-3:2e-3", Q: "40e-6:300e-6:log"}
@@ -267,25 +271,85 @@ class TestSearch:
             )
             assert told(found) == told(tuned)[:trials]
 
-    def test_trials_of_who_is_gone_are_taken_over_those_of_others_are_left(self, tuned, piston, client, tmp_path):
-        def go(folder, trials):
-            return harness.tune(piston, FREE, ["margin"], folder, trials=trials, batch=4, client=client)
+    def test_trials_of_another_program_are_waited_for_and_taken_over_once_it_is_gone(
+        self, tuned, piston, client, tmp_path
+    ):
+        """Both programs end with the same trials and the same best."""
 
-        go(tmp_path / "shared", 4)
-        state = Study(tune.Folder(tmp_path / "shared"))
+        def go(trials, watch=sweep.ignore):
+            return harness.tune(
+                piston, FREE, ["margin"], tmp_path / "x", trials=trials, batch=4, client=client, watch=watch
+            )
+
+        go(4)
+        state = Study(tune.Folder(tmp_path / "x"))
+
+        def compute(event):
+            if event["event"] == "waiting":
+                state.compute(client, asked, sweep.ignore)
+
         with state.present() as other:
-            asked = [trial.number for trial in state.ask(other, 8)]
-            assert asked == [4, 5, 6, 7]
-            beside = go(tmp_path / "shared", 12)
-            assert [trial.number for trial in beside.trials] == [0, 1, 2, 3, 8, 9, 10, 11]
-        after = go(tmp_path / "shared", 12)
-        assert [trial.number for trial in after.trials] == list(range(12))
+            asked = state.ask(other, 8)
+            assert [trial.number for trial in asked] == [4, 5, 6, 7]
+            beside = go(12, compute)
+            assert [trial.number for trial in beside.trials] == list(range(12))
+            assert same(beside, state.tuning())
+            written = scenario.load(tmp_path / "x" / "best.yaml")
+            assert written.identity == beside.scenario(beside.best).identity
+            assert len(state.ask(other, 16)) == 4
+        assert [trial.number for trial in go(16).trials] == list(range(16))
 
-    def test_a_journal_that_cannot_be_read_is_one_line(self, tuned, tmp_path):
+    def test_the_best_is_written_while_no_other_program_can(self, piston, client, tmp_path, monkeypatch):
+        """Or one that knows fewer trials would write it over a better one."""
+        write, written = Tuning.write, []
+
+        def locked(tuning, trial, path):
+            with pytest.raises(InputError, match="another sweep computes into it"), tuning.folder.locked():
+                pass
+            written.append(trial.number)
+            write(tuning, trial, path)
+
+        monkeypatch.setattr(Tuning, "write", locked)
+        harness.tune(piston, FREE, ["tool.rms_error"], tmp_path / "x", trials=2, client=client)
+        assert written
+
+    @pytest.mark.parametrize(
+        ("lines", "line"),
+        [
+            (b"{broken\n", 1),
+            (b"null\n", 1),
+            (b"[]\n", 1),
+            (b"{}\n", 1),
+            (b'{"op_code":99,"worker_id":"x"}\n', 1),
+            (b'{"op_code":4,"worker_id":"x"}\n', 1),
+            (b"\xff\n", 1),
+        ],
+    )
+    def test_a_journal_of_something_else_is_one_line(self, tuned, tmp_path, lines, line):
         for name in ("sweep.json", "scenario.yaml"):
             (tmp_path / name).write_bytes((tuned.folder.path / name).read_bytes())
-        (tmp_path / "trials.log").write_text("{broken\n" * 2, encoding="utf-8")
-        with pytest.raises(LatheError, match=r"trials\.log: no journal of Optuna"):
+        (tmp_path / "trials.log").write_bytes(lines)
+        with pytest.raises(InputError, match=rf"trials\.log, line {line}: no journal of Optuna, or damaged") as refused:
+            tune.load(tmp_path)
+        assert "\n" not in str(refused.value)
+
+    def test_a_line_that_a_process_was_stopped_in_is_left_out_and_said(self, tuned, tmp_path, capsys):
+        for name in ("sweep.json", "scenario.yaml", "trials.log"):
+            (tmp_path / name).write_bytes((tuned.folder.path / name).read_bytes())
+        journal = tmp_path / "trials.log"
+        lines = journal.read_bytes().splitlines(keepends=True)
+        last = max(number for number, line in enumerate(lines) if b'"op_code":6' in line)
+        journal.write_bytes(b"".join(lines[:last]) + lines[last][:-30])
+        assert told(tune.load(tmp_path)) == told(tuned)[:-1]
+        assert f"{journal}: the last line is not whole" in capsys.readouterr().err
+
+    def test_a_trial_of_another_program_is_refused(self, tuned, tmp_path):
+        for name in ("sweep.json", "scenario.yaml", "trials.log"):
+            (tmp_path / name).write_bytes((tuned.folder.path / name).read_bytes())
+        storage = JournalStorage(JournalFileBackend(str(tmp_path / "trials.log")))
+        study = optuna.load_study(study_name="tuning", storage=storage)
+        study.add_trial(optuna.create_trial(value=0.0))
+        with pytest.raises(InputError, match=r"trials\.log: trial 20 is another program's"):
             tune.load(tmp_path)
 
     def test_a_folder_holds_one_tuning_and_no_sweep(self, tuned, piston, client):

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """``lathe view`` and the scene behind it: what Rerun is given is what was recorded."""
 
+import contextlib
 import importlib.util
+import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +27,7 @@ from lathe_rc.cli import main  # noqa: E402
 from lathe_rc.errors import LatheError  # noqa: E402
 from lathe_rc.view import rerun_part as parts  # noqa: E402
 from lathe_rc.view.rerun_blueprint import blueprint  # noqa: E402
+from lathe_rc.view.rerun_output import _free_port, end, viewer  # noqa: E402
 from lathe_rc.view.rerun_pieces import Pieces  # noqa: E402
 from lathe_rc.view.rerun_revolutions import ANGLES, Revolutions  # noqa: E402
 from lathe_rc.view.rerun_scene import Scene  # noqa: E402
@@ -52,6 +56,17 @@ def turned(tmp_path_factory):
     learning = {"events": ["revolution 9: freeze"]}
     harness.run(scenario(spindle_encoder={"revolutions": 12.3}, tool=given, learning_controller=learning), bag=bag)
     return bag, reader.read(bag)
+
+
+def listening(group):
+    """Local addresses at which a group of processes listens, as /proc/net has them."""
+    inodes = set()
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if os.getpgid(int(process.name)) == group:
+                inodes |= {os.readlink(file) for file in process.glob("fd/*")}
+    rows = [line.split() for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()[1:]]
+    return [row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in inodes]
 
 
 class View:
@@ -199,9 +214,20 @@ def test_every_curve_and_picture_has_a_view(turned, shown):
     }
 
 
+def beside_the_part(types, **more):
+    """Views on the right, below the form error."""
+    return blueprint(types, **more).root_container.contents[-1].contents[-1].contents
+
+
+def test_the_form_error_comes_first(turned):
+    error, harmonics = blueprint(turned[1].types).root_container.contents[0].contents
+    assert error.name.startswith("form error [10^y µm]: RMS")
+    assert harmonics.name == "form error by harmonic, latest revolution [µm]"
+
+
 def test_desired_and_actual_position_of_the_tool_are_in_one_view(turned):
     """And the title names the colours of its two curves, so that no legend lies on them."""
-    views = blueprint(turned[1].types).root_container.contents[-1].contents
+    views = beside_the_part(turned[1].types)
     (view,) = [view for view in views if isinstance(view, rrb.TimeSeriesView) and "tool position" in view.name]
     assert view.name == "tool position [µm]: desired blue, actual orange, latest 0.3 s"
     assert view.contents == ["/signals/tool/reference", "/signals/tool/displacement"]
@@ -231,9 +257,9 @@ def test_states_of_the_supervisor_and_faults_are_bands(tmp_path):
 def test_where_nothing_has_happened_there_are_neither_bands_nor_events(turned):
     types = turned[1].types
     silent = [topic for topic, kind in types.items() if kind == messages.EVENT]
-    rows = blueprint(types, silent=silent).root_container.contents[-1].contents
+    rows = beside_the_part(types, silent=silent)
     assert not any(isinstance(row, rrb.StateTimelineView) for row in rows)
-    assert any(isinstance(row, rrb.StateTimelineView) for row in blueprint(types).root_container.contents[-1].contents)
+    assert any(isinstance(row, rrb.StateTimelineView) for row in beside_the_part(types))
 
 
 def test_a_bag_without_a_tool_has_only_curves():
@@ -418,6 +444,23 @@ def test_bad_input_is_refused_and_leaves_nothing(turned, tmp_path, monkeypatch):
     assert "--output with --web" in refused("view", turned[0], "-o", tmp_path / "x.rrd", "--web")
     assert "-o FILE.rrd or --web" in refused("view", turned[0])
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]
+
+
+@pytest.mark.parametrize(("kind", "count"), [("spawn", 1), ("serve", 2)])
+def test_a_viewer_listens_on_this_computer_alone(kind, count, monkeypatch):
+    """A window without a screen, and a page; their sockets by the kernel's own table."""
+    monkeypatch.setenv("DISPLAY", ":0")
+    shown = viewer(kind, _free_port())
+    if kind == "spawn":
+        shown.options.append("--headless")
+    process = shown.start()
+    try:
+        while len(found := listening(process.pid)) < count:
+            assert process.poll() is None
+            time.sleep(0.02)
+    finally:
+        end(process)
+    assert {place.partition(":")[0] for place in found} == {"0100007F"}  # 127.0.0.1
 
 
 def test_a_bag_without_a_revolution_has_no_surface(tmp_path):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """./lathe: make the environment if it is not there or out of date, then run the command in it."""
 
+import ast
 import os
 import signal
 import sys
@@ -16,7 +17,12 @@ from steps import exclusive
 from workplace import PYTHON, ROOT, VENV, RefusalError, StepError, say
 
 COMPLETES = "_LATHE_COMPLETE"  #: in the environment: a shell asks what may follow
-OWN = ("docs", "setup", "test", "python")  #: commands of ./lathe alone
+OWN = {
+    "docs": "Serve the documentation as a site, or write it.",
+    "setup": f"Set up; also for commands that need more: ./lathe setup {' '.join(f'[{name}]' for name in GROUPS)}.",
+    "test": "Run linters and tests.",
+    "python": "Run Python in the environment of the checkout.",
+}  #: commands of ./lathe alone
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -29,6 +35,8 @@ def main(arguments: Sequence[str]) -> int:
             change_to(python)
         if COMPLETES in os.environ:
             return complete(Recipe(ros).ready([]))
+        if is_help(arguments):
+            return show_help(Recipe(ros).ready([]), arguments)
         wanted = set_up(ros, needed(arguments))
     except RefusalError as refusal:
         say(str(refusal))
@@ -49,6 +57,32 @@ def complete(ready: Changes | None) -> int:
     if ready:
         environ = run_environment(ready, os.environ) | {"_LATHE_ALSO": " ".join(OWN)}
         os.execve(PYTHON, [str(PYTHON), *command([])], environ)
+    return 0
+
+
+def is_help(arguments: Sequence[str]) -> bool:
+    """Tell whether a help text is asked for; words after ``python`` are those of a script."""
+    return arguments[:1] != ["python"] and any(word in ("-h", "--help") for word in arguments or ["--help"])
+
+
+def show_help(ready: Changes | None, arguments: Sequence[str]) -> int:
+    """Print a help text without setting anything up: that of a command of lathe_rc only where it is set up."""
+    name = next(iter(arguments), "")
+    if name == "docs":
+        os.execv(sys.executable, [sys.executable, *command(arguments)])
+    if name == "test":
+        print(ast.get_docstring(ast.parse((ROOT / "tools" / "check.py").read_text(encoding="utf-8"))))
+    elif name in OWN:
+        print(f"./lathe {name}: {OWN[name]}")
+    elif ready:
+        os.execve(PYTHON, [str(PYTHON), *command(arguments)], run_environment(ready, os.environ))
+    else:
+        sys.path.append(str(ROOT))
+        from lathe_rc.command_list import COMMANDS
+
+        print("Usage: ./lathe COMMAND [OPTIONS]. Nothing is set up yet: ./lathe setup, or the first command, does it;")
+        print("after that each COMMAND has its own --help.\n")
+        print(*(f"  {name:<12}{summary}" for name, summary in sorted((COMMANDS | OWN).items())), sep="\n")
     return 0
 
 
@@ -88,7 +122,7 @@ def command(arguments: Sequence[str]) -> list[str]:
         return ["-m", "benchmarks", *arguments]
     if arguments[:1] == ["python"]:
         return list(arguments[1:])
-    return ["-m", "lathe_rc", *arguments]
+    return [str(ROOT / "lathe_rc" / "__main__.py"), *arguments]  # not -m: the current folder is no place for code
 
 
 def change_to(python: Path) -> None:

@@ -28,13 +28,14 @@ def pip(*options: str | Path) -> list[str | Path]:
 
 
 def uv(lists: Iterable[str], locks: Iterable[str]) -> list[str | Path]:
-    """Return a command line that installs what files in requirements/ list, in the versions of lock files.
+    """Return a command line that installs what files in requirements/ list, as lock files say: versions and hashes.
 
     All is compiled to byte code: where Python may not write any later, each start would compile it anew.
     """
     files = [word for name in lists for word in ("-r", REQUIREMENTS / name)]
     constraints = [word for name in locks for word in ("-c", REQUIREMENTS / name)]
-    return [PYTHON.with_name("uv"), "pip", "install", "--compile-bytecode", "--python", PYTHON, *files, *constraints]
+    target: list[str | Path] = ["--python", PYTHON, "--overrides", REQUIREMENTS / "overrides.txt"]
+    return [PYTHON.with_name("uv"), "pip", "install", "--compile-bytecode", *target, *files, *constraints]
 
 
 def npm() -> list[str | Path]:

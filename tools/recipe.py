@@ -138,8 +138,9 @@ class Recipe:
                 CONSTRAINTS.write_text("\n".join(constrain(locked, found)), encoding="utf-8")
                 self._install(step, "runtime.in", "build.in")
             else:
-                uv = installer.pip("--constraint", REQUIREMENTS / "python.lock", "uv")
-                step.run(*uv, environ=build_environment(self._ros))
+                text = (REQUIREMENTS / "python.lock").read_text(encoding="utf-8")
+                CONSTRAINTS.write_text(pinned("uv", text), encoding="utf-8")
+                step.run(*installer.pip("-r", CONSTRAINTS), environ=build_environment(self._ros))
                 self._install(step, "ros.in", MESSAGES_LIST, "runtime.in", "build.in")
                 mend_cmake_paths(VENV, site_packages())
 
@@ -208,6 +209,14 @@ def colcon(*options: str | Path) -> list[str | Path]:
         *("--event-handlers", "console_direct+", "--executor", "sequential"),
         *options,
     ]
+
+
+def pinned(name: str, lock: str) -> str:
+    """Return the lines of a lock file on one package: its version and the hashes of its files."""
+    found = re.search(rf"^{re.escape(name)}==.*(?:\n +--hash=.*)*", lock, re.MULTILINE)
+    if found is None:
+        raise LookupError(f"no {name} in the lock file")
+    return found[0] + "\n"
 
 
 def constrain(lock: Iterable[str], found: Iterable[str]) -> list[str]:

@@ -11,12 +11,14 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.bag import provenance
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading import sound_records
+from lathe_rc.bag.reading.source import Source, files_of
 from lathe_rc.bag.snapshot import first_sample, span_of
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.wire import Decoder
-from lathe_rc.errors import InputError, shown
+from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.files import contents, replacing
 
 DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, as the harness found them
 _MOST_FINDINGS = 20  # listed for one topic
@@ -32,23 +34,45 @@ class Findings:
         lost: what should be there: gaps, topics that end early.
         digests: of each signal topic, as `lathe_rc.cell.recording` makes them; empty if something is lost.
         compared: topics whose digest was recorded and is the same.
+        strangers: code and files that the bag names and does not hold.
         messages: all of them.
         samples: of the dense topics that are all of one length.
         first: where a snapshot begins; 0 of a whole run.
+        unread: topics that were not looked at, as they are not of ROS 2.
     """
 
     wrong: list[str] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
     digests: dict[str, str] = field(default_factory=dict)
     compared: int = 0
+    strangers: list[str] = field(default_factory=list)
     messages: int = 0
     samples: int = 0
     first: int = 0
+    unread: list[str] = field(default_factory=list)
 
     @property
     def exit_code(self) -> int:
         """0: clean; 3: something is lost; 1: something is wrong."""
         return 1 if self.wrong else 3 if self.lost else 0
+
+
+class _Sparse:
+    """Looks at the messages of a topic that are no blocks."""
+
+    def __init__(self, topic: str, msgtype: str, findings: Findings) -> None:
+        self._topic, self._type, self._findings = topic, msgtype, findings
+        self._told = 0
+        self.part = SparseTopic()
+
+    def add(self, log_ns: int, data: bytes) -> None:
+        if self._told >= _MOST_FINDINGS:
+            return  # the digests are not asked for any more
+        try:
+            self.part.append(log_ns, messages.values_of(self._type, data))
+        except ValueError as error:
+            self._told += 1
+            self._findings.wrong.append(f"{self._topic}: at {log_ns} ns: {shown(error)}")
 
 
 class _Dense:
@@ -110,24 +134,27 @@ def check(path: Path) -> Findings:
         InputError: not a bag, or one that is cut off or broken: then only `lathe_rc.bag.repairing.recover` reads it.
     """
     findings, digester = Findings(), Digester()
-    sparse: dict[str, SparseTopic] = {}
     with Source(path) as source:
         types = {topic: said.type for topic, said in source.topics.items()}
         part, findings.first = span_of(source.about), first_sample(source.about)
         dense = {t: _Dense(t, k, findings, digester) for t, k in types.items() if k in messages.block_types()}
-        sparse = {topic: SparseTopic() for topic, kind in types.items() if kind in messages.sparse_types()}
+        sparse = {t: _Sparse(t, k, findings) for t, k in types.items() if k in messages.sparse_types()}
         counts = dict.fromkeys(types, 0)
         findings.wrong += source.contradictions
+        findings.strangers = provenance.strangers(source.about)
+        findings.unread = list(map(str, source.unread))
         for topic, log_ns, data in source.messages():
             counts[topic] += 1
             if topic in dense:
                 dense[topic].add(log_ns, data)
             elif topic in sparse:
-                _add(sparse[topic], topic, types[topic], log_ns, data, findings)
+                sparse[topic].add(log_ns, data)
         for topic, said in source.topics.items():
             if said.count != counts[topic]:
                 findings.wrong.append(f"{topic}: {counts[topic]} messages, {said.count} by the index")
         findings.messages = sum(counts.values())
+    for file in files_of(path):
+        findings.wrong += sound_records.damage(file) if file.suffix == ".mcap" else []
     _ends(dense, findings, part=part is not None)
     if not dense and messages.CELL_STATE in types.values():
         findings.lost.append("no block: the cell of this bag did not begin")
@@ -139,16 +166,9 @@ def check(path: Path) -> Findings:
         for topic, first in provenance.held(source.about).items()
     ]
     if dense and not findings.lost and not findings.wrong:
-        findings.digests = digester.result(sparse)
+        findings.digests = digester.result({topic: looked.part for topic, looked in sparse.items()})
         _compare(path, findings)
     return findings
-
-
-def _add(part: SparseTopic, topic: str, msgtype: str, log_ns: int, data: bytes, findings: Findings) -> None:
-    try:
-        part.append(log_ns, messages.values_of(msgtype, data))
-    except ValueError as error:
-        findings.wrong.append(f"{topic}: at {log_ns} ns: {shown(error)}")
 
 
 def _ends(dense: Mapping[str, _Dense], findings: Findings, *, part: bool) -> None:
@@ -171,13 +191,13 @@ def recorded(path: Path) -> dict[str, str]:
     file = path / DIGESTS
     if not path.is_dir() or not file.exists():
         return {}
-    if file.stat().st_size > _MOST_DIGESTS:
-        raise InputError(f"{file}: {file.stat().st_size} B; allowed: up to {_MOST_DIGESTS}")
     try:
-        told: Any = json.loads(file.read_text(encoding="utf-8"))
+        told: Any = json.loads(contents(file, _MOST_DIGESTS))
         return {str(topic): str(digest) for topic, digest in told["digest"].items()}
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise InputError(f"{file}: not what the harness writes; remove it") from None
+    except OSError as error:
+        raise InputError(f"{file}: {error.strerror}; remove it") from None
 
 
 def _compare(path: Path, findings: Findings) -> None:
@@ -190,5 +210,13 @@ def _compare(path: Path, findings: Findings) -> None:
 
 
 def write_digests(path: Path, digest: Mapping[str, str]) -> None:
-    """Leave the digests of a run in its bag's folder."""
-    (path / DIGESTS).write_text(json.dumps({"digest": dict(digest)}, indent=1) + "\n", encoding="utf-8")
+    """Leave the digests of a run in its bag's folder.
+
+    Raises:
+        LatheError: the disk does not take them.
+    """
+    try:
+        with replacing(path / DIGESTS) as file:
+            file.write(json.dumps({"digest": dict(digest)}, indent=1).encode() + b"\n")
+    except OSError as error:
+        raise LatheError(f"{path / DIGESTS}: cannot write ({error.strerror}); the bag is complete without") from None

@@ -7,15 +7,17 @@ import json
 import math
 import platform
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
 
-from lathe_rc import __version__, extensions
+from lathe_rc import __version__, trust
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.parameters import NodeParameters, Value
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario, kind_of
 from lathe_rc.cell.stages import STAGES
@@ -30,7 +32,7 @@ ORIGINS = "lathe_rc.origins"  #: where classes of others come from, if there are
 HELD = "lathe_rc.held"  #: samples from which on the newest value of a topic stands for those of a lost node
 RECOVERED = "lathe_rc.recovered"  #: that the bag was completed, and what that cost
 _MOST_FILE = 2**19  # longest such file that is kept [B]
-_LONGEST_NAME = 80  # characters of a file
+_CODE = re.compile(r"[\w.]+:[\w.]+")  # package.module:Class
 _HASH = 12  # characters that are shown of one
 _MOST_ORIGINS = 256
 _PACKAGES = ("numpy", "scipy", "numba", "mcap", "rosbags")
@@ -125,39 +127,72 @@ def origins(about: Mapping[str, str]) -> list[Origin]:
 
 
 def _check_installed(about: Mapping[str, str]) -> None:
-    """Refuse a bag whose classes of others are not here.
+    """Refuse a bag whose classes of others are not here; nothing is imported.
 
     Raises:
         InputError: names one, and what to install.
     """
     for origin in origins(about):
-        try:
-            extensions.find(origin.name, "it")
-        except InputError as error:
-            module = origin.name.partition(":")[0].partition(".")[0]
-            allowed = f"put {module} where Python looks for it (the current folder, or PYTHONPATH)"
-            if origin.package:
-                allowed = f"install {origin.package}"
+        package = origin.name.partition(":")[0].partition(".")[0]
+        if package not in sys.modules and (not package.isidentifier() or find_spec(package) is None):
+            allowed = (
+                f"install {origin.package or package}, or {trust.OPTION} {package} if it lies in the current folder"
+            )
             raise InputError(
-                f"{', '.join(origin.used)}: the bag was made with {origin.name}, and {error}; allowed: {allowed}"
-            ) from None
+                f"{', '.join(origin.used)}: the bag was made with {origin.name}, and there is no module {package}; "
+                f"allowed: {allowed}"
+            )
 
 
-def changes(about: Mapping[str, str]) -> list[str]:
-    """Changes since a bag was made in the classes of others, all of which are installed; a line for each class."""
+def changes(about: Mapping[str, str], scenario: Scenario) -> list[str]:
+    """Changes since a bag was made in the classes of others of its scenario; a line for each class."""
+    made, here = {origin.name: origin for origin in origins(about)}, _origins(scenario.nodes)
     found = []
-    for origin in origins(about):
-        extensions.find(origin.name, origin.name)
-        now = extensions.origin(origin.name.partition(":")[0])
-        version = now.get("version", "")
+    for name, now in here.items():
+        if (origin := made.get(name)) is None:
+            continue
+        version, source = str(now.get("version", "")), str(now["source"])
         if version != origin.version:
             what = f"version {version or 'none'} here, and {origin.version or 'none'} when the bag was made"
-        elif now["source"] != origin.source:
-            what = f"source {now['source'][:_HASH]} here, and {origin.source[:_HASH]} when the bag was made"
+        elif source != origin.source:
+            what = f"source {source[:_HASH]} here, and {origin.source[:_HASH]} when the bag was made"
         else:
             continue
-        found.append(f"{origin.name} has {what}")
+        found.append(f"{name} has {what}")
     return found
+
+
+def named_files(about: Mapping[str, str]) -> dict[str, str]:
+    """The files, by NODE.PARAM, that a bag's scenario names and the bag does not hold.
+
+    Raises:
+        InputError: the bag's scenario is no parameter file.
+    """
+    return {
+        f"{node}.{key}": str(value)
+        for node, values in values_of(about).items()
+        for key, value in values.items()
+        if key.endswith("_file") and value and f"{FILE}{node}.{key}" not in about
+    }
+
+
+def strangers(about: Mapping[str, str]) -> list[str]:
+    """Code that a bag's scenario names, and files that the bag does not hold; a line each, nothing is imported.
+
+    Raises:
+        InputError: the bag's scenario is no parameter file.
+    """
+    code = [
+        f"{node}.{key} names code, {shown(each)}"
+        for node, values in values_of(about).items()
+        for key, value in values.items()
+        for each in (value if isinstance(value, list) else [value])
+        if isinstance(each, str) and _CODE.fullmatch(each)
+    ]
+    files = [
+        f"{key} names a file that the bag does not hold, {shown(path)}" for key, path in named_files(about).items()
+    ]
+    return [*dict.fromkeys(code), *files]
 
 
 def held(about: Mapping[str, str]) -> dict[str, int]:
@@ -178,14 +213,19 @@ def namespace(about: Mapping[str, str]) -> str:
     return next((topic.removesuffix("/cell_state") for topic in topics if topic.endswith("/cell_state")), "")
 
 
-def tolerances(about: Mapping[str, str]) -> dict[str, float]:
-    """Tolerance [m] by relative topic of each tool that has one, as the scenario of a bag says; empty if there is none.
+def values_of(about: Mapping[str, str]) -> dict[str, dict[str, Value]]:
+    """Values by node and parameter as the scenario of a bag says, none of them checked; empty if the bag has none.
 
     Raises:
         InputError: the bag's scenario is no parameter file.
     """
+    return ros_yaml.parse(about[SCENARIO], f"{SCENARIO} of the bag") if SCENARIO in about else {}
+
+
+def tolerances(nodes: Mapping[str, Mapping[str, Value]]) -> dict[str, float]:
+    """Tolerance [m] by relative topic of each tool that has one, by what `values_of` found."""
     found: dict[str, float] = {}
-    for node, values in ros_yaml.parse(about[SCENARIO], f"{SCENARIO} of the bag").items() if SCENARIO in about else ():
+    for node, values in nodes.items():
         allowed, remap = values.get("tolerance", 0.0), values.get("remap", [])
         if str(values.get("stage") or node) == Tool.kind and isinstance(allowed, float) and 0.0 < allowed < math.inf:
             rules = [str(rule).partition(":=") for rule in remap] if isinstance(remap, list) else []
@@ -206,32 +246,30 @@ def _versions() -> dict[str, str]:
 def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str] = ()) -> Scenario:
     """The scenario that a bag was made with.
 
-    Its files are written to ``folder``, which must last as long as it. Files that it names and the bag does not hold
-    are copied there: a run of what somebody else recorded writes to no file that it names.
+    Its files are written to ``folder``, which must last as long as it. The scenario of a bag is data: it names no
+    others, and no code that is not allowed (`lathe_rc.trust`).
 
     Raises:
-        InputError: the bag has none, or one that this version does not accept.
+        InputError: the bag has none, or one that is not allowed, or that this version does not accept.
     """
     if SCENARIO not in about:
         raise InputError("the bag holds no scenario; it was not made by lathe_rc, or its recorder never saw the cell")
     _check_installed(about)
     file = folder / "scenario.yaml"
     file.write_bytes(about[SCENARIO].encode(errors="surrogatepass"))
-    sets: list[str] = []
+    copies: dict[str, Path] = {}
     for key, text in about.items():
-        node, dot, name = key.removeprefix(FILE).rpartition(".")
-        if not key.startswith(FILE) or not dot:
+        parameter = key.removeprefix(FILE)
+        if not key.startswith(FILE):
             continue
-        place = folder / f"file{len(sets)}"
+        copies[parameter] = folder / f"file{len(copies)}"
         try:
-            place.write_bytes(base64.b64decode(text))
+            copies[parameter].write_bytes(base64.b64decode(text))
         except ValueError:
             raise InputError(
-                f"{key[:80]!r} of the bag is not base64; recover the bag, or set {node[:80]!r} anew"
+                f"{key[:80]!r} of the bag is not base64; recover the bag, or set {parameter[:80]!r} anew"
             ) from None
-        sets.append(f"{node}.{name}={place}")
-    sets += _copied(scenarios.load(file, sets, complete=True), folder)
-    loaded = scenarios.load(file, [*sets, *overrides], complete=True)
+    loaded = scenarios.load(file, overrides, complete=True, copies=copies)
     return Scenario(about.get(NAME, "") or loaded.name, loaded.nodes)
 
 
@@ -242,23 +280,3 @@ def nose_radius(about: Mapping[str, str]) -> float:
             if 0.0 < float(text) < math.inf:
                 return float(text)
     return 0.0
-
-
-def _copied(scenario: Scenario, folder: Path) -> list[str]:
-    """Copy files from elsewhere that a scenario names to ``folder``; what to set so that it names these."""
-    sets: list[str] = []
-    for node, table in scenario.nodes.items():
-        for row in type(table).rows().values():
-            named = Path(str(getattr(table, row.name))) if row.is_path else Path()
-            if not named.name or named.is_relative_to(folder.resolve()):
-                continue
-            place = folder / f"named{len(sets)}" / re.sub(r"[^\w.-]", "_", named.name)[-_LONGEST_NAME:]
-            place.parent.mkdir(exist_ok=True)
-            try:
-                # A memory is written, perhaps, before it is read.
-                with contextlib.suppress(FileNotFoundError):
-                    place.write_bytes(contents(named))
-            except OSError as error:
-                raise InputError(f"{node}.{row.name} = {str(named)[:200]!r}: {error.strerror}; set another") from None
-            sets.append(f"{node}.{row.name}={place}")
-    return sets

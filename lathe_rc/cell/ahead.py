@@ -15,6 +15,7 @@ import threading
 from collections import deque
 from collections.abc import Iterable, Iterator
 
+from lathe_rc import trust
 from lathe_rc.cell import native
 from lathe_rc.cell.program import compile_loop
 from lathe_rc.cell.scenario import TABLES, kind_of
@@ -22,18 +23,15 @@ from lathe_rc.cell.stage import Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.extensions import search_path
+from lathe_rc.jit import can_keep
 
 _REFUSED = "refused: "  # begins what a process says of a stage whose step cannot be compiled
 
 
 def uncompiled(stages: Iterable[Stage]) -> list[Stage]:
     """Those whose steps nobody has compiled on this machine; of those that have the same one, the first."""
-    known, found = native.compiled(), []
-    for stage in stages:
-        if stage.is_compiled and (name := stage.native().name) not in known:
-            known.add(name)
-            found.append(stage)
-    return found
+    steps = {stage.native().name: stage for stage in reversed(list(stages)) if stage.is_compiled}
+    return [stage for name, stage in reversed(steps.items()) if not native.is_kept(name)]
 
 
 def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
@@ -47,7 +45,8 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
         LatheError: a process that compiles has ended.
     """
     # The longest first, so that all processes end at about the same time: the larger its memory, the more a step does.
-    numbered = enumerate(sorted(uncompiled(stages), key=lambda stage: -stage.native().words.size))
+    missing = sorted(uncompiled(stages), key=lambda stage: -stage.native().words.size)
+    numbered = enumerate(missing if missing and can_keep() else [])
     waiting = deque(numbered)
     left = {number: stage.name for number, stage in waiting}
     done: queue.SimpleQueue[tuple[int, str]] = queue.SimpleQueue()
@@ -74,7 +73,8 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
 def _start() -> "subprocess.Popen[str]":
     """Start a process that compiles the steps of the stages that its input names."""
     environment = os.environ | {"PYTHONPATH": search_path()}
-    return subprocess.Popen([sys.executable, "-m", __name__], stdin=-1, stdout=-1, text=True, env=environment)
+    command = [*trust.interpreter(__name__), *trust.arguments()]
+    return subprocess.Popen(command, stdin=-1, stdout=-1, text=True, env=environment)
 
 
 def _have_compiled(
@@ -96,6 +96,7 @@ def _have_compiled(
 
 def main() -> None:
     """Compile what each line of the standard input names."""
+    trust.taken_from(sys.argv[1:])
     for line in sys.stdin:
         name, kind, values = json.loads(line)
         stage = STAGES[kind](name, TABLES[kind].read(name, values))

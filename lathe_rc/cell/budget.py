@@ -11,6 +11,7 @@ from lathe_rc.analysis.budget import TOLD, Budget, Causes, Decomposition
 from lathe_rc.analysis.metrology import evenly
 from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.cell import batch, models
+from lathe_rc.cell.cures import Loop
 from lathe_rc.cell.parameters import NodeParameters, Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
@@ -29,9 +30,7 @@ from lathe_rc.messages import Samples, Signals
 _TURN = 2.0 * np.pi
 _PREFIXES = ("", "coarse_", "fine_", "cut_")  # of the parameters of a part; those of stages with several have one
 _FACTOR = 0.9  # of a cycle, which a flat Q may have; or what the scenario's own has, if that is more
-_BANDS = np.geomspace(60_000.0, 500.0, 32)  # [rad/s] where the flat Q may end, the widest that converges is taken
-_STOP = 2.0  # its stop band begins at so many times that
-_RIPPLE = 1e-6
+_CONVERGES = 0.98  # but never more than this: the own one may run with allow_unstable
 
 #: Parameters that are a cause in whatever node they stand, with the value that switches it off.
 _ANYWHERE: Mapping[str, Mapping[str, Value]] = {
@@ -59,6 +58,13 @@ _SOMEWHERE: Mapping[str, Mapping[type[NodeParameters], Mapping[str, Value]]] = {
         VibrationParameters: {"random_rms": 0.0, "line_amplitude": [], "line_frequency": [], "line_phase": []}
     },
 }
+#: Of these causes, those that make one revolution differ from the next.
+_CHANGING = {
+    "noise": _ANYWHERE["noise"],
+    "quantisation": _ANYWHERE["quantisation"],
+    "vibration": _SOMEWHERE["vibration"][VibrationParameters],
+}
+_CONSTANT = ("harmonics", "polygon")  # profiles that are the same all along the part
 _SPEED = [name for name in SpeedLawParameters.model_fields if name not in NodeParameters.model_fields]
 
 
@@ -200,42 +206,43 @@ def _model(scenario: Scenario) -> dict[str, Cause]:
     return {"model": Cause(off)}
 
 
-def _flat(stage: LearningController, speeds: Collection[float], cell: Cell) -> dict[str, Value] | None:
-    """The widest flat Q with which a channel converges; None if there is none."""
-    responses = [response for response, _ in cell.learned(stage)]
-
-    def factor(of: LearningController) -> float:
-        return max((of.worst(response, speed)[0] for response in responses for speed in speeds), default=np.inf)
-
-    allowed = max(factor(stage), _FACTOR)
-    for band in _BANDS:
-        values: dict[str, Value] = {
-            "q_filter": "fir",
-            "q_pass": float(band),
-            "q_stop": float(_STOP * band),
-            "q_ripple": _RIPPLE,
-        }
-        try:
-            other = type(stage)(stage.name, stage.parameters.model_copy(update=values))
-        except InputError:  # the grid, or the memory, has no room for it
-            continue
-        if factor(other) <= allowed:
-            return {f"{stage.name}.{name}": value for name, value in values.items()}
-    return None
-
-
 def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
     """The part that Q forgets: off, each Q is 1 as far as its channel converges with it."""
     off: dict[str, Value] = {}
     low, high = cell.master.speed_range()
     for stage in cell.stages.values():
         if isinstance(stage, LearningController):
-            flat = _flat(stage, stage.checked_speeds(low, high), cell)
+            loop = Loop(stage, [response for response, _ in cell.learned(stage)], stage.checked_speeds(low, high))
+            flat = loop.flat(min(max(loop.factor({}), _FACTOR), _CONVERGES))
             if flat is None:
                 left_out["Q floor"] = f"{stage.name} converges with no flat Q"
                 return {}
-            off |= flat
+            off |= {f"{stage.name}.{name}": value for name, value in flat.items()}
     return {"Q floor": Cause(off)}
+
+
+def changing(nodes: Mapping[str, Mapping[str, Value]]) -> list[str]:
+    """Name the causes in a scenario's values that make one revolution differ from the next, but for speed and cut.
+
+    Args:
+        nodes: all values by node and parameter, none of them checked; empty lists may be left out.
+    """
+    found = [
+        name
+        for name, off in _CHANGING.items()
+        if any(
+            values.get(f"{prefix}{each}", none) != none
+            for values in nodes.values()
+            for prefix in _PREFIXES
+            for each, none in off.items()
+        )
+    ]
+    fed = any(
+        values.get("profile", _CONSTANT[0]) not in _CONSTANT
+        and (values.get("feed", 0.0) != 0.0 or values.get("height_from") == "slide")
+        for values in nodes.values()
+    )
+    return [*found, *(["feed"] if fed else [])]
 
 
 def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[str, str]]:
@@ -262,7 +269,7 @@ def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[
         if not off or cause.needs not in ("", *kept):
             continue
         try:
-            Cell(scenario.varied(off).nodes).check()
+            Cell(scenario.varied(off).nodes).check(cures=False)
         except InputError as error:
             left_out[name] = str(error)
         else:

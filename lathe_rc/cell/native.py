@@ -2,12 +2,11 @@
 """Steps as functions of addresses: what a program calls without Python, and a stage alone with little of it.
 
 For each kind of step a function is written that takes the addresses of its memory and of the arrays of its ports, and
-calls it. It stands in a module of its own, which is kept beside the compiled kernels: it depends on how the memory and
-the ports are made, not on what is in them.
+calls it. It stands in a module of its own, whose compiled code is kept: it depends on the types of the memory and the
+ports, not on their values.
 """
 
 import hashlib
-import importlib.util
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -22,8 +21,7 @@ from numba.core.errors import NumbaError
 
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.extensions import is_ours, source_hash
-from lathe_rc.files import replacing
-from lathe_rc.jit import cache_folder, kernel
+from lathe_rc.jit import cache_folder, kernel, read_kept
 from lathe_rc.placed import Placed, Words, call
 
 Integers = npt.NDArray[np.int64]
@@ -37,7 +35,8 @@ The source is {source}.
 """
 
 import {module}
-from lathe_rc.placed import at, entry, floats, octets, ports, store, word
+from lathe_rc.jit import entry
+from lathe_rc.placed import at, floats, octets, ports, store, word
 
 STEP = {step}
 
@@ -231,25 +230,17 @@ def _source(module: str) -> str:
     return "that of lathe_rc" if is_ours(module) else source_hash(module, imports=True)
 
 
-def compiled() -> set[str]:
-    """Names of the modules that have been compiled on this machine."""
-    return {path.name.partition(".")[0] for path in cache_folder().rglob("step_*.nbi")}
+def is_kept(name: str) -> bool:
+    """Whether the compiled code of a module is on this machine, undamaged."""
+    files = list(cache_folder().glob(f"*/{name}.*"))
+    return any(path.suffix == ".nbi" for path in files) and None not in [read_kept(path) for path in files]
 
 
 @cache
 def _module(name: str, text: str, memory: Placed) -> ModuleType:
-    """The module of a text, kept in a file: Numba keeps what it has compiled for a file."""
-    folder = cache_folder() / "steps"
-    path = folder / f"{name}.py"
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as file:
-            file.write(text.encode())
-    spec = importlib.util.spec_from_file_location(f"lathe_rc_steps.{name}", path)
-    assert spec is not None, "it is a Python file"
-    assert spec.loader is not None, "it is a Python file"
-    module = importlib.util.module_from_spec(spec)
+    """The module of a text, in no file: only what is compiled of it is kept."""
+    module = ModuleType(f"lathe_rc_steps.{name}")
     vars(module)["MEMORY"] = memory
     sys.modules[module.__name__] = module
-    spec.loader.exec_module(module)
+    exec(compile(text, f"{name}.py", "exec"), vars(module))  # noqa: S102 - written here
     return module

@@ -49,6 +49,7 @@ class Row:
         type: of the value, or of its elements.
         is_list: whether it is an array.
         choices: allowed texts; empty where any will do.
+        is_file: whether it names a file or folder, a scenario's own or any.
         named: what else may be named, classes of other packages; None: nothing.
         low, high: range of a number, ends allowed or not as ``limits`` says; infinite where there is none.
         limits: the range in words, empty where there is none.
@@ -64,6 +65,7 @@ class Row:
         self.name, self.doc = name, info.description or ""
         self.default: Value = info.get_default(call_default_factory=True)
         self.unit, self.is_path, self.drive = str(extra["unit"]), bool(extra["path"]), str(extra["drive"])
+        self.is_file = self.is_path or name.endswith("_file")
         annotation: Any = info.annotation
         metadata = list(info.metadata)
         self.is_list = get_origin(annotation) is list

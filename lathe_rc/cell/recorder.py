@@ -17,7 +17,7 @@ class RecorderParameters(NodeParameters):
 
     bag: str = parameter("", "folder of the bag; must not exist; empty: bag_ and the run id", path=True)
     compression: Literal["zstd", "none"] = parameter("zstd", "compression of the bag's chunks")
-    chunk_size: Annotated[int, Ge(4096), Le(2**28)] = parameter(
+    chunk_size: Annotated[int, Ge(4096), Le(2**26)] = parameter(
         2**20, "size of the bag's chunks: what a crash may lose", "B"
     )
     mode: Literal["continuous", "snapshot", "both"] = parameter(

@@ -92,10 +92,11 @@ class Recording:
 
     def errors_picture(self) -> str:
         """The form error by revolution as a picture in HTML; empty without a revolution."""
-        return html.errors_picture(self.errors, self._turns_before() if self.errors.rms.size else 0)
+        return html.errors_picture(self.errors, self.turns_before if self.errors.rms.size else 0)
 
-    def _turns_before(self) -> int:
-        """Revolutions before the first that is complete."""
+    @property
+    def turns_before(self) -> int:
+        """Revolutions before the first that is complete, as of a snapshot; the recording has an encoder."""
         return turns_before(self.of_type(messages.ENCODER)["angle_true"])
 
     @property
@@ -190,7 +191,7 @@ class Recording:
             )
             raise InputError(f"nothing to draw: the recording has {why}")
         angle, tool = self.of_type(messages.ENCODER)["angle_true"], self.of_type(messages.TOOL)
-        return TurnedForm(angle, tool["reference"], tool["error"], self.errors, self._turns_before())
+        return TurnedForm(angle, tool["reference"], tool["error"], self.errors, self.turns_before)
 
     def messages(self, topic: str) -> list[Sparse]:
         """The messages of a sparse topic, by its fully qualified name."""

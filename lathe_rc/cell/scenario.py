@@ -7,15 +7,17 @@ Longer than 400 lines: a scenario's way from its text to its tables, and back.
 import hashlib
 import json
 import re
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import cast
 
 import yaml
 
-from lathe_rc import files
+from lathe_rc import files, resources, trust
 from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Value
 from lathe_rc.cell.recorder import KIND as RECORDER
@@ -255,11 +257,12 @@ class Scenario:
             node, name = _target(whole, kinds, target)
             for each in [node] if node != _EVERYONE else self.nodes:
                 found = changes.setdefault(each, {})
+                value = _of_user(kinds[each], name, value, Path())
                 if element is not None:
                     before = found.get(name, getattr(self.nodes[each], name, None))
                     found[name] = _with_element(target, before, element, value)
                 else:
-                    found[name] = _absolute(kinds[each], name, value, Path())
+                    found[name] = value
         tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
         given = "run_id" in values or not self._has_own_run_id
         for node, changed in changes.items():
@@ -329,8 +332,8 @@ def _target(text: str, kinds: Mapping[str, str], what: str) -> tuple[str, str]:
     return node, name
 
 
-def _override(text: str, nodes: dict[str, dict[str, Value]]) -> None:
-    """Apply ``NODE.PARAM=VALUE`` or, for a shared parameter, ``PARAM=VALUE``."""
+def _override(text: str, nodes: dict[str, dict[str, Value]]) -> tuple[str, str]:
+    """Apply ``NODE.PARAM=VALUE`` or, for a shared parameter, ``PARAM=VALUE``; returns node and parameter."""
     target, equals, value = text.partition("=")
     if not equals:
         raise InputError(f"--set {text!r}; allowed: NODE.PARAM=VALUE, or PARAM=VALUE for a shared parameter")
@@ -342,15 +345,74 @@ def _override(text: str, nodes: dict[str, dict[str, Value]]) -> None:
             values.pop(name, None)
         nodes.setdefault(node, {})[name] = parsed
     else:
-        nodes[node][name] = _absolute(kinds[node], name, parsed, Path())
+        nodes[node][name] = _of_user(kinds[node], name, parsed, Path())
+    return node, name
 
 
-def _absolute(kind: str, name: str, value: Value, folder: Path) -> Value:
-    """A path relative to ``folder`` made absolute; anything else as it is."""
+def _of_user(kind: str, name: str, value: Value, folder: Path) -> Value:
+    """A value that the user gives: a path relative to ``folder`` made absolute, the code that it names allowed."""
     row = TABLES[kind].rows().get(name)
+    if name == "stage" or (row is not None and row.named is not None):
+        for each in value if isinstance(value, list) else [value]:
+            trust.allow_named(each)
     if row is None or not row.is_path or not isinstance(value, str) or not value:
         return value
     return str((folder / value).resolve())
+
+
+def read(
+    path: Path,
+    overrides: Iterable[str] = (),
+    copies: Mapping[str, Path] | None = None,
+    stages: Mapping[str, str] = MappingProxyType({}),
+) -> dict[str, dict[str, Value]]:
+    """The values of a parameter file by node and name, with absolute paths. One that lies in a bag is data.
+
+    Args:
+        path: of the file.
+        overrides: see `load`.
+        copies: see `load`.
+        stages: of nodes for which the file names none.
+
+    Raises:
+        InputError: the file is none, or it is data and names code that is not allowed, or files elsewhere.
+    """
+    folder = path.parent if copies is not None else trust.bag_around(path.parent)
+    nodes = ros_yaml.read(path)
+    outside: dict[tuple[str, str], Path] = {}
+    for name, values in nodes.items():
+        if name == _EVERYONE:
+            continue
+        if folder is None:
+            trust.allow_named(values.get("stage"))
+        kind = kind_of(name, values.get("stage") or stages.get(name))
+        for key, value in values.items():
+            row = TABLES[kind].rows().get(key)
+            if folder is None:
+                values[key] = _of_user(kind, key, value, path.parent)
+            elif row is not None and row.is_file and isinstance(value, str) and value:
+                place = _stands_for(f"{name}.{key}", value, path.parent, copies)
+                values[key] = str(place)
+                if not (place.is_relative_to(folder.resolve()) or resources.is_own(place)):
+                    outside[name, key] = place
+    for text in overrides:
+        outside.pop(_override(text, nodes), None)
+    for (name, key), place in outside.items():
+        what = f"a file outside of the bag {folder}" if copies is None else "a file that the bag does not hold"
+        raise InputError(f"{shown(f'{name}.{key} = {place}')}: {what}; allowed: --set {shown(name)}.{key}=FILE")
+    return nodes
+
+
+WRITTEN = ("memory_file", "restart_file")  #: parameters whose files a run may make itself
+
+
+def _stands_for(parameter: str, value: str, folder: Path, copies: Mapping[str, Path] | None) -> Path:
+    """The file that stands for one that data names: its copy, a new one where a run makes it, or itself, resolved."""
+    if copies is not None and parameter in copies:
+        return copies[parameter].resolve()
+    if copies is not None and parameter.rpartition(".")[2] in WRITTEN:
+        return Path(tempfile.mkdtemp(dir=folder)).resolve() / "state"
+    return (folder / value).resolve()
 
 
 def content(path: Path) -> str:
@@ -403,7 +465,9 @@ def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mappi
     return Scenario(name, named, fingerprints)
 
 
-def load(path: Path, overrides: Iterable[str] = (), *, complete: bool = False) -> Scenario:
+def load(
+    path: Path, overrides: Iterable[str] = (), *, complete: bool = False, copies: Mapping[str, Path] | None = None
+) -> Scenario:
     """Read a scenario.
 
     Args:
@@ -411,6 +475,8 @@ def load(path: Path, overrides: Iterable[str] = (), *, complete: bool = False) -
         overrides: ``NODE.PARAM=VALUE``, or ``PARAM=VALUE`` for shared parameters, applied in order.
         complete: what the file leaves out has its default, as in those of `Scenario.to_yaml`; otherwise models of
             drives that are not given are those of the drives, see `lathe_rc.cell.models`.
+        copies: of the files of a bag's scenario, by NODE.PARAM, all in the folder of ``path``; it is data then, and
+            names no others. None: it is the user's own, unless it lies in a bag (`lathe_rc.trust`).
 
     Raises:
         InputError: one line for the first thing that is wrong.
@@ -429,14 +495,7 @@ def load(path: Path, overrides: Iterable[str] = (), *, complete: bool = False) -
         Traceback (most recent call last):
         lathe_rc.errors.InputError: --set 'tol.feed=1.0': no node 'tol' in the scenario; did you mean tool?
     """
-    nodes = ros_yaml.read(path)
-    for name, values in nodes.items():
-        if name != _EVERYONE:
-            kind = kind_of(name, values.get("stage"))
-            for key, value in values.items():
-                values[key] = _absolute(kind, key, value, path.parent)
-    for text in overrides:
-        _override(text, nodes)
+    nodes = read(path, overrides, copies)
     shared = nodes.pop(_EVERYONE, {})
     SharedParameters.read(_EVERYONE, shared)
     if not nodes:

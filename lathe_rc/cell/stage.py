@@ -164,8 +164,8 @@ class Stage(ABC):
         self._scheduled: list[tuple[int, str]] = []
         self._remarks: list[str] = []  # events that came of the one that is carried out
 
-    def doubts(self, seconds: float) -> list[str]:
-        """Return doubts about values that can be meant, one line each, for a run of so many seconds; inf: endless."""
+    def warnings(self, seconds: float) -> list[str]:
+        """Return the doubts about its parameters, one line each, for a run of so many seconds; inf: without end."""
         return []
 
     def declare(self, *, inputs: Sequence[Input] = (), outputs: Sequence[Output] = (), tells: bool = False) -> None:

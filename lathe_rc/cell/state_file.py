@@ -20,7 +20,7 @@ import numpy as np
 
 from lathe_rc.cell.parameters import Table
 from lathe_rc.errors import LatheError, shown
-from lathe_rc.files import contents
+from lathe_rc.files import contents, sealed, unsealed
 
 _MOST = 2**28  # longest such file [B]
 _TABLE, _ARRAY, _NUMBER, _KIND, _ENUM = "table", "array", "number", "kind", "enum"
@@ -114,7 +114,7 @@ def save(path: Path, *parts: bytes) -> None:
     try:
         new.unlink(missing_ok=True)
         with open(new, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
-            file.writelines(parts)
+            file.write(sealed(b"".join(parts)))
         new.replace(path)
     except OSError as error:
         raise LatheError(f"{path}: the state cannot be kept ({error.strerror})") from None
@@ -143,7 +143,7 @@ def load(path: Path, table: Table, fresh: Mapping[str, object], *others: type) -
     classes = own.met | {(each.__module__, each.__qualname__) for each in others}
     try:
         _check_owner(path)
-        stream, state = io.BytesIO(contents(path, _MOST)), dict[str, Any]()
+        stream, state = io.BytesIO(unsealed(contents(path, _MOST))), dict[str, Any]()
         # Each part by a reader of its own: the names of one are unknown to the next.
         while stream.tell() < stream.getbuffer().nbytes:
             state |= _Reader(stream, table, frozenset(classes)).load()

@@ -15,6 +15,7 @@ import numpy as np
 
 from lathe_rc.analysis.learning import Response
 from lathe_rc.cell import extremes
+from lathe_rc.cell.cures import Loop
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stage import Input, Output, Stage
@@ -171,7 +172,8 @@ class Cell:
         unknown: see above.
         unchecked: what `check` could not check since it depends on them, or since a law or drive of others does not
             tell what is needed; one line each.
-        warnings: what makes the form worse than the laws can do, and its cure; one line each. `check` finds them.
+        warnings: doubts about parameters that can be meant, and what makes the form worse than the laws can do, with
+            its cure; one line each. `check` finds them.
         factors: largest factor of a cycle over all frequencies, sup|Q - γZ| of repetitive control, by learning node;
             below 1 the error of each cycle is smaller than that of the one before. `check` finds it.
         stages: by node name, in the order of the forward edges.
@@ -190,8 +192,7 @@ class Cell:
         *,
         stage: Callable[[str, NodeParameters], Stage] = new_stage,
     ) -> None:
-        self.unknown, self.unchecked = unknown or {}, list[str]()
-        self.warnings: list[str] = []
+        self.unknown, self.unchecked, self.warnings = unknown or {}, list[str](), list[str]()
         self.factors: dict[str, float] = {}
         self._tables = nodes
         with extremes.refused(nodes):
@@ -278,8 +279,11 @@ class Cell:
         delays = [port.delay for stage in self.stages.values() for port in stage.inputs if port.delay]
         return min(delays, default=None)
 
-    def check(self) -> None:
+    def check(self, *, cures: bool = True) -> None:
         """Refuse what cannot work, with the figures, before anything moves; `unchecked` says what was left out.
+
+        Args:
+            cures: look for parameters with which learning would converge, which takes half a second at most.
 
         Raises:
             InputError: a block longer than a feedback delay, a profile that a drive cannot follow, a flank of the tool
@@ -287,11 +291,12 @@ class Cell:
                 learned, a learning loop that does not converge.
         """
         with extremes.refused(self._tables):
-            self._check()
+            self._check(cures=cures)
 
-    def _check(self) -> None:
+    def _check(self, *, cures: bool) -> None:
         self.unchecked.clear()
-        self.warnings.clear()
+        seconds = (self.master.expected_samples or math.inf) * self.master.shared.step
+        self.warnings = [doubt for stage in self.stages.values() for doubt in stage.warnings(seconds)]
         self.factors.clear()
         low, high = self.master.speed_range()
         if low <= 0.0:
@@ -303,9 +308,7 @@ class Cell:
                 f"{self.master.name}.nominal_rpm and its deviations: a revolution takes {samples:.3g} samples at "
                 f"{high:.4g} rad/s; allowed: {_LEAST_SAMPLES} or more (turn slower, or raise sample_rate)"
             )
-        seconds = (self.master.expected_samples or math.inf) * self.master.shared.step
         for stage in self.stages.values():
-            self.warnings += stage.doubts(seconds)
             for port in stage.inputs:
                 if 0 < port.delay < stage.shared.block_size:
                     raise InputError(
@@ -324,7 +327,14 @@ class Cell:
                 self._check_preview(stage)
             if isinstance(stage, Learner):
                 self._check_delay(stage, high)
-                self._check_convergence(stage, stage.checked_speeds(low, high))
+                self._check_convergence(stage, stage.checked_speeds(low, high), cures=cures)
+                self.warnings += stage.encoder_warnings(low, high, self.master.parameters.counts_per_revolution)
+
+    @property
+    def margins(self) -> dict[str, float | None]:
+        """Stability margin of each learning controller, 1 less its factor of a cycle; None if that is not known."""
+        learners = (name for name, stage in self.stages.items() if isinstance(stage, Learner))
+        return {name: 1.0 - self.factors[name] if name in self.factors else None for name in learners}
 
     def learned(self, stage: Learner) -> list[tuple[Response, str]]:
         """Responses and names of the drives that a channel commands."""
@@ -337,7 +347,7 @@ class Cell:
             if remapped(drive.shared, topic) in commands and any(port.topic == topic for port in drive.inputs)
         ]
 
-    def _check_convergence(self, stage: Learner, speeds: Collection[float]) -> None:
+    def _check_convergence(self, stage: Learner, speeds: Collection[float], *, cures: bool) -> None:
         command = remapped(stage.shared, stage.outputs[0].topic)
         unknown = [name for name, member in self.unknown.items() if command in member.reads]
         for name in unknown:
@@ -356,7 +366,8 @@ class Cell:
             if told:
                 worst, speed = max(told)
                 self.factors[stage.name] = max(worst[0], self.factors.get(stage.name, 0.0))
-                _check_factor(stage, drive, worst, speed)
+                loop = Loop(stage, [response for response, _ in learned], speeds)
+                _check_factor(loop, drive, worst, speed, cures=cures)
             else:
                 untold.append(f"{stage.name}: {stage.kind} tells no factor of a cycle: nobody knows if it converges")
         if not learned and not unknown:
@@ -440,12 +451,14 @@ class Cell:
             self.unchecked.append(f"{stage.name}: {stage.kind} tells no longest feedback_delay")
         elif delay > largest:
             least = stage.shared.block_size
-            allowed = f"allowed: {least} up to {largest}"
+            allowed = f"{least} up to {largest}"
             if largest < least:
-                allowed = f"not even a block of {least}; give more cycle_revolutions, less lead_time, or turn slower"
+                allowed = f"{largest} or less, with a block_size no longer than that"
+            if largest < 1:
+                allowed = "a longer cycle, a shorter lead, or a spindle that turns slower"
             raise InputError(
                 f"{stage.name}.feedback_delay = {delay} samples: at {speed:.4g} rad/s the cycle leaves "
-                f"{max(largest, 0)}; {allowed}"
+                f"{max(largest, 0)}; allowed: {allowed}"
             )
 
     def _check_preview(self, stage: LearningController) -> None:
@@ -510,11 +523,12 @@ def _check_flank(owner: Tool | ProfileStage | None) -> None:
         )
 
 
-def _check_factor(stage: Learner, drive: str, worst: tuple[float, float], speed: float) -> None:
-    largest, waves = worst
+def _check_factor(loop: Loop, drive: str, worst: tuple[float, float], speed: float, *, cures: bool) -> None:
+    (largest, waves), stage = worst, loop.stage
     where = f"{waves * speed:.5g} rad/s ({waves:.4g} waves at {speed:.4g} rad/s)"
     if largest >= 1.0 and not stage.parameters.allow_unstable:
+        told = " or ".join(loop.cures() if cures else []) or stage.remedy
         raise InputError(
             f"{stage.name}: learning diverges with {drive}: {stage.factor} = {largest:.4g} at {where} with "
-            f"{stage.settings()}; allowed: below 1 ({stage.remedy}, damp the drive, or set allow_unstable)"
+            f"{stage.settings()}; allowed: below 1 ({told}; or set allow_unstable)"
         )

@@ -4,6 +4,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from lathe_rc.bag.repairing.recover import recover as recover_bag
 _JSON = click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 _BAG = click.argument("path", metavar="BAG", type=click.Path(path_type=Path))
 _LOSSY = 3  # exit code where something is missing
+_SIMULATED = 10**17  # [ns] that simulated time does not reach: three years; other clocks have passed it in 1973
 
 
 @click.group()
@@ -43,9 +45,13 @@ def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
 @_BAG
 @click.option("--metrics/--no-metrics", default=True, help="form error of the part; reads the whole bag")
 @_JSON
-def info(path: Path, *, metrics: bool, as_json: bool) -> None:
-    """Topics, rates, span, scenario and the form error of the part."""
-    with Source(path) as source:
+@click.pass_context
+def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> None:
+    """Topics, rates, span, scenario and the form error of the part.
+
+    Of a damaged bag: what can be read of it, and the damage; exit code 3.
+    """
+    with Source(path, partial=True) as source:
         span = (source.last_ns - source.first_ns) * 1e-9
         types = {topic: said.type for topic, said in source.topics.items()}
         topics: dict[str, dict[str, Any]] = {
@@ -59,15 +65,19 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
         told: dict[str, Any] = {
             "bag": str(path),
             "start_s": source.first_ns * 1e-9,
+            "start": _date(source.first_ns),
             "span_s": span,
             "topics": topics,
+            "unread": [asdict(each) for each in source.unread],
             "about": dict(source.about),
             "contradictions": source.contradictions,
+            "strangers": provenance.strangers(source.about),
+            "damage": source.damage,
         }
-    told["error_um"] = _metrics(path, types) if metrics else None
+    told["error_um"] = _metrics(path, types) if metrics and not source.damage else None
     if as_json:
         click.echo(json.dumps(told))
-        return
+        ctx.exit(_LOSSY if source.damage else 0)
     console = Console(highlight=False, soft_wrap=True)
     table = RichTable(show_edge=False, header_style="bold")
     for column, justify in (("topic", "left"), ("type", "left"), ("messages", "right"), ("rate [Hz]", "right")):
@@ -76,9 +86,13 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
         rate = f"{said['rate_hz']:.4g}" if said["rate_hz"] else ""
         table.add_row(Text(topic), Text(said["type"].rpartition("/")[2]), str(said["messages"]), rate)
     console.print(table)
-    for what in told["contradictions"]:
+    for each in source.unread:
+        console.print(Text(f"not read: {each}"))
+    for what in (*told["contradictions"], *told["damage"]):
         click.echo(what, err=True)
-    console.print(f"span: {span:.6g} s from {told['start_s']:.6g} s on")
+    for what in told["strangers"]:
+        console.print(Text(what))
+    console.print(f"span: {span:.6g} s from {told['start'] or format(told['start_s'], '.6g') + ' s'} on")
     if told["error_um"]:
         first, last = told["error_um"]["first"], told["error_um"]["last"]
         console.print(
@@ -97,6 +111,14 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
             console.print(Text(f"{key.removeprefix(provenance.FILE)}: a file, {len(text)} characters in base64"))
         else:
             console.print(Text(f"{key.removeprefix('lathe_rc.')}: {text}"))
+    ctx.exit(_LOSSY if source.damage else 0)
+
+
+def _date(log_ns: int) -> str | None:
+    """Date of a log time in UTC; None: simulated time, which begins near 0."""
+    if log_ns < _SIMULATED:
+        return None
+    return datetime.fromtimestamp(log_ns // 10**9, timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
 @bag.command()
@@ -106,7 +128,8 @@ def info(path: Path, *, metrics: bool, as_json: bool) -> None:
 def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
     """Verify sequence, gaps, numbers, checksums and recorded digests.
 
-    Exit code 0: clean, 3: lossy, 1: wrong, 2: no bag, or one that cannot be read.
+    Exit code 0: clean, 3: lossy, 1: wrong, 2: no bag, or one that cannot be read. Code and files that it names and
+    does not hold get a line each.
     """
     found = check_bag(path)
     told = {
@@ -114,6 +137,8 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
         "clean": not found.exit_code,
         "wrong": found.wrong,
         "lost": found.lost,
+        "strangers": found.strangers,
+        "unread": found.unread,
         "messages": found.messages,
         "samples": found.samples,
         "digests_compared": found.compared,
@@ -122,7 +147,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(told))
     else:
-        for what in (*found.wrong, *found.lost):
+        for what in (*found.wrong, *found.lost, *found.strangers, *(f"not read: {each}" for each in found.unread)):
             click.echo(what)
         state = {0: "clean", 1: "wrong", _LOSSY: "lossy"}[found.exit_code]
         digests = f"{found.compared} digests as recorded" if found.compared else "no digests recorded"
@@ -136,7 +161,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
 @_JSON
 @click.pass_context
 def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: bool) -> None:
-    """Write what is whole of a broken bag to a new one; exit code 0: nothing is missing, 3: something is."""
+    """Copy what is whole of a broken bag to a new one; exit code 0: no message is missing, 3: some are."""
     target = output or path.with_name(f"{path.stem if path.is_file() else path.name}_recovered")
     found = recover_bag(path, target)
     told = {
@@ -144,6 +169,7 @@ def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: boo
         "output": str(target),
         "saved": found.saved,
         "skipped": found.skipped,
+        "missing": found.missing,
         "lost_bytes": found.lost_bytes,
         "damage": list(found.damage),
     }

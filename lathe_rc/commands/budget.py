@@ -12,6 +12,7 @@ from lathe_rc.commands import options
 @click.argument("scenario")
 @click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of the runs")
 @options.overrides
+@options.allow_code
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def budget(scenario: str, revolutions: float | None, overrides: tuple[str, ...], *, as_json: bool) -> None:
     """Tell what causes make of the form error of a SCENARIO: it runs offline with one after the other switched off."""

@@ -15,5 +15,5 @@ from lathe_rc.scaffold import KINDS, begin
 def new(kind: str, name: str, *, plain: bool) -> None:
     """Begin a package NAME, in a folder of that name, with a control law, a drive, a stage or a study of your own."""
     files = begin(kind, name, Path(), compiled=not plain)
-    run = f"lathe run {name}.yaml" if KINDS[kind].members else f"lathe study {name}:STUDY"
+    run = f"lathe run {name}.yaml" if KINDS[kind].members else f"lathe study --allow-code {name} {name}:STUDY"
     click.echo(f"{name}: {', '.join(files)}\nnext: cd {name} && {run}")

@@ -1,7 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Options that several commands have; to import them takes no more than click."""
 
+from collections.abc import Iterable
+
 import click
+
+from lathe_rc import trust
+
+allow_code = click.option(
+    trust.OPTION,
+    multiple=True,
+    metavar="PACKAGE",
+    is_eager=True,
+    expose_value=False,
+    callback=lambda _ctx, _option, packages: _allow(packages),
+    help="import classes that scenario, bag or members name from this package, also of the current folder; repeatable",
+)
+
+
+def _allow(packages: Iterable[str]) -> None:
+    for package in packages:
+        trust.allow(package)
+
 
 overrides = click.option(
     "--set", "overrides", multiple=True, metavar="NODE.PARAM=VALUE", help="also PARAM=VALUE if shared"

@@ -48,17 +48,24 @@ def _events(result: harness.Result) -> RichTable:
 
 
 def facts(result: harness.Result) -> list[str]:
-    """Whether the part is in tolerance, what was sent and lost, how fast, and who was refused."""
+    """Whether the form error grows, whether the part is in tolerance, what was sent and lost, how fast, and who was refused."""
     refused = [f"{count} messages refused from {sender}" for sender, count in result.refused.items()]
     surface = result.surface
     return [
-        *([result.verdict.told()] if result.verdict else []),
+        *(each.told() for each in (result.growth, result.verdict) if each),
+        *_margins(result),
         *([part.along_in_words(surface) if isinstance(surface, Lay) else surface] if surface else []),
         f"{result.blocks} blocks sent, {result.dropped} lost; {result.errors.rms.size} revolutions",
         f"{result.simulated_s:.2f} s simulated in {result.wall_s:.2f} s: {result.real_time_factor:.1f}x real time",
         *(_lateness(result.lateness) if result.lateness else []),
         *refused,
     ]
+
+
+def _margins(result: harness.Result) -> list[str]:
+    """The stability margin of each learning controller, in one line."""
+    told = [f"{name} {'not known' if margin is None else f'{margin:.4g}'}" for name, margin in result.margins.items()]
+    return [f"stability margin: {', '.join(told)}"] if told else []
 
 
 def _lateness(told: Lateness) -> list[str]:

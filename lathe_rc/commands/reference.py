@@ -5,11 +5,13 @@ import click
 
 from lathe_rc import reference as pages
 from lathe_rc.cell.scenario import TABLES
+from lathe_rc.commands import options
 from lathe_rc.errors import InputError
 
 
 @click.command()
 @click.argument("stages", nargs=-1)
+@options.allow_code
 def reference(stages: tuple[str, ...]) -> None:
     """Print the reference of nodes, topics, messages and parameters as Markdown, or that of some STAGES alone."""
     for kind in stages:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from lathe_rc.commands import options
+
 
 @click.command()
 @click.argument("bag", type=click.Path(path_type=Path))
@@ -16,6 +18,7 @@ import click
 @click.option("--topics", multiple=True, metavar="TOPIC", help="repeatable; default: all")
 @click.option("--wait", type=click.IntRange(min=0), default=0, metavar="N", help="begin when each topic has N readers")
 @click.option("--as-cell", is_flag=True, help="as the nodes that made it; begins when a recorder node is ready")
+@options.allow_code
 def replay(
     bag: Path, rate: float, start: float, end: float, topics: tuple[str, ...], wait: int, *, loop: bool, as_cell: bool
 ) -> None:

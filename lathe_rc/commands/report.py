@@ -5,12 +5,15 @@ from pathlib import Path
 
 import click
 
+from lathe_rc.commands import options
+
 
 @click.command()
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True, help="HTML file"
 )
+@options.allow_code
 @click.option("--budget", is_flag=True, help="what the form error is made of, by some ten runs of the bag's scenario")
 def report(bag: Path, output: Path, *, budget: bool) -> None:
     """Tell what a recording holds on one page: result, figures, what was lost; it opens without network."""

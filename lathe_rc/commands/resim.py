@@ -19,6 +19,7 @@ from lathe_rc.bag.resimulation import identify
 from lathe_rc.bag.resimulation.bag_spindle import asked_for
 from lathe_rc.bag.resimulation.identify import Identified
 from lathe_rc.bag.resimulation.resim import Resimulation, resimulate
+from lathe_rc.commands import options
 from lathe_rc.errors import InputError
 
 _SHOWN = 10  # revolutions
@@ -122,6 +123,7 @@ def _has_scenario(bag: Path) -> bool:
 @click.option("--write-parameters", type=click.Path(path_type=Path), help="file for the scenario, or the drive, found")
 @click.option("--write-form", type=click.Path(path_type=Path), help="CSV file for the tool's position by angle")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="folder of a bag for the result; must not exist")
+@options.allow_code
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 @click.pass_context
 def resim(

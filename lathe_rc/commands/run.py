@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lathe_rc import starting
+from lathe_rc import starting, trust
 from lathe_rc.commands import options
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 @options.start
 @click.option("--require-tolerance", is_flag=True, help="exit with 1 unless the run ends within the tool's tolerance")
 @click.option("--budget", is_flag=True, help="tell what the form error is made of as well, by some ten further runs")
+@options.allow_code
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def run(
     scenario: str,
@@ -49,6 +50,7 @@ def run(
     as_json: bool,
 ) -> None:
     """Run a SCENARIO, a ROS 2 parameter file, to its end."""
+    trust.allow_own_code()
     if mode != "offline" and start != "spawn":
         starting.server().preload({})  # it imports while this process does
     from lathe_rc.commands import running

@@ -12,7 +12,7 @@ from rich.progress import Progress
 
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Row, Value
-from lathe_rc.commands import picture
+from lathe_rc.commands import options, picture
 from lathe_rc.errors import InputError
 from lathe_rc.names import instead
 from lathe_rc.studies import STUDIES
@@ -146,6 +146,7 @@ def _summary(name: str) -> str:
 
 
 @click.group(cls=_Studies, invoke_without_command=True)
+@options.allow_code
 @click.pass_context
 def study(ctx: click.Context) -> None:
     """Compute a table or figure of the papers; without a name, list the studies."""

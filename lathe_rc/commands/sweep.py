@@ -124,6 +124,7 @@ def space_of(
 @click.option("--out", type=click.Path(path_type=Path), help="folder of the results; default: sweep-SCENARIO")
 @options.scheduler
 @options.workers
+@options.allow_code
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def run(
     scenario: str,
@@ -277,6 +278,7 @@ def _said(name: str, value: object) -> str:
 @click.option("--cell", type=click.IntRange(0), help="run this cell again, and compare it with its row")
 @click.option("--bag", type=click.Path(path_type=Path), help="with --cell: folder to record it to")
 @click.option("--goal", metavar="COLUMN", help="what the page judges cells by  [default: tool.max_error]")
+@options.allow_code
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def show(folder: Path, cell: int | None, bag: Path | None, goal: str | None, *, as_json: bool) -> None:
     """Show what is in the FOLDER of a sweep, and write FOLDER/page.html and its figures: maps, sensitivity, yield."""

@@ -67,6 +67,7 @@ _STEPS = 5  # of the history that are shown
 @click.option("--out", type=click.Path(path_type=Path), help="folder of the results; default: tune-SCENARIO")
 @options.scheduler
 @options.workers
+@options.allow_code
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 def tune(
     scenario: str,
@@ -145,6 +146,9 @@ class _Watch(Watch):
 
     def __call__(self, event: Mapping[str, Any]) -> None:
         """Take an event of `lathe_rc.sweep.tune.run`."""
+        if event["event"] == "waiting":
+            self.describe("another program computes the last trials")
+            return
         if event["event"] != "told":
             self.told = event.get("trials", self.told)
             super().__call__(event)

@@ -10,8 +10,14 @@ better: the edge was passed within the last sample. γ is then more than such an
 The intensity of the noise follows from what the speed is expected to do: a deviation of relative amplitude d at the
 frequency w has a derivative of order k of d·Ω0·w^k, which lasts about 1/w. The filter is then as fast as the counts
 allow.
+
+It takes the rounding to a count for white noise. It is none where the counts per sample c are near a ratio p/m of small
+numbers: the rounding then repeats every m samples but for a beat of m·|c - p/m| per sample, which the filter follows if
+it is slow enough.
 """
 
+from collections.abc import Collection
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +30,7 @@ Array = npt.NDArray[np.float64]
 _TURN = 2.0 * np.pi
 _ROUNDING = 1e-18  # [rad²] variance of an ideal encoder
 _LEAST_SPREAD = 0.2  # of the speed before the first sample, relative to the nominal one
+_FOLLOWED = 1.75  # beats up to so many times the filter's bandwidth are: by simulation at 16 and 64 kHz, 1000, 3000 rpm
 
 
 class AngleFilterTable(NamedTuple):
@@ -66,6 +73,36 @@ def angle_filter(step: float, counts: int, nominal: float, deviation: float, fre
     intensity = float(spread[order - 1] ** 2 / frequency)
     state = np.array([0.0, nominal, 0.0, 0.0])
     return AngleFilterTable(step, quantum, order, intensity, state, np.diag(variances), np.array([np.nan]))
+
+
+def counts_per_sample(filter_: AngleFilterTable, speed: float) -> float:
+    """Counts that the encoder passes in a sample at a speed [rad/s]; 0: it is ideal."""
+    return speed * filter_.step / filter_.quantum if filter_.quantum else 0.0
+
+
+def followed_ratio(
+    filter_: AngleFilterTable, low: float, high: float, ratios: Collection[Fraction]
+) -> Fraction | None:
+    """Ratio near which the rounding of the counts beats so slowly that the filter follows it.
+
+    Args:
+        filter_: before its first sample.
+        low, high: speeds between which the spindle turns [rad/s].
+        ratios: of counts per sample that are looked at.
+
+    Returns:
+        The one of the smallest numbers; None: near none of them.
+    """
+    if not filter_.quantum:
+        return None
+    passed = counts_per_sample(filter_, float(filter_.state[1]))
+    width = filter_.quantum * min(passed, 1.0)  # of a reading, of which there is one in 1/c samples where c is below 1
+    power = width**2 / 12.0 * filter_.step / min(passed, 1.0)
+    bandwidth = (filter_.intensity / power) ** (0.5 / filter_.order)  # [rad/s]
+    beat = _FOLLOWED * bandwidth * filter_.step / _TURN  # per sample
+    slowest, fastest = counts_per_sample(filter_, low), counts_per_sample(filter_, high)
+    near = [each for each in ratios if slowest - beat / each.denominator < each < fastest + beat / each.denominator]
+    return min(near, key=lambda each: (each.numerator * each.denominator, each), default=None)
 
 
 @inlined

@@ -64,12 +64,14 @@ def smoothing(waves: float, points: int) -> Array:
     Raises:
         InputError: it is wider than a revolution.
     """
-    deviation = _HALF * points / (_TURN * waves)
+    unit = _HALF * points / _TURN
+    deviation = unit / waves
     reach = int(np.ceil(_TAIL * deviation))
-    if 4 * reach + 1 > points:
+    widest = (points - 1) // 4
+    if reach > widest:
         raise InputError(
-            f"{waves:g} waves per revolution: the filter is wider than a revolution; allowed: {_HALF * 22 / _TURN:.0f} "
-            "waves or more"
+            f"{waves:g} waves per revolution: the filter is wider than a revolution; allowed: "
+            f"{np.ceil(_TAIL * unit / widest):.0f} waves or more"
         )
     gauss = np.exp(-0.5 * (np.arange(-reach, reach + 1) / deviation) ** 2)
     gauss /= gauss.sum()

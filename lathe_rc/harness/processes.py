@@ -8,7 +8,6 @@ import queue
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -18,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 
-from lathe_rc import starting
+from lathe_rc import starting, trust
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.extensions import search_path
@@ -115,6 +114,7 @@ class Processes:
             environment[THROUGHPUT] = "1"
         name = "+".join(group)
         arguments = [
+            *trust.arguments(),
             *(f"{node}:{self._scenario.kind(node)}" for node in group),
             *("--ros-args", "--params-file", str(self._file), "-r", f"__ns:={self._namespace}"),
             *("--enclave", absolute(self._namespace, group[0])),
@@ -139,7 +139,7 @@ class Processes:
     def _command(self, first: str, arguments: Sequence[str]) -> list[str]:
         """The command that starts a process as an interpreter of its own; empty where it is to be forked."""
         prefix = self._prefix.get(first, ())
-        words = [*prefix, sys.executable, "-m", "lathe_rc.nodes.container", *arguments]
+        words = [*prefix, *trust.interpreter("lathe_rc.nodes.container"), *arguments]
         return words if prefix or self._fresh else []
 
     def _listen(self, name: str, line: socket.socket, child: Child) -> None:

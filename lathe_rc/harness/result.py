@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from lathe_rc import part
 from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.metrology import Lay, Measurement
-from lathe_rc.analysis.tolerance import Verdict
+from lathe_rc.analysis.tolerance import Growth, Verdict
 from lathe_rc.cell.durations import Lateness
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
@@ -41,7 +41,10 @@ class Result:
         refused: messages from outside the cell that the nodes refused, by sender.
         not_reached: events that the run was too short for, by node.
         unchecked: what the check before the start could not see, since laws or drives of others do not tell it.
-        warnings: what makes the form worse than the laws can do, and its cure, as the check before the start found it.
+        warnings: doubts about parameters that can be meant, and what makes the form worse than the laws can do, with
+            its cure, as the check before the start found them.
+        margins: stability margin by learning controller, 1 less the largest factor of a cycle over all frequencies
+            and speeds (sup|Q - γZ| of repetitive control) [1]; None of a law that tells no factor.
         lateness: of the blocks; None if there was no pace to keep, as offline or with a ``speed_factor`` of 0.
 
     Example:
@@ -71,6 +74,7 @@ class Result:
     not_reached: Mapping[str, Sequence[str]] = field(default_factory=dict)
     unchecked: Sequence[str] = ()
     warnings: Sequence[str] = ()
+    margins: Mapping[str, float | None] = field(default_factory=dict)
     lateness: Lateness | None = None
 
     def __repr__(self) -> str:
@@ -134,6 +138,11 @@ class Result:
         """Whether the part is in tolerance; None if the scenario's tool has no ``tolerance``."""
         return part.verdict(self.scenario, self.recording)
 
+    @property
+    def growth(self) -> Growth | None:
+        """The growth of a form error that diverges, or grows otherwise; None if it does not."""
+        return part.error_growth(self.recording)
+
     @cached_property
     def surface(self) -> Lay | str | None:
         """The surface along the part, or why there is none; None: the scenario has no tool with a `nose_radius`."""
@@ -158,7 +167,7 @@ class Result:
 
     def summary(self) -> dict[str, object]:
         """The output of ``lathe run --json``."""
-        errors, step, verdict = self.errors, self.scenario.shared.step, self.verdict
+        errors, step, verdict, growth = self.errors, self.scenario.shared.step, self.verdict, self.growth
 
         def of(revolution: int) -> dict[str, Any] | None:
             return part.numbers(self.part, revolution) if errors.rms.size else None
@@ -181,6 +190,7 @@ class Result:
             "not_reached": {node: list(events) for node, events in self.not_reached.items()},
             "unchecked": list(self.unchecked),
             "warnings": list(self.warnings),
+            "stability_margin": dict(self.margins),
             "error_um": {
                 "first": of(0),
                 "last": of(-1),
@@ -189,6 +199,7 @@ class Result:
                 "per_revolution_ront": (self.part.roundness.peak_to_valley * 1e6).tolist() if errors.rms.size else [],
             },
             "tolerance_um": verdict.summary() if verdict else None,
+            "growth_um": growth.summary() if growth else None,
             "along_um": part.along(self.surface) if isinstance(self.surface, Lay) else self.surface,
             "bag": str(self.bag) if self.bag else None,
             "snapshots": [str(path) for path in self.snapshots],

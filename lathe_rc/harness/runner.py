@@ -85,7 +85,7 @@ def run(
 
         refuse_existing(bag)
     result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace), start)
-    result = replace(result, unchecked=cell.unchecked, warnings=cell.warnings)
+    result = replace(result, unchecked=cell.unchecked, warnings=cell.warnings, margins=cell.margins)
     if result.bag is not None:
         from lathe_rc.bag.check import write_digests
 

@@ -5,8 +5,11 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple, NoReturn
 
+from lathe_rc import trust
+from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Table
 from lathe_rc.errors import InputError, LatheError
 
@@ -92,8 +95,12 @@ def executable(name: str, table: type[Table], run: Callable[[list[str]], int]) -
         table: its parameters.
         run: what it does with a command line of ROS; returns the exit code.
     """
-    words = sys.argv[1:]
-    exit_with(lambda: 0 if help_or_refusal(f"ros2 run lathe_rc {name}", name, table, words) else run(words))
+
+    def work() -> int:
+        words = trust.taken_from(sys.argv[1:])
+        return 0 if help_or_refusal(f"ros2 run lathe_rc {name}", name, table, words) else run(words)
+
+    exit_with(work)
 
 
 def exit_with(work: Callable[[], int]) -> NoReturn:
@@ -116,3 +123,21 @@ def rules(words: Sequence[str]) -> Iterator[Rule]:
             target, _, value = following.partition(":=")
             node, _, parameter = target.rpartition(":")
             yield Rule(following, node, parameter, value)
+
+
+def parameter_files(words: Sequence[str]) -> list[Path]:
+    """The parameter files of a command line of ROS."""
+    return [Path(following) for word, following in pairwise([*words, ""]) if word == "--params-file"]
+
+
+def texts(words: Sequence[str]) -> set[str]:
+    """All texts that are values of parameters on a command line of ROS and in its files.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    values = [ros_yaml.parse_value(rule.value, f"-p {rule.text}") for rule in rules(words)]
+    values += [
+        value for path in parameter_files(words) for own in ros_yaml.read(path).values() for value in own.values()
+    ]
+    return {value for value in values if isinstance(value, str)}

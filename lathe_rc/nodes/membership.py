@@ -7,14 +7,14 @@ The time master names the members; each announces who it is and how far it has c
 import json
 import os
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from lathe_rc_msgs.msg import CellState, Member
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
-from lathe_rc import messages
+from lathe_rc import messages, trust
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import MASTERS
@@ -150,9 +150,12 @@ class Membership(Lifecycle):
         if kind is not None:
             values = json.loads(member.parameters) | {"stage": member.stage}
             missing = [row for row in kind.rows() if row not in values]
-            if not missing:
+            refused = "" if missing else _refused(kind, values)
+            if not missing and not refused:
                 return kind.read(name, values)
-            why = f"its parameters do not say {missing[0]}" + (f" and {len(missing) - 1} others" if missing[1:] else "")
+            why = refused or f"its parameters do not say {missing[0]}" + (
+                f" and {len(missing) - 1} others" if missing[1:] else ""
+            )
         if name not in self._told_unknown:
             self._told_unknown.add(name)
             self.get_logger().info(f"{name}, stage {shown(repr(member.stage))}, is known by its topics alone: {why}")
@@ -248,6 +251,20 @@ class Membership(Lifecycle):
     def _who_publishes(self, topic: str) -> list[str]:
         """Nodes that publish a topic, as the graph lists them."""
         return sorted(_name(end) for end in self.get_publishers_info_by_topic(topic))
+
+
+def _refused(kind: type[NodeParameters], values: Mapping[str, object]) -> str:
+    """Why the parameters that a member announces are not taken: they name code or files that it may not name."""
+    for row in kind.rows().values():
+        value = values[row.name]
+        if row.named is not None:
+            registry = row.named.registry
+            for name in row.named.others(value):
+                if not registry.permits(name):
+                    return f"{row.name} = {shown(repr(name))}: {registry.why_not(name)}"
+        if row.is_file and value and not trust.may_announce(str(value)):
+            return f"{row.name} = {shown(repr(value))}: a file that no parameter file of this process names"
+    return ""
 
 
 def _names(endpoints: list[Any]) -> set[str]:

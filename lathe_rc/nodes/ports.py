@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from ament_index_python import has_resource
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from lathe_rc import messages
@@ -21,8 +22,16 @@ from lathe_rc.nodes.refused_messages import ForeignMessage
 
 
 def message_class(msgtype: str) -> Any:
-    """The rclpy class of a message type."""
+    """The rclpy class of a message type. A bag or a topic names it: no package is imported but those of interfaces.
+
+    Raises:
+        ImportError: there is no such package of interfaces here.
+        AttributeError: it has no such message.
+        ValueError: that is no name of a type.
+    """
     package, kind, name = msgtype.split("/")
+    if package != messages.PACKAGE and not (package and has_resource("rosidl_interfaces", package)):
+        raise ImportError(f"{package} is no package of interfaces here")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
 
 

@@ -12,6 +12,7 @@ import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from functools import cache, partial
 from types import FrameType
 from typing import Any, NoReturn, cast
 
@@ -21,6 +22,8 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 from rclpy.type_support import check_for_type_support
 
+from lathe_rc import trust
+from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import names_others
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
@@ -174,7 +177,14 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
 
     Returns:
         The exit code: 0, or that of the first node that has failed, or whose cell went to its safe state.
+
+    Raises:
+        InputError: a parameter file lies in a bag, and names code that is not allowed or files elsewhere.
     """
+    for file in arguments.parameter_files(args):
+        if trust.bag_around(file.parent) is not None:
+            scenarios.load(file)  # it is data, and refused if it names code or files elsewhere
+    trust.user_names(cache(partial(arguments.texts, args)))
     faulthandler.enable()  # a crash of a library leaves where it happened in the log
     faulthandler.register(signal.SIGUSR1)  # and the harness can ask where a silent process is
     _tune(members[0][0])
@@ -238,7 +248,7 @@ def split(words: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:
     Raises:
         InputError: there are none, or something else stands before ``--ros-args``.
     """
-    named, rest = arguments.split(words)
+    named, rest = arguments.split(trust.taken_from(words))
     for text in named or [""]:
         if not text or text.startswith("-") or ":=" in text:
             raise InputError(f"no node {text!r}; allowed: {TABLES.allowed()}, or NAME:STAGE; then {arguments.ROS} ...")

@@ -4,14 +4,18 @@
 import json
 import tempfile
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import chain
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NoReturn
 
 from builtin_interfaces.msg import Time
 from lathe_rc_msgs.msg import CellState, Member, Progress
 from rclpy.duration import Duration
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -20,15 +24,18 @@ from rosbags.interfaces import Qos, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
+from lathe_rc import trust
 from lathe_rc.bag import provenance
+from lathe_rc.bag.reading.limits import MOST_BEFORE, MOST_SENT
 from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.storage import Message
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.replayer import KIND, ReplayerParameters
 from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.names import instead
 from lathe_rc.nodes import alone, arguments
 from lathe_rc.nodes.ports import latched_qos, message_class
@@ -41,13 +48,15 @@ _CLOCK_END = 2**31 * 10**9  # [ns] that it cannot tell any more
 # the order of their publication need not wait much longer for one that is late
 _PROMPT = 100_000_000
 _SETBACK = 1_000_000_000  # [ns] by which the computer's clock may be set back without harm
+_LONG = 10.0  # [s] of wall time until the next message that a user is told of
 _LOOK = 0.05  # [s] of wall time between looks at services and signals
 
 
 def _qos(recorded: Sequence[Qos]) -> QoSProfile:
-    """As the topic was offered; reliable if nothing is known of it."""
-    best_effort = bool(recorded) and recorded[0].reliability == QosReliability.BEST_EFFORT
-    latched = bool(recorded) and recorded[0].durability == QosDurability.TRANSIENT_LOCAL
+    """As the topic was offered; reliable and volatile if nothing is known, or its publishers differ, as in rosbag2."""
+    first = recorded[0] if recorded and not _mixed(recorded) else None
+    best_effort = first is not None and first.reliability == QosReliability.BEST_EFFORT
+    latched = first is not None and first.durability == QosDurability.TRANSIENT_LOCAL
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=_DEPTH,
@@ -56,40 +65,49 @@ def _qos(recorded: Sequence[Qos]) -> QoSProfile:
     )
 
 
+def _mixed(recorded: Sequence[Qos]) -> bool:
+    """Whether publishers of a topic offered different things; history and depth are their own affair."""
+    return len({each._replace(history=recorded[0].history, depth=0) for each in recorded}) > 1
+
+
 class Replayer:
     """Sends the messages of a bag in the order of their log times.
 
     Args:
         node: carries the services ``~/pause``, ``~/resume`` and ``~/toggle_paused``, and /clock.
         parameters: what and how fast.
+        source: the bag.
 
     Raises:
-        InputError: no bag, a topic that it has not, or a message type that this machine has not.
+        InputError: a topic that the bag has not, or a message type that this machine has not.
     """
 
-    def __init__(self, node: Node, parameters: ReplayerParameters) -> None:
-        self._node, self._parameters = node, parameters
-        if not parameters.bag:
-            raise InputError(f"{KIND}.bag is empty; name the bag's folder")
+    def __init__(self, node: Node, parameters: ReplayerParameters, source: Source) -> None:
+        self._node, self._parameters, self._source = node, parameters, source
         if parameters.as_cell and (parameters.loop or parameters.start or parameters.end or parameters.topics):
             raise InputError(
                 f"{KIND}.as_cell: a cell is replayed whole and once; leave out loop, start, end and topics"
             )
-        self._source = Source(Path(parameters.bag))
         self._topics = set(parameters.topics) or set(self._source.topics) - {_CLOCK}
         if unknown := sorted(self._topics - set(self._source.topics)):
             known = instead(unknown[0], sorted(self._source.topics), listing=f"lathe bag info {parameters.bag}")
             raise InputError(f"{KIND}.topics: {unknown[0]} is not in the bag; {known}")
         if _CLOCK in self._topics:
             raise InputError(f"{KIND}.topics: {_CLOCK} is the replayer's own and tells the log times of the bag")
-        start, end, span_ns = parameters.start, parameters.end, self._source.last_ns - self._source.first_ns
+        if len(self._topics) > MOST_SENT:
+            raise InputError(f"{parameters.bag}: {len(self._topics)} topics; allowed: up to {MOST_SENT}, named by --topics")
+        start, end, span_ns = parameters.start, parameters.end, source.last_ns - source.first_ns
         if round(start * 1e9) > span_ns or 0.0 < end <= start:
             raise InputError(
                 f"{KIND}.start = {start:g} s, end = {end:g} s: nothing to send; allowed: a start up to "
                 f"{span_ns * 1e-9:g} s, where the bag's last message is, and an end after it, or 0"
             )
-        if not 0 <= self._source.first_ns <= self._source.last_ns < _CLOCK_END:
-            raise InputError(f"{parameters.bag}: log times up to {self._source.last_ns} ns; {_CLOCK} ends in 2038")
+        self._start_ns = source.first_ns + round(start * 1e9)
+        self._stop_ns = source.first_ns + round(end * 1e9) if end else source.last_ns + 1
+        if min(self._stop_ns - 1, source.last_ns) >= _CLOCK_END:
+            raise InputError(
+                f"{parameters.bag}: log times up to {source.last_ns} ns; {_CLOCK} ends in 2038; --end leaves later ones out"
+            )
         self._classes = {topic: self._class(topic) for topic in sorted(self._topics)}
         self.paused = False
         self.sent = 0
@@ -138,7 +156,7 @@ class Replayer:
         else:
             for topic in sorted(self._topics):
                 self._publish(self._node, topic)
-        for what in self._source.contradictions:
+        for what in (*self._source.contradictions, *(f"not sent: {each}" for each in self._source.unread)):
             self._node.get_logger().warning(what)
         if _CLOCK in self._source.topics:
             self._node.get_logger().info(f"{_CLOCK} of the bag is left out: the replayer's tells the log times")
@@ -150,8 +168,13 @@ class Replayer:
         return int(self._publishers[topic].get_subscription_count())
 
     def _publish(self, node: Node, topic: str) -> None:
-        qos = _qos(self._source.topics[topic].qos)
-        self._publishers[topic] = node.create_publisher(self._classes[topic], topic, qos)
+        recorded = self._source.topics[topic].qos
+        if _mixed(recorded):
+            self._node.get_logger().warning(f"{topic}: its publishers offered different QoS; it is sent reliable and volatile")
+        try:
+            self._publishers[topic] = node.create_publisher(self._classes[topic], topic, _qos(recorded))
+        except InvalidTopicNameException as error:
+            raise InputError(f"{topic}: no name of a topic in ROS ({shown(error)}); name others with --topics") from None
         self._waiting[topic] = 0
 
     def _join(self) -> None:
@@ -169,7 +192,7 @@ class Replayer:
         self._node.create_subscription(Member, "/members", heard, latched_qos(256))
         self._node.create_subscription(Progress, "/progress", progressed, latched_qos(256))
         # The recorder puts the scenario's files into its bag as well, so they stay as long as the replayer.
-        self._folder = tempfile.TemporaryDirectory(prefix="lathe-replay-")
+        self._folder = tempfile.TemporaryDirectory(prefix=trust.REPLAYED)
         scenario = provenance.scenario_of(self._source.about, Path(self._folder.name))
         cell = Cell(scenario.nodes)
         announced = []
@@ -235,11 +258,26 @@ class Replayer:
         self._send(_STATE, self._ended)
         self._acknowledged(_STATE)
 
-    def _chosen(self) -> Iterator[tuple[str, int, bytes]]:
-        first = self._source.first_ns
-        start = first + round(self._parameters.start * 1e9) if self._parameters.start else None
-        stop = first + round(self._parameters.end * 1e9) if self._parameters.end else None
-        return self._source.messages(self._topics, start_ns=start, stop_ns=stop)
+    def _chosen(self) -> Iterator[Message]:
+        if self._start_ns > self._source.first_ns:
+            yield from self._latched()
+        yield from self._source.messages(self._topics, start_ns=self._start_ns, stop_ns=self._stop_ns)
+
+    def _latched(self) -> Iterator[Message]:
+        """Latched messages from before the start, as many as their publishers kept: a late reader had them too."""
+        kept: dict[str, deque[Message]] = {}
+        for topic in sorted(self._topics):
+            if _qos(recorded := self._source.topics[topic].qos).durability == DurabilityPolicy.TRANSIENT_LOCAL:
+                kept[topic] = deque(maxlen=min(sum(max(each.depth, 1) for each in recorded), _DEPTH))
+        size = 0
+        for message in self._source.messages(set(kept), stop_ns=self._start_ns):
+            messages = kept[message[0]]
+            size += len(message[2]) - (len(messages[0][2]) if len(messages) == messages.maxlen else 0)
+            if size > MOST_BEFORE:
+                raise InputError(f"latched messages from before the start take more than {MOST_BEFORE} B; begin at 0")
+            messages.append(message)
+        for topic, _, data in sorted(chain.from_iterable(kept.values()), key=itemgetter(1)):
+            yield topic, self._start_ns, data
 
     def _once(self) -> None:
         rate, origin, began = self._parameters.rate, None, time.monotonic()
@@ -248,6 +286,11 @@ class Replayer:
             if origin is None:
                 origin, began = log_ns, time.monotonic()
             due = began + (log_ns - origin) * 1e-9 / rate if rate else 0.0
+            if (wait := due - time.monotonic()) > _LONG:
+                offset = (log_ns - self._source.first_ns) * 1e-9
+                self._node.get_logger().warning(
+                    f"{topic}: the next message comes in {_span(wait)}, {offset:.9g} s after the first; --start passes over it"
+                )
             began += self._wait_until(due)
             if log_ns != told:
                 told = log_ns
@@ -317,10 +360,20 @@ class Replayer:
         self._waiting[topic] = 0
 
 
+def _span(seconds: float) -> str:
+    """A time in a unit that suits it."""
+    units = (("years", 31_556_952.0), ("days", 86_400.0), ("h", 3600.0), ("min", 60.0))
+    name, unit = next(((name, unit) for name, unit in units if seconds >= 2.0 * unit), ("s", 1.0))
+    return f"{seconds / unit:.3g} {name}"
+
+
 def _work(node: Node, parameters: ReplayerParameters) -> None:
-    replayer = Replayer(node, parameters)
-    replayer.run()
-    node.get_logger().info(f"{replayer.sent} messages sent")
+    if not parameters.bag:
+        raise InputError(f"{KIND}.bag is empty; name the bag's folder")
+    with Source(Path(parameters.bag)) as source:
+        replayer = Replayer(node, parameters, source)
+        replayer.run()
+        node.get_logger().info(f"{replayer.sent} messages sent")
 
 
 def run(values: Mapping[str, object], args: Sequence[str]) -> int:

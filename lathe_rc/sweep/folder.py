@@ -4,20 +4,23 @@
 DIR/scenario.yaml    the cell, as it was given
 DIR/sweep.json       its identity, what is measured, the spaces, or what is tuned
 DIR/rows/*.parquet   a row a cell, see `lathe_rc.sweep.row`
+
+Each of these files has a checksum, which is compared when it is read; those of older versions have none.
 """
 
+import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 import filelock
 import pyarrow as pa
 import pyarrow.compute
-import pyarrow.dataset
 import pyarrow.parquet
+import pydantic
 
 from lathe_rc import files
 from lathe_rc.cell import scenario as scenarios
@@ -29,6 +32,36 @@ from lathe_rc.sweep.row import Measure
 from lathe_rc.sweep.space import Space
 
 _FORMAT = 1
+_WRITING = "write.lock"  # held while one of the files is written
+_MOST = 2**30  # longest file of rows [B]
+
+
+@dataclass(frozen=True)
+class _Tuning:
+    """What is tuned; see `lathe_rc.sweep.tune`."""
+
+    targets: list[str]
+    free: dict[str, str | list[Value]]
+    goals: list[str]
+    subjects: list[str]
+    percentile: float
+    over: Space
+    sampler: str
+    seed: int
+    batch: int
+    formulas: bool
+
+
+@dataclass(frozen=True)
+class _Contents:
+    """The content of a sweep.json; see `Folder`."""
+
+    format: int
+    name: str
+    identity: str
+    measures: list[tuple[str, str, str]]
+    spaces: list[Space]
+    tuning: _Tuning | None = None
 
 
 class Folder:
@@ -50,20 +83,20 @@ class Folder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            told = json.loads(files.contents(path / "sweep.json"))
-        except (OSError, ValueError):
-            raise InputError(f"{path} holds no sweep; allowed: a folder that lathe sweep has written") from None
-        if told.get("format") != _FORMAT:
-            raise InputError(f"{path}: format {told.get('format')} of another lathe_rc; allowed: {_FORMAT}")
-        self.scenario = replace(scenarios.load(path / "scenario.yaml"), name=told["name"])
-        if self.scenario.identity != told["identity"]:
+        if not _is_there(path / "sweep.json"):
+            raise InputError(f"{path} holds no sweep; allowed: a folder that lathe sweep has written")
+        told = _contents(path / "sweep.json")
+        if told.format != _FORMAT:
+            raise InputError(f"{path}: format {told.format} of another lathe_rc; allowed: {_FORMAT}")
+        _read(path / "scenario.yaml")
+        self.scenario = replace(scenarios.load(path / "scenario.yaml"), name=told.name)
+        if self.scenario.identity != told.identity:
             raise InputError(
                 f"{path}: its scenario has changed, or a file that it names; allowed: as it was, or a new folder"
             )
-        self.measures = [Measure(*each) for each in told["measures"]]
-        self.spaces = [Space(**each) for each in told["spaces"]]
-        self.tuning: Mapping[str, Any] | None = told.get("tuning")
+        self.measures = [Measure(*each) for each in told.measures]
+        self.spaces = told.spaces
+        self.tuning: Mapping[str, Any] | None = asdict(told.tuning) if told.tuning else None
 
     @staticmethod
     def begin(
@@ -79,9 +112,25 @@ class Folder:
             InputError: it holds something else.
             LatheError: it cannot be written.
         """
-        new = not (path / "sweep.json").exists()
-        if new and path.exists() and (not path.is_dir() or any(each.name != "lock" for each in path.iterdir())):
+        with _reading(path):
+            if _is_other(path) and not (path / _WRITING).exists():  # else another process has begun it just now
+                raise InputError(f"{path} holds something else than a sweep; allowed: a new folder, or that of a sweep")
+        with writing(path):
+            path.mkdir(parents=True, exist_ok=True)
+        with _locked(path / _WRITING):
+            return Folder._begin(path, scenario, space, measures, tuning)
+
+    @staticmethod
+    def _begin(
+        path: Path,
+        scenario: Scenario,
+        space: Space | None,
+        measures: Sequence[Measure],
+        tuning: Mapping[str, Any] | None,
+    ) -> "Folder":
+        if _is_other(path):
             raise InputError(f"{path} holds something else than a sweep; allowed: a new folder, or that of a sweep")
+        new = not _is_there(path / "sweep.json")
         spaces = []
         if not new:
             there = Folder(path)
@@ -102,14 +151,15 @@ class Folder:
             "measures": [list(each) for each in measures],
             "spaces": [each.to_json() for each in spaces],
             **({} if tuning is None else {"tuning": tuning}),
+            "checksum": files.ROOM.decode(),
         }
         with writing(path):
             (path / "rows").mkdir(parents=True, exist_ok=True)
             if new:
                 with files.replacing(path / "scenario.yaml") as stream:
-                    stream.write(scenario.to_yaml(given=True).encode())
+                    stream.write(files.sealed(scenario.to_yaml(given=True).encode() + b"# " + files.ROOM + b"\n"))
             with files.replacing(path / "sweep.json") as stream:
-                stream.write(json.dumps(told, indent=1).encode())
+                stream.write(files.sealed(json.dumps(told, indent=1).encode()))
         return Folder(path)
 
     @contextmanager
@@ -122,15 +172,8 @@ class Folder:
         Raises:
             InputError: somebody does already.
         """
-        lock = filelock.FileLock(self.path / "lock")
-        try:
-            lock.acquire(blocking=wait)
-        except filelock.Timeout:
-            raise InputError(f"{self.path}: another sweep computes into it; allowed: one at a time") from None
-        try:
+        with _locked(self.path / "lock", wait=wait):
             yield
-        finally:
-            lock.release()
 
     @property
     def targets(self) -> list[str]:
@@ -166,14 +209,24 @@ class Folder:
         return found if columns is None else found.select(list(columns))
 
     def _read(self, columns: Sequence[str] | None) -> pa.Table:
-        files_ = sorted(str(path) for path in (self.path / "rows").glob("*.parquet"))
-        if not files_:
-            whole = self.schema.empty_table()
-            return whole if columns is None else whole.select(list(columns))
+        place, whole = self.path / "rows", self.schema.empty_table()
+        with _reading(place):
+            paths = sorted(path for path in place.iterdir() if path.suffix == ".parquet") if _is_there(place) else []
+        return pa.concat_tables(
+            [whole if columns is None else whole.select(list(columns)), *(self._rows(path, columns) for path in paths)]
+        )
+
+    def _rows(self, path: Path, columns: Sequence[str] | None) -> pa.Table:
+        """The rows in a file."""
+        content = pa.BufferReader(_read(path))
         try:
-            return pyarrow.dataset.dataset(files_, schema=self.schema).to_table(columns=columns)
+            names = pyarrow.parquet.read_schema(content).names
+            if missing := [name for name in row.HEAD if name not in names]:
+                raise InputError(f"{path}: no rows of a sweep: without the column {missing[0]}; allowed: without it")
+            content.seek(0)
+            return pyarrow.parquet.read_table(content, columns=columns and list(columns), schema=self.schema)
         except (pa.ArrowException, OSError) as error:
-            raise LatheError(f"{self.path}: {shown(error)}") from None
+            raise InputError(f"{path}: no rows of a sweep ({shown(error)}); allowed: without it") from None
 
     def row(self, number: int) -> dict[str, Any]:
         """The row of a cell, by column.
@@ -205,10 +258,96 @@ class Folder:
             LatheError: it cannot be written; what was written before is there still.
         """
         place = self.path / "rows"
-        with writing(self.path), filelock.FileLock(self.path / "write.lock"):  # a tuning is computed by several
+        with _locked(self.path / _WRITING), writing(self.path):  # a tuning is computed by several
             taken = [int(path.stem) for path in place.glob("*.parquet") if path.stem.isdigit()]
             with files.replacing(place / f"{max(taken, default=-1) + 1:06d}.parquet") as stream:
-                pyarrow.parquet.write_table(pa.concat_tables(rows), cast("Any", stream), compression="zstd")
+                stream.write(_parquet(pa.concat_tables(rows)))
+
+
+def _parquet(rows: pa.Table) -> bytes:
+    """A Parquet file with a checksum among its metadata: those of its pages, for other programs, leave out the rest."""
+    content = io.BytesIO()
+    with pyarrow.parquet.ParquetWriter(content, rows.schema, compression="zstd", write_page_checksum=True) as writer:
+        writer.write_table(rows)
+        writer.add_key_value_metadata({"checksum": files.ROOM.decode()})
+    return files.sealed(content.getvalue())
+
+
+def _contents(path: Path) -> _Contents:
+    try:
+        return pydantic.TypeAdapter(_Contents).validate_json(_read(path))
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(each) for each in first["loc"])
+        told = f"{where}: {first['msg']}" if where else first["msg"]
+        raise InputError(f"{path}: not written by lathe sweep or lathe tune ({shown(told)})") from None
+
+
+def _read(path: Path) -> bytes:
+    """The content of a file of a sweep.
+
+    Raises:
+        InputError: it cannot be read, or is damaged.
+    """
+    try:
+        with _reading(path):
+            content = files.contents(path, _MOST)
+        files.unsealed(content, needed=False)
+    except files.DamagedError as error:
+        cure = "; without it, a sweep computes its cells again" if path.suffix == ".parquet" else ""
+        raise InputError(f"{path}: damaged ({error}); allowed: as it was written{cure}") from None
+    return content
+
+
+def _is_other(path: Path) -> bool:
+    """Whether there is something else than the folder of a sweep."""
+    with _reading(path):
+        if not _is_there(path):
+            return False
+        names = {each.name for each in path.iterdir()} if path.is_dir() else {""}
+        return "sweep.json" not in names and not names <= {"lock", _WRITING}
+
+
+@contextmanager
+def _locked(path: Path, *, wait: bool = True) -> Iterator[None]:
+    """Hold a lock.
+
+    Raises:
+        InputError: there can be none; without ``wait``: another process holds it.
+    """
+    lock = filelock.FileLock(path)
+    try:
+        lock.acquire(blocking=wait)
+    except filelock.Timeout:
+        raise InputError(f"{path.parent}: another sweep computes into it; allowed: one at a time") from None
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or shown(error)}") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _is_there(path: Path) -> bool:
+    with _reading(path):
+        try:
+            path.lstat()
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        return True
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Say in one line why something cannot be read.
+
+    Raises:
+        InputError: it cannot.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{error.filename or path}: {error.strerror or shown(error)}") from None
 
 
 def _difference(there: Mapping[str, Any] | None, asked: Mapping[str, Any] | None) -> str:

@@ -5,6 +5,7 @@ Of a learning controller (`lathe_rc.analysis.learning`), with Q, drive and inter
 
 - ``learning_gain``: γ = 1, as in paper 001, eqs 1-5;
 - ``q_time``: the shortest with sup|Q - γZ| <= 1 - margin, since what is left grows with it: (1 - Q)/(γZ + 1 - Q);
+- ``q_pass``, ``q_stop``, ``q_ripple`` of a flat Q (fir): the widest one with that margin;
 - ``lead_time``: the lag of the drive at low frequencies, with which no slow change of the form is late; where no Q
   keeps the margin with it, the lead that allows the shortest ``q_time``; where Q is not free, the one with the least
   sup|Q - γZ|.
@@ -17,27 +18,32 @@ that makes F0; the feedback delay is in it, limits, the elasticity and keyways a
 import math
 from collections.abc import Callable, Collection
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import scipy
 
 from lathe_rc.analysis.pid_tuning import fastest
+from lathe_rc.cell.cures import Loop
+from lathe_rc.cell.cures import lag as drive_lag
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.cutting_process import CuttingProcessParameters
 from lathe_rc.cell.stages.feed_drive import FeedDriveParameters
 from lathe_rc.cell.stages.force_controller import ForceController
 from lathe_rc.cell.stages.learning_controller import LearningController
+from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.plants.cutting_force import SpecificForce
 from lathe_rc.transfer import TransferFunction
 
 _PID = ("proportional", "integral", "derivative", "derivative_filter")
+_LEARNING = {"lead_time", "q_time", "q_pass", "q_stop", "q_ripple", "learning_gain"}
 _PHASE_MARGIN, _GAIN_MARGIN = 60.0, 2.0  # [°], factor
 _BAND = (0.1, 1e3)  # [rad/s] of its crossover
 MARGIN = 0.05  #: that is kept where none is asked for
 _SHORTEST, _LONGEST = 1e-6, 1e-3  # [s] of q_time
+_GAIN = "γ = 1 (paper 001, eqs 1-5)"
 _NONE = 1.0  # [s]: in place of a q_time that there is not
 _HALVINGS = 16
 _LEADS = 20  # that are looked at before the best is refined
@@ -70,30 +76,28 @@ def settings(scenario: Scenario, targets: Collection[str], margin: float = MARGI
         free = {target.rpartition(".")[2] for target in targets if target.rpartition(".")[0] == name}
         if isinstance(stage, ForceController) and free & set(_PID):
             found |= {f"{name}.{key}": value for key, value in _force(scenario, stage).items()}
-        if isinstance(stage, LearningController) and free & {"lead_time", "q_time", "learning_gain"}:
+        if isinstance(stage, LearningController) and free & _LEARNING:
             found |= {f"{name}.{key}": value for key, value in _learning(cell, stage, free, margin).items()}
     return {target: found[target] for target in targets if target in found}
 
 
 def _learning(cell: Cell, stage: LearningController, free: Collection[str], margin: float) -> dict[str, Found]:
-    learned, speeds = cell.learned(stage), stage.checked_speeds(*cell.master.speed_range())
-    if not learned or stage.parameters.q_filter == "fir":
+    responses = [response for response, _ in cell.learned(stage)]
+    if not responses:
         return {}
+    loop = Loop(stage, responses, stage.checked_speeds(*cell.master.speed_range()))
     gain = 1.0 if "learning_gain" in free else stage.parameters.learning_gain
+    if stage.parameters.q_filter == "fir":
+        return _flat(loop, free, gain, margin)
 
     def factor(lead: float, q_time: float) -> float:
         """sup|Q - γZ|; infinite where the memory cannot hold Q."""
-        changed = {"lead_time": lead, "q_time": q_time, "learning_gain": gain}
-        try:
-            other = LearningController(stage.name, stage.parameters.model_copy(update=changed))
-        except InputError:
-            return math.inf
-        return max(other.worst(response, speed)[0] for response, _ in learned for speed in speeds)
+        return loop.factor({"lead_time": lead, "q_time": q_time, "learning_gain": gain})
 
     found: dict[str, Found] = {}
     lead, q_time = stage.parameters.lead_time, stage.parameters.q_time
     if "lead_time" in free:
-        lag = max(_lag(response) for response, _ in learned)
+        lag = max(map(drive_lag, responses))
         if "q_time" not in free:
             lead = _least(lambda each: factor(each, q_time), _FAR * lag)
             found["lead_time"] = Found(lead, "T0 with the least sup|Q - γZ|")
@@ -109,8 +113,29 @@ def _learning(cell: Cell, stage: LearningController, free: Collection[str], marg
             return {}
         found["q_time"] = Found(q_time, f"shortest with sup|Q - γZ| <= {1.0 - margin:.4g}")
     if "learning_gain" in free:
-        found["learning_gain"] = Found(gain, "γ = 1 (paper 001, eqs 1-5)")
+        found["learning_gain"] = Found(gain, _GAIN)
     return found
+
+
+def _flat(loop: Loop, free: Collection[str], gain: float, margin: float) -> dict[str, Found]:
+    """Of a flat Q; the lead is the lag of the drive where that allows one, else as it is given."""
+    given = loop.stage.parameters
+    assert isinstance(given, LearningControllerParameters), "it has a Q"
+    stop, ripple = (None if name in free else getattr(given, name) for name in ("q_stop", "q_ripple"))
+    leads = [(given.lead_time, "as it is")]
+    if "lead_time" in free:
+        leads.insert(0, (max(map(drive_lag, loop.responses)), "T0 = lag of the drive"))
+    for lead, told in leads:
+        values = {"lead_time": lead, "learning_gain": gain}
+        if "q_pass" in free:
+            flat = loop.flat(1.0 - margin, stop, ripple, values)
+        else:
+            flat = {} if loop.factor(values) <= 1.0 - margin else None
+        if flat is not None:
+            why = f"widest flat Q with sup|Q - γZ| <= {1.0 - margin:.4g}"
+            found = {name: Found(cast("float", flat[name]), why) for name in ("q_pass", "q_stop", "q_ripple") if name in flat}
+            return {**found, "lead_time": Found(lead, told), "learning_gain": Found(gain, _GAIN)}
+    return {}
 
 
 def _force(scenario: Scenario, stage: ForceController) -> dict[str, Found]:
@@ -134,12 +159,6 @@ def _force(scenario: Scenario, stage: ForceController) -> dict[str, Found]:
         return {}
     values = (gains.proportional, gains.integral, gains.derivative, gains.filter)
     return {name: Found(value, "PID of 60° and 6 dB") for name, value in zip(_PID, values, strict=True)}
-
-
-def _lag(response: Callable[[np.ndarray], np.ndarray]) -> float:
-    """Delay of a drive at low frequencies [s]."""
-    low = 1.0
-    return float(-np.angle(response(np.array([low])))[0] / low)
 
 
 def _least(cost: Callable[[float], float], longest: float) -> float:

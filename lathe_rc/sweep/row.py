@@ -58,7 +58,7 @@ STATISTICS: Mapping[str, Callable[[Samples], float]] = {
 }  #: what can be said of a signal in the last revolution
 
 _ARROW = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
-_HEAD = {"cell": pa.int64(), "key": pa.string(), "status": pa.string(), "reason": pa.string()}
+HEAD = {"cell": pa.int64(), "key": pa.string(), "status": pa.string(), "reason": pa.string()}  #: columns of each row
 _FOUND = {
     "tool.max_error": pa.float64(),
     "tool.rms_error": pa.float64(),
@@ -117,7 +117,7 @@ def measure(text: str, scenario: Scenario) -> Measure:
 
 def schema(scenario: Scenario, targets: Sequence[str], measures: Sequence[Measure]) -> pa.Schema:
     """Columns of the rows of a sweep."""
-    columns = dict(_HEAD)
+    columns = dict(HEAD)
     for target in targets:
         row = scenario.parameter(target)
         columns[target] = pa.list_(_ARROW[row.type]) if row.is_list else _ARROW[row.type]
@@ -218,7 +218,7 @@ def compute(
         scenario = base.varied(values)
         row["seed"] = scenario.shared.seed
         cell = bench.cell(scenario)
-        cell.check()
+        cell.check(cures=False)
         keeper = _Keeper(cell, cell.samples, measures)
         started = True
         errors = bench.run(cell, keeper)

@@ -5,9 +5,13 @@ Trials are asked for a batch at a time. Each is drawn with a random generator of
 and what came of a batch is told in the order of the numbers: the same search, whoever computes it and when.
 """
 
+import hashlib
+import json
+import os
+import sys
 import uuid
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +28,8 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from lathe_rc.cell.parameters import Value
-from lathe_rc.errors import LatheError, shown
+from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.files import open_file
 from lathe_rc.sweep import formulas
 from lathe_rc.sweep.aims import Score, aims
 from lathe_rc.sweep.folder import Folder, writing
@@ -39,6 +44,7 @@ BATCH = 8  #: trials that are asked for at once
 _STUDY = "tuning"
 _POPULATION = 3 * BATCH  # of NSGA-II
 _UNKNOWN = 1e9  # what the samplers are told in place of a cost that there is not: beyond all that there are
+_CHECKSUM = "checksum"  # of a line of the journal, in itself
 _BY, _SCORE = "by", "score"  # attributes of a trial: its worker, its result
 
 
@@ -58,22 +64,92 @@ class _Lock(JournalFileOpenLock):
         self._lock.release()
 
 
+class _Journal(JournalFileBackend):
+    """Optuna's journal. Each line has a checksum; lines of older versions have none."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(str(path), _Lock(path.with_suffix(".lock")))
+        self.line = 0  #: number of the line that was read last
+        if self._cut():
+            print(f"lathe: {path}: the last line is not whole: left out, and done again", file=sys.stderr)
+
+    def _cut(self) -> bool:
+        """Remove a line that a process was stopped in, or a full disk; by it the next line would be lost as well."""
+        with open(self._file_path, "rb+", opener=open_file) as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(size - 1, 0))
+            if file.read() in (b"", b"\n"):
+                return False
+            file.seek(0)
+            file.truncate(file.read().rfind(b"\n") + 1)
+        return True
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        """See `JournalFileBackend`."""
+        self._cut()
+        super().append_logs([log | {_CHECKSUM: _checksum(log)} for log in logs])
+
+    def read_logs(self, log_number_from: int) -> Generator[dict[str, Any]]:
+        """See `JournalFileBackend`.
+
+        Raises:
+            InputError: a line is damaged.
+        """
+        starts = self._log_number_offset
+        with open(self._file_path, "rb", opener=open_file) as file:
+            file.seek(starts[log_number_from])
+            for number, line in enumerate(file, log_number_from):
+                if not line.endswith(b"\n"):  # it is being written
+                    return
+                starts[number + 1] = starts[number] + len(line)
+                self.line = number + 1
+                yield self._log(line)
+
+    def _log(self, line: bytes) -> dict[str, Any]:
+        try:
+            log = json.loads(line)
+        except ValueError as error:
+            raise self.refusal(error) from None
+        if not isinstance(log, dict):
+            raise self.refusal("no log")
+        checksum = _checksum(log)
+        if log.pop(_CHECKSUM, checksum) != checksum:
+            raise self.refusal("its checksum is that of another content")
+        return log
+
+    def refusal(self, reason: object) -> InputError:
+        """The error for the line that was read last."""
+        return InputError(
+            f"{self._file_path}, line {self.line}: no journal of Optuna, or damaged ({shown(reason)}); "
+            "allowed: as it was written, or a new folder"
+        )
+
+
+def _checksum(log: Mapping[str, Any]) -> str:
+    text = json.dumps({name: value for name, value in log.items() if name != _CHECKSUM})
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
 def _opened(path: Path, goals: int) -> tuple[JournalStorage, optuna.Study]:
     """The journal, and the study in it.
 
     Raises:
-        LatheError: it cannot be read.
+        InputError: it cannot be read.
     """
     try:
-        storage = JournalStorage(JournalFileBackend(str(path), _Lock(path.with_suffix(".lock"))))
+        journal = _Journal(path)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or shown(error)}") from None
+    try:
+        storage = JournalStorage(journal)
         directions = [StudyDirection.MINIMIZE] * goals
         return storage, optuna.create_study(
             study_name=_STUDY, storage=storage, directions=directions, load_if_exists=True
         )
-    except (ValueError, KeyError) as error:
-        raise LatheError(
-            f"{path}: no journal of Optuna ({shown(error)}); allowed: as it was written, or a new folder"
-        ) from None
+    except (LatheError, OSError):
+        raise
+    except Exception as error:  # noqa: BLE001 - Optuna lets through whatever a foreign line leads to
+        raise journal.refusal(f"{type(error).__name__}: {error}") from None
 
 
 class Study:
@@ -151,6 +227,12 @@ class Study:
         """How many trials are computed."""
         return len(self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
 
+    def others_compute(self, most: int) -> bool:
+        """Whether other processes compute trials of the first ``most``, if this one has just `ask` ed for none."""
+        return any(
+            trial.number < most for trial in self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+        )
+
     def ask(self, me: str, most: int) -> list[FrozenTrial]:
         """The next batch: trials that somebody has left, filled up with new ones to ``most`` in all."""
         with writing(self._folder.path), self._folder.locked(wait=True), _quiet():
@@ -199,9 +281,9 @@ class Study:
         with writing(self._folder.path), self._folder.locked(wait=True), _quiet():
             for number, each in jobs.items():
                 self._tell(number, self._aims.score(self._known[job.key] for job in each))
-        tuning = self.tuning()
-        if best := tuning.best:
-            tuning.write(best, self._folder.path / "best.yaml")
+            tuning = self.tuning()
+            if best := tuning.best:  # while no other process writes one of fewer trials
+                tuning.write(best, self._folder.path / "best.yaml")
         watch({"event": "told", "tuning": tuning})
 
     def _take(self, table: pa.Table) -> None:
@@ -233,6 +315,11 @@ class Study:
         """The tuning so far."""
         found = []
         for trial in self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+            if _SCORE not in trial.user_attrs or not trial.params.keys() >= self._free.keys():
+                raise InputError(
+                    f"{self._folder.path / 'trials.log'}: trial {trial.number} is another program's; allowed: as "
+                    "lathe tune has written it, or a new folder"
+                )
             costs, violations, margin = cast("tuple[list[float], list[float], float]", trial.user_attrs[_SCORE])
             found.append(Trial(trial.number, self._values(trial), Score(tuple(costs), tuple(violations), margin)))
         return Tuning(self._folder, self._aims, self._over, found, self._formulas)

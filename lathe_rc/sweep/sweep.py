@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import distributed
 import pyarrow as pa
 
+from lathe_rc import trust
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario, content
@@ -149,7 +150,9 @@ def order_of(folder: Folder) -> Order:
     """The order that all jobs of a folder share."""
     scenario = folder.scenario
     text = scenario.to_yaml(given=True)
-    return Order(scenario.name, text, scenario.identity, folder.targets, folder.measures, folder.schema)
+    return Order(
+        scenario.name, text, scenario.identity, folder.targets, folder.measures, folder.schema, trust.arguments()
+    )
 
 
 def keep(

@@ -9,7 +9,9 @@ DIR, the rest        see `lathe_rc.sweep.folder`: cell n of trial m is the row m
 """
 
 import json
+import time
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import distributed
@@ -26,6 +28,7 @@ from lathe_rc.sweep.study import BATCH, Study
 from lathe_rc.sweep.sweep import Watch, crew_for, ignore
 from lathe_rc.sweep.tuned import Tuning
 
+_PAUSE = 0.2  # [s] before looking again whether other processes have computed their trials
 SAMPLERS = ("tpe", "cmaes", "nsga2")
 
 
@@ -69,7 +72,8 @@ def run(
         workers: processes of this machine.
         client: of Dask, in place of both.
         watch: called with the events of `lathe_rc.sweep.sweep.run`, ``began`` with the trials that are there, and with
-            ``told`` (tuning: all trials so far), after each batch.
+            ``told`` (tuning: all trials so far), after each batch, and ``waiting``, again and again, while the last
+            trials are those of other programs.
 
     Raises:
         InputError: what is asked for cannot be, or the folder holds something else.
@@ -114,14 +118,20 @@ def run(
         asked = state.ask(me, trials)
         there = state.finished()
         watch({"event": "began", "cells": trials * state.count, "computed": there * state.count, "trials": there})
-        if asked:
-            with crew_for(scenario, client, scheduler, workers, watch) as crew:
-                while asked:
+        with ExitStack() as stack:
+            crew = None
+            while asked or state.others_compute(trials):
+                if asked:
+                    crew = crew or stack.enter_context(crew_for(scenario, client, scheduler, workers, watch))
                     state.compute(crew, asked, watch)
-                    asked = state.ask(me, trials)
-    tuning = state.tuning()
-    if len(goals) > 1:
-        _write_front(tuning)
+                else:  # the best is known when all trials are, also those of other processes
+                    watch({"event": "waiting"})
+                    time.sleep(_PAUSE)
+                asked = state.ask(me, trials)
+    with kept.locked(wait=True):
+        tuning = state.tuning()
+        if len(goals) > 1:
+            _write_front(tuning)
     return tuning
 
 

@@ -6,6 +6,7 @@ compile what is not compiled yet, as many as take `TASK` seconds.
 """
 
 import logging
+import os
 import signal
 import tempfile
 import threading
@@ -22,6 +23,7 @@ import distributed
 import pyarrow as pa
 from distributed.scheduler import KilledWorker
 
+from lathe_rc import trust
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.batch import Bench
 from lathe_rc.cell.parameters import Value
@@ -72,6 +74,7 @@ class Order(NamedTuple):
         targets: columns of what differs.
         measures: what is measured.
         schema: of the rows.
+        code: options that let a worker import packages for it, see `lathe_rc.trust`.
     """
 
     name: str
@@ -80,6 +83,7 @@ class Order(NamedTuple):
     targets: Sequence[str]
     measures: Sequence[Measure]
     schema: pa.Schema
+    code: Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,7 @@ def _scenario(name: str, text: str, identity: str) -> Scenario:
         InputError: it is not the same there.
     """
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{name}.yaml"
+        path = Path(folder) / "scenario.yaml"
         path.write_text(text, encoding="utf-8")
         found = replace(scenarios.load(path), name=name)
     if found.identity != identity:
@@ -111,6 +115,7 @@ def _scenario(name: str, text: str, identity: str) -> Scenario:
 def compute(share: Share) -> pa.Table:
     """The rows of some cells; a task of Dask."""
     order = share.order
+    trust.taken_from(order.code)
     base, bench = _scenario(order.name, order.text, order.identity), Bench()
     rows = [
         {"cell": job.number, "key": job.key, **row.compute(base, job.values, order.targets, order.measures, bench)}
@@ -143,6 +148,7 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[distribute
     # Ctrl-C is for this process, which ends its workers.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN) if _in_main_thread() else None
     try:
+        os.environ["PYTHONSAFEPATH"] = "1"  # of the workers: the current folder is not on their path
         with dask.config.set(_SETTINGS):
             cluster = distributed.LocalCluster(
                 n_workers=workers,

@@ -134,7 +134,7 @@ def _form(form: Form, cycles: Mapping[str, Envelope], maps: int) -> FormSection:
             "Error map",
             figures.form_map(form),
             "Radius of the part less desired radius over spindle angle and revolution; red: material left. The "
-            f"colours are linear around zero and logarithmic beyond the largest of the last quarter.{grouped}",
+            f"colours are linear around zero and logarithmic beyond the largest of the quietest quarter of revolutions.{grouped}",
             page,
             [charts.form_map(form, maps)],
         ),
@@ -148,7 +148,8 @@ def _form(form: Form, cycles: Mapping[str, Envelope], maps: int) -> FormSection:
         Picture(
             "Error spectrum",
             figures.spectrum(form),
-            "Amplitude A_n of r = Σ A_n·sin(nφ + ψ_n) by undulations per revolution n.",
+            "Amplitude A_n of r = Σ A_n·sin(nφ + ψ_n) by undulations per revolution n of the first, best and last "
+            "revolution.",
             page,
             [charts.spectrum(form)],
         ),
@@ -393,6 +394,7 @@ def render(told: Gathered, name: str, command: str, made_of: Budget | None = Non
         judged=judged(told, losses(told), made_of),
         budget_hint=hint(told, made_of),
         facts=_facts(told),
+        missing=told.missing,
         budget=_budget(made_of) if made_of else None,
         forms=forms,
         signals=signals,

@@ -18,6 +18,7 @@ from lathe_rc.view.report_figures import (
     limited,
     plain,
     shown_revolutions,
+    spectrum_range,
     um,
 )
 from lathe_rc.view.report_form import Form, Revolution
@@ -242,16 +243,16 @@ def spectrum(form: Form) -> Spec:
     names = {"first": _FIRST, "best": _BEST, "last": _LAST}
     rows: Rows = []
     labels = ["_0", "_1", "_2"]
-    top = max(float(um(r.amplitude[1:]).max()) for _, _, r in shown)
+    low, high = spectrum_range(form)
     for k, (name, _, revolution) in enumerate(shown):
         label = f"{name} revolution ({revolution.numbers['revolution']})"
         labels[names[name.split(", ")[-1]]] = label
         width = 0.8 / len(shown)
         left = k * width - 0.4
         for order, value in enumerate(um(revolution.amplitude[1:]).tolist(), start=1):
-            x, y = order + left, max(value, top * 1e-6) or FLOOR
+            x, y = order + left, max(value, low) or FLOOR
             rows.append({"n": order, "u": _number(x), "u2": _number(x + width), "v": _number(y), "l": label})
-    kind = "log" if top > 0.0 else "linear"
+    kind = "log" if high else "linear"
     legend = {**_LEGEND, "symbolType": "square", "values": list(dict.fromkeys(row["l"] for row in rows))}
     return _spec(
         260,
@@ -261,8 +262,8 @@ def spectrum(form: Form) -> Spec:
         encoding={
             "x": _quantity("u", "undulations per revolution", scale=_axis(ends=(0.4, 50.6)), axis={"grid": False}),
             "x2": {"field": "u2"},
-            "y": _quantity("v", "amplitude [µm]", scale=_axis(kind, (top * 1e-6, top * 2) if top > 0.0 else None)),
-            "y2": {"datum": _number(top * 1e-6)},
+            "y": _quantity("v", "amplitude [µm]", scale=_axis(kind, (low, high) if high else None)),
+            "y2": {"datum": _number(low)},
             "color": {"field": "l", "type": "nominal", "scale": {"domain": labels}, "legend": legend},
             "tooltip": _tip(n="undulations per revolution", v="amplitude [µm]"),
         },

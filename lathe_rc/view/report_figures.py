@@ -54,13 +54,20 @@ def limited(values: Samples) -> Samples:
 
 
 def colour_range(rows: Samples) -> tuple[float, float]:
-    """Largest magnitude of a map [µm], and up to which its colours are linear: what is left at the end.
+    """Largest magnitude of a map [µm], and up to which its colours are linear: the largest of its quietest quarter.
 
-    So both the first cycles and the rest can be seen.
+    So the first cycles, the rest, and a fault can be seen.
     """
-    largest = max(float(np.abs(rows).max()), FLOOR)
-    rest = float(np.abs(rows[-max(1, len(rows) // 4) :]).max())
-    return largest, min(max(rest, largest * 1e-4), largest)
+    each = np.sort(np.abs(rows).max(axis=1))
+    largest = max(float(each[-1]), FLOOR)
+    return largest, min(max(float(each[(len(each) - 1) // 4]), largest * 1e-4), largest)
+
+
+def spectrum_range(form: Form) -> tuple[float, float]:
+    """Range of amplitudes [µm] in which each shown revolution has three decades; (0, 0) without any amplitude."""
+    tops = [float(um(revolution.amplitude[1:]).max()) for _, _, revolution in shown_revolutions(form)]
+    tops = [top for top in tops if top > 0.0]
+    return (min(min(tops) * 1e-3, max(tops) * 1e-6), max(tops) * 2.0) if tops else (0.0, 0.0)
 
 
 def _figure(height: float) -> Figure:
@@ -168,9 +175,9 @@ def spectrum(form: Form) -> str:
         label = f"{name} revolution ({revolution.numbers['revolution']})"
         axes.bar(order + (k - (len(shown) - 1) / 2) * width, amplitude, width, color=colour, label=label)
     axes.set(xlabel="undulations per revolution", ylabel="amplitude [µm]", xlim=(0.4, 50.6))
-    top = max(float(um(r.amplitude[1:]).max()) for _, _, r in shown)
-    if top > 0.0:
-        axes.set(yscale="log", ylim=(top * 1e-6, top * 2))
+    low, high = spectrum_range(form)
+    if high:
+        axes.set(yscale="log", ylim=(low, high))
     _grid(axes)
     axes.legend(loc="upper right")
     return _svg(figure)

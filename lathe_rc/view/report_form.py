@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The form of the part from a stream: measured revolution by revolution as soon as each is complete."""
 
+from array import array
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 from lathe_rc import part
 from lathe_rc.analysis.form_errors import that_count
 from lathe_rc.analysis.metrology import POINTS, Lay, Measurement, evenly, lay, measure
-from lathe_rc.analysis.tolerance import LAST, Judge, Verdict
+from lathe_rc.analysis.tolerance import LAST, Growth, Verdict, growth, judge
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Samples, Signals
@@ -63,7 +64,7 @@ class Form:
     def __init__(self, encoder: str, tool: str, tolerance: float = 0.0, nose_radius: float = 0.0) -> None:
         self._encoder, self.tool, self.tolerance = encoder, tool, tolerance
         self._nose_radius = nose_radius
-        self._judge: Judge | None = None
+        self._largest, self._before = array("d"), 0  # form error [m] of every revolution, and those before the first
         self._angle, self._error, self._height = np.empty(0), np.empty(0), np.empty(0)
         self._along = deque[tuple[Samples, Samples]](maxlen=_ALONG)  # profiles and heights
         self.surface: Lay | str | None = None
@@ -81,7 +82,7 @@ class Form:
         if not self.refused:
             if first and not self._angle.size and not self._done:
                 # A snapshot begins in the midst of a revolution.
-                self._done = int(np.ceil(dense[self._encoder]["angle_true"][0] / _TURN))
+                self._done = self._before = int(np.ceil(dense[self._encoder]["angle_true"][0] / _TURN))
             angle, tool = dense[self._encoder]["angle_true"], dense[self.tool]
             kept = that_count(angle, tool["error"])
             self._angle = np.concatenate([self._angle, angle[kept]])
@@ -93,7 +94,14 @@ class Form:
     @property
     def verdict(self) -> Verdict | None:
         """Whether the form is in tolerance; None if it has none, or cannot be measured to its end."""
-        return self._judge.verdict() if self._judge and not self.refused else None
+        if not self.tolerance or self.refused:
+            return None
+        return judge(np.array(self._largest), self.tolerance, self._before)
+
+    @property
+    def growth(self) -> Growth | None:
+        """The growth of the form error in the revolutions that were measured; None if it does not grow."""
+        return growth(np.array(self._largest), self._before)
 
     def finish(self) -> None:
         """Measure what is left."""
@@ -162,9 +170,7 @@ class Form:
         rms = found.form.rms[:whole]
         self.rms.add(rms)
         self.largest.add(found.form.largest[:whole])
-        if self.tolerance:
-            self._judge = self._judge or Judge(self.tolerance, self._done)
-            self._judge.add(found.form.largest[:whole])
+        self._largest.extend(found.form.largest[:whole])
         if self.first is None:
             self.first = self._revolution(found, 0)
         best = int(np.argmin(rms))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a report, gathered in one pass over the bag and in memory that does not grow with it."""
+"""The figures of a report, gathered in one pass over the bag, in memory that grows by 8 bytes a revolution."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,6 +13,7 @@ from lathe_rc.bag.provenance import nose_radius
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import Feeder
 from lathe_rc.bag.snapshot import first_sample, span_of
+from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError
@@ -146,7 +147,8 @@ class Gathered:
         curves: signals and cycles.
         host: what the host topics say.
         stopped: why the bag was not read to its end; empty if it was.
-        unjudged: why nothing is known of tolerances; empty if it is.
+        nodes: values of the bag's scenario by node and parameter, none of them checked; empty if it has none.
+        unjudged: why nothing is known of the scenario, tolerances among it; empty if it is.
     """
 
     about: Mapping[str, str]
@@ -158,6 +160,7 @@ class Gathered:
     step_ns: int = 0
     run_id: str = ""
     stopped: str = ""
+    nodes: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
     unjudged: str = ""
 
     @property
@@ -167,6 +170,17 @@ class Gathered:
         snapshot = span_of(self.about)
         ends = 0 < snapshot[1] == self.samples if snapshot else not any(tally.open_end for tally in dense)
         return bool(dense) and not self.stopped and ends
+
+    def has(self, kind: str) -> bool:
+        """Whether there are messages of a type."""
+        return any(tally.count for tally in self.topics.values() if tally.type == kind)
+
+    @property
+    def missing(self) -> str:
+        """What there is not of encoder and tool."""
+        kinds = {tally.type for tally in self.topics.values()}
+        named = {"encoder": messages.ENCODER, "tool": messages.TOOL}
+        return f"the bag has no {' and no '.join(name for name, kind in named.items() if kind not in kinds)}"
 
     @property
     def seconds(self) -> float:
@@ -178,10 +192,10 @@ class Gathered:
         return place * (self.step_ns * 1e-9)
 
 
-def _tolerances(about: Mapping[str, str]) -> tuple[Mapping[str, float], str]:
-    """Tolerances by relative topic of the tool, and why they cannot be had."""
+def _values_of(about: Mapping[str, str]) -> tuple[Mapping[str, Mapping[str, Value]], str]:
+    """Values by node of the scenario, and why they cannot be had."""
     try:
-        return provenance.tolerances(about), ""
+        return provenance.values_of(about), ""
     except InputError as error:
         return {}, str(error)
 
@@ -200,13 +214,14 @@ def gather(path: Path) -> Gathered:
     with Source(path) as source:
         types = {topic: found.type for topic, found in source.topics.items()}
         encoders = of_type(types, messages.ENCODER)
-        allowed, unjudged = _tolerances(source.about)
+        nodes, unjudged = _values_of(source.about)
+        allowed = provenance.tolerances(nodes)
         nose = nose_radius(source.about)
         tools = of_type(types, messages.TOOL) if encoders else []
         forms = [Form(encoders[0], tool, _of(tool, allowed), nose) for tool in tools]
         curves = Curves(types)
         told = Gathered(source.about, {topic: Tally(kind) for topic, kind in sorted(types.items())}, forms, curves)
-        told.unjudged = unjudged
+        told.nodes, told.unjudged = nodes, unjudged
         first = first_sample(source.about)
         feeder = Feeder(types, [*forms, curves], _PIECE, first)
         try:

@@ -13,6 +13,7 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.analysis.budget import Budget
+from lathe_rc.cell.budget import changing
 from lathe_rc.cell.stages.command_limits import LIMITED
 from lathe_rc.view.report_figures import um
 from lathe_rc.view.report_form import Form
@@ -60,16 +61,25 @@ def judged(told: Gathered, losses: Sequence[str], made_of: Budget | None) -> Tol
     """
     form = next(iter(told.forms), None)
     happened = list(_happened(told))
+    growth = form.growth if form else None
     wrong = [Finding(text, BAD) for text in [*happened, *losses]]
     limits = [*(_causes(made_of) if made_of else ()), *_limited(told)]
-    if form and not happened:  # else the form error is what those have made of it
+    if form and not happened and not growth:  # else the form error is what those have made of it
         limits += _form(told, form)
-    return Told(_verdict(form), wrong, limits)
+    verdict = _verdict(told, form)
+    if growth:
+        mood = BAD if growth.diverges or verdict.mood == BAD else WARN
+        verdict = Finding(f"{_sentence(growth.told())} {verdict.text}", mood)
+    return Told(verdict, wrong, limits)
 
 
-def _verdict(form: Form | None) -> Finding:
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}."
+
+
+def _verdict(told: Gathered, form: Form | None) -> Finding:
     if form is None:
-        return Finding("No form to judge: the bag has no encoder and tool.")
+        return Finding(f"No form to judge: {told.missing}.")
     if form.refused or form.last is None:
         return Finding("Not judged: the form cannot be measured to its end.", BAD)
     if form.verdict is None:
@@ -78,8 +88,7 @@ def _verdict(form: Form | None) -> Finding:
             f"No tolerance to judge by: the form error of the last revolution is {last['rms']:.3g} µm RMS, "
             f"{last['max']:.3g} µm at most."
         )
-    text = form.verdict.told()
-    return Finding(f"{text[0].upper()}{text[1:]}.", GOOD if form.verdict.in_tolerance else BAD)
+    return Finding(_sentence(form.verdict.told()), GOOD if form.verdict.in_tolerance else BAD)
 
 
 def _at(told: Gathered, alike: Alike) -> str:
@@ -127,8 +136,8 @@ def _form(told: Gathered, form: Form) -> Iterator[Finding]:
     changing = float(np.mean((profiles - mean) ** 2)) * count / (count - 1)
     share = min(changing / power, 1.0)
     parts = [
-        (1.0 - share, f"repeats from revolution to revolution{_waves(mean)}: what learning and its Q filter leave"),
-        (share, f"changes from revolution to revolution: noise, encoder, vibration, speed{_speed(told)}"),
+        (1.0 - share, f"repeats from revolution to revolution{_waves(mean)}{_left(told)}"),
+        (share, f"changes from revolution to revolution{_changing(told)}"),
     ]
     for part, text in sorted(parts, reverse=True):
         if part >= _SOME:
@@ -140,15 +149,15 @@ def _trend(rms: messages.Samples, form: Form) -> Iterator[Finding]:
     half = len(rms) // 2
     before, after = rms[:half], rms[-half:]
     factor = float(after.mean() / before.mean()) if before.mean() else 1.0
-    each = factor ** (1.0 / (len(rms) - half))
-    if after.max() < before.min() and factor < 1.0 - _CHANGE:
+    each = float(np.median(rms[1:] / rms[:-1])) if rms.all() else 1.0  # a step is no trend
+    if after.max() < before.min() and factor < 1.0 - _CHANGE and each < 1.0:
         more = ""
         if form.verdict and not form.verdict.in_tolerance:
             turns = math.ceil(math.log(form.tolerance / form.verdict.largest) / math.log(each))
             more = f"; in tolerance after some {turns} more, if it goes on like this"
         yield Finding(f"Learning is not over: the form error falls by {1.0 - each:.1%} a revolution{more}.", WARN)
-    elif after.min() > before.max() and factor > 1.0 + _CHANGE:
-        yield Finding(f"The form error grows by {each - 1.0:.1%} a revolution.", BAD)
+    elif after.min() > before.max() and factor > 1.0 + _CHANGE and each > 1.0:
+        yield Finding(f"The form error grows by {each - 1.0:.1%} a revolution in the last {len(rms)}.", WARN)
 
 
 def _waves(mean: messages.Samples) -> str:
@@ -158,13 +167,24 @@ def _waves(mean: messages.Samples) -> str:
     return f", most at {order} UPR ({amplitude[order]:.3g} µm)"
 
 
+def _left(told: Gathered) -> str:
+    """The origin of a form error that repeats, if the cell learns."""
+    return ": what learning and its Q filter leave" if told.has(messages.LEARNING) else ""
+
+
+def _changing(told: Gathered) -> str:
+    """The causes of a form error that changes, of those that this run contains."""
+    names = [*changing(told.nodes), *(["cut"] if told.has(messages.CUT) else []), *filter(None, [_speed(told)])]
+    return f": {', '.join(names)}" if names else ""
+
+
 def _speed(told: Gathered) -> str:
-    """By how much the spindle speed varies."""
+    """By how much the spindle speed varies; empty if it does not."""
     for (_, name), series in told.curves.signals.items():
         low, high = series.extremes
         if name == "speed_true" and low > 0.0 and math.isfinite(high):
             deviation = (high - low) / (high + low)
-            return f" (which varies by ±{deviation:.1%})" if deviation >= _VARIES else ""
+            return f"speed (which varies by ±{deviation:.1%})" if deviation >= _VARIES else ""
     return ""
 
 

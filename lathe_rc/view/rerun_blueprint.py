@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a run opens in Rerun: the part and its error map on the left, curves on the right."""
+"""How a run opens in Rerun: the form error above, the part and its error map on the left, curves on the right."""
 
 from collections.abc import Collection, Mapping
 
@@ -117,13 +117,12 @@ def blueprint(types: Mapping[str, str], *, live: bool = False, silent: Collectio
         top.append(
             rrb.BarChartView(
                 origin="/form_error/spectrum",
-                name="form error by harmonic [µm]",
+                name="form error by harmonic, latest revolution [µm]",
                 plot_legend=rrb.PlotLegend(visible=False),
             )
         )
     first = [plots.pop(plot) for plot in (ERROR, POSITION) if plot in plots]
-    rows: list[rrb.View | rrb.Container] = [rrb.Horizontal(*top, column_shares=[3, 2][: len(top)])] if top else []
-    rows += first
+    rows: list[rrb.View | rrb.Container] = [*first]
     tabs: list[rrb.View] = list(plots.values())
     if live or said & {*LOGGED}:  # live, what had to be left out stands there
         tabs.append(rrb.TextLogView(origin="/events", name="events"))
@@ -131,9 +130,11 @@ def blueprint(types: Mapping[str, str], *, live: bool = False, silent: Collectio
         rows.append(rrb.Tabs(*tabs, active_tab=0))
     if messages.SAFETY_STATUS in kinds or said & {*LOGGED}:
         rows.append(rrb.StateTimelineView(origin=f"/{ROOT}", name="states of the supervisor, faults, limits met"))
+    above = [rrb.Horizontal(*top, column_shares=[3, 2][: len(top)])] if top else []
     right = rrb.Vertical(*rows)
+    below = rrb.Horizontal(left, right, column_shares=[4, 5]) if left else right
     return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[4, 5]) if left else right,
+        rrb.Vertical(*above, below, row_shares=[2, 5] if above else [1]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline="time", play_state="following", playback_speed=1.0 if live else 0.1),

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote, urlsplit
 
-from lathe_rc import extras
+from lathe_rc import extras, trust
 from lathe_rc.cell.rerun_bridge import PORT, Kind
 from lathe_rc.errors import InputError, LatheError
 
@@ -67,7 +67,7 @@ class Viewer:
     def start(self, *files: Path) -> "subprocess.Popen[bytes]":
         """Start it, with files to show; it gets no Ctrl-C of its own."""
         return subprocess.Popen(
-            [sys.executable, "-m", "rerun", *self.options, *map(str, files)],
+            [*trust.interpreter("rerun"), *self.options, *map(str, files)],
             env=os.environ | {"RUST_LOG": "error"},
             stdout=sys.stderr,
             start_new_session=True,
@@ -92,12 +92,12 @@ def viewer(kind: Kind, port: int = PORT) -> Viewer:
         InputError: a window without a display.
     """
     data = _free_port()
+    options = ["--bind", _HOST, "--port", str(data)]  # by itself, Rerun listens on all interfaces
     if kind == "serve":
         page = f"http://{_HOST}:{port}/?url={quote(f'rerun+http://{_HOST}:{data}/proxy', safe='')}"
-        options = ["--serve-web", "--bind", _HOST, "--web-viewer-port", str(port), "--port", str(data)]
-        return Viewer(options, data, f"{page}  (Ctrl-C ends it)")
+        return Viewer([*options, "--serve-web", "--web-viewer-port", str(port)], data, f"{page}  (Ctrl-C ends it)")
     if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
-        return Viewer(["--port", str(data)], data, "the view opens in a window; close it to go on")
+        return Viewer(options, data, "the view opens in a window; close it to go on")
     raise InputError("no display for a window; use -o FILE.rrd or --web")
 
 

@@ -1,19 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages among the records of an MCAP chunk, found by compiled code."""
+"""The records of a piece of an MCAP file that matter to a reader, found by compiled code."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.jit import kernel
 
-_MESSAGE = 5  # opcode
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 2, 3, 4, 5, 6, 15  # opcodes
 _HEAD = 9  # bytes of opcode and length ahead of a record
 _BEFORE = 22  # bytes of a message record ahead of its data: channel, sequence, log time, publish time
 
 Bytes = npt.NDArray[np.uint8]
 Places = npt.NDArray[np.uint64]
+
+
+class Found(NamedTuple):
+    """The records of a piece.
+
+    Attributes:
+        messages: channel, log time [ns], begin and end of the data of each message, shape (messages, 4).
+        others: opcode, begin and end of the content of each schema, channel, chunk and end mark, shape (others, 3).
+        end: where the last record that is whole ends.
+    """
+
+    messages: Places
+    others: Places
+    end: int
 
 
 @kernel
@@ -26,42 +40,56 @@ def _little(data: Bytes, place: int, size: int) -> Any:
 
 
 @kernel
-def _walk(data: Bytes, found: Places) -> int:
-    """Fill channel, log time, begin and end of each message; returns their number, -1 if a record is broken."""
-    place, count, size = 0, 0, data.size
-    while place < size:
-        if place + _HEAD > size:
-            return -1
+def _walk(data: Bytes, messages: Places, others: Places) -> tuple[int, int, int]:
+    """Fill both tables as far as they go; returns the numbers of messages, or -1, and of others, and the end."""
+    place, count, further, size = 0, 0, 0, data.size
+    while place + _HEAD <= size:
         length = _little(data, place + 1, 8)
         begin = place + _HEAD
         if length > np.uint64(size - begin):
-            return -1
-        place = begin + np.int64(length)
-        if data[begin - _HEAD] == _MESSAGE:
+            break
+        opcode, place = data[place], begin + np.int64(length)
+        if opcode == _MESSAGE:
             if length < _BEFORE:
-                return -1
-            if count < found.shape[0]:
-                found[count, 0] = _little(data, begin, 2)
-                found[count, 1] = _little(data, begin + 6, 8)
-                found[count, 2] = begin + _BEFORE
-                found[count, 3] = place
+                return -1, further, begin - _HEAD
+            if count < messages.shape[0]:
+                messages[count, 0] = _little(data, begin, 2)
+                messages[count, 1] = _little(data, begin + 6, 8)
+                messages[count, 2] = begin + _BEFORE
+                messages[count, 3] = place
             count += 1
-    return count
+        elif _FOOTER <= opcode <= _CHUNK or opcode == _DATA_END:
+            if further < others.shape[0]:
+                others[further, 0] = opcode
+                others[further, 1] = begin
+                others[further, 2] = place
+            further += 1
+    return count, further, place
 
 
-def walk(whole: bytes) -> Places:
-    """Where the messages stand among the records of a chunk.
+def walk_part(part: bytes) -> Found:
+    """The records of a part of a file, of which the last may be cut off.
 
-    Returns:
-        Channel, log time [ns], begin and end of the data of each message, shape (messages, 4).
+    Raises:
+        ValueError: a message is shorter than its own head.
+    """
+    data = np.frombuffer(part, np.uint8)
+    # What a chunk says of itself is not believed: its records are counted.
+    count, further, end = _walk(data, np.empty((0, 4), np.uint64), np.empty((0, 3), np.uint64))
+    if count < 0:
+        raise ValueError("a message is shorter than its head")
+    messages, others = np.empty((count, 4), np.uint64), np.empty((further, 3), np.uint64)
+    _walk(data, messages, others)
+    return Found(messages, others, end)
+
+
+def walk(whole: bytes) -> Found:
+    """The records of a chunk.
 
     Raises:
         ValueError: a record is longer than the chunk, or shorter than its own head.
     """
-    data = np.frombuffer(whole, np.uint8)
-    count = _walk(data, np.empty((0, 4), np.uint64))  # what a chunk says of itself is not believed: it is counted
-    if count < 0:
-        raise ValueError("a record is longer than its chunk, or too short")
-    found = np.empty((count, 4), np.uint64)
-    _walk(data, found)
+    found = walk_part(whole)
+    if found.end != len(whole):
+        raise ValueError("a record is longer than its chunk")
     return found

@@ -1,80 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening bags, whoever made them: rosbag2 folders of any storage and compression that rosbags reads, or an MCAP file.
+"""Opening bags, whoever made them: rosbag2 folders of any storage and compression, or a file of one.
 
-Nothing in a bag is trusted: what it says of sizes is checked before anything of that size is made.
+Nothing in a bag is trusted: what it says of sizes is checked before anything of that size is made. The limits stand in
+`lathe_rc.bag.reading.limits`.
 """
 
 import heapq
+import sqlite3
+import struct
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from io import BytesIO
-from itertools import chain, pairwise
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
-import numpy as np
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
-from mcap.records import Channel
 from mcap.writer import MCAP0_MAGIC
-from rosbags.interfaces import Connection, Qos
-from rosbags.rosbag2 import Reader
+from rosbags.interfaces import Qos
+from zstandard import ZstdError
 
-from lathe_rc.bag.reading import precheck
-from lathe_rc.bag.reading.chunk_messages import Places, walk
-from lathe_rc.bag.reading.precheck import MOST_TEXT, MOST_TOPICS, read_record
-from lathe_rc.bag.reading.unpacking import read_chunk, unpack, unpack_file, unpacked_size
+from lathe_rc.bag.reading import metadata, precheck
+from lathe_rc.bag.reading.limits import MOST_OPEN, MOST_TOPICS
+from lathe_rc.bag.reading.mcap_storage import open_mcap
+from lathe_rc.bag.reading.metadata import Metadata
+from lathe_rc.bag.reading.sqlite_storage import open_sqlite, with_journal
+from lathe_rc.bag.reading.storage import Batch, Message, Span, Storage
+from lathe_rc.bag.reading.unpacking import Budget, unpack, unpack_file, unpacked_size
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
 
-Message = tuple[str, int, bytes]  #: topic, log time [ns] and bytes
-
 _NEVER = 2**64  # log time after all others [ns]
-_CHANNELS = 2**16  # numbers that a channel may have
-_AT_ONCE = 2**14  # messages of a batch
 _SQLITE = b"SQLite format 3\0"
-_METADATA = "metadata.yaml"
 _KINDS = (".mcap", ".db3", ".zstd")
 _RECOVER = "; lathe bag recover saves the rest"
+_WRONG = (ValueError, OSError, struct.error, sqlite3.Error, ZstdError)  # what broken bytes and files lead to
 
-
-@dataclass(frozen=True)
-class Batch:
-    """Messages that stand in the same bytes.
-
-    Attributes:
-        whole: the bytes.
-        topics: by channel.
-        places: channel, log time [ns], begin and end of each message, shape (messages, 4).
-    """
-
-    whole: bytes
-    topics: Mapping[int, str]
-    places: Places
-
-    def __len__(self) -> int:
-        """Number of messages."""
-        return len(self.places)
-
-    def __iter__(self) -> Iterator[Message]:
-        """Topic, log time [ns] and bytes of each."""
-        for channel, log_ns, begin, end in self.places.tolist():
-            yield self.topics[channel], log_ns, self.whole[begin:end]
-
-    @classmethod
-    def of(cls, message: Message) -> "Batch":
-        """A batch of one."""
-        topic, log_ns, data = message
-        return cls(data, {0: topic}, np.array([[0, log_ns, 0, len(data)]], np.uint64))
+Read = tuple[Span, Mapping[int, str]]  # and its channels that are wanted
 
 
 @dataclass(frozen=True)
 class Topic:
-    """The bag's metadata of a topic.
+    """A topic of a bag.
 
     Attributes:
         type: message type.
@@ -87,185 +56,187 @@ class Topic:
     count: int
 
 
+@dataclass(frozen=True)
+class Unread:
+    """A topic of a bag whose messages are not read.
+
+    Attributes:
+        topic: its name.
+        type: message type; empty: none is told.
+        why: it is not read.
+        count: messages.
+    """
+
+    topic: str
+    type: str
+    why: str
+    count: int
+
+    def __str__(self) -> str:
+        """In words."""
+        return f"{self.topic} {self.type}".strip() + f", {self.count} messages {self.why}"
+
+
 def files_of(path: Path) -> list[Path]:
-    """The files with the messages of a bag, by name: those of a folder, or the one that is named."""
-    found = [path] if path.is_file() else path.glob("*")
-    return sorted(file for file in found if file.suffix in _KINDS and file.is_file())
-
-
-def _damage(path: Path) -> str:
-    """The first record of an MCAP file that is longer than it says or than allowed, and its place; empty: none."""
-    limit = path.stat().st_size - len(MCAP0_MAGIC)
-    qos = precheck.Qos()
-    with path.open("rb") as stream:
-        head = stream.read(len(MCAP0_MAGIC))
-        if head != MCAP0_MAGIC:
-            return "" if precheck.is_packed(head) else f"{path.name}: not an MCAP file"
-        place = stream.tell()
-        try:
-            while (record := read_record(stream, limit)) and record[0] != Opcode.FOOTER:
-                if record[0] == Opcode.CHUNK:
-                    whole = read_chunk(record[1], place)
-                    inside = BytesIO(whole)
-                    while inner := read_record(inside, len(whole)):
-                        _add_qos(qos, *inner)
-                _add_qos(qos, *record)
-                place = stream.tell()
-        except MemoryError:
-            raise
-        except Exception as error:  # noqa: BLE001 - mcap raises whatever broken bytes lead to
-            return f"{path.name}: {shown(error)}"
-    return ""
-
-
-def _add_qos(qos: precheck.Qos, opcode: int, content: bytes) -> None:
-    if opcode == Opcode.CHANNEL:
-        qos.add(Channel.read(ReadDataStream(BytesIO(content))))
-
-
-def _check_storage(path: Path) -> None:
-    """Refuse a file that a library could not read in bounded memory and time; others than those of bags pass.
+    """The files with the messages of a bag, by name: those of a folder, or the one that is named.
 
     Raises:
-        ValueError: says why; mcap and SQLite raise others.
+        InputError: a link in the folder leads out of it.
     """
-    with path.open("rb") as stream:
-        head = stream.read(len(_SQLITE))
-    if precheck.is_packed(head):
-        with tempfile.TemporaryDirectory(prefix="lathe-unpacked-") as folder:
-            plain = Path(folder) / path.stem
-            with plain.open("wb") as out:
-                out.writelines(unpack_file(path))
-            with plain.open("rb") as stream:
-                if precheck.is_packed(stream.read(len(_SQLITE))):
-                    raise ValueError(f"{path.name} is compressed twice")
-            _check_storage(plain)
-    elif head == _SQLITE:
-        precheck.check_database(path)
-    elif head.startswith(MCAP0_MAGIC) and not precheck.summary_of(path) and (why := _damage(path)):
-        raise ValueError(why)
-
-
-def _batches(whole: bytes, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[Batch]:
-    """The wanted messages among the records of a chunk, by log time."""
-    found = walk(whole)
-    wanted = np.zeros(_CHANNELS, dtype=bool)
-    wanted[list(topics)] = True
-    found = found[wanted[found[:, 0]]]
-    if start_ns or stop_ns < _NEVER:
-        found = found[(found[:, 1] >= start_ns) & (found[:, 1] < stop_ns)]
-    if np.any(found[1:, 1] < found[:-1, 1]):
-        found = found[np.argsort(found[:, 1], kind="stable")]
-    for first in range(0, len(found), _AT_ONCE):
-        yield Batch(whole, topics, found[first : first + _AT_ONCE])
+    found = [path] if path.is_file() else [*path.glob("*")]
+    for file in found:
+        if file != path and not file.resolve().is_relative_to(path.resolve()):
+            raise InputError(f"{file}: a link that leads out of the bag; allowed: the file itself in its place")
+    return sorted(file for file in found if file.suffix in _KINDS and file.is_file())
 
 
 class Source:
     """A bag that is read; a context manager.
 
     Args:
-        path: a rosbag2 folder or an MCAP file.
+        path: a rosbag2 folder or a file of one.
+        partial: take what can be read of a bag that is damaged.
 
     Attributes:
         path: see above.
         topics: by name.
+        unread: further ones, whose messages are not serialized as ROS 2 does, or have no type.
         about: texts that the bag says of itself, see docs/bags.md.
         first_ns, last_ns: smallest and largest log time; 0 and 0 if it is empty.
-        contradictions: where metadata.yaml says other than the files hold, one line each; the files count.
+        contradictions: where the bag says other of itself than its files hold, one line each; the files count.
+        damage: what cannot be read, one line each; empty unless ``partial``.
 
     Raises:
-        InputError: not a bag, or one that cannot be whole.
+        InputError: not a bag, or one that cannot be whole; with ``partial``: one of which nothing can be read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, partial: bool = False) -> None:
         self.path = path
+        self.about: Mapping[str, str] = {}
+        self.first_ns = self.last_ns = 0
+        self.topics: dict[str, Topic] = {}
+        self.unread: list[Unread] = []
+        self.contradictions: list[str] = []
+        self.damage: list[str] = []
+        self._storages: list[Storage] = []
+        self._size, self._packed = 0, False
+        self._temporary = ExitStack()
         try:
-            self._check_files()
-            self._reader = Reader(path)
-            self._reader.open()
-        except (LatheError, MemoryError):
+            self._open()
+        except _WRONG as error:
+            self.damage.append(_reason(error))
+        except BaseException:
+            self._temporary.close()
             raise
-        except Exception as error:  # noqa: BLE001 - the libraries raise whatever broken bytes lead to
-            why, files = shown(error), files_of(path)
-            for file in files:
-                why = (file.suffix == ".mcap" and _damage(file)) or why
-            raise InputError(f"{path}: not a readable bag ({why}){_RECOVER if files else ''}") from None
-        try:
-            self._read_head()
-        except (LatheError, MemoryError):
-            self._reader.close()
-            raise
-        except Exception as error:  # noqa: BLE001 - see above
-            self._reader.close()
-            raise InputError(f"{path}: not a readable bag ({shown(error)})") from None
+        saved = any(topic.count for topic in self.topics.values())
+        if self.damage and not (partial and (saved or self.unread)):
+            self._temporary.close()
+            raise InputError(f"{path}: not a readable bag ({self.damage[0]}){_RECOVER if saved else ''}")
+        if self.unread and not self.topics and not partial:
+            self._temporary.close()
+            raise InputError(f"{path}: no topic that can be read ({self.unread[0]}); allowed: messages of ROS 2")
 
-    def _check_files(self) -> None:
-        """Look at what the libraries would believe.
+    def _open(self) -> None:
+        told = self._metadata()
+        files = files_of(self.path) if self.path.is_dir() else [self.path]
+        if told:
+            self.about, self._packed = told.about, told.packed
+            files = [self.path / name for name in told.files]
+        for file in files:
+            try:
+                self._storages.append(self._storage(file))
+                self._size += file.stat().st_size
+            except _WRONG as error:
+                self.damage.append(f"{file.name}: {_reason(error)}")
+        for storage in self._storages:
+            self.damage += storage.damage
+            self.contradictions += storage.remarks
+        self._gather()
+        filled = [storage for storage in self._storages if any(c.count for c in storage.channels.values())]
+        self.first_ns = min((storage.first_ns for storage in filled), default=0)
+        self.last_ns = max((storage.last_ns for storage in filled), default=0)
+        if told:
+            self._compare(told)
+        if len(self.topics) > MOST_TOPICS:
+            raise ValueError(f"{len(self.topics)} topics; allowed: up to {MOST_TOPICS}")
 
-        Raises:
-            InputError: metadata that is too long.
-            ValueError: there is nothing, or see `_check_storage`.
-        """
+    def _metadata(self) -> Metadata | None:
+        """The metadata of a folder; without them, its files count."""
         if not self.path.exists():
             raise ValueError("there is no such folder or file")
-        if self.path.is_dir():
-            metadata = self.path / _METADATA
-            if not metadata.exists():
-                lack = "" if files_of(self.path) else ", nor a .mcap or .db3 file"
-                raise ValueError(f"no {_METADATA} in that folder{lack}")
-            if metadata.stat().st_size > MOST_TEXT * 16:
-                raise InputError(f"{metadata}: {metadata.stat().st_size} B; allowed: up to {MOST_TEXT * 16}")
-            precheck.check_yaml(metadata.read_text(encoding="utf-8"), _METADATA)
-        for file in sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]:
-            if file.is_file():
-                _check_storage(file)
-            elif file.exists() and not file.is_dir():
-                raise ValueError(f"{file.name} is no file")  # opening a pipe would wait for its writer
+        if not self.path.is_dir():
+            return None
+        files = files_of(self.path)
+        if not (self.path / metadata.NAME).exists():
+            if not files:
+                raise ValueError(f"no {metadata.NAME} in that folder, nor a .mcap or .db3 file")
+            names = f"{files[0].name} alone is" if len(files) == 1 else f"its {len(files)} files are"
+            self.contradictions.append(f"no {metadata.NAME} in that folder: {names} read; lathe bag recover writes one")
+            return None
+        try:
+            told = metadata.read(self.path)
+        except ValueError as error:
+            self.damage.append(shown(error))
+            return None
+        if told.repeated:
+            self.contradictions.append(f"{metadata.NAME} names a file more than once")
+        return told
 
-    def _read_head(self) -> None:
-        whole: Any = self._reader.storage
-        self._storages: list[Any] = getattr(whole, "storages", [whole])
-        self._packed = self._reader.compression_mode == "message"
-        self.topics = self._topics_of(self._reader.connections)
-        custom: Any = getattr(whole.metadata, "custom", None) or {}
-        texts = {key: text for key, text in custom.items() if isinstance(key, str) and isinstance(text, str)}
-        self.about: Mapping[str, str] = {key[:256]: text[:MOST_TEXT] for key, text in texts.items()}
-        spans = [each.metadata for each in self._storages if each.metadata.message_count]
-        self.first_ns = min((precheck.number(span.start_time) for span in spans), default=0)
-        self.last_ns = max((precheck.number(span.end_time) for span in spans), default=1) - 1
-        self.contradictions = self._believe_the_files()
+    def _storage(self, path: Path, depth: int = 0) -> Storage:
+        """A file, unpacked first if it is compressed as a whole."""
+        if not path.is_file():
+            raise ValueError("no file" if path.exists() else "there is no such file")  # a pipe would keep us waiting
+        with path.open("rb") as stream:
+            head = stream.read(len(_SQLITE))
+        if head.startswith(MCAP0_MAGIC):
+            return open_mcap(path)
+        if head == _SQLITE:
+            return open_sqlite(with_journal(path, self._folder()))
+        if not precheck.is_packed(head):
+            raise ValueError("a bag of ROS 1" if head.startswith(b"#ROSBAG") else "not an MCAP or SQLite file")
+        if depth:
+            raise ValueError("compressed twice")
+        plain = self._folder() / path.stem
+        with plain.open("wb") as out:
+            out.writelines(unpack_file(path))
+        return self._storage(plain, 1)
 
-    def _believe_the_files(self) -> list[str]:
-        """Take the numbers of messages from the files; tells where metadata.yaml says something else."""
+    def _folder(self) -> Path:
+        """A new folder that goes with the bag."""
+        return Path(self._temporary.enter_context(tempfile.TemporaryDirectory(prefix="lathe-bag-")))
+
+    def _gather(self) -> None:
+        """The topics of all files."""
+        unread: dict[tuple[str, str, str], int] = {}
+        for channel in chain.from_iterable(storage.channels.values() for storage in self._storages):
+            known = self.topics.get(channel.topic)
+            why = channel.unread or (known and known.type != channel.type and f"beside those of {known.type}") or ""
+            if why:
+                key = channel.topic, channel.type, why
+                unread[key] = unread.get(key, 0) + channel.count
+                continue
+            before = known or Topic(channel.type, (), 0)
+            qos = before.qos if set(channel.qos) <= set(before.qos) else before.qos + channel.qos
+            self.topics[channel.topic] = Topic(channel.type, qos, before.count + channel.count)
+        self.unread = [Unread(*key, count) for key, count in unread.items()]
+
+    def _compare(self, told: Metadata) -> None:
+        """Take what the files do not say from the metadata, and note where these contradict them."""
         wrong: list[tuple[str, int]] = []
-        if self._reader.message_count and self.last_ns:
-            told = precheck.number(self._reader.start_time), precheck.number(self._reader.end_time) - 1
-            held = zip(("first", "last"), told, (self.first_ns, self.last_ns), strict=True)
+        if told.span and self._storages:
+            held = zip(("first", "last"), told.span, (self.first_ns, self.last_ns), strict=True)
             wrong += [(f"{which} message at {said} ns", found) for which, said, found in held if said != found]
-        connections = [each for storage in self._storages for each in storage.connections]
-        counted = sum(each.msgcount for each in connections)
-        if counted == sum(each.metadata.message_count for each in self._storages):  # an index may leave them out
-            found = self._topics_of(connections)
-            for topic, said in {**found, **self.topics}.items():
-                told_of = self.topics[topic].count if topic in self.topics else 0
-                count = found[topic].count if topic in found else 0
-                wrong += [(f"{told_of} messages of {topic}", count)] if told_of != count else []
-                self.topics[topic] = replace(said, count=count)
-        return [f"{_METADATA} says {said}; the files: {found}" for said, found in wrong]
-
-    def _topics_of(self, connections: Sequence[Connection]) -> dict[str, Topic]:
-        """The topics by a file, or by the metadata."""
-        found: dict[str, Topic] = {}
-        for connection in connections:
-            precheck.check_name(connection.topic)
-            precheck.check_name(connection.msgtype)
-            ext: Any = connection.ext
-            known = found.get(connection.topic)
-            count = precheck.number(connection.msgcount) + (known.count if known else 0)
-            found[connection.topic] = Topic(connection.msgtype, tuple(ext.offered_qos_profiles), count)
-        if len(found) > MOST_TOPICS:
-            raise InputError(f"{self.path}: {len(found)} topics; allowed: up to {MOST_TOPICS}")
-        return found
+        unread = {each.topic: each.count for each in self.unread}
+        for topic, said in told.topics.items():
+            known = self.topics.get(topic)
+            if known and not known.qos:
+                self.topics[topic] = replace(known, qos=said.qos)
+            elif not known and topic not in unread:
+                self.topics[topic] = Topic(said.type, said.qos, 0)
+            count = (known.count if known else 0) + unread.get(topic, 0)
+            wrong += [(f"{said.count} messages of {topic}", count)] if said.count != count else []
+        wrong += [(f"0 messages of {topic}", said.count) for topic, said in self.topics.items() if topic not in told.topics]
+        self.contradictions += [f"{metadata.NAME} says {said}; the files: {found}" for said, found in wrong]
 
     def __enter__(self) -> "Source":
         """Itself."""
@@ -275,36 +246,7 @@ class Source:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close it."""
-        self._reader.close()
-
-    def _chunks(self, storage: Any, topics: Mapping[int, str], start_ns: int, stop_ns: int) -> Iterator[Batch]:
-        """Messages of the wanted connections of an MCAP file, by its index."""
-        chunks = [
-            chunk
-            for chunk in storage.chunks
-            if chunk.message_end_time >= start_ns
-            and chunk.message_start_time < stop_ns
-            and (not chunk.message_index_offsets or topics.keys() & chunk.message_index_offsets.keys())
-        ]
-        with Path(str(storage.path)).open("rb") as stream:
-
-            def read(chunk: Any) -> Iterator[Batch]:
-                stream.seek(chunk.chunk_start_offset)
-                record = read_record(stream, chunk.chunk_start_offset + chunk.chunk_length)
-                whole = read_chunk(record[1] if record else b"", chunk.chunk_start_offset)
-                return _batches(whole, topics, start_ns, stop_ns)
-
-            def late(chunk: Any) -> Iterator[Message]:
-                yield "", chunk.message_start_time, b""  # a chunk is not read before its time
-                yield from chain.from_iterable(read(chunk))
-
-            if all(a.message_end_time <= b.message_start_time for a, b in pairwise(chunks)):
-                for chunk in chunks:
-                    yield from read(chunk)
-                return
-            for message in heapq.merge(*map(late, chunks), key=itemgetter(1)):
-                if message[0]:
-                    yield Batch.of(message)
+        self._temporary.close()
 
     def blocks(self, topic: str, *, start_ns: int | None = None) -> Iterator[Block]:
         """The blocks of a dense topic, from a log time [ns] on.
@@ -349,24 +291,81 @@ class Source:
             InputError: the bag is broken where the next message should be.
         """
         names = set(self.topics) if topics is None else topics & set(self.topics)
+        start, stop = start_ns or 0, _NEVER if stop_ns is None else stop_ns
+        budget = Budget(self._size)
+        reads: list[Read] = []
+        for storage in self._storages:
+            wanted = {
+                number: channel.topic
+                for number, channel in storage.channels.items()
+                if channel.topic in names and not channel.unread and channel.type == self.topics[channel.topic].type
+            }
+            reads += [
+                (span, wanted)
+                for span in storage.spans
+                if wanted and span.last_ns >= start and span.first_ns < stop
+                and (not span.channels or not span.channels.isdisjoint(wanted))
+            ]  # fmt: skip
         try:
-            for storage in self._storages:
-                wanted = [c for c in storage.connections if c.topic in names]
-                if not wanted:
-                    continue
-                if getattr(storage, "chunks", None):
-                    channels = {c.id: c.topic for c in wanted}
-                    found = self._chunks(storage, channels, start_ns or 0, _NEVER if stop_ns is None else stop_ns)
-                else:
-                    single = storage.messages(wanted, start=start_ns, stop=stop_ns)
-                    found = (Batch.of((connection.topic, log_ns, data)) for connection, log_ns, data in single)
-                yield from chain.from_iterable(map(self._unpacked, found)) if self._packed else found
-        except (LatheError, MemoryError):
-            raise
-        except Exception as error:  # noqa: BLE001 - the libraries raise whatever broken bytes lead to
-            raise InputError(f"{self.path}: broken ({shown(error)}){_RECOVER}") from None
+            for group in _overlapping(reads):
+                found = _merged(group, start, stop, budget)
+                yield from chain.from_iterable(self._unpacked(each, budget) for each in found) if self._packed else found
+        except _WRONG as error:
+            hint = _RECOVER if any(map(_readable, reads)) else ""
+            raise InputError(f"{self.path}: broken ({_reason(error)}){hint}") from None
 
-    def _unpacked(self, batch: Batch) -> Iterator[Batch]:
-        """Messages that are compressed one by one; rosbags would unpack each to whatever size it says."""
+    def _unpacked(self, batch: Batch, budget: Budget) -> Iterator[Batch]:
+        """Messages that are compressed one by one, none of them to more than it says."""
         for topic, log_ns, data in batch:
-            yield Batch.of((topic, log_ns, unpack("zstd", data, unpacked_size(data[:18]))))
+            whole = unpack("zstd", data, unpacked_size(data[:18]))
+            budget.take(len(whole))
+            yield Batch.of((topic, log_ns, whole))
+
+
+def _reason(error: Exception) -> str:
+    return (error.strerror if isinstance(error, OSError) else "") or shown(error)
+
+
+def _overlapping(reads: Sequence[Read]) -> Iterator[list[Read]]:
+    """Groups of spans that follow each other in time; those of a group overlap."""
+    group: list[Read] = []
+    end = 0
+    for read in sorted(reads, key=lambda read: read[0].first_ns):
+        if group and read[0].first_ns >= end:
+            yield group
+            group = []
+        group.append(read)
+        end = max(end, read[0].last_ns)
+    if group:
+        yield group
+
+
+def _merged(group: Sequence[Read], start: int, stop: int, budget: Budget) -> Iterator[Batch]:
+    """The messages of spans that overlap, by log time."""
+    if len(group) == 1:
+        ((span, wanted),) = group
+        yield from span.read(wanted, start, stop, budget)
+        return
+    at_a_time = 0
+    edges = [(span.first_ns, span.size) for span, _ in group] + [(span.last_ns + 1, -span.size) for span, _ in group]
+    for _, size in sorted(edges):
+        at_a_time += size
+        if at_a_time > MOST_OPEN:
+            raise ValueError(f"chunks of the same time take more than {MOST_OPEN} B; record them in order of time")
+
+    def late(span: Span, wanted: Mapping[int, str]) -> Iterator[Message]:
+        yield "", span.first_ns, b""  # a span is not read before its time
+        yield from chain.from_iterable(span.read(wanted, start, stop, budget))
+
+    for message in heapq.merge(*(late(*read) for read in group), key=itemgetter(1)):
+        if message[0]:
+            yield Batch.of(message)
+
+
+def _readable(read: Read) -> bool:
+    """Whether there is a message in a span."""
+    span, wanted = read
+    try:
+        return any(span.read(wanted, 0, _NEVER, Budget(span.size)))
+    except _WRONG:
+        return False

@@ -9,13 +9,35 @@ import lz4.frame
 import zstandard
 from isal.isal_zlib import crc32
 
-from lathe_rc.bag.reading.precheck import MOST_BYTES
+from lathe_rc.bag.reading.limits import EXPANSION, MOST_BYTES, MOST_SMALL, MOST_SMALL_MESSAGES
 from lathe_rc.errors import shown
-
-MOST_UNPACKED = 2**36  #: of a file that is compressed as a whole [B]
 
 _PIECE = 2**20  # of a file that is unpacked [B]
 _CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
+
+
+class Budget:
+    """Bytes and messages that files may still give, see `limits`.
+
+    Args:
+        size: of the files [B].
+    """
+
+    def __init__(self, size: int) -> None:
+        self._bytes = MOST_SMALL + EXPANSION * size
+        self._messages = MOST_SMALL_MESSAGES + size
+
+    def take(self, size: int, messages: int = 0) -> None:
+        """Count bytes, and messages in them.
+
+        Raises:
+            ValueError: they are more than files of this size have.
+        """
+        self._bytes -= size
+        self._messages -= messages
+        if self._bytes < 0 or self._messages < 0:
+            what = f"{EXPANSION} times its size" if self._bytes < 0 else "a message for each of its bytes"
+            raise ValueError(f"it unpacks to more than {what}; no recording does")
 
 
 def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
@@ -58,13 +80,11 @@ def unpack_file(path: Path) -> Iterator[bytes]:
         ValueError: it is longer than allowed.
         ZstdError: it is broken.
     """
-    size = 0
+    budget = Budget(path.stat().st_size)
     with path.open("rb") as stream:
         reader = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
         while piece := reader.read(_PIECE):
-            size += len(piece)
-            if size > MOST_UNPACKED:
-                raise ValueError(f"{path.name} unpacks to more than {MOST_UNPACKED} B, which is not allowed")
+            budget.take(len(piece))
             yield piece
 
 

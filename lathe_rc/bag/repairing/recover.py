@@ -5,13 +5,14 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from rosbags.interfaces import ConnectionExtRosbag2
+
 from lathe_rc.bag import provenance
-from lathe_rc.bag.repairing.salvage import Salvage
+from lathe_rc.bag.repairing.salvage import Salvage, Topic
 from lathe_rc.bag.writing.writer import BagWriter, refuse_existing
-from lathe_rc.errors import shown
+from lathe_rc.errors import LatheError, shown
 
 _CHUNK = 2**20  # [B]
-_ENCODING = "cdr"  # how messages are serialized in what this package writes
 
 
 @dataclass(frozen=True)
@@ -20,66 +21,71 @@ class Recovery:
 
     Attributes:
         saved: messages.
-        skipped: messages of topics whose type or serialization format nobody knows.
+        skipped: messages of topics that cannot be copied.
+        missing: messages that the bag counts beyond those that are there.
         lost_bytes: bytes of the files that gave nothing.
         damage: what was wrong, one line each.
+        lossy: whether messages are missing, or may be wrong.
     """
 
     saved: int
     skipped: int
+    missing: int
     lost_bytes: int
     damage: tuple[str, ...]
-
-    @property
-    def lossy(self) -> bool:
-        """Whether anything is missing."""
-        return bool(self.lost_bytes or self.skipped)
+    lossy: bool
 
 
 def recover(path: Path, target: Path) -> Recovery:
-    """Write what is whole of a bag to a new one.
+    """Copy what is whole of a bag to a new one, understood or not.
 
     Args:
         path: folder or file.
-        target: folder of the new bag; must not exist.
+        target: folder of the new bag; must not exist. It is removed again if the recovery fails.
 
     Raises:
         InputError: nothing to read from, or the target exists.
-        LatheError: the disk does not take it.
+        LatheError: the disk does not take it, or cannot be read.
     """
     refuse_existing(target)
-    salvage = Salvage(path)
-    writer = BagWriter(target, compression="zstd", chunk_size=_CHUNK, about={})
-    known: set[str] = set()
-    refused: dict[str, str] = {}
-    saved = skipped = 0
-
-    def announce(topic: str) -> None:
-        said = salvage.topics[topic]
-        if said.encoding != _ENCODING:
-            refused[topic] = f"serialization format {shown(said.encoding)!r}"
-        elif writer.copy_topic(topic, said.type, said.qos, definition=said.definition, digest=said.digest):
-            known.add(topic)
-        else:
-            refused[topic] = f"type {said.type}"
-
     try:
-        for topic, log_ns, data in salvage:
-            if topic not in known and topic not in refused:
-                announce(topic)
-            if topic in refused:
-                skipped += 1
-                continue
-            writer.write(topic, log_ns, data)
-            saved += 1
-        for topic in salvage.topics:
-            if topic not in known and topic not in refused:  # announced, without a message
-                announce(topic)
-        writer.tell(salvage.about | {provenance.RECOVERED: f"{saved} messages; {salvage.lost_bytes} B lost"})
-    finally:
-        writer.close()
-    damage = [*salvage.damage, *(f"{topic}: {what} is not known" for topic, what in refused.items())]
-    return Recovery(saved, skipped, salvage.lost_bytes, tuple(damage))
+        salvage = Salvage(path)
+        writer = BagWriter(target, compression="zstd", chunk_size=_CHUNK, about={}, profile=salvage.profile)
+        try:
+            saved = _copy(salvage, writer)
+        except BaseException:
+            writer.abort()
+            shutil.rmtree(target)
+            raise
+    except OSError as error:
+        raise LatheError(f"{path}: cannot be recovered ({error.strerror or shown(error)})") from None
+    return Recovery(saved, salvage.skipped, salvage.missing, salvage.lost_bytes, tuple(salvage.damage), salvage.lossy)
+
+
+def _copy(salvage: Salvage, writer: BagWriter) -> int:
+    """Copy everything; returns the number of messages."""
+    channels: dict[Topic, int] = {}
+    saved = 0
+
+    def announce(topic: Topic) -> int:
+        ext = ConnectionExtRosbag2(topic.encoding, list(topic.qos))
+        records = topic.schema, topic.channel
+        channels[topic] = writer.copy_channel(topic.name, topic.type, ext, topic.digest, records)
+        return channels[topic]
+
+    salvage.copied = writer.copy_record
+    for topic, sequence, log_ns, publish_ns, data in salvage:
+        number = channels.get(topic)
+        if number is None:
+            number = announce(topic)
+        writer.copy(number, sequence, log_ns, publish_ns, data)
+        saved += 1
+    for topic in salvage.topics.keys() - channels.keys():  # without a message
+        announce(topic)
+    missing = f", {salvage.missing} messages missing" if salvage.missing else ""
+    writer.tell(salvage.about | {provenance.RECOVERED: f"{saved} messages; {salvage.lost_bytes} B lost{missing}"})
+    writer.close()
+    return saved
 
 
 def mend(path: Path) -> Recovery | None:
@@ -96,11 +102,13 @@ def mend(path: Path) -> Recovery | None:
     workshop = path.with_name(f"{path.name}.mending")
     shutil.rmtree(workshop, ignore_errors=True)
     workshop.mkdir()
-    new = workshop / path.name  # the file inside takes the folder's name
-    found = recover(path, new)
-    old = path.with_name(f"{path.name}.cut")
-    path.rename(old)
-    new.rename(path)
-    workshop.rmdir()
-    shutil.rmtree(old)
+    try:
+        new = workshop / path.name  # the file inside takes the folder's name
+        found = recover(path, new)
+        old = path.with_name(f"{path.name}.cut")
+        path.rename(old)
+        new.rename(path)
+        shutil.rmtree(old)
+    finally:
+        shutil.rmtree(workshop)
     return found

@@ -1,97 +1,187 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every message that is whole in a bag that is not: cut off, or broken in places."""
+"""Every message that is whole in a bag that is not: cut off, or broken in places.
+
+Bytes are copied, not understood: schemas, channels and messages keep every byte but for their numbers.
+"""
 
 import sqlite3
 import struct
 import tempfile
-from collections.abc import Iterator
-from contextlib import closing
-from dataclasses import dataclass, field
-from functools import lru_cache
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, NamedTuple
 
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Metadata, Schema
-from mcap.writer import MCAP0_MAGIC
+from mcap.records import Channel, Header, Metadata, Schema, Statistics
 from rosbags.interfaces import Qos
-from rosbags.rosbag2.metadata import parse_qos
 
-from lathe_rc.bag.reading import precheck
-from lathe_rc.bag.reading.precheck import MOST_BYTES, MOST_TEXT, MOST_TOPICS, read_record
+from lathe_rc import messages
+from lathe_rc.bag.reading import metadata, precheck, qos
+from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_METADATA, MOST_TEXT, MOST_TOPICS
+from lathe_rc.bag.reading.sound_records import SoundRecords, Told
 from lathe_rc.bag.reading.source import files_of
-from lathe_rc.bag.reading.unpacking import read_chunk, unpack, unpack_file, unpacked_size
-from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.bag.reading.sqlite_storage import connect, with_journal
+from lathe_rc.bag.reading.unpacking import unpack, unpack_file, unpacked_size
+from lathe_rc.bag.writing.mcap_file import channel_content, schema_content
+from lathe_rc.errors import InputError, shown
+
+ROS2 = "ros2"  #: profile of the files of rosbag2
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message that is compressed by itself; CDR begins with a zero
-_MOST_DESCRIBED = 16 * MOST_TEXT  # texts and definitions that are kept [characters]
 _MOST_DAMAGE = 1000  # places that are told
+_SQLITE_PAGE = 4096  # bytes that are said to be lost where SQLite does not say
+_MOST_ID_BITS = 62  # of a row
+_SCHEMALESS = "__schemaless__"  # type of messages without a schema, as rosbags calls it
 
 
 @dataclass(frozen=True)
-class Announced:
-    """A topic as a broken bag announces it; texts may be empty."""
+class Topic:
+    """A channel of a bag; the bytes are those of its records, numbers at their beginning included.
 
+    Attributes:
+        name: of the topic.
+        type: of its messages; may be empty.
+        encoding: of its messages.
+        qos: as far as it is understood.
+        digest: of the type; may be empty.
+        schema: None if it has none.
+        channel: the record.
+    """
+
+    name: str
     type: str
-    definition: str
-    digest: str
-    qos: tuple[Qos, ...]
     encoding: str
+    qos: tuple[Qos, ...]
+    digest: str
+    schema: bytes | None
+    channel: bytes
 
 
-@lru_cache(maxsize=8)
-def _profiles(text: str) -> tuple[Qos, ...]:
-    """QoS as YAML has it; most topics of a bag have the same, and to read it takes longer than a chunk of messages."""
-    return tuple(parse_qos(text))
+class Message(NamedTuple):
+    """A message; times in ns."""
+
+    topic: Topic
+    sequence: int
+    log_ns: int
+    publish_ns: int
+    data: bytes
+
+
+class _Definition(NamedTuple):
+    """A schema or channel record, and whether a checksum vouches for it."""
+
+    content: bytes
+    checked: bool
 
 
 @dataclass
 class Salvage:
-    """The readable rest of a bag; iterate over it to get topic, log time [ns] and bytes of each whole message.
+    """The readable rest of a bag; iterate over it to get each whole message.
 
     Args:
         path: a rosbag2 folder or a file of one.
 
     Attributes:
-        topics: announced so far, by name.
+        copied: gets attachments, and metadata that this package does not write, as opcode and content.
+        topics: all that can be copied.
+        profile: of the files.
         about: texts that the bag says of itself.
         damage: what was wrong and where, one line each.
         lost_bytes: bytes of the files that gave nothing.
+        skipped: messages of topics that cannot be copied.
+        missing: messages that the bag counts beyond those that are there.
+        lossy: whether messages are missing, or may be wrong.
 
     Raises:
         InputError: there is no file of a bag.
     """
 
     path: Path
-    topics: dict[str, Announced] = field(default_factory=dict)
+    copied: Callable[[int, bytes], None] = lambda _opcode, _content: None
+    topics: dict[Topic, None] = field(default_factory=dict)
     about: dict[str, str] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     lost_bytes: int = 0
-    _qos: precheck.Qos = field(default_factory=precheck.Qos, repr=False)
+    skipped: int = 0
+    missing: int = 0
+    lossy: bool = False
     _described: int = 0  # characters of texts and definitions
+    _counted: int | None = None  # messages by the file that is read
+    _ended: bool = True  # whether that file goes to its end
 
     def __post_init__(self) -> None:
         self._files = files_of(self.path)
         if not self._files:
             raise InputError(f"{self.path}: no bag; allowed: a folder with .mcap or .db3 files, or such a file")
+        self._metadata = self._read_metadata()
+        self.profile = self._profile(self._files[0])
 
-    def __iter__(self) -> Iterator[tuple[str, int, bytes]]:
+    def _read_metadata(self) -> metadata.Metadata | None:
+        """The metadata of a folder, if they can be read."""
+        if not (self.path / metadata.NAME).exists():
+            return None
+        try:
+            told = metadata.read(self.path)
+            self._describe(told.about)
+        except ValueError as error:
+            self._tell(shown(error))
+            return None
+        return told
+
+    def _profile(self, file: Path) -> str:
+        """The profile of an MCAP file."""
+        if file.suffix != ".mcap":
+            return ROS2
+        with file.open("rb") as stream:
+            size = min(file.stat().st_size, MOST_TEXT)
+            first = next(iter(SoundRecords(stream, size, lambda _why, _lost: None)), None)
+        if first is None or first.opcode != Opcode.HEADER:
+            return ROS2
+        return str(Header.read(ReadDataStream(BytesIO(first.content))).profile)
+
+    def __iter__(self) -> Iterator[Message]:
         """The whole messages in the order of the files."""
+        packed = self._metadata is not None and self._metadata.packed
+        read, complete = 0, True
         for file in self._files:
-            for topic, log_ns, data in self._file(file):
-                if not data.startswith(_ZSTD):
-                    yield topic, log_ns, data
-                    continue
-                try:
-                    yield topic, log_ns, unpack("zstd", data, unpacked_size(data[:18]))
-                except ValueError as error:
-                    self._lose(file, 0, len(data), f"{topic} at {log_ns} ns: {error}")
+            lost, skipped, found = self.lost_bytes, self.skipped, 0
+            self._counted, self._ended = None, True
+            for message in self._file(file):
+                found += 1
+                if message.data.startswith(_ZSTD) and (packed or message.topic.encoding == "cdr"):
+                    yield from self._unpacked(file, message)
+                else:
+                    yield message
+            found += self.skipped - skipped
+            read += found
+            complete &= (self.lost_bytes == lost and self._ended) or self._counted == found
+            self._miss(file.name, self._counted, found)
+        told = sum(topic.count for topic in self._metadata.topics.values()) if self._metadata else None
+        self._miss(metadata.NAME, told, read)
+        self.lossy |= bool(self.missing or self.skipped) or not (complete or told == read)
 
-    def _file(self, file: Path) -> Iterator[tuple[str, int, bytes]]:
+    def _miss(self, name: str, counted: int | None, read: int) -> None:
+        if counted is not None and counted > read:
+            self._tell(f"{name} counts {counted} messages, {counted - read} more than there are")
+            self.missing = max(self.missing, counted - read)
+
+    def _unpacked(self, file: Path, message: Message) -> Iterator[Message]:
+        """A message that is compressed by itself, as it was before."""
+        try:
+            yield message._replace(data=unpack("zstd", message.data, unpacked_size(message.data[:18])))
+        except ValueError as error:
+            self._lose(file, f"{message.topic.name} at {message.log_ns} ns: {error}", len(message.data))
+            self.lossy = True
+
+    def _file(self, file: Path) -> Iterator[Message]:
         if file.suffix != ".zstd":
             yield from (self._mcap if file.suffix == ".mcap" else self._sqlite)(file)
             return
@@ -108,140 +198,265 @@ class Salvage:
             except ValueError as error:
                 raise InputError(f"{file}: {error}") from None
             except zstandard.ZstdError as error:
-                self.damage.append(f"{file.name}: {shown(error)}")
+                self._tell(f"{file.name}: {shown(error)}")
+
+    def _tell(self, what: str) -> None:
+        if len(self.damage) < _MOST_DAMAGE:
+            self.damage.append(what)
+
+    def _lose(self, file: Path, why: str, size: int) -> None:
+        self._tell(f"{file.name}: {shown(why)}")
+        self.lost_bytes += size
+
+    def count(self, length: int) -> None:
+        """Count what is kept beside the messages.
+
+        Raises:
+            ValueError: it is too much.
+        """
+        if self._described + length > MOST_METADATA:
+            raise ValueError(f"more than {MOST_METADATA} characters of texts and definitions")
+        self._described += length
+
+    def _describe(self, about: Mapping[str, str]) -> None:
+        """Take texts that the bag says of itself."""
+        self.count(sum(map(len, [*about, *about.values()])))
+        self.about |= about
+
+    def add(self, topic: Topic, offered: str) -> Topic:
+        """Announce a topic; its quality of service is copied also where it is not understood.
+
+        Raises:
+            ValueError: it cannot be copied.
+        """
+        precheck.check_name(topic.name)
+        try:
+            topic = replace(topic, qos=qos.of_text(offered))
+        except ValueError as error:
+            self._tell(f"{topic.name}: quality of service that is copied, not understood ({shown(error)})")
+        if len(self.topics) >= MOST_TOPICS and topic not in self.topics:
+            raise ValueError(f"more than {MOST_TOPICS} topics")
+        self.topics[topic] = None
+        return topic
 
     # ---- MCAP ---------------------------------------------------------------------------------------
 
-    def _mcap(self, file: Path) -> Iterator[tuple[str, int, bytes]]:
-        size = file.stat().st_size
-        channels: dict[int, str] = {}
-        schemas: dict[int, Schema] = {}
+    def _mcap(self, file: Path) -> Iterator[Message]:
+        def told(why: str, lost: int) -> None:
+            self._lose(file, why, lost)
+
         with file.open("rb") as stream:
-            if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                self._lose(file, 0, size, "not an MCAP file")
-                return
-            yield from self._records(file, stream, size, schemas, channels)
+            sound = SoundRecords(stream, file.stat().st_size, told)
+            sound.check_sums()
+            known, unchecked = _Definitions(self, sound), 0
+            for record in () if sound.summary_wrong else sound.summary():
+                known.add(record.opcode, record.content, checked=record.checked)
+            for record in sound:
+                if record.opcode == Opcode.STATISTICS and not sound.summary_wrong:
+                    self._counted = Statistics.read(ReadDataStream(BytesIO(record.content))).message_count
+                for opcode, content in sound.inside(record):
+                    if opcode == Opcode.MESSAGE and len(content) >= _MESSAGE.size:
+                        channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content)
+                        if topic := known.topics.get(channel) or known.topic_of(channel):
+                            yield Message(topic, sequence, log_ns, publish_ns, content[_MESSAGE.size :])
+                            unchecked += not record.checked
+                    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                        known.add(opcode, content, checked=record.checked)
+                    else:
+                        self._other(opcode, content, 0 if sound.ended else len(content), told)
+            known.finish()
+            self._ended = sound.ended
+            if unchecked and sound.data_wrong:
+                self._tell(f"{file.name}: {unchecked} messages have no checksum of their own; some may be wrong")
+                self.lossy = True
 
-    def _lose(self, file: Path, place: int, end: int, why: str) -> None:
-        if len(self.damage) < _MOST_DAMAGE:
-            self.damage.append(f"{file.name}: {shown(why)}")
-        self.lost_bytes += end - place
-
-    def _records(
-        self,
-        file: Path,
-        stream: BinaryIO,
-        size: int,
-        schemas: dict[int, Schema],
-        channels: dict[int, str],
-        inside: int | None = None,
-    ) -> Iterator[tuple[str, int, bytes]]:
-        """The records of a file, or those of a chunk at byte ``inside`` of it."""
-        while True:
-            place = stream.tell()
-            try:
-                record = read_record(stream, size)
-            except ValueError as error:
-                self._lose(file, place, size, str(error))
-                return
-            if record is None:
-                if inside is None:
-                    self._lose(file, size, size, "ends without a footer")
-                return
-            opcode, content = record
-            if opcode == Opcode.FOOTER:
-                return
-            if opcode == Opcode.CHUNK:
-                if inside is not None:
-                    self._lose(file, 0, len(content), f"chunk in the chunk at byte {inside}")
-                    continue
-                try:
-                    whole = read_chunk(content, place)
-                except ValueError as error:
-                    self._lose(file, place, stream.tell(), str(error))
-                    continue
-                yield from self._records(file, BytesIO(whole), len(whole), schemas, channels, inside=place)
-            elif found := self._record(file, opcode, content, schemas, channels):
-                yield found
-
-    def _record(
-        self, file: Path, opcode: int, content: bytes, schemas: dict[int, Schema], channels: dict[int, str]
-    ) -> tuple[str, int, bytes] | None:
-        """The message in a record, if it is one; others are taken note of."""
+    def _other(self, opcode: int, content: bytes, lost: int, told: Told) -> None:
+        """Keep what is neither a message nor describes one."""
         try:
-            if opcode == Opcode.MESSAGE:
-                channel, _, log_ns, _ = _MESSAGE.unpack_from(content)
-                return channels[channel], log_ns, content[_MESSAGE.size :]
-            data = ReadDataStream(BytesIO(content))
-            if opcode == Opcode.SCHEMA:
-                schema = Schema.read(data)
-                self._describe(len(schema.data))
-                schemas[schema.id] = schema
-            elif opcode == Opcode.CHANNEL:
-                self._channel(Channel.read(data), schemas, channels)
-            elif opcode == Opcode.METADATA:
-                metadata = Metadata.read(data)
+            if opcode == Opcode.METADATA:
+                metadata = Metadata.read(ReadDataStream(BytesIO(content)))
                 if metadata.name == "lathe_rc":
-                    self._describe(sum(map(len, [*metadata.metadata, *metadata.metadata.values()])))
-                    self.about |= metadata.metadata
-        except MemoryError:
-            raise
-        except Exception as error:  # noqa: BLE001 - mcap and rosbags raise whatever broken bytes lead to
-            self._lose(file, 0, len(content), f"record of kind {opcode}: {shown(error)}")
-        return None
-
-    def _describe(self, length: int) -> None:
-        """Count what is kept beside the messages."""
-        if self._described + length > _MOST_DESCRIBED:
-            raise ValueError(f"more than {_MOST_DESCRIBED} characters of texts and definitions")
-        self._described += length
-
-    def _channel(self, channel: Channel, schemas: dict[int, Schema], channels: dict[int, str]) -> None:
-        schema = schemas[channel.schema_id]
-        precheck.check_name(channel.topic)
-        precheck.check_name(schema.name)
-        self._qos.add(channel)
-        qos = _profiles(channel.metadata.get("offered_qos_profiles", "") or "[]")
-        digest = channel.metadata.get("topic_type_hash", "")
-        self.topics[channel.topic] = Announced(schema.name, schema.data.decode(), digest, qos, channel.message_encoding)
-        channels[channel.id] = channel.topic
+                    self._describe(metadata.metadata)
+                elif metadata.name != "rosbag2":  # the new bag has its own
+                    self.copied(opcode, content)
+            elif opcode == Opcode.ATTACHMENT:
+                self.copied(opcode, content)
+            elif opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+                raise ValueError("a chunk in the chunk, or a message that is too short")  # noqa: TRY301
+            elif opcode > Opcode.DATA_END:
+                raise ValueError("it is not copied")  # noqa: TRY301
+        except ValueError as error:
+            told(f"record of kind {opcode}: {error}", lost)
 
     # ---- SQLite -------------------------------------------------------------------------------------
 
-    def _sqlite(self, file: Path) -> Iterator[tuple[str, int, bytes]]:
-        try:
-            with closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as base:
-                precheck.check_tables(base)
-                names = self._sqlite_topics(base)
-                rows = base.execute(
-                    "SELECT topic_id, timestamp, data FROM messages WHERE length(data) <= ? ORDER BY id", (MOST_BYTES,)
-                )
-                for number, log_ns, data in rows:
-                    if number in names and isinstance(log_ns, int) and log_ns >= 0 and isinstance(data, bytes):
-                        yield names[number], log_ns, data
-        except (LatheError, MemoryError):
-            raise
-        except Exception as error:  # noqa: BLE001 - SQLite and rosbags raise whatever broken bytes lead to
-            self._lose(file, 0, 0, shown(error))
+    def _sqlite(self, file: Path) -> Iterator[Message]:
+        with tempfile.TemporaryDirectory(prefix="lathe-salvage-") as folder:
+            yield from self._database(file, Path(folder))
 
-    def _sqlite_topics(self, base: sqlite3.Connection) -> dict[int, str]:
-        names: dict[int, str] = {}
+    def _database(self, file: Path, folder: Path) -> Iterator[Message]:
         try:
-            rows = base.execute("SELECT topic_type, encoded_message_definition FROM message_definitions")
-            defined = {kind: text for kind, text in rows.fetchmany(MOST_TOPICS) if isinstance(text, str)}
-        except sqlite3.Error:
-            defined = {}  # bags of older ROS have none
-        try:
-            listed = base.execute("SELECT id, name, type, serialization_format, offered_qos_profiles FROM topics")
-        except sqlite3.Error:  # those of the oldest do not have that either
-            listed = base.execute("SELECT id, name, type, serialization_format, '' FROM topics")
-        for number, name, kind, encoding, qos in listed.fetchmany(MOST_TOPICS):
-            precheck.check_name(name)
-            precheck.check_name(kind)
-            text = qos if isinstance(qos, str) else ""
-            precheck.check_yaml(text, "offered_qos_profiles")
-            definition = defined.get(kind, "")
-            self._describe(len(definition) + len(text))
-            names[number] = name
-            self.topics[name] = Announced(kind, definition, "", _profiles(text), str(encoding))
-        return names
+            with closing(connect(with_journal(file, folder))) as base:
+                with suppress(sqlite3.DatabaseError):  # of a broken page; the others are read below
+                    precheck.check_tables(base)
+                topics, strange = self._sqlite_topics(file, base), 0
+                for number, log_ns, data in self._sqlite_rows(file, base):
+                    topic = topics.get(number)
+                    if topic and isinstance(log_ns, int) and log_ns >= 0 and isinstance(data, bytes):
+                        yield Message(topic, 0, log_ns, log_ns, data)
+                    else:
+                        strange += 1
+                if strange:
+                    self.skipped += strange
+                    self._tell(f"{file.name}: {strange} messages without a topic, a time or bytes that can be copied")
+        except (sqlite3.Error, ValueError) as error:
+            self._lose(file, str(error), file.stat().st_size)
+
+    def _sqlite_rows(self, file: Path, base: sqlite3.Connection) -> Iterator[tuple[Any, Any, Any]]:
+        """Topic, time and bytes of the messages on all pages that are whole; no bytes if there are too many."""
+        query = (
+            f"SELECT id, topic_id, timestamp, CASE WHEN length(data) <= {MOST_BYTES} THEN data END"  # noqa: S608 - a constant
+            " FROM messages WHERE id >= ? ORDER BY id"
+        )
+        first = 0
+
+        def readable(step: int) -> bool:
+            try:
+                base.execute(f"{query} LIMIT 1", (first + step,)).fetchone()
+            except sqlite3.DatabaseError:
+                return False
+            return True
+
+        while True:
+            try:
+                for number, *row in base.execute(query, (first,)):
+                    yield row[0], row[1], row[2]
+                    first = number + 1
+            except sqlite3.DatabaseError as error:
+                self._lose(file, f"from message {first} on: {error}", _SQLITE_PAGE)
+            else:
+                return
+            step = next((2**k for k in range(_MOST_ID_BITS) if readable(2**k)), None)
+            if step is None:
+                return
+            first += bisect_left(range(step), 1, lo=step // 2, key=readable)
+
+    def _sqlite_topics(self, file: Path, base: sqlite3.Connection) -> dict[Any, Topic]:
+        """Topics by number."""
+        definitions = _select(base, "message_definitions", ("topic_type", "encoding", "encoded_message_definition"))
+        defined = {kind: (encoding, text) for kind, encoding, text in definitions}
+        names = ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
+        topics: dict[Any, Topic] = {}
+        for number, name, kind, encoding, offered, digest in _select(base, "topics", names):
+            try:
+                precheck.check_name(kind)
+                how, text, known = _known(kind)
+                how, text = defined.get(kind, (how, text))
+                self.count(len(text) + len(offered))
+                said = {"offered_qos_profiles": offered, "topic_type_hash": digest or known}
+                schema, channel = schema_content(kind, how, text.encode()), channel_content(name, encoding, said)
+                topics[number] = self.add(Topic(name, kind, encoding, (), digest or known, schema, channel), offered)
+            except ValueError as error:
+                self._tell(f"{file.name}: {shown(name)}: {error}")
+        return topics
+
+
+class _Definitions:
+    """Schemas and channels of an MCAP file, wherever they stand in it."""
+
+    def __init__(self, salvage: Salvage, sound: SoundRecords) -> None:
+        self._salvage, self._sound = salvage, sound
+        self._known: dict[tuple[int, int], _Definition] = {}
+        self.topics: dict[int, Topic] = {}  #: by number of the channel, that have come
+        self._lost: Counter[str] = Counter()  # messages by why they are not copied
+        self._why: dict[int, str] = {}
+        self._searched = False
+
+    def add(self, opcode: int, content: bytes, *, checked: bool) -> None:
+        """Take a record, if it is one of a schema or channel; the last one counts that a checksum vouches for."""
+        if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
+            return
+        key = opcode, int.from_bytes(content[:2], "little")
+        before = self._known.get(key)
+        if before is None or before.content == content:
+            self._known[key] = _Definition(content, checked or (before is not None and before.checked))
+            return
+        equals = checked == before.checked
+        kind = Opcode(opcode).name.lower()
+        self._sound.told(f"{kind} {key[1]} is described in two ways", len(content) if equals else 0)
+        if checked or equals:
+            self._known[key] = _Definition(content, checked)
+            self.topics.clear()
+
+    def _find(self, opcode: int, number: int) -> bytes | None:
+        """The content of a record that may stand further behind, if everything ahead of it is damaged."""
+        key = opcode, number
+        if key not in self._known and not self._searched:
+            self._searched = True
+            told, self._sound.told = self._sound.told, lambda _why, _lost: None
+            for record in self._sound:
+                for kind, content in self._sound.inside(record):
+                    if (kind, int.from_bytes(content[:2], "little")) not in self._known:
+                        self.add(kind, content, checked=record.checked)
+            self._sound.told = told
+        return self._known[key].content if key in self._known else None
+
+    def topic_of(self, number: int) -> Topic | None:
+        """The topic of a message's channel; None if it cannot be copied."""
+        if number not in self._why:
+            try:
+                content = self._find(Opcode.CHANNEL, number)
+                if content is None:
+                    raise ValueError(f"channel {number} is described nowhere")  # noqa: TRY301
+                topic = self.topics[number] = self._made(content)
+            except MemoryError:
+                raise
+            except Exception as error:  # noqa: BLE001 - mcap raises whatever broken bytes lead to
+                self._why[number] = shown(error)
+            else:
+                return topic
+        self._lost[self._why[number]] += 1
+        return None
+
+    def _made(self, content: bytes) -> Topic:
+        channel = Channel.read(ReadDataStream(BytesIO(content)))
+        name, schema, kind = shown(channel.topic), None, _SCHEMALESS
+        if channel.schema_id:
+            schema = self._find(Opcode.SCHEMA, channel.schema_id)
+            if schema is None:
+                self._sound.told(f"{name}: schema {channel.schema_id} is described nowhere", 0)
+            else:
+                kind = Schema.read(ReadDataStream(BytesIO(schema))).name
+                precheck.check_name(kind)
+        self._salvage.count(len(content) + len(schema or b""))
+        digest = channel.metadata.get("topic_type_hash", "")
+        topic = Topic(channel.topic, kind, channel.message_encoding, (), digest, schema, content)
+        return self._salvage.add(topic, channel.metadata.get("offered_qos_profiles", ""))
+
+    def finish(self) -> None:
+        """Announce what has no message, and tell what is not copied."""
+        for opcode, number in list(self._known):
+            new = opcode == Opcode.CHANNEL and number not in self.topics and number not in self._why
+            if new and self.topic_of(number) is None:
+                self._lost[self._why[number]] -= 1
+        self._salvage.skipped += self._lost.total()
+        for why, count in self._lost.items():
+            self._sound.told(f"{why}: {count} messages of it are not copied", 0)
+
+
+def _known(kind: str) -> tuple[str, str, str]:
+    """Encoding, text and hash of a type's definition, empty if this package does not have it."""
+    store = messages.store()
+    if kind not in store.fielddefs:
+        return "", "", ""
+    return "ros2msg", store.generate_msgdef(kind, ros_version=2)[0], store.hash_rihs01(kind)
+
+
+def _select(base: sqlite3.Connection, table: str, columns: tuple[str, ...]) -> list[tuple[Any, ...]]:
+    """Rows of a table as texts, but for a number in the first column; bags of older ROS lack columns and tables."""
+    there = {row[1] for row in base.execute(f"PRAGMA table_info({table})")}
+    if columns[0] not in there:
+        return []
+    listed = ", ".join(name if name in there else "''" for name in columns)
+    rows = base.execute(f"SELECT {listed} FROM {table}").fetchmany(MOST_TOPICS)  # noqa: S608 - of constants
+    return [(first, *(text if isinstance(text, str) else "" for text in rest)) for first, *rest in rows]

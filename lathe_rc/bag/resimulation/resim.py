@@ -121,11 +121,13 @@ def with_controller(scenario: Scenario, file: Path) -> Scenario:
     """
     shared = {name: getattr(scenario.shared, name) for name in SharedParameters.model_fields}
     nodes = dict(scenario.nodes)
-    for name, values in ros_yaml.read(file).items():
+    for name in ros_yaml.read(file):
+        if name not in {"/**", *nodes}:
+            raise InputError(f"{file}: no node {name!r} in the bag's scenario; {instead(name, nodes)}")
+    stages = {name: table.stage for name, table in scenario.nodes.items()}
+    for name, values in scenarios.read(file, stages=stages).items():
         if name == "/**":
             continue
-        if name not in nodes:
-            raise InputError(f"{file}: no node {name!r} in the bag's scenario; {instead(name, nodes)}")
         own = {key: value for key, value in values.items() if key not in SharedParameters.model_fields}
         stage = own.get("stage") or nodes[name].stage
         kind = kind_of(name, stage)
@@ -183,7 +185,7 @@ def resimulate(
     with Source(path) as source, tempfile.TemporaryDirectory(prefix="lathe-resim-") as folder:
         _refuse_part(source)
         recorded = Recorded(source, topics or {})
-        original = None if scenario is not None else _of_bag(recorded, source, Path(folder))
+        original = None if scenario is not None else _of_bag(recorded, source, Path(folder), overrides)
         if scenario is not None:
             chosen = scenarios.load(resources.scenario(scenario), overrides)
         else:
@@ -192,7 +194,7 @@ def resimulate(
             chosen = provenance.scenario_of(source.about, Path(folder), overrides) if overrides else original
         if controller is not None:
             chosen = with_controller(chosen, controller)
-        warnings = provenance.changes(source.about) if original is not None else []
+        warnings = provenance.changes(source.about, original) if original is not None else []
         _refuse_events(chosen, original)
         drives = identify.drives(recorded, chosen) if identified else []
         chosen = identify.with_identified(chosen, drives)
@@ -244,15 +246,17 @@ def resimulate(
     )
 
 
-def _of_bag(recorded: Recorded, source: Source, folder: Path) -> Scenario:
-    """The bag's scenario.
+def _of_bag(recorded: Recorded, source: Source, folder: Path, overrides: Sequence[str]) -> Scenario:
+    """The bag's scenario, with the files that it does not hold as ``overrides`` name them.
 
     Raises:
         InputError: it has none; says what it has and what is asked for.
     """
     if provenance.SCENARIO not in source.about:
         raise InputError(f"{source.path}: {asked_for(recorded)}")
-    return provenance.scenario_of(source.about, folder)
+    lacks = {name for name in provenance.named_files(source.about) if not name.endswith(scenarios.WRITTEN)}
+    given = [text for text in overrides if text.partition("=")[0].strip() in lacks]
+    return provenance.scenario_of(source.about, folder, given)
 
 
 @contextmanager

@@ -4,6 +4,9 @@
 The records are those of the mcap library; its own writer takes 14 µs for a message, as much as a stage of the cell
 needs for a block. Here a message costs a header and two appends, a row of
 blocks one append, and the rest of the work is done once a chunk.
+
+Schemas and channels stand again at the beginning of chunks 2, 3, 5, 9, 17 and so on: a damaged chunk takes no other
+with it, also in a file that was cut off before its summary.
 """
 
 import io
@@ -18,9 +21,11 @@ import numpy as np
 import numpy.typing as npt
 import zstandard
 from isal.isal_zlib import crc32
-from mcap.data_stream import RecordBuilder
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
+    Attachment,
+    AttachmentIndex,
     Channel,
     ChunkIndex,
     DataEnd,
@@ -34,6 +39,7 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
+_HEAD = struct.Struct("<BQ")  # opcode, length
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _AFTER_LENGTH = _MESSAGE.size - 9  # bytes of it that the length counts
 TIMES = (16, 8)  #: where log time and publish time stand ahead of a message's bytes [B]
@@ -125,11 +131,27 @@ def _in_order(parts: list[npt.NDArray[np.uint64]]) -> npt.NDArray[np.uint64]:
     return whole[np.argsort(whole[:, 1])]
 
 
+def _record(opcode: int, *parts: bytes) -> bytes:
+    """A record of these contents."""
+    return b"".join([_HEAD.pack(opcode, sum(map(len, parts))), *parts])
+
+
 def _encoded(*records: _Record) -> bytes:
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
     return bytes(builder.end())
+
+
+def schema_content(name: str, encoding: str, text: bytes) -> bytes:
+    """The content of a schema record, with number 0."""
+    return _encoded(Schema(id=0, data=text, encoding=encoding, name=name))[_HEAD.size :]
+
+
+def channel_content(topic: str, encoding: str, metadata: Mapping[str, str]) -> bytes:
+    """The content of a channel record, with number 0."""
+    channel = Channel(id=0, topic=topic, message_encoding=encoding, metadata=dict(metadata), schema_id=0)
+    return _encoded(channel)[_HEAD.size :]
 
 
 class McapFile:
@@ -139,6 +161,7 @@ class McapFile:
         path: of the file; must not exist.
         chunk_size: bytes of messages after which a chunk is written.
         compress: with zstd.
+        profile: of the file.
 
     Attributes:
         counts: messages by channel, of the chunks that have been written.
@@ -148,30 +171,34 @@ class McapFile:
         OSError: the file cannot be made; later from any method: the disk does not take it.
     """
 
-    def __init__(self, path: Path, *, chunk_size: int, compress: bool) -> None:
+    def __init__(self, path: Path, *, chunk_size: int, compress: bool, profile: str = "ros2") -> None:
         self._stream = path.open("xb", buffering=0)
         self._chunk_size = chunk_size
         self._compressor = zstandard.ZstdCompressor(level=_LEVEL) if compress else None
-        self._schemas: list[Schema] = []
-        self._channels: list[Channel] = []
+        self._schemas: list[bytes] = []
+        self._channels: list[bytes] = []
         self._chunks: list[ChunkIndex] = []
         self._metadata: list[MetadataIndex] = []
+        self._attachments: list[AttachmentIndex] = []
         self.counts: dict[int, int] = {}
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self._chunk = io.BytesIO()  # the messages of the chunk, and behind them what earlier ones have left
         self._begin_chunk()
-        self._offset = 0
+        self._offset = self._crc = 0
         self._reserve = path.with_name(f"{path.name}.reserve")
         self._kept = self._described = 0
         self._refused: OSError | None = None
-        self._put(MCAP0_MAGIC + _encoded(Header("ros2", "lathe_rc")))
+        self._put(MCAP0_MAGIC + _encoded(Header(profile, "lathe_rc")))
 
     def _begin_chunk(self) -> None:
         self._chunk.seek(0)  # its memory is used again
         self._size = 0
         self._singles: dict[int, list[int]] = {}  # log time and place of each message that is not in a row, by channel
         self._runs: list[_Run] = []
+        before = len(self._chunks)
+        if before and before & (before - 1) == 0:  # see the top
+            self._size += self._chunk.write(b"".join([*self._schemas, *self._channels]))
 
     def _put(self, *parts: bytes | memoryview) -> None:
         """Write at the end; what does not fit leaves no trace."""
@@ -184,11 +211,13 @@ class McapFile:
             self._stream.truncate(self._offset)
             self._stream.seek(self._offset)
             raise
-        self._offset += sum(map(len, parts))
+        for part in parts:
+            self._offset += len(part)
+            self._crc = crc32(part, self._crc)
 
     def _keep_room(self) -> None:
         """Hold as much of the disk as completing the file will take: then a full disk cannot make it unreadable."""
-        needed = _ROOM + _ROOM_PER_CHUNK * (len(self._chunks) + 1) + 2 * self._described
+        needed = _ROOM + _ROOM_PER_CHUNK * (len(self._chunks) + 1) + 4 * self._described
         if needed > self._kept:
             needed += _ROOM
             with self._reserve.open("ab") as stream:
@@ -201,36 +230,50 @@ class McapFile:
 
     def add_schema(self, name: str, text: str) -> int:
         """Describe a message type; returns its number."""
-        schema = Schema(id=len(self._schemas) + 1, data=text.encode(), encoding="ros2msg", name=name)
-        self._schemas.append(schema)
-        self._append(_encoded(schema))
-        return schema.id
+        return self.copy_schema(schema_content(name, "ros2msg", text.encode()))
 
     def add_channel(self, topic: str, schema: int, encoding: str, metadata: Mapping[str, str]) -> int:
         """Announce a topic; returns its number."""
-        channel = Channel(
-            id=len(self._channels) + 1,
-            topic=topic,
-            message_encoding=encoding,
-            metadata=dict(metadata),
-            schema_id=schema,
-        )
-        self._channels.append(channel)
-        self.counts[channel.id] = 0
-        self._append(_encoded(channel))
-        return channel.id
+        return self.copy_channel(channel_content(topic, encoding, metadata), schema)
+
+    def copy_schema(self, content: bytes) -> int:
+        """Describe a message type as a record of another file does; returns its number here."""
+        number = len(self._schemas) + 1
+        self._schemas.append(_record(Opcode.SCHEMA, struct.pack("<H", number), content[2:]))
+        self._append(self._schemas[-1])
+        return number
+
+    def copy_channel(self, content: bytes, schema: int) -> int:
+        """Announce a topic as a record of another file does.
+
+        Args:
+            content: of the record.
+            schema: its number here; 0: none.
+
+        Returns:
+            The channel's number here.
+        """
+        number = len(self._channels) + 1
+        self._channels.append(_record(Opcode.CHANNEL, struct.pack("<HH", number, schema), content[4:]))
+        self.counts[number] = 0
+        self._append(self._channels[-1])
+        return number
 
     def _append(self, data: bytes) -> None:
         self._described += len(data)
         self._size += self._chunk.write(data)
 
-    def add_message(self, channel: int, log_ns: int, data: bytes | memoryview) -> None:
-        """Append a message."""
+    def add_message(
+        self, channel: int, log_ns: int, data: bytes | memoryview, *, publish_ns: int | None = None, sequence: int = 0
+    ) -> None:
+        """Append a message; without ``publish_ns`` it was published at its log time."""
         index = self._singles.get(channel)
         if index is None:
             index = self._singles[channel] = []
         index += (log_ns, self._size)
-        self._size += self._chunk.write(message_head(channel, log_ns, len(data))) + self._chunk.write(data)
+        published = log_ns if publish_ns is None else publish_ns
+        head = _MESSAGE.pack(Opcode.MESSAGE, len(data) + _AFTER_LENGTH, channel, sequence, log_ns, published)
+        self._size += self._chunk.write(head) + self._chunk.write(data)
         if self._size > self._chunk_size:
             self.flush()
 
@@ -281,7 +324,8 @@ class McapFile:
         last = max([*singles, *(run.last_ns for run in self._runs)])
         compression = b"zstd" if self._compressor else b""
         with self._chunk.getbuffer() as memory, memory[: self._size] as whole:
-            data = self._compressor.compress(whole) if self._compressor else whole
+            # A copy if it is not compressed: views of the chunk, alive in the traceback of a full disk, would block it.
+            data = self._compressor.compress(whole) if self._compressor else bytes(whole)
             length = _CHUNK.size - 9 + 4 + len(compression) + 8 + len(data)
             head = _CHUNK.pack(Opcode.CHUNK, length, first, last, self._size, crc32(whole))
             head += struct.pack(f"<I{len(compression)}sQ", len(compression), compression, len(data))
@@ -312,19 +356,42 @@ class McapFile:
             )
         )
 
-    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Append texts that describe the file."""
+    def add_metadata(self, name: str, values: Mapping[str, str], *, last: bool = False) -> None:
+        """Append texts that describe the file; ``last``: in the room that has been kept for them."""
+        content = _encoded(Metadata(name=name, metadata=dict(values)))[_HEAD.size :]
+        self.copy_record(Opcode.METADATA, content, last=last)
+
+    def copy_record(self, opcode: int, content: bytes, *, last: bool = False) -> None:
+        """Append an attachment or metadata as a record of another file has it; ``last``: see `add_metadata`."""
         self.flush()
-        record = _encoded(Metadata(name=name, metadata=dict(values)))
-        self._metadata.append(MetadataIndex(offset=self._offset, length=len(record), name=name))
-        self._put(record)
+        record, stream = _record(opcode, content), ReadDataStream(io.BytesIO(content))
+        if opcode == Opcode.METADATA and not last:  # metadata.yaml may repeat it, twice as long for its escapes
+            self._described += len(record)
+            self._keep_room()
+        if opcode == Opcode.METADATA:
+            name = Metadata.read(stream).name
+            self._put(record)
+            self._metadata.append(MetadataIndex(offset=self._offset - len(record), length=len(record), name=name))
+        else:
+            found = Attachment.read(stream)
+            self._put(record)
+            self._attachments.append(
+                AttachmentIndex(
+                    offset=self._offset - len(record),
+                    length=len(record),
+                    log_time=found.log_time,
+                    create_time=found.create_time,
+                    data_size=len(found.data),
+                    name=found.name,
+                    media_type=found.media_type,
+                )
+            )
 
     def finish(self) -> None:
         """Write the summary and close the file."""
         try:
             self.flush()
-            self.free_room()
-            self._put(_encoded(DataEnd(0)))
+            self._put(_encoded(DataEnd(self._crc)))
             self._put(self._summary())
         finally:
             self.abort()
@@ -336,7 +403,7 @@ class McapFile:
 
     def _summary(self) -> bytes:
         statistics = Statistics(
-            attachment_count=0,
+            attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts=self.counts,
             chunk_count=len(self._chunks),
@@ -347,10 +414,11 @@ class McapFile:
             schema_count=len(self._schemas),
         )
         groups = {
-            Opcode.SCHEMA: _encoded(*self._schemas),
-            Opcode.CHANNEL: _encoded(*self._channels),
+            Opcode.SCHEMA: b"".join(self._schemas),
+            Opcode.CHANNEL: b"".join(self._channels),
             Opcode.STATISTICS: _encoded(statistics),
             Opcode.CHUNK_INDEX: _encoded(*self._chunks),
+            Opcode.ATTACHMENT_INDEX: _encoded(*self._attachments),
             Opcode.METADATA_INDEX: _encoded(*self._metadata),
         }
         start = place = self._offset

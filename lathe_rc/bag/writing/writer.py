@@ -6,6 +6,7 @@ flush, which are what a crash promise needs; `lathe_rc.bag.writing.mcap_file` ha
 during which a cell that is being recorded would wait; libyaml takes some ms.
 """
 
+import shutil
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -16,6 +17,8 @@ import yaml
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
     Qos,
     QosDurability,
     QosHistory,
@@ -25,7 +28,6 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lathe_rc import messages
 from lathe_rc.bag.writing.mcap_file import McapFile, RowPlan
@@ -33,6 +35,7 @@ from lathe_rc.errors import InputError, LatheError
 
 Compression = Literal["zstd", "none"]
 Durability = Literal["volatile", "transient_local"]
+Records = tuple[bytes | None, bytes]
 
 FLUSH_PERIOD = 0.5  #: [s] of wall time after which a recorder writes messages out even if they fill no chunk
 _FOREVER = QosTime(9223372036, 854775807)
@@ -113,12 +116,14 @@ def offered_qos(depth: int, durability: Durability) -> Qos:
 class _McapStorage:
     """rosbags' storage interface on `McapFile`."""
 
-    def __init__(self, path: Path, compression: CompressionMode, chunk_size: int, *, compress: bool) -> None:
+    def __init__(
+        self, path: Path, compression: CompressionMode, chunk_size: int, profile: str, *, compress: bool
+    ) -> None:
         assert compression is CompressionMode.NONE, "chunks are compressed, not messages or files"
         self.path = path / f"{path.name}.mcap"
-        self.file = McapFile(self.path, chunk_size=chunk_size, compress=compress)
+        self.file = McapFile(self.path, chunk_size=chunk_size, compress=compress, profile=profile)
         self._schemas: dict[str, int] = {}
-        self.channels: dict[int, int] = {}
+        self.channels: dict[int, list[int]] = {}  # by connection
 
     def add_msgtype(self, connection: Connection) -> None:
         """Add a message type's definition."""
@@ -127,26 +132,27 @@ class _McapStorage:
     def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
         """Add a topic."""
         assert isinstance(connection.ext, ConnectionExtRosbag2)
-        self.channels[connection.id] = self.file.add_channel(
+        number = self.file.add_channel(
             connection.topic,
             self._schemas[connection.msgtype],
             connection.ext.serialization_format,
             {"offered_qos_profiles": offered_qos_profiles, "topic_type_hash": connection.digest},
         )
+        self.channels[connection.id] = [number]
 
     def close(self, version: int, metadata: str) -> None:
         """Finish the file."""
         self.file.free_room()
-        self.file.add_metadata("rosbag2", {"serialized_metadata": metadata})
+        self.file.add_metadata("rosbag2", {"serialized_metadata": metadata}, last=True)
         self.file.finish()
 
 
 class _Writer(RosbagWriter):
     """rosbags' writer with the storage above, which gets the messages directly and counts them itself."""
 
-    def __init__(self, path: Path, chunk_size: int, *, compress: bool) -> None:
+    def __init__(self, path: Path, chunk_size: int, profile: str, *, compress: bool) -> None:
         super().__init__(path, version=9, storage_plugin=StoragePlugin.MCAP)
-        make = partial(_McapStorage, chunk_size=chunk_size, compress=compress)
+        make = partial(_McapStorage, chunk_size=chunk_size, profile=profile, compress=compress)
         self.STORAGE_PLUGINS = {StoragePlugin.MCAP: make}  # type: ignore[dict-item]  # wants a class, only calls it
 
     @property
@@ -157,7 +163,7 @@ class _Writer(RosbagWriter):
     def close(self) -> None:
         """See rosbags; the metadata count the messages that the storage has been given."""
         file = self.mcap.file
-        self.counts = {number: file.counts[channel] for number, channel in self.mcap.channels.items()}
+        self.counts = {key: sum(map(file.counts.__getitem__, each)) for key, each in self.mcap.channels.items()}
         if file.first_ns is not None and file.last_ns is not None:
             self.min_timestamp, self.max_timestamp = file.first_ns, file.last_ns
         super().close()
@@ -183,21 +189,36 @@ class BagWriter:
         compression: of the chunks.
         chunk_size: bytes after which a chunk is written out: what a crash may lose.
         about: texts that the bag says of itself, see `tell`.
+        profile: of the MCAP file.
 
     Raises:
         InputError: the folder exists, or cannot be made where it is to be.
     """
 
-    def __init__(self, path: Path, *, compression: Compression, chunk_size: int, about: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        compression: Compression,
+        chunk_size: int,
+        about: Mapping[str, str],
+        profile: str = "ros2",
+    ) -> None:
         refuse_existing(path)
-        self._writer = _Writer(path, chunk_size, compress=compression == "zstd")
+        self._writer = _Writer(path, chunk_size, profile, compress=compression == "zstd")
         try:
             self._writer.open()
         except OSError as error:
             raise InputError(f"{path}: cannot be made ({error.strerror})") from None
         self._file = self._writer.mcap.file
         self._channels: dict[str, int] = {}
-        self.tell(about)
+        self._copied: dict[bytes | None, int] = {}  # schemas
+        try:
+            self.tell(about)
+        except LatheError:
+            self.abort()
+            shutil.rmtree(path)
+            raise
 
     def tell(self, about: Mapping[str, str]) -> None:
         """Store texts: in the file at once, where they survive a crash, and in metadata.yaml at the end.
@@ -221,40 +242,66 @@ class BagWriter:
             topic, self._writer.add_connection(topic, msgtype, msgdef=text, rihs01=digest, offered_qos_profiles=[qos])
         )
 
-    def copy_topic(self, topic: str, msgtype: str, qos: Sequence[Qos], *, definition: str, digest: str) -> bool:
-        """Announce a topic as another bag describes it.
+    def copy_topic(self, topic: str, msgtype: str, qos: Sequence[Qos], *, definition: str, digest: str) -> None:
+        """Announce a topic of a type that this package need not know, with the text and the hash of its definition."""
+        self._added(
+            topic,
+            self._writer.add_connection(
+                topic, msgtype, msgdef=definition, rihs01=digest, offered_qos_profiles=list(qos)
+            ),
+        )
+
+    def copy_channel(self, topic: str, msgtype: str, ext: ConnectionExtRosbag2, digest: str, records: Records) -> int:
+        """Announce a topic as another bag does, understood or not.
 
         Args:
-            topic: name.
-            msgtype: message type.
-            qos: of its publishers.
-            definition: text of the type; may be empty if this package or ROS itself has it.
+            topic: its name.
+            msgtype: of its messages.
+            ext: their encoding and the quality of service that its publishers offer.
             digest: of the type; may be empty.
+            records: contents of the records of its schema, None if it has none, and of its channel.
 
         Returns:
-            False if nobody knows the type.
+            Its number for `copy`.
         """
-        store = messages.store()
+        schema, channel = records
+        if schema not in self._copied:
+            self._copied[schema] = self._file.copy_schema(schema) if schema is not None else 0
+        number = self._file.copy_channel(channel, self._copied[schema])
+        for known in self._writer.connections:
+            if (known.topic, known.msgtype, known.ext) == (topic, msgtype, ext):
+                self._writer.mcap.channels[known.id].append(number)
+                return number
+        key = len(self._writer.connections) + 1
+        nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
+        self._writer.connections.append(Connection(key, topic, msgtype, nothing, digest, 0, ext, self._writer))
+        self._writer.mcap.channels[key] = [number]
+        return number
+
+    def copy(self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
+        """Append a message to a channel that has been copied.
+
+        Raises:
+            LatheError: the disk does not take it.
+        """
         try:
-            if definition and not digest:
-                store = get_typestore(Stores.ROS2_JAZZY)
-                own = get_types_from_msg(definition, msgtype)
-                store.register({name: fields for name, fields in own.items() if name not in store.fielddefs})
-            if definition and digest:
-                made = self._writer.add_connection(
-                    topic, msgtype, msgdef=definition, rihs01=digest, offered_qos_profiles=qos
-                )
-            else:
-                made = self._writer.add_connection(topic, msgtype, typestore=store, offered_qos_profiles=qos)
-        except (OSError, MemoryError):
-            raise
-        except Exception:  # noqa: BLE001 - rosbags makes code of a definition, which raises whatever that leads to
-            return False
-        self._added(topic, made)
-        return True
+            self._file.add_message(channel, log_ns, data, publish_ns=publish_ns, sequence=sequence)
+        except OSError as error:
+            raise self._full(error) from None
+
+    def copy_record(self, opcode: int, content: bytes) -> None:
+        """Append an attachment or metadata as another file has it.
+
+        Raises:
+            LatheError: the disk does not take it.
+        """
+        try:
+            self._file.copy_record(opcode, content)
+        except OSError as error:
+            raise self._full(error) from None
 
     def _added(self, topic: str, connection: Connection) -> None:
-        self._channels[topic] = self._writer.mcap.channels[connection.id]
+        (self._channels[topic],) = self._writer.mcap.channels[connection.id]
 
     def write(self, topic: str, log_ns: int, data: bytes | memoryview) -> None:
         """Append a message to a topic that has been announced.
@@ -283,9 +330,8 @@ class BagWriter:
             raise self._full(error) from None
 
     def _full(self, error: OSError) -> LatheError:
-        return LatheError(
-            f"{self._writer.path}: cannot write ({error.strerror}); what was recorded before is readable: make room"
-        )
+        before = "" if self._file.first_ns is None else "what was recorded before is readable: "
+        return LatheError(f"{self._writer.path}: cannot write ({error.strerror}); {before}make room")
 
     def flush(self) -> None:
         """Hand what has been written so far to the operating system.
@@ -298,15 +344,28 @@ class BagWriter:
         except OSError as error:
             raise self._full(error) from None
 
+    def abort(self) -> None:
+        """Close the file as it is."""
+        self._file.abort()
+
     def close(self) -> None:
         """Finish the file and its metadata.
 
         Raises:
-            LatheError: the disk did not take the last messages; the bag is complete but for them.
+            LatheError: the disk did not take the last messages; the bag is complete but for them, or says so.
         """
         try:
             self._file.flush()
         except OSError as error:
             raise self._full(error) from None
         finally:
+            self._complete()
+
+    def _complete(self) -> None:
+        """Write index and metadata, for which the file has kept room."""
+        try:
             self._writer.close()
+        except OSError as error:
+            raise LatheError(
+                f"{self._writer.path}: cannot be completed ({error.strerror}); make room, then lathe bag recover it"
+            ) from None

@@ -6,14 +6,15 @@ angle and reads it ahead, and answers what the memory does not know with a distu
 `lathe_rc.cell.stages.form_law` and `lathe_rc.control.disturbance`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from itertools import product
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc.analysis.learning import Array, Complex, Response
-from lathe_rc.cell.parameters import about, parameter
+from lathe_rc.cell.parameters import Value, about, parameter
 from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, feed_forward
 from lathe_rc.cell.stages.law import Now
 from lathe_rc.control.angle_filter import AngleFilterTable, at, follow
@@ -122,7 +123,7 @@ class DisturbanceController(FormLaw):
     law: Memory
     sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
     factor = "sup|factor of a revolution|"
-    remedy = "a model nearer to the drive, a smaller observer_bandwidth"
+    remedy = "a model nearer to the drive"
 
     def __init__(self, name: str, parameters: DisturbanceControllerParameters) -> None:
         parameters.make(name)  # refuses what cannot be made, as ours
@@ -146,6 +147,17 @@ class DisturbanceController(FormLaw):
         parameters = self.parameters
         model = f"{parameters.model_natural_frequency:.4g} rad/s, {parameters.model_damping:.3g}"
         return f"a model of {model}, {parameters.model_delay * 1e3:.3g} ms"
+
+    def cures(self, lag: float) -> Iterable[Iterable[Mapping[str, Value]]]:
+        """See `Learner`: fewer waves that are learned, a slower observer, or both where neither helps alone."""
+        parameters = self.parameters
+        waves = [float(f"{parameters.learned_waves * 0.8**k:.2g}") for k in range(9)]
+        observers = [float(f"{parameters.observer_bandwidth * 0.6**k:.2g}") for k in range(9)]
+        yield ({"learned_waves": each} for each in waves[1:])
+        if parameters.observer_bandwidth:
+            yield ({"observer_bandwidth": each} for each in observers[1:])
+            both = sorted(product(range(1, 9), repeat=2), key=sum)
+            yield ({"learned_waves": waves[i], "observer_bandwidth": observers[j]} for i, j in both)
 
     def _model_error(self, drive: Response, frequency: Array) -> Complex:
         """E = Wi/Ŵi - 1, the delays included."""

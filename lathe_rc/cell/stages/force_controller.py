@@ -82,7 +82,7 @@ class ForceController(Stage):
             outputs=[Output("longitudinal/command", messages.SERVO)],
         )
 
-    def doubts(self, seconds: float) -> list[str]:
+    def warnings(self, seconds: float) -> list[str]:
         """See `Stage`."""
         return [f"{self.name}.{doubt}" for doubt in self.trajectory.doubts(seconds)]
 

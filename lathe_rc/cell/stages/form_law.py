@@ -7,7 +7,9 @@ for a drive e^{-pτ}/(1 + a1·p + a2·p²). The form is a function of the angle 
 right at any speed. Angle, speed and dΩ/dt are those of `lathe_rc.control.angle_filter`.
 """
 
+import math
 from collections.abc import Mapping
+from fractions import Fraction
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
@@ -16,11 +18,24 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc.cell.parameters import Value, parameter
 from lathe_rc.cell.stages.form import FORM, Form, FormParameters
 from lathe_rc.cell.stages.law import Law, LawParameters
-from lathe_rc.control.angle_filter import AngleFilterTable, angle_filter, at, follow
+from lathe_rc.control.angle_filter import (
+    AngleFilterTable,
+    angle_filter,
+    at,
+    counts_per_sample,
+    follow,
+    followed_ratio,
+)
 from lathe_rc.control.disturbance import FormAhead
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.profile_table import derivatives_at
+
+#: counts per sample at which the error is 2 to 8 times that beside them; at others it is less, see docs/robust.md
+_BAD = frozenset(Fraction(p, m) for p in (1, 2, 3) for m in (1, 2, 3))
+_CLEAR = _BAD | {Fraction(n) for n in (4, 5)} | {Fraction(1, n) for n in (4, 5)}  # a named sample rate is at none of
+#: [Hz] whole kHz whose step is a whole number of ns
+_RATES = [1000 * kilo for kilo in range(1, 1001) if 1_000_000 % kilo == 0]
 
 
 class FormLawParameters(LawParameters, FormParameters):
@@ -108,14 +123,35 @@ class FormLaw(Law):
 
     def make_filter(self) -> AngleFilterTable:
         """The filter of the spindle angle before sample 0."""
+        return self._filter(self.parameters.step, self.parameters.encoder_counts)
+
+    def _filter(self, step: float, counts: int) -> AngleFilterTable:
         parameters = self.parameters
         return angle_filter(
-            parameters.step,
-            parameters.encoder_counts,
-            parameters.nominal_speed,
-            parameters.expected_deviation,
-            parameters.expected_frequency,
+            step, counts, parameters.nominal_speed, parameters.expected_deviation, parameters.expected_frequency
         )
+
+    def encoder_warnings(self, low: float, high: float, counts: int) -> list[str]:
+        """See `Learner`: counts per sample near a ratio of small numbers."""
+        rate = self.parameters.sample_rate
+        spindle = self._filter(1.0 / rate, counts)
+        ratio = followed_ratio(spindle, low, high, _BAD)
+        if ratio is None:
+            return []
+        # Nearest first, and higher ones before lower ones, which see the encoder less often.
+        near = [each for each in _RATES if rate / 2 <= each <= rate * 2]
+        rates = sorted(near, key=lambda each: (each < rate, abs(math.log(each / rate))))
+        cure = next((each for each in rates if not followed_ratio(self._filter(1.0 / each, counts), low, high, _CLEAR)), 0)
+        if cure:
+            told = f"sample_rate = {cure} ({_passed(self._filter(1.0 / cure, counts), low, high)})"
+        else:
+            finer = math.ceil(1.1 * max(_BAD) * counts / counts_per_sample(spindle, low))
+            told = f"{finer} counts per revolution or more: no sample rate up to {2 * rate} keeps clear of such ratios"
+        return [
+            f"{self.name}: counts per sample c = counts·rpm/(60·sample_rate) = {_passed(spindle, low, high)}, near "
+            f"{ratio}: the encoder's rounding repeats slowly there, the angle filter follows it, and the form error "
+            f"is 2 to 8 times as large; cure: {told}"
+        ]
 
     def make_forward(self) -> ForwardTable:
         """The feed-forward before sample 0."""
@@ -127,6 +163,12 @@ class FormLaw(Law):
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
         """See `Learner`: half a revolution, since what is late must not meet what is learned."""
         return int(np.pi / (speed * self.parameters.step))
+
+
+def _passed(spindle: AngleFilterTable, low: float, high: float) -> str:
+    """Counts per sample between two speeds [rad/s], in words."""
+    slowest, fastest = f"{counts_per_sample(spindle, low):.3g}", f"{counts_per_sample(spindle, high):.3g}"
+    return slowest if slowest == fastest else f"{slowest} to {fastest}"
 
 
 @kernel

@@ -2,14 +2,14 @@
 """The common part of all controllers that learn a drive, for the checks before a start."""
 
 from abc import abstractmethod
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Mapping
 from typing import Annotated, ClassVar
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell.parameters import ObedientParameters, RestartParameters, parameter
+from lathe_rc.cell.parameters import ObedientParameters, RestartParameters, Value, parameter
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.stages.obedience import Obedience
 from lathe_rc.cell.stages.retraction import BoundedParameters
@@ -45,7 +45,7 @@ class Learner(Stage):
 
     parameters: LearnerParameters
     factor: ClassVar[str] = "sup|factor of a cycle|"  #: what `worst` tells, in words
-    remedy: ClassVar[str] = "change the law"  #: for a loop that diverges, in words
+    remedy: ClassVar[str] = "change the law"  #: for a loop that diverges where none of its `cures` helps, in words
 
     @abstractmethod
     def worst(self, drive: Response, speed: float) -> tuple[float, float] | None:
@@ -63,9 +63,26 @@ class Learner(Stage):
         """Speeds [rad/s] for which `worst` is asked, of a spindle that turns between two."""
         return {low, (low + high) / 2, high}
 
+    def cures(self, lag: float) -> Iterable[Iterable[Mapping[str, Value]]]:
+        """Parameters that may make a loop converge which does not: of each kind of cure the gentlest first.
+
+        Args:
+            lag: of the drive at low frequencies [s].
+        """
+        return ()
+
     def settings(self) -> str:
         """The parameters that decide whether learning converges, in words."""
         return "its parameters"
+
+    def encoder_warnings(self, low: float, high: float, counts: int) -> list[str]:
+        """What makes the form worse than the law can do, and its cure, one line each; nothing is refused for it.
+
+        Args:
+            low, high: speeds between which the spindle turns [rad/s].
+            counts: of its encoder per revolution; 0: an ideal one.
+        """
+        return []
 
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int | None:
         """Longest feedback delay [sample] that the cycle leaves.

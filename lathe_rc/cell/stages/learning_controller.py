@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Self-learning controller of one channel."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.analysis.learning import LearningLoop, Response
-from lathe_rc.cell.parameters import about
+from lathe_rc.cell.parameters import Value, about
 from lathe_rc.cell.stage import Input, Output, Sparse
 from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.stages.learning_margin import Margins
@@ -27,6 +27,9 @@ from lathe_rc.safety.state_machine import Reaction
 _SETTLED = 4.0  # lead times until a drive has followed
 _FILE_ACTIONS = ("save", "load")
 _STATUS = "coarse/learning"  # topic
+_LEAST_Q = 1e-6  # [s] from which on a wider Q is looked for
+_QS = 30  # that are tried, each a quarter wider than the one before
+_LEADS = (1.0, 0.9, 1.1, 0.8, 1.2, 0.7, 1.3)  # leads that are tried, in lags
 
 
 class LearningController(Learner):
@@ -42,7 +45,7 @@ class LearningController(Learner):
     announces = ("joined", "lost", OUT_OF_REACH)
     parameters: LearningControllerParameters
     factor = "sup|Q - Z|"
-    remedy = "widen Q, change the lead"
+    remedy = "another lead, correction or Q"
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: LearningControllerParameters) -> None:
@@ -140,7 +143,23 @@ class LearningController(Learner):
 
     def settings(self) -> str:
         """See `Learner`."""
-        return f"lead_time = {self.parameters.lead_time * 1e3:.4g} ms, q_time = {self.parameters.q_time * 1e6:.4g} µs"
+        parameters = self.parameters
+        q = f"q_time = {parameters.q_time * 1e6:.4g} µs"
+        if parameters.q_filter == "fir":
+            q = f"q_pass = {parameters.q_pass:.4g} rad/s, q_stop = {parameters.q_stop:.4g} rad/s"
+        return f"lead_time = {parameters.lead_time * 1e3:.4g} ms, {q}"
+
+    def cures(self, lag: float) -> Iterable[Iterable[Mapping[str, Value]]]:
+        """See `Learner`: a lead near what the correction leaves of the lag, or a Q that forgets more."""
+        parameters = self.parameters
+        if parameters.correction.startswith("second_order_inverse"):
+            lag -= self.correction.inverse[0]
+        yield ({"lead_time": float(f"{part * lag:.3g}")} for part in _LEADS)
+        if parameters.q_filter == "fir":
+            q = (("q_pass", parameters.q_pass, 0.8), ("q_stop", parameters.q_stop, 0.8))
+        else:
+            q = (("q_time", max(parameters.q_time, _LEAST_Q), 1.25),)
+        yield ({name: float(f"{value * by**k:.2g}") for name, value, by in q} for k in range(1, _QS))
 
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
         """See `Learner`."""

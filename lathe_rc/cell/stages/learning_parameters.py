@@ -15,6 +15,7 @@ from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.lead import LeadLaw, Preview
 from lathe_rc.control.q_check import check
 from lathe_rc.control.q_filter import Exponential, Gaussian, LowPass, MovingAverage, QFilter
+from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 
 _LEAD_LAWS = {law.name.lower(): law for law in LeadLaw}
@@ -122,20 +123,50 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         Raises:
             InputError: it is wider than the memory can hold, its bands are out of order, or one of others is none.
         """
-        per_point = self.points_per_revolution / (2 * np.pi)  # grid points per radian
+        if self.q_filter not in (*Q_FILTERS.own, "fir"):
+            make = cast("Callable[[float, int], QFilter]", Q_FILTERS[self.q_filter])
+            with about(node, "q_filter"), code_of_others(repr(self.q_filter)):
+                made = make(self.q_time / self._point_time, self.cycle_points)
+                check(made)
+                return made
+        with about(node, *(("q_pass", "q_stop", "q_ripple") if self.q_filter == "fir" else ("q_time",))):
+            try:
+                return self._own_q()
+            except InputError as error:
+                raise InputError(f"{error}{self._q_that_fits()}") from None
+
+    @property
+    def _point_time(self) -> float:
+        """Time in which the spindle passes a grid point at nominal speed [s]."""
+        return 2.0 * np.pi / (self.nominal_speed * self.points_per_revolution)
+
+    def _own_q(self) -> QFilter:
+        """The Q filter, one of ours."""
+        point = self._point_time
         if self.q_filter == "fir":
-            edge = 1.0 / (self.nominal_speed * per_point)
-            with about(node, "q_pass", "q_stop", "q_ripple"):
-                return _own_q(LowPass, self.q_pass * edge, self.q_stop * edge, self.q_ripple, self.cycle_points)
+            return _own_q(LowPass, self.q_pass * point, self.q_stop * point, self.q_ripple, self.cycle_points)
         make = cast("Callable[[float, int], QFilter]", Q_FILTERS[self.q_filter])
-        width = self.q_time * self.nominal_speed * per_point
-        if self.q_filter in Q_FILTERS.own:
-            with about(node, "q_time"):
-                return _own_q(make, width, self.cycle_points)
-        with about(node, "q_filter"), code_of_others(repr(self.q_filter)):
-            made = make(width, self.cycle_points)
-            check(made)
-            return made
+        return _own_q(make, self.q_time / point, self.cycle_points)
+
+    def _q_that_fits(self) -> str:
+        """The cure of a Q filter that the memory cannot hold: parameters near by that it can, in words."""
+        highest = float(f"{0.99 * np.pi / self._point_time:.3g}")  # [rad/s] of a wave that the grid has
+        tried: list[dict[str, float]] = []
+        for k in range(1, 60):
+            if self.q_filter != "fir":
+                tried.append({"q_time": self.q_time * 0.8**k})
+            elif self.q_pass < highest:  # a wider transition has a shorter kernel
+                tried.append({"q_stop": min(max(self.q_stop, self.q_pass) * 1.1**k, highest)})
+            else:
+                tried.append({"q_pass": highest * 0.8**k, "q_stop": highest})
+        for values in tried:
+            rounded = {name: float(f"{value:.3g}") for name, value in values.items()}
+            try:
+                self.model_copy(update=rounded)._own_q()  # noqa: SLF001 - its own class
+            except InputError:
+                continue
+            return f"; as with {' and '.join(f'{name} = {value:g}' for name, value in rounded.items())}"
+        return "; as with more points_per_revolution"
 
     def make_correction(self, node: str) -> Correction:
         """The correction of a node with its given model.

@@ -305,7 +305,7 @@ class PositionController(Stage):
         steps: dict[str, Step] = {"pid": pid_step, "sampled_link": link_step, "periodic_hyperstable": periodic_step}
         return steps[self.parameters.law]
 
-    def doubts(self, seconds: float) -> list[str]:
+    def warnings(self, seconds: float) -> list[str]:
         """See `Stage`."""
         return [f"{self.name}.{doubt}" for doubt in self.trajectory.doubts(seconds)]
 

@@ -36,7 +36,7 @@ class ProfileStage(Stage):
             outputs=[Output("reference", messages.REFERENCE, Joint("reference"))],
         )
 
-    def doubts(self, seconds: float) -> list[str]:
+    def warnings(self, seconds: float) -> list[str]:
         """See `Stage`."""
         return self.form.doubts
 

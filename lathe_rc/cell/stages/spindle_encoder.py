@@ -107,7 +107,7 @@ class SpindleEncoder(TimeMaster):
                 "allowed: not before its end"
             )
 
-    def doubts(self, seconds: float) -> list[str]:
+    def warnings(self, seconds: float) -> list[str]:
         """See `Stage`: a tachogram that does not meet the run."""
         time, deviation, _ = self._law.tachogram
         rpm, doubt = self.parameters.nominal_rpm * (1.0 + deviation), ""

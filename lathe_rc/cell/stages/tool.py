@@ -130,7 +130,7 @@ class Tool(Stage):
             inputs.append(Input("cut", messages.CUT, ("deflection",), parameters.deflection_delay))
         self.declare(inputs=inputs, outputs=[Output("tool", messages.TOOL, Joint("displacement"))])
 
-    def doubts(self, seconds: float) -> list[str]:
+    def warnings(self, seconds: float) -> list[str]:
         """See `Stage`."""
         return self.form.doubts if self.form else []
 

@@ -1,0 +1,335 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags that are made to harm: bombs, wrong lengths, indexes, names, metadata, schemas, files that are none.
+
+Each maker takes a folder and a ``random.Random`` and returns the bag; `attack` calls a command with it, under limits,
+and says what must not be. tests/test_hostile_bags.py has a sample, tests/system/test_hostile_bags.py thousands.
+"""
+
+import contextlib
+import os
+import resource
+import shutil
+import signal
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from hashlib import sha256
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import fuzz_mutate as mutate
+import fuzz_targets as fuzz
+import lz4.frame
+import yaml
+import zstandard
+from click.testing import CliRunner
+from fuzz_targets import CUT
+from mcap.records import ChunkIndex, Statistics
+from mcap.writer import CompressionType, IndexType, Writer
+
+from lathe_rc.cli import main
+
+MEMORY = 2**30  #: that a command may take beyond what the process has [B]
+LONGEST = 30  #: of CPU time [s]
+STRING = b"\0\1\0\0\2\0\0\0x\0"
+NAMES = (
+    *("/", "/tool/", "/../../x", "//", "/a b", "relative", "~/x", "/1a", "/é", "/{node}", "/" + "x" * 1024, "/\u202eelif"),
+    *("", "/a\nb", "/\x1b[2J", "/clock", "/tool", "/encoder", "/tool/joint_states", "/cell_state", "/.", "/a/b/c/d/e/f"),
+)  # fmt: skip
+TYPES = (
+    *("std_msgs/msg/String", "std_msgs/String", "x", "", "a/msg/B", "lathe_rc_msgs/msg/ToolBlock", "../msg/x", "os/msg/system"),
+    *("lathe_rc_msgs/msg/EncoderBlock", "lathe_rc_msgs/msg/Event", "x" * 1025, "std_msgs/srv/String", "std_msgs/msg/"),
+)  # fmt: skip
+ODD: Sequence[Any] = (
+    *(None, [], {}, "", "null", 0, -1, 2**63, 2**64, 10**30, 1.5, float("nan"), True, "2001-99-99", "x" * 5000, [None]),
+    *([[]], {"a": None}, "../../etc/passwd", "/dev/zero", "/", "..", ".", "bag.mcap", ["bag.mcap"] * 5000, "cdr", "json"),
+)  # fmt: skip
+
+
+# ---- makers
+
+
+def _bomb(folder: Path, random: Random) -> Path:
+    """Chunks that unpack to far more than the file, of what takes long to read, with or without an index."""
+    record = random.choice(
+        (
+            bytes(9),  # empty records
+            struct.pack("<BQHIQQ", 5, 22, 1, 0, 10**18, 10**18),  # empty messages
+            struct.pack("<BQHIQQ", 5, 32, 1, 0, 10**18, 10**18) + STRING,
+            struct.pack("<BQHIII", 3, 14, 1, 0, 0, 0),  # schemas
+            struct.pack("<BQ", 4, 0),
+        )
+    )
+    size, count = random.choice((2**16, 2**20, 2**24, 2**26)), random.choice((1, 3, 40))
+    whole = record * (size // len(record))
+    declared = random.choice((len(whole), len(whole), 2**28, 2**27, 2**62, 1))
+    name, packed = random.choice(
+        (
+            (b"zstd", zstandard.compress(whole)),
+            (b"lz4", lz4.frame.compress(whole)),
+            (b"zstd", zstandard.compress(b"") * random.choice((10, 10**5, 10**6))),
+            (b"lz4", lz4.frame.compress(b"") * 10**5),
+        )
+    )
+    chunk = struct.pack("<QQQII", 10**18, 10**18, declared, 0, len(name)) + name + struct.pack("<Q", len(packed)) + packed
+    return _assemble(folder, [(6, chunk)] * count, indexed=random.random() < 0.5, sizes=(declared, len(packed)), random=random)
+
+
+def _assemble(folder: Path, records: Sequence[tuple[int, bytes]], *, indexed: bool, sizes: Any, random: Random) -> Path:
+    string = b"std_msgs/msg/String"
+    schema = struct.pack("<HI", 1, len(string)) + string + struct.pack("<I7sI11s", 7, b"ros2msg", 11, b"string data")
+    channel = struct.pack("<HHI2sI3sI", 1, 1, 2, b"/t", 3, b"cdr", 0)
+    data, index = b"\x89MCAP0\r\n" + _record(1, struct.pack("<I4sI", 4, b"ros2", 0)), b""
+    head = [(3, schema), (4, channel)]
+    for opcode, content in (*head, *records):
+        if opcode == 6:
+            place = struct.pack("<QQQQIQ", 10**18, 10**18, len(data), len(content) + 9, 0, 0)
+            index += _record(8, place + struct.pack("<I4sQQ", 4, b"zstd", sizes[1], sizes[0]))
+        data += _record(opcode, content)
+    count = len(records)
+    statistics = struct.pack("<QHIIIIQQI", 5, 1, 1, 0, 0, count, 10**18, 10**18, 10) + struct.pack("<HQ", 1, random.choice((5, 2**63)))
+    summary = b"".join(_record(*each) for each in head) + index + _record(11, statistics) if indexed else b""
+    path = folder / "bag.mcap"
+    path.write_bytes(data + summary + _record(2, struct.pack("<QQI", len(data) if indexed else 0, 0, 0)) + data[:8])
+    return path
+
+
+def _record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def _written(folder: Path, random: Random) -> Path:
+    """Odd names, types, encodings, definitions, quality of service and times, in files of any layout."""
+    path = folder / "bag.mcap"
+    types = random.choice((IndexType.ALL, IndexType.NONE, IndexType.CHUNK, IndexType.MESSAGE))
+    compression = random.choice(list(CompressionType))
+    options = {"use_chunking": random.random() < 0.7, "use_statistics": random.random() < 0.8}
+    options |= {"use_summary_offsets": random.random() < 0.5, "repeat_channels": random.random() < 0.8}
+    with path.open("wb") as stream:
+        writer = Writer(stream, index_types=types, compression=compression, chunk_size=random.choice((1, 500, 10**6)), **options)
+        writer.start(profile=random.choice(("ros2", "", "ros1", "x" * 1000)))
+        channels = []
+        for _ in range(random.choice((0, 1, 3, 3, 3, 100, 5000))):
+            definition = random.choice((b"string data", b"", b"\xff", b"x" * 10**5, b"uint8[] data", random.randbytes(20)))
+            encoding = random.choice(("ros2msg", "ros2msg", "ros2idl", "jsonschema", ""))
+            schema = writer.register_schema(random.choice(TYPES), encoding, definition)
+            qos = random.choice(("", "[]", "{}", "- {reliability: 1}", "a: b: c", "&a [*a]", "[" * 50, "- 5\n- durability: true\n", "x" * 9999))
+            kind = random.choice(("cdr", "cdr", "cdr", "json", "", "ros1"))
+            name = random.choice((*NAMES, "/good")) + random.choice(("", str(len(channels))))
+            number = random.choice((schema, schema, 0, 77))
+            channels.append(writer.register_channel(name, kind, number, {"offered_qos_profiles": qos}))
+        for number in range(random.choice((0, 5, 300)) if channels else 0):
+            log_ns = random.choice((10**18 + number, 10**18 + number, 0, 2**63, 2**64 - 1, 10**18 - number * 10**9))
+            data = random.choice((STRING, STRING, b"", random.randbytes(50), b"\0\1\0\0" + b"\xff" * 60))
+            writer.add_message(random.choice(channels), log_ns, data, log_ns, number)
+        writer.finish()
+    return path
+
+
+def _index(folder: Path, random: Random) -> Path:
+    """One number of the index or the statistics that is another."""
+    path = folder / "bag.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=200, enable_crcs=False)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        channels = [writer.register_channel(name, "cdr", schema) for name in ("/a", "/b")]
+        for number in range(40):
+            writer.add_message(channels[number % 2], 10**18 + number, STRING, 10**18 + number)
+        indexes: list[ChunkIndex] = writer._Writer__chunk_indices  # type: ignore[attr-defined]
+        statistics: Statistics = writer._Writer__statistics  # type: ignore[attr-defined]
+        for _ in range(random.choice((1, 3))):
+            target: Any = random.choice([*indexes, statistics])
+            name = random.choice([name for name, value in vars(target).items() if isinstance(value, int)])
+            most = 2**32 - 1 if isinstance(target, Statistics) and "time" not in name and name != "message_count" else 2**64 - 1
+            most = 2**16 - 1 if name == "schema_count" else most
+            setattr(target, name, min(random.choice((*mutate.NUMBERS, getattr(target, name) + 1)), most))
+        writer.finish()
+    return path
+
+
+def _metadata(folder: Path, random: Random) -> Path:
+    """A value of the metadata that is another one, or none."""
+    bag = _folder(folder, random.choice(fuzz._folder_seeds()))
+    told = yaml.safe_load((bag / "metadata.yaml").read_text())
+    for _ in range(random.choice((1, 1, 4))):
+        _spoil(told, random)
+    text = yaml.safe_dump(told if random.random() < 0.9 else random.choice(ODD))
+    text = random.choice((text, text, text, text + "\n" * 15_000_000, "# " + "x" * 2**24 + text, text + "&a [*a]"))
+    (bag / "metadata.yaml").write_text(text)
+    return bag
+
+
+def _spoil(node: Any, random: Random) -> None:
+    """Replace, remove or double one part somewhere below."""
+    keys = list(node) if isinstance(node, dict) else list(range(len(node)))
+    if not keys:
+        return
+    key = random.choice(keys)
+    if isinstance(node[key], dict | list) and random.random() < 0.8:
+        _spoil(node[key], random)
+    elif random.random() < 0.2:
+        del node[key]
+    else:
+        node[key] = random.choice(ODD)
+
+
+def _no_file(folder: Path, random: Random) -> Path:
+    """A pipe, a folder, a link or nothing where a file should be; a lone one as well."""
+    bag = _folder(folder, random.choice(fuzz._folder_seeds()))
+    place = random.choice(sorted(bag.iterdir()))
+    whole = folder / "whole"
+    shutil.move(place, whole)
+    what = random.randrange(8)
+    targets = {1: "/dev/zero", 2: "/dev/stdin", 3: str(place), 4: "nowhere", 5: "/etc/passwd", 6: str(whole)}
+    if what == 0:
+        os.mkfifo(place)
+    elif what == 7:
+        place.mkdir()
+    else:
+        place.symlink_to(targets[what])
+    return place if random.random() < 0.2 else bag
+
+
+def _database(folder: Path, random: Random) -> Path:
+    """Rows, tables and pages of SQLite that are not as rosbag2 makes them."""
+    bag = _folder(folder, random.choice([seed for seed in fuzz._folder_seeds() if b"SQLite format" in seed]))
+    path = next(bag.glob("*.db3*"))
+    statements = (
+        "UPDATE messages SET timestamp = -5", "UPDATE messages SET timestamp = 'x'", "UPDATE messages SET data = NULL",
+        "UPDATE messages SET data = 'text'", "UPDATE messages SET topic_id = 99", "UPDATE messages SET topic_id = NULL",
+        "DROP TABLE topics", "DROP TABLE messages", "DELETE FROM topics", "UPDATE topics SET name = NULL",
+        "UPDATE topics SET type = x'ff'", "UPDATE topics SET id = -5", "UPDATE topics SET offered_qos_profiles = '{'",
+        "UPDATE topics SET serialization_format = 'json'", "UPDATE topics SET name = '/../../x'",
+        "CREATE VIEW v AS SELECT 1", "CREATE TRIGGER t AFTER INSERT ON topics BEGIN SELECT 1; END",
+        "UPDATE messages SET data = zeroblob(268435456) WHERE id = 1", "UPDATE messages SET data = zeroblob(1000000)",
+        "INSERT INTO topics SELECT id + 10000 * abs(random() % 9999), name, type, serialization_format, offered_qos_profiles, '' FROM topics",
+        "UPDATE messages SET timestamp = 9223372036854775807 WHERE id % 2", "ALTER TABLE messages RENAME COLUMN id TO number",
+        "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT 200000) INSERT INTO messages SELECT NULL, 1, i, x'' FROM n",
+    )  # fmt: skip
+    with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(path)) as base:
+        for _ in range(random.choice((0, 1, 2))):
+            base.execute(random.choice(statements))
+        base.commit()
+    data = bytearray(path.read_bytes())
+    for _ in range(random.choice((0, 0, 1, 20))):
+        data[random.randrange(100, len(data))] = random.randrange(256)
+    path.write_bytes(data[: random.choice((len(data), len(data), len(data) // 2))])
+    if random.random() < 0.2:
+        path.with_name(path.name + random.choice(("-wal", "-journal"))).write_bytes(random.randbytes(5000))
+    return random.choice((bag, path))
+
+
+def _damaged(folder: Path, random: Random) -> Path:
+    """Damage to a run that can be simulated again: records, metadata or bytes."""
+    target = fuzz.TARGETS[random.choice(("resim", "resim", "folder"))]
+    return _folder(folder, target.damaged(random))
+
+
+def _damaged_file(folder: Path, random: Random) -> Path:
+    (folder / "bag.mcap").write_bytes(fuzz.TARGETS["mcap"].damaged(random))
+    return folder / "bag.mcap"
+
+
+def _folder(folder: Path, data: bytes) -> Path:
+    fuzz.write_folder(folder / "bag", data)
+    return folder / "bag"
+
+
+MAKERS: dict[str, Callable[[Path, Random], Path]] = {
+    "bomb": _bomb,
+    "written": _written,
+    "index": _index,
+    "metadata": _metadata,
+    "no file": _no_file,
+    "database": _database,
+    "damaged": _damaged,
+    "damaged file": _damaged_file,
+}  #: kinds of hostile bags
+
+
+# ---- commands
+
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "check": ("bag", "check", "BAG"),
+    "info": ("bag", "info", "BAG"),
+    "json": ("bag", "info", "BAG", "--json"),
+    "recover": ("bag", "recover", "BAG", "-o", "OUT/new"),
+    "tachogram": ("bag", "tachogram", "BAG", "-o", "OUT/speed.csv"),
+    "measure": ("measure", "BAG"),
+    "export": ("export", "BAG", "-o", "OUT/tables"),
+    "report": ("report", "BAG", "-o", "OUT/page.html"),
+    "view": ("view", "BAG", "--save", "OUT/bag.rrd"),
+    "resim": ("resim", "BAG", "-o", "OUT/again"),
+    "replay": ("replay", "BAG", "--rate", "0"),
+}  #: those that take a bag
+
+
+class HarmError(AssertionError):
+    """What a command must not do."""
+
+
+def _too_long(*_: object) -> None:
+    raise HarmError(f"more than {LONGEST} s of CPU time")
+
+
+@contextlib.contextmanager
+def limits() -> Iterator[None]:
+    """Bound memory and time of this process."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, before[1]))
+    handler = signal.signal(signal.SIGPROF, _too_long)
+    signal.setitimer(signal.ITIMER_PROF, LONGEST)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, handler)
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def _seal(folder: Path) -> dict[str, str]:
+    """What stands in a folder."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        content = path.read_bytes() if path.is_file() and not path.is_symlink() else b""
+        found[str(path.relative_to(folder))] = sha256(content).hexdigest()
+    return found
+
+
+def attack(box: Path, bag: Path, command: str) -> tuple[int, str]:
+    """Exit code and output of a command, called in ``box``.
+
+    Raises:
+        HarmError: a traceback, too much memory or time, anything that is left or changed.
+    """
+    out, here, temporary = (box / name for name in ("out", "here", "temporary"))
+    for folder in (out, here, temporary):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+    before = _seal(bag.parent)
+    words = [word.replace("BAG", str(bag)).replace("OUT", str(out)) for word in COMMANDS[command]]
+    was, old = Path.cwd(), os.environ.get("TMPDIR")
+    import tempfile
+
+    os.chdir(here)
+    tempfile.tempdir = str(temporary)
+    try:
+        with limits():
+            done = CliRunner().invoke(main, words)
+    finally:
+        os.chdir(was)
+        tempfile.tempdir = old
+    if done.exception and not isinstance(done.exception, SystemExit):
+        raise HarmError(f"{command}: {type(done.exception).__name__}: {done.exception}") from done.exception
+    if done.exit_code not in (0, 1, 2, 3) or "not enough memory" in done.output:
+        raise HarmError(f"{command}: exit code {done.exit_code}: {done.output[-300:]}")
+    if done.exit_code == 2 and len([line for line in done.stderr.splitlines() if line.startswith("lathe: ")]) != 1:
+        raise HarmError(f"{command}: no line, or several: {done.stderr[-500:]}")
+    if left := [*temporary.iterdir(), *here.iterdir()]:
+        raise HarmError(f"{command}: left {left[0]}")
+    if _seal(bag.parent) != before:
+        raise HarmError(f"{command}: changed the bag, or something beside it")
+    return done.exit_code, done.output

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One file of every kind that lathe_rc writes and reads again, and damage to it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from lathe_rc import completing, jit
+from lathe_rc.cell import program, scenario, state_file
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.control import memory_file
+from lathe_rc.errors import LatheError
+from lathe_rc.signals import kept_table
+from lathe_rc.sweep import row, study, tune
+from lathe_rc.sweep.folder import Folder
+from lathe_rc.sweep.space import Space
+from lathe_rc.sweep.study import Study
+from lathe_rc.sweep.sweep import ignore
+
+CONFIG = Path(__file__).parents[1] / "config"
+OWN = "learning_controller"
+LEAD = f"{OWN}.lead_time"
+
+
+class Kept(NamedTuple):
+    """A file, and what its reader makes of it."""
+
+    path: Path
+    read: Callable[[], object]
+
+
+def load() -> scenario.Scenario:
+    """A cell that learns."""
+    return scenario.load(CONFIG / "piston.yaml", ["spindle_encoder.revolutions=4"])
+
+
+def made_up(number: int, key: str, lead: float) -> dict[str, Any]:
+    """A row that nothing was computed for."""
+    error = abs(lead - 1.3e-3) + 1e-6
+    found = {"cell": number, "key": key, "status": row.DONE, LEAD: lead, "tool.rms_error": error, "margin": 0.2}
+    return found | {"tool.max_errors": [error, 2 * error], "seconds": 0.1, "seed": 0, "version": "1", "digest": key}
+
+
+def swept(path: Path) -> Folder:
+    """A sweep of 40 cells."""
+    leads = np.linspace(1e-3, 2e-3, 40).tolist()
+    folder = Folder.begin(path, load(), Space(grid={LEAD: leads}), [row.measure("coarse/state.effort:max", load())])
+    rows = [made_up(number, f"{number:032x}", lead) for number, lead in enumerate(leads)]
+    folder.write([pa.Table.from_pylist(rows, folder.schema)])
+    return folder
+
+
+def computed(_crew: object, order: Any, jobs: Any, _count: int) -> Any:
+    """Rows for the jobs of a tuning, in place of `lathe_rc.sweep.workers.rows`."""
+    yield pa.Table.from_pylist([made_up(job.number, job.key, job.values[LEAD]) for job in jobs], order.schema)
+
+
+def tuned(path: Path, trials: int = 8) -> Folder:
+    """A tuning whose rows are made up; `computed` has to stand in for the workers."""
+    told = {
+        "targets": [LEAD], "free": {LEAD: "1e-3:2e-3"}, "goals": ["tool.rms_error"], "subjects": [],
+        "percentile": 100.0, "over": Space().to_json(), "sampler": "tpe", "seed": 0, "batch": 4, "formulas": False,
+    }  # fmt: skip
+    start = load().varied({LEAD: 1.8e-3})
+    folder = Folder.begin(path, start, None, [], told)
+    state = Study(folder)
+    with state.present() as me:
+        while asked := state.ask(me, trials):
+            state.compute(None, asked, ignore)
+    return folder
+
+
+def _rows(folder: Path) -> Kept:
+    path = swept(folder).path
+    return Kept(path / "rows" / "000000.parquet", lambda: Folder(path).table().to_pylist())
+
+
+def _sweep(folder: Path) -> Kept:
+    path = swept(folder).path
+
+    def read() -> object:
+        found = Folder(path)
+        return found.scenario.name, found.measures, found.spaces, found.tuning, found.targets
+
+    return Kept(path / "sweep.json", read)
+
+
+def _scenario(folder: Path) -> Kept:
+    path = swept(folder).path
+    return Kept(path / "scenario.yaml", lambda: Folder(path).scenario)
+
+
+def _journal(folder: Path) -> Kept:
+    path = tuned(folder).path
+    return Kept(path / "trials.log", lambda: [tuple(trial) for trial in tune.load(path).trials])
+
+
+def _memory(folder: Path) -> Kept:
+    folder.mkdir()
+    path = folder / "memory.npz"
+    memory_file.save(path, np.random.default_rng(1).standard_normal(128), 128)
+    return Kept(path, lambda: memory_file.load(path, 128, 128).tobytes())
+
+
+def _state(folder: Path) -> Kept:
+    folder.mkdir()
+    path, cell = folder / "state", load()
+    stage = Cell(cell.nodes).stages[OWN]
+    state_file.save(path, state_file.dump({"stage": stage}), state_file.dump({"events": [("reset", 3)]}))
+
+    def read() -> object:
+        found = state_file.load(path, cell.nodes[OWN], {"stage": stage, "events": []})
+        return state_file.dump({"stage": found["stage"]}), found["events"]
+
+    return Kept(path, read)
+
+
+def _table(_folder: Path) -> Kept:
+    def read() -> object:
+        return kept_table.kept(b"one", lambda: np.linspace(0.0, 1.0, 64)).tobytes()
+
+    read()
+    (path,) = (jit.cache_folder() / "tables").iterdir()
+    return Kept(path, read)
+
+
+def _completion(_folder: Path) -> Kept:
+    completing.known()
+    (path,) = Path(completing.platformdirs.user_cache_path("lathe_rc")).glob("completion-*.json")
+    return Kept(path, completing.known)
+
+
+def _compiled(suffix: str) -> Callable[[Path], Kept]:
+    def made(_folder: Path) -> Kept:
+        def read() -> object:
+            passes = jit.kernel(program._passes.py_func)
+            return [passes(np.arange(9.0), turn) for turn in (-1.0, 4.0, 8.0, 9.0)]
+
+        read()
+        (path,) = jit.cache_folder().glob(f"*/program._passes*{suffix}")
+        return Kept(path, read)
+
+    return made
+
+
+KINDS: dict[str, Callable[[Path], Kept]] = {
+    "rows of a sweep": _rows,
+    "sweep.json": _sweep,
+    "scenario of a sweep": _scenario,
+    "journal of a tuning": _journal,
+    "memory of a controller": _memory,
+    "state of a node": _state,
+    "table of a form": _table,
+    "completion": _completion,
+    "index of compiled code": _compiled(".nbi"),
+    "compiled code": _compiled(".nbc"),
+}
+
+
+def flip(kept: Kept, bits: int, said: Callable[[], str]) -> int:
+    """Flip single bits of a file, one after the other, and read it each time.
+
+    Args:
+        kept: the file.
+        bits: how many.
+        said: gives the lines on the error stream since the last call.
+
+    Returns:
+        How many of them were noticed; the others changed nothing.
+
+    Raises:
+        AssertionError: a value has changed in silence, or the refusal is none in one line that names the file.
+    """
+    whole, expected, noticed = kept.path.read_bytes(), kept.read(), 0
+    size = 8 * len(whole)
+    # The same bits each time: the first and the last, and as many between them as were asked for.
+    for bit in np.linspace(0, size - 1, bits).astype(int) ^ np.arange(bits) % 8:
+        content = bytearray(whole)
+        content[bit // 8] ^= 1 << bit % 8
+        kept.path.write_bytes(content)
+        said()
+        try:
+            found = kept.read()
+        except LatheError as error:
+            told, found = f"{error}\n", expected
+        else:
+            told = said()
+        noticed += bool(told)
+        assert found == expected or str(kept.path) in told, (bit, found)
+        assert not told or (str(kept.path) in told and told.count("\n") == 1), (bit, told)
+    kept.path.write_bytes(whole)
+    assert kept.read() == expected
+    return noticed
+
+
+def prepare(monkeypatch: Any, folder: Path) -> None:
+    """A cache of its own, tunings without workers, and few words to complete."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder / "cache"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "home"))
+    monkeypatch.setattr(study, "rows", computed)
+    monkeypatch.setattr(
+        completing, "look", lambda: {"commands": {"run": {"params": ["--set"]}}, "nodes": {"tool": ["form"]}}
+    )
