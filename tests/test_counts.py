@@ -3,22 +3,28 @@
 
 import io
 import itertools
+import json
 import os
 import pty
 
 import numpy as np
 import pytest
 from cells import encoder, scenario
+from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lathe_rc import harness
+from lathe_rc.bag.reading import stream
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cli import main
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.signals import speed
 from lathe_rc.signals.counts import CountedAngle, CsvReader, LineReader
+from lathe_rc.view.report_form import Form
 
 STEP_NS, COUNTS = 15_625, 1000
 TURN = 2 * np.pi
@@ -358,6 +364,62 @@ def test_a_file_whose_times_do_not_rise_is_refused(tmp_path):
     path.write_text("time_ns,counts\n0,0\n1000000,2\n1000000,3\n2000000,5\n")
     with pytest.raises(InputError, match="1 readings are not later than those before them; allowed: times that rise"):
         harness.run(follower(path, revolutions=0.0))
+
+
+def still(*pieces):
+    """Counts once a millisecond: of each piece so many readings, and the counts from one to the next."""
+    return np.cumsum(np.concatenate([np.full(readings, step, dtype=float) for readings, step in pieces])).astype(int)
+
+
+@pytest.mark.parametrize(
+    "counts",
+    [
+        still((1, 0), (1, 0), (200, 17)),
+        still((100, 0), (200, 17)),
+        still((100, 17), (50, 0), (150, 17)),
+        still((100, 17), (50, 0), (50, 17), (50, 0), (100, 17)),
+        still((200, 17), (100, 0)),
+        still((120, 17), (1, 0), (120, 17)),
+        still((50, 0), (2, 1), (3, 0), (200, 17)),
+        still((100, 0.01), (200, 17)),
+        still((100, 0), *[(1, step) for step in range(17)], (200, 17)),
+        17 * (still((250, 17)) // 17 // 2 * 2),
+        20 * (still((250, 17)) // 20),
+        50 * (still((250, 17)) // 50),
+    ],
+)
+def test_what_stands_still_is_turned_and_measured(tmp_path, counts):
+    path = tmp_path / "counts.csv"
+    path.write_text("\n".join(["time_s,counts", *(f"{n / 1000},{count}" for n, count in enumerate(counts))]))
+    result = harness.run(follower(path, revolutions=0.0))
+    found = result.part
+    assert found.form.rms.size == found.profile.shape[0] == int(counts[-1] / COUNTS + 1e-3) > 0
+    assert np.all(np.isfinite(found.form.rms))
+    assert np.abs(found.profile).max() < 1.1 * found.form.largest.max()
+    assert_allclose(np.sqrt((found.profile**2).mean(axis=1)), found.form.rms, rtol=0.02)
+
+
+def test_a_bag_with_a_standstill_goes_through_every_command(tmp_path):
+    """The tachogram says how long the spindle stands; a re-simulation gives the events, too."""
+    path, bag = tmp_path / "counts.csv", tmp_path / "bag"
+    counts = still((50, 0), (80, 17), (20, 0), (80, 17))
+    path.write_text("\n".join(["time_s,counts", *(f"{n / 1000},{count}" for n, count in enumerate(counts))]))
+    result = harness.run(follower(path, revolutions=0.0), bag=bag)
+    assert [event.text.partition(":")[0] for event in result.event_log] == ["too slow"]
+    again = resimulate(bag)
+    assert not again.different
+    said = {}
+    for words in (["info"], ["tachogram", "-o", tmp_path / "speed.csv"]):
+        done = CliRunner().invoke(main, ["bag", words[0], str(bag), *map(str, words[1:]), "--json"])
+        said[words[0]] = json.loads(done.stdout)
+    last = said["info"]["error_um"]["last"]
+    assert last["rms"] == pytest.approx(result.errors.rms[-1] * 1e6, rel=0.01)
+    assert (said["tachogram"]["standstill"], said["tachogram"]["stands_from"]) == pytest.approx((0.067, 1e-3), abs=2e-4)
+    form = Form("/encoder", "/tool")
+    stream.feed(bag, [form])
+    form.finish()
+    assert form.refused == ""
+    assert form.last.numbers["rms"] == pytest.approx(last["rms"], rel=0.01)
 
 
 def test_a_lead_law_that_must_know_the_speed_in_advance_is_refused(tmp_path):

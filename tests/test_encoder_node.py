@@ -16,6 +16,7 @@ from lathe_rc.bag.check import check
 from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.errors import LatheError
+from lathe_rc.nodes import encoder_node
 
 pytest.importorskip("rclpy")
 
@@ -80,7 +81,7 @@ def test_a_serial_line_leads_a_cell_and_gives_the_bits_of_a_file_of_its_counts(t
 
 
 def test_a_topic_leads_a_cell(tmp_path, ghost, domain):
-    """An angle within a revolution of the second joint; it tells them by name."""
+    """An angle within a revolution of the second joint, told by name; joint states without it are others'."""
     path = tmp_path / "counts.csv"
     write_counts(path, 0.2)
     publisher = ghost.create_publisher(JointState, "/lathe/joints", 1000)
@@ -90,6 +91,8 @@ def test_a_topic_leads_a_cell(tmp_path, ghost, domain):
         while not publisher.get_subscription_count():
             pass
         for time, count in readings(path):
+            publisher.publish(JointState(name=["gripper"], position=[0.01]))
+            publisher.publish(JointState(name=["x", "spindle"], position=[0.0], velocity=[0.0, 104.7]))
             joints = JointState(name=["x", "spindle"], position=[0.0, TURN * (count % COUNTS) / COUNTS])
             joints.header.stamp.sec, joints.header.stamp.nanosec = divmod(time, 10**9)
             publisher.publish(joints)
@@ -184,6 +187,45 @@ def test_silence_is_an_error_and_names_the_topic_that_nobody_publishes():
         LatheError, match=r"no counts for .* max_silence = 0.2 s; nobody publishes /spindle/joint_states"
     ):
         harness.run(cell, mode="composed")
+
+
+def test_silence_of_the_spindle_among_others_is_an_error_that_names_them(ghost, domain):
+    publisher = ghost.create_publisher(JointState, "/spindle/joint_states", 10)
+    ended = threading.Event()
+
+    def publish():
+        while not ended.wait(0.01):
+            publisher.publish(JointState(name=["gripper", "wrist"], position=[0.01, 0.2]))
+
+    writer = threading.Thread(target=publish, daemon=True)
+    writer.start()
+    cell = device(source="topic", device="", joint="spindle", max_silence=0.5)
+    message = r"\d+ messages on /spindle/joint_states have no position of joint 'spindle', the last of gripper, wrist"
+    with pytest.raises(LatheError, match=rf"no counts for .* max_silence = 0.5 s; {message} with 2 positions$"):
+        harness.run(cell, mode="composed", domain=domain)
+    ended.set()
+    writer.join(10.0)
+
+
+@pytest.mark.parametrize(
+    ("joint", "names", "positions", "place"),
+    [
+        ("", ["x", "y"], [0.1, 0.2], 0),
+        ("", [], [0.1], 0),
+        ("", [], [], None),
+        ("", ["x"], [], None),
+        ("spindle", ["spindle"], [0.1], 0),
+        ("spindle", ["x", "spindle"], [0.1, 0.2], 1),
+        ("spindle", ["x", "spindle"], [0.1], None),
+        ("spindle", ["spindle", "x"], [0.1], 0),
+        ("spindle", ["spindle"], [], None),
+        ("spindle", ["Spindle"], [0.1], None),
+        ("spindle", [], [0.1], None),
+        ("spindle", ["gripper"], [0.1], None),
+    ],
+)
+def test_a_joint_state_without_the_spindle_s_position_is_another_s(joint, names, positions, place):
+    assert encoder_node._place(JointState(name=names, position=positions), joint) == place
 
 
 def test_a_line_that_cannot_be_opened_is_refused_before_the_cell_begins():

@@ -85,11 +85,11 @@ def first_away(time):
         (decay, 1e-3, ["--lag", "5e-4"], {"inverse"}, "inverse: response in steps of 0.001 s, lags from 0.0005 s; al"),
         (lambda t: t - 0.02 * decay(t), 1e-3, ["--integrator"], set(), ""),
         (lambda t: 5.0 * t, 0.1, ["--integrator"], {"inverse"}, "inverse: response in steps of 0.1 s"),
-        (first_away, 1e-3, ["--poles", "2", "--zeros", "1"], {"inverse"}, "inverse of .*a zero that is not stable; all"),
+        (first_away, 1e-3, ["--poles", "2", "--zeros", "1"], {"inverse"}, "inverse of .*a zero that is not stable; "),
         (lambda t: -decay(t), 1e-3, [], {"pid", "loop"}, "tuning: no crossover from 5 to 500 rad/s has margins of 60"),
         (decay, 1e-3, ["--gain-margin", "1e9"], {"pid", "loop"}, r"tuning: no crossover from .* of 60° and 1e\+09"),
         (decay, 1e-3, ["--delay", "10"], {"pid", "loop"}, "tuning: no crossover from 5 to 500 rad/s has margins of"),
-        (lambda t: -decay(t), 0.005, [], {"inverse", "pid", "loop"}, "inverse: .* record[)]; tuning: no crossover from"),
+        (lambda t: -decay(t), 0.005, [], {"inverse", "pid", "loop"}, "inverse: .*; tuning: no crossover from"),
     ],
 )
 def test_a_model_without_an_inverse_or_a_pid_is_kept(tmp_path, monkeypatch, response, step, options, lacking, message):

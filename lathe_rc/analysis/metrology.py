@@ -10,6 +10,7 @@ is that of ISO 16610-21 for closed profiles.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -60,12 +61,11 @@ def evenly(angle: Array, values: Array, points: int = POINTS) -> Array:
     if not whole:
         return np.empty((0, points))
     at = np.arange(whole * points) / points
-    if steps.min() > _STANDSTILL * steps.max():
-        spline = scipy.interpolate.CubicSpline(turns, values)
-    else:
+    spline: Any = scipy.interpolate.CubicSpline
+    if steps.min() <= _STANDSTILL * steps.max():
         leaves = np.append(np.diff(np.floor(angle / (_STANDSTILL * steps.max()))) > 0.0, True)
-        turns, spline = turns[leaves], scipy.interpolate.PchipInterpolator(turns[leaves], values[leaves])
-    return np.asarray(spline(np.clip(at, turns[0], turns[-1]))).reshape(whole, points)
+        turns, values, spline = turns[leaves], values[leaves], scipy.interpolate.PchipInterpolator
+    return np.asarray(spline(turns, values)(np.clip(at, turns[0], turns[-1]))).reshape(whole, points)
 
 
 @dataclass(frozen=True)

@@ -206,6 +206,6 @@ def tachogram(path: Path, output: Path | None, tolerance: float, topic: str, *, 
     click.echo(f"{held}, within {made.largest:.4g} rpm: {target}")
     if made.stands_from is not None:
         click.echo(
-            f"the spindle stands still for {made.standstill:.4g} s, first at {made.stands_from:.4g} s: a spindle_encoder "
-            "refuses the rows with 0 rpm"
+            f"the spindle stands still for {made.standstill:.4g} s, first at {made.stands_from:.4g} s: a "
+            "spindle_encoder refuses the rows with 0 rpm"
         )

@@ -174,9 +174,7 @@ def _show(told: Mapping[str, Any], delay: float) -> None:
 
     for name in ("model", "inverse"):
         if found := told.get(name):
-            top, bottom = (
-                ", ".join(f"{value:.5g}" for value in found[part]) for part in ("numerator", "denominator")
-            )
+            top, bottom = (", ".join(f"{value:.5g}" for value in found[part]) for part in ("numerator", "denominator"))
             console.print(f"{name:8} [{top}] / [{bottom}], RMS {found['rms']:.3g}", markup=False)
     if "pid" in told:
         loop = told["loop"]

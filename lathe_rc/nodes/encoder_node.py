@@ -33,6 +33,17 @@ def _losing_it() -> Iterator[None]:
         raise _EncoderLostError(*error.args) from None
 
 
+def _place(joints: Any, name: str) -> int | None:
+    """Place of a joint, without a name the first, in the positions of a joint state; None: it has none.
+
+    Several nodes may publish on one topic, as the grippers of a robot do, and a driver may publish velocities alone.
+    """
+    if name and name not in joints.name:
+        return None
+    place = list(joints.name).index(name) if name else 0
+    return place if place < len(joints.position) else None
+
+
 class EncoderNode(SpindleNode):
     """See the module; with a file it is a spindle like any other.
 
@@ -67,7 +78,7 @@ class EncoderNode(SpindleNode):
     def statistics(self) -> dict[str, object]:
         """See `CellNode`."""
         counted = self.stage.counted
-        told = {"newest reading [s]": round(counted.time, 6), "late readings": counted.late}
+        told: dict[str, object] = {"newest reading [s]": round(counted.time, 6), "late readings": counted.late}
         if self._overlooked:
             told["joint states without the spindle"] = f"{self._overlooked}, the last {self._other}"
         return {**super().statistics(), **told} if self.stage.live else super().statistics()
@@ -83,10 +94,8 @@ class EncoderNode(SpindleNode):
 
     @_losing_it()
     def _on_joints(self, joints: Any) -> None:
-        where, name = self.topic(self._device.topic), self._device.joint
-        place = list(joints.name).index(name) if name in joints.name else 0
-        if (name and name not in joints.name) or place >= len(joints.position):
-            # Several nodes may share the topic, as those of a robot's grippers do.
+        where, place = self.topic(self._device.topic), _place(joints, self._device.joint)
+        if place is None:
             self._overlooked += 1
             self._other = f"of {', '.join(joints.name) or 'no joint'} with {len(joints.position)} positions"
             return
@@ -171,7 +180,7 @@ class EncoderNode(SpindleNode):
                 why = f"; nobody publishes {topic}"
             elif self._overlooked:
                 wanted = f"joint {self._device.joint!r}" if self._device.joint else "a first joint"
-                why = f"; {self._overlooked} messages on {topic} have no position of {wanted}, the last is {self._other}"
+                why = f"; {self._overlooked} messages on {topic} have no position of {wanted}, the last {self._other}"
             raise LatheError(
                 f"{self.get_name()}: no counts for {silent:.3g} s, after {self.stage.counted.time:.6g} s; allowed: up "
                 f"to max_silence = {self._device.max_silence:g} s{why}"

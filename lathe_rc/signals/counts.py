@@ -214,7 +214,7 @@ class CountedAngle:
         """Samples that the readings reach to."""
         return 0 if self._newest is None else (self._newest[0] - self._start_ns) // self._step_ns + 1
 
-    def add(self, time_ns: int, count: int | float) -> None:
+    def add(self, time_ns: int, count: float) -> None:
         """Take a reading.
 
         Raises:

@@ -91,6 +91,7 @@ def parse_table(
             raise InputError(f"{path}:{n}: {len(row)} values; allowed: {len(header)}, as in the header{decimals}")
         numbers.append([_number(text, path, n) for text in row])
     if since_first and numbers:
-        for line, (_, row) in zip(numbers, rows[1:], strict=True):
-            line[0] = float(Decimal(row[0]) - Decimal(rows[1][1][0]))
+        first = Decimal(rows[1][1][0])
+        for taken, (_, row) in zip(numbers, rows[1:], strict=True):
+            taken[0] = float(Decimal(row[0]) - first)
     return header, np.array(numbers).reshape(-1, len(header))

@@ -34,7 +34,8 @@ class SpeedLawParameters(NodeParameters):
         [], "deviation there relative to the nominal speed, held before the first and after the last", "1"
     )
     tachogram_file: str = parameter(
-        "", "CSV file with time_s,rpm instead of both, from its first row on: the speed itself, the other deviations add to it",
+        "",
+        "CSV file with time_s,rpm instead of both, from its first row on: the speed itself, other deviations add to it",
         path=True,
     )
     random_rms: Annotated[float, Ge(0)] = parameter(0.0, "random deviation: RMS relative to the nominal speed", "1")

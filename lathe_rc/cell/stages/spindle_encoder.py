@@ -110,20 +110,19 @@ class SpindleEncoder(TimeMaster):
     def warnings(self, seconds: float) -> list[str]:
         """See `Stage`: a tachogram that does not meet the run."""
         time, deviation, _ = self._law.tachogram
-        rpm, where = self.parameters.nominal_rpm * (1.0 + deviation), f"the run at {seconds:.5g} s"
-        if not np.isfinite(seconds):
-            where = "the run does not end"
+        rpm, doubt = self.parameters.nominal_rpm * (1.0 + deviation), ""
         if self.parameters.tachogram_file and time[-1] < (1.0 - _SHORT) * seconds:
-            return [
-                f"{self.name}.tachogram_file ends {time[-1]:.5g} s after its first row, {where}: the spindle goes on "
-                f"at {rpm[-1]:.5g} rpm"
-            ]
-        if self.parameters.tachogram_time and time[0] >= seconds:
-            return [
-                f"{self.name}.tachogram_time begins at {time[0]:.10g} s, after the end of the run at {seconds:.5g} s: "
-                f"the spindle turns at {rpm[0]:.5g} rpm throughout; times count from the start of the run"
-            ]
-        return []
+            end = f"the run at {seconds:.5g} s" if np.isfinite(seconds) else "the run does not end"
+            doubt = (
+                f"tachogram_file ends {time[-1]:.5g} s after its first row, {end}: the spindle goes on at "
+                f"{rpm[-1]:.5g} rpm"
+            )
+        elif self.parameters.tachogram_time and time[0] >= seconds:
+            doubt = (
+                f"tachogram_time begins at {time[0]:.10g} s, after the end of the run at {seconds:.5g} s: the spindle "
+                f"turns at {rpm[0]:.5g} rpm throughout; times count from the start of the run"
+            )
+        return [f"{self.name}.{doubt}"] if doubt else []
 
     def sample_at(self, angle: float) -> int:
         """See `TimeMaster`."""

@@ -92,10 +92,8 @@ class Trajectory:
         """A file that begins after the end of a run of so many seconds, as one line."""
         if self._kind != "csv" or self._times[0] < seconds:
             return []
-        return [
-            f"trajectory_file begins at {self._times[0]:.10g} s, after the end of the run at {seconds:.5g} s: the set "
-            f"point is its first value throughout; times count from the start of the run"
-        ]
+        start = f"trajectory_file begins at {self._times[0]:.10g} s, after the end of the run at {seconds:.5g} s"
+        return [f"{start}: the set point is its first value throughout; times count from the start of the run"]
 
     def prepare(self, first: int, samples: int) -> None:
         """Make the samples ``first`` on ready, up to 8192."""
