@@ -170,10 +170,9 @@ class LearningController(Learner):
         elif parameters.correction == "lead_lag":
             lag -= self.correction.lead - self.correction.lag
         yield ({"lead_time": float(f"{part * lag:.3g}")} for part in _LEADS)
+        q = [("q_time", max(parameters.q_time, _LEAST_Q), 1.25)]
         if parameters.q_filter == "fir":
-            q = (("q_pass", parameters.q_pass, 0.8), ("q_stop", parameters.q_stop, 0.8))
-        else:
-            q = (("q_time", max(parameters.q_time, _LEAST_Q), 1.25),)
+            q = [("q_pass", parameters.q_pass, 0.8), ("q_stop", parameters.q_stop, 0.8)]
         yield ({name: float(f"{value * by**k:.2g}") for name, value, by in q} for k in range(1, _QS))
 
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
