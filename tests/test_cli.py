@@ -28,7 +28,7 @@ CELL = """
 /tool: {ros__parameters: {}}
 """
 KEYS = ["scenario", "mode", "simulated_s", "wall_s", "real_time_factor", "revolutions", "blocks", "dropped"]
-KEYS += ["lateness_s", "refused", "events", "not_reached", "unchecked", "warnings"]
+KEYS += ["lateness_s", "refused", "events", "not_reached", "unchecked", "warnings", "stability_margin"]
 KEYS += ["error_um", "tolerance_um", "along_um", "bag", "snapshots", "digest"]
 PER_REVOLUTION = ["per_revolution_rms", "per_revolution_peak_to_valley", "per_revolution_ront"]
 
@@ -109,7 +109,14 @@ def test_stdout_of_the_process_is_the_object_alone():
 def test_people_get_a_table():
     result = lathe("run", "cell.yaml")
     assert result.exit_code == 0
-    for text in ("first revolution", "last revolution", "RMS [µm]", "180 blocks sent, 0 lost", "x real time"):
+    for text in (
+        "first revolution",
+        "last revolution",
+        "RMS [µm]",
+        "180 blocks sent, 0 lost",
+        "x real time",
+        "stability margin: learning_controller 0.0",
+    ):
         assert text in result.stdout
 
 

@@ -153,7 +153,7 @@ def test_a_height_that_a_slide_makes_is_refused():
 
 
 @pytest.mark.parametrize(("counts", "noise"), [(0, 0.0), (1000, 0.0), (3000, 200.0), (10**5, 20.0), (10**6, 200.0)])
-def test_no_sensor_makes_it_more_than_half_as_wrong_as_the_variable_lead(counts, noise):
+def test_it_is_less_than_half_as_wrong_as_the_variable_lead_where_no_counts_are_warned_of(counts, noise):
     """Slow and fast deviations, harmonics 2 and 5; it begins with a model that is 20 % wrong."""
     made = []
     for name in ("speed_deviation", "robust"):

@@ -245,7 +245,7 @@ def test_where_no_delay_fits_the_refusal_says_what_to_change():
     cell = Cell(scenario(learning_controller={"lead_time": 0.9}).nodes)
     with pytest.raises(InputError) as refusal:
         cell.check()
-    leaves = "at 104.7 rad/s the cycle leaves 0; not even a block of 64; give more cycle_revolutions, less lead_time,"
+    leaves = "at 104.7 rad/s the cycle leaves 0; allowed: a longer cycle, a shorter lead, or a spindle that"
     assert leaves in str(refusal.value)
 
 

@@ -76,7 +76,7 @@ class Loop(NamedTuple):
             others: parameters that are changed as well.
         """
         for ratio, each in dict.fromkeys((ratio, ripple or own) for ratio, own in _SHAPES):
-            bands = _BANDS if stop is None else _BANDS[_BANDS < stop]
+            bands = _BANDS if stop is None else _BANDS[stop > _BANDS]
             made = ({"q_pass": float(band), "q_stop": stop or float(ratio * band)} for band in bands)
             shape = {**others, "q_filter": "fir", "q_ripple": each}
             if found := self.first(({**shape, **band} for band in made), allowed):

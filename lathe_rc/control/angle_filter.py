@@ -80,14 +80,13 @@ def counts_per_sample(filter_: AngleFilterTable, speed: float) -> float:
     return speed * filter_.step / filter_.quantum if filter_.quantum else 0.0
 
 
-def followed_ratio(
-    filter_: AngleFilterTable, low: float, high: float, ratios: Collection[Fraction]
-) -> Fraction | None:
+def followed_ratio(filter_: AngleFilterTable, low: float, high: float, ratios: Collection[Fraction]) -> Fraction | None:
     """Ratio near which the rounding of the counts beats so slowly that the filter follows it.
 
     Args:
         filter_: before its first sample.
-        low, high: speeds between which the spindle turns [rad/s].
+        low: least speed of the spindle [rad/s].
+        high: largest one [rad/s].
         ratios: of counts per sample that are looked at.
 
     Returns:

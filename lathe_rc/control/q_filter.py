@@ -52,7 +52,8 @@ class QFilter(ABC):
     def __init__(self, reach: int, cycle: int) -> None:
         if 2 * reach >= cycle:
             raise InputError(
-                f"Q filter reaches {reach} grid points to each side; allowed: less than half the cycle of {cycle} points"
+                f"Q filter reaches {reach} grid points to each side; allowed: less than half the cycle of {cycle} "
+                "points"
             )
         self.reach = reach
         # At least as long as it reaches: the margins then cost no more than the points, whatever the width.

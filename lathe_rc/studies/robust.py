@@ -37,7 +37,7 @@ Values = Mapping[str, Value]
 _TURN = 2.0 * np.pi
 _LAST = 10  # revolutions that are judged
 _SPREAD = 0.2  # of the drives, relative
-_TOLD = (1038.0, 0.804, 0.36e-3)  # natural frequency [rad/s], damping and delay [s] that the laws are told
+TOLD = (1038.0, 0.804, 0.36e-3)  # natural frequency [rad/s], damping and delay [s] that the laws are told
 _MASS = 1.2  # [kg] of it
 _MODEL = ("model_natural_frequency", "model_damping", "model_delay")
 _FREQUENCIES = np.geomspace(1.0, 3e4, 4000)  # [rad/s] at which a margin is looked for
@@ -79,7 +79,7 @@ _INVERSE: cells.Values = {
     "correction": "second_order_inverse_dynamic",
     "correction_model": "identified",
     "lead_law": "variable_second_order",
-    "lead_time": _TOLD[2],
+    "lead_time": TOLD[2],
     "q_time": 40e-6,
     "soft_start": 1.0,
     "acceleration_window": 64,
@@ -225,7 +225,7 @@ class _Judged:
         return float(first) if first < self.largest.size else np.inf
 
 
-class _Judge:
+class Judge:
     """Keeps what is judged of a run: only where there is material.
 
     Args:
@@ -261,7 +261,7 @@ class _Judge:
         )
 
 
-def _drives(count: int) -> list[tuple[float, float, float, float]]:
+def drives_near(count: int) -> list[tuple[float, float, float, float]]:
     """Factors of natural frequency, damping, stiffness and delay; the told drive first."""
     ends = (1.0 - _SPREAD, 1.0 + _SPREAD)
     corners = [*product(ends, repeat=4)]
@@ -271,22 +271,30 @@ def _drives(count: int) -> list[tuple[float, float, float, float]]:
     return [(1.0, 1.0, 1.0, 1.0), *[*corners, *map(tuple, random)][:count]]
 
 
+def machine(frequency: float, damping: float, stiffness: float, delay: float) -> Values:
+    """A drive by factors of the one that the laws are told."""
+    natural_frequency, own_damping, own_delay = TOLD
+    return {
+        "loaded_drive.coarse_natural_frequency": natural_frequency * frequency,
+        "loaded_drive.coarse_damping": own_damping * damping,
+        "loaded_drive.coarse_delay": own_delay * delay,
+        # the force bends the drive by its stiffness, which is the mass times the square of the natural frequency
+        "loaded_drive.coarse_moving_mass": _MASS * stiffness / frequency**2,
+    }
+
+
+def model(frequency: float = 1.0, damping: float = 1.0, delay: float = 1.0) -> Values:
+    """What the law is told of it."""
+    factors = zip(_MODEL, TOLD, (frequency, damping, delay), strict=True)
+    return {f"controller.{name}": value * factor for name, value, factor in factors}
+
+
 def _cell(
     bases: Mapping[tuple[str, bool], Scenario], condition: str, law: str, drive: tuple[float, float, float, float]
 ) -> Scenario:
-    frequency, damping, stiffness, delay = drive
-    true = (_TOLD[0] * frequency, _TOLD[1] * damping, _TOLD[2] * delay)
-    told = true if law == _KNOWS else _TOLD
-    machine = ("coarse_natural_frequency", "coarse_damping", "coarse_delay")
-    return bases[law, condition == _SLOWED].varied(
-        {
-            **CONDITIONS[condition],
-            **{f"loaded_drive.{name}": value for name, value in zip(machine, true, strict=True)},
-            # the force bends the drive by its stiffness, which is the mass times the square of the natural frequency
-            "loaded_drive.coarse_moving_mass": _MASS * stiffness / frequency**2,
-            **{f"controller.{name}": value for name, value in zip(_MODEL, told, strict=True)},
-        }
-    )
+    frequency, damping, _, delay = drive
+    told = model(frequency, damping, delay) if law == _KNOWS else model()
+    return bases[law, condition == _SLOWED].varied({**CONDITIONS[condition], **machine(*drive), **told})
 
 
 def _margin(scenario: Scenario) -> float:
@@ -316,12 +324,12 @@ def run(parameters: RobustParameters, track: Track = untracked) -> RobustResult:
         for law in LAWS
         for slowed, spindle in ((False, {}), (True, _SPINDLE))
     }
-    drives = _drives(count)
+    drives = drives_near(count)
     made = [_cell(bases, *names) for names in product(conditions, LAWS, drives)]
     shape = len(conditions), len(LAWS), len(drives)
     largest, rms, settled, effort = np.full((4, *shape), np.nan)
     curves = np.full((*shape, revolutions), np.nan)
-    for place, judged in zip(np.ndindex(shape), cells.kept(made, _Judge, track), strict=True):
+    for place, judged in zip(np.ndindex(shape), cells.kept(made, Judge, track), strict=True):
         if judged is None:
             continue
         found = judged.largest[:revolutions]

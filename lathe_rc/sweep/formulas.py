@@ -18,7 +18,7 @@ that makes F0; the feedback delay is in it, limits, the elasticity and keyways a
 import math
 from collections.abc import Callable, Collection
 from functools import partial
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -133,7 +133,7 @@ def _flat(loop: Loop, free: Collection[str], gain: float, margin: float) -> dict
             flat = {} if loop.factor(values) <= 1.0 - margin else None
         if flat is not None:
             why = f"widest flat Q with sup|Q - γZ| <= {1.0 - margin:.4g}"
-            found = {name: Found(cast("float", flat[name]), why) for name in ("q_pass", "q_stop", "q_ripple") if name in flat}
+            found = {name: Found(value, why) for name, value in flat.items() if isinstance(value, float)}
             return {**found, "lead_time": Found(lead, told), "learning_gain": Found(gain, _GAIN)}
     return {}
 

@@ -156,7 +156,7 @@ class DisturbanceController(FormLaw):
         yield ({"learned_waves": each} for each in waves[1:])
         if parameters.observer_bandwidth:
             yield ({"observer_bandwidth": each} for each in observers[1:])
-            both = sorted(product(range(1, 9), repeat=2), key=sum)
+            both = sorted(product(range(1, 9, 2), repeat=2), key=sum)
             yield ({"learned_waves": waves[i], "observer_bandwidth": observers[j]} for i, j in both)
 
     def _model_error(self, drive: Response, frequency: Array) -> Complex:

@@ -141,17 +141,20 @@ class FormLaw(Law):
         # Nearest first, and higher ones before lower ones, which see the encoder less often.
         near = [each for each in _RATES if rate / 2 <= each <= rate * 2]
         rates = sorted(near, key=lambda each: (each < rate, abs(math.log(each / rate))))
-        cure = next((each for each in rates if not followed_ratio(self._filter(1.0 / each, counts), low, high, _CLEAR)), 0)
+        cure = next(
+            (each for each in rates if not followed_ratio(self._filter(1.0 / each, counts), low, high, _CLEAR)), 0
+        )
         if cure:
             told = f"sample_rate = {cure} ({_passed(self._filter(1.0 / cure, counts), low, high)})"
         else:
             finer = math.ceil(1.1 * max(_BAD) * counts / counts_per_sample(spindle, low))
             told = f"{finer} counts per revolution or more: no sample rate up to {2 * rate} keeps clear of such ratios"
-        return [
+        what = (
             f"{self.name}: counts per sample c = counts·rpm/(60·sample_rate) = {_passed(spindle, low, high)}, near "
             f"{ratio}: the encoder's rounding repeats slowly there, the angle filter follows it, and the form error "
             f"is 2 to 8 times as large; cure: {told}"
-        ]
+        )
+        return [what]
 
     def make_forward(self) -> ForwardTable:
         """The feed-forward before sample 0."""

@@ -79,7 +79,8 @@ class Learner(Stage):
         """What makes the form worse than the law can do, and its cure, one line each; nothing is refused for it.
 
         Args:
-            low, high: speeds between which the spindle turns [rad/s].
+            low: least speed of the spindle [rad/s].
+            high: largest one [rad/s].
             counts: of its encoder per revolution; 0: an ideal one.
         """
         return []

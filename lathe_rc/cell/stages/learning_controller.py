@@ -29,7 +29,20 @@ _FILE_ACTIONS = ("save", "load")
 _STATUS = "coarse/learning"  # topic
 _LEAST_Q = 1e-6  # [s] from which on a wider Q is looked for
 _QS = 30  # that are tried, each a quarter wider than the one before
-_LEADS = (1.0, 0.9, 1.1, 0.8, 1.2, 0.7, 1.3)  # leads that are tried, in lags
+_LEADS = (
+    1.0,
+    0.9,
+    1.1,
+    0.8,
+    1.2,
+    0.7,
+    1.3,
+    1.5,
+    1.75,
+    2.0,
+    2.25,
+    2.5,
+)  # that are tried, in lags: more where a drive rings
 
 
 class LearningController(Learner):
@@ -154,11 +167,12 @@ class LearningController(Learner):
         parameters = self.parameters
         if parameters.correction.startswith("second_order_inverse"):
             lag -= self.correction.inverse[0]
+        elif parameters.correction == "lead_lag":
+            lag -= self.correction.lead - self.correction.lag
         yield ({"lead_time": float(f"{part * lag:.3g}")} for part in _LEADS)
+        q = [("q_time", max(parameters.q_time, _LEAST_Q), 1.25)]
         if parameters.q_filter == "fir":
-            q = (("q_pass", parameters.q_pass, 0.8), ("q_stop", parameters.q_stop, 0.8))
-        else:
-            q = (("q_time", max(parameters.q_time, _LEAST_Q), 1.25),)
+            q = [("q_pass", parameters.q_pass, 0.8), ("q_stop", parameters.q_stop, 0.8)]
         yield ({name: float(f"{value * by**k:.2g}") for name, value, by in q} for k in range(1, _QS))
 
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:

@@ -156,7 +156,8 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
             if self.q_filter != "fir":
                 tried.append({"q_time": self.q_time * 0.8**k})
             elif self.q_pass < highest:  # a wider transition has a shorter kernel
-                tried.append({"q_stop": min(max(self.q_stop, self.q_pass) * 1.1**k, highest)})
+                stop = self.q_stop if self.q_pass < self.q_stop < highest else self.q_pass
+                tried.append({"q_stop": min(stop * 1.1**k, highest)})
             else:
                 tried.append({"q_pass": highest * 0.8**k, "q_stop": highest})
         for values in tried:

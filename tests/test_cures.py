@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a refusal or a warning before a start names as a cure does cure."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lathe_rc import harness
+from lathe_rc.cell import batch
+from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.stages.learner import Learner
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError
+
+CONFIG = Path(__file__).parents[1] / "config"
+FAST = ("nominal_rpm=3000.0",)
+FIR = ("learning_controller.q_filter=fir",)
+WAVES = "disturbance_controller.learned_waves=2.0"
+
+
+def load(name, *changes):
+    return scenarios.load(CONFIG / f"{name}.yaml", list(changes))
+
+
+def refused(name, *changes):
+    with pytest.raises(InputError) as refusal:
+        Cell(load(name, *changes).nodes).check()
+    return str(refusal.value)
+
+
+def cures(said):
+    """The alternatives that are named, each as changes of the scenario; a parameter without its node is the one's."""
+    node = re.match(r"\w+", said)[0]
+    for cure in re.split(r" or (?=\w+\.)", said.rpartition("allowed: ")[2]):
+        found = re.findall(r"(?:(\w+)\.)?(\w+) = ([\d.e+-]*\d)", cure)
+        if found:
+            yield [f"{of or node}.{name}={float(value)!r}" for of, name, value in found]
+
+
+DIVERGES = [
+    ("robust_cutting", *FAST),
+    ("piston", *FIR),
+    ("piston", *FIR, *FAST, "learning_controller.feedback_delay=1000"),
+    ("piston", "learning_controller.lead_time=0.0"),
+    ("piston", "learning_controller.q_time=0.0", "learning_controller.q_filter=gaussian"),
+    ("two_channel", "fine_controller.lead_time=0.0"),
+    ("adaptive_inverse", "learning_controller.lead_time=2e-3"),
+    ("lead_lag", "learning_controller.lead_time=0.1e-3"),
+]
+NO_ROOM = [
+    ("piston", "learning_controller.q_time=0.1"),
+    ("piston", "learning_controller.q_time=0.1", "learning_controller.q_filter=moving_average"),
+    ("piston", *FIR, "learning_controller.q_stop=2350.0", "learning_controller.q_pass=2300.0"),
+    ("piston", *FIR, "learning_controller.q_stop=90000.0", "learning_controller.q_pass=2300.0"),
+    ("piston", *FIR, "learning_controller.q_stop=2000.0", "learning_controller.q_pass=2300.0"),
+]
+
+
+@pytest.mark.parametrize("given", DIVERGES, ids=" ".join)
+def test_each_parameter_that_is_named_for_a_loop_that_diverges_lets_it_start(given):
+    said = refused(*given)
+    named = list(cures(said))
+    assert named, said
+    if "fir" in " ".join(given):
+        assert "q_time" not in said
+    for changes in named:
+        Cell(load(*given, *changes).nodes).check()
+
+
+@pytest.mark.parametrize("given", NO_ROOM, ids=" ".join)
+def test_q_filter_that_is_named_fits_into_the_memory(given):
+    (changes,) = cures(refused(*given))
+    Cell(load(*given, *changes).nodes)
+
+
+def test_what_is_named_learns_where_what_was_refused_grows():
+    """The form has waves near the worst ones."""
+    form = ("tool.profile=harmonics", "tool.harmonic_order=[10]", "tool.harmonic_amplitude=[1e-6]")
+    given = ("piston", "learning_controller.lead_time=0.0", *form)
+    made = [
+        load(*given, "spindle_encoder.revolutions=20", *changes)
+        for changes in (["learning_controller.allow_unstable=true"], *cures(refused(*given)))
+    ]
+    grown, *learned = (outcome.kept.rms for outcome in batch.run(made, batch.Errors, threads=1))
+    assert grown[-1] > 2.0 * grown[0]
+    assert all(errors[-1] < 0.1 * errors[0] for errors in learned)
+
+
+def test_where_the_model_alone_is_wrong_no_other_cure_is_named():
+    said = refused("robust", "disturbance_controller.model_natural_frequency=400.0")
+    assert said.endswith("allowed: below 1 (a model nearer to the drive; or set allow_unstable)")
+
+
+@pytest.mark.parametrize("points", [64, 512, 4096])
+def test_fewest_waves_that_a_memory_learns_are_allowed(points):
+    grid = f"disturbance_controller.points_per_revolution={points}"
+    least = int(re.search(r"allowed: (\d+) waves or more", refused("robust", WAVES, grid))[1])
+    load_with = [f"disturbance_controller.learned_waves={waves}.0" for waves in (least, least - 1)]
+    Cell(load("robust", grid, load_with[0]).nodes)
+    refused("robust", grid, load_with[1])
+
+
+@pytest.mark.parametrize(
+    ("name", "node", "rpm"),
+    [("piston", "learning_controller", 3000.0), ("robust", "disturbance_controller", 30000.0)],  # a block fits, or not
+)
+def test_feedback_delay_that_is_allowed_fits_into_the_cycle(name, node, rpm):
+    """With the block that it asks for, where even a block is too long."""
+    said = refused(name, f"nominal_rpm={rpm}")
+    assert "lead_time" not in said
+    largest = int(re.search(r"(\d+)(?: or less|$)", said.rpartition("allowed: ")[2])[1])
+    changes = [
+        f"nominal_rpm={rpm}",
+        "electrodynamic_actuator.max_acceleration=1e9",
+        f"{node}.feedback_delay={largest}",
+        f"block_size={min(largest, 64)}",
+    ]
+    cell = Cell(load(name, *changes, f"{node}.allow_unstable=true", "electrodynamic_actuator.max_velocity=1e3").nodes)
+    cell.check()
+
+
+# --- counts per sample
+
+BAD, GOOD = (1280, 2048, 3500, 3840, 4096, 4200, 5760, 7000, 8192, 11520), (3000, 3400, 4500, 5000, 10000, 100_000)
+NOMINAL = 1000 * np.pi / 30
+
+
+def warnings(name, counts, *changes):
+    cell = Cell(load(name, *changes).nodes)
+    laws = (stage for stage in cell.stages.values() if isinstance(stage, Learner))
+    return [said for law in laws for said in law.warnings(*cell.master.speed_range(), counts)]
+
+
+def rate_of(said):
+    return int(re.search(r"cure: sample_rate = (\d+)", said)[1])
+
+
+def test_counts_near_a_ratio_of_small_numbers_are_warned_of_and_no_others():
+    law = Cell(load("robust").nodes).stages["disturbance_controller"]
+    assert [counts for counts in (*BAD, *GOOD, 0) if law.warnings(0.9 * NOMINAL, 1.1 * NOMINAL, counts)] == list(BAD)
+    assert not law.warnings(0.98 * NOMINAL, 1.02 * NOMINAL, 4096)  # its speeds stay beside the ratio
+    assert "near 1:" in law.warnings(0.98 * NOMINAL, 1.02 * NOMINAL, 3800)[0]
+
+
+@pytest.mark.parametrize(
+    ("counts", "changes"),
+    [(4096, ()), (1365, FAST), (1024, ("sample_rate=16000",)), (8192, ("sample_rate=100000", "nominal_rpm=1500.0"))],
+)
+def test_the_named_sample_rate_is_clear_of_them_at_other_speeds_and_rates(counts, changes):
+    changes = (*changes, "spindle_encoder.deviation_start=0.0")
+    (said,) = warnings("robust", counts, *changes)
+    assert warnings("robust", counts, *changes, f"sample_rate={rate_of(said)}") == []
+
+
+def test_laws_without_an_angle_filter_are_not_warned_of():
+    assert warnings("speed_deviation", 4096) == []
+    assert len(warnings("robust_cutting", 4096, "controller.stage=compound_controller")) == 1
+
+
+def test_named_sample_rate_halves_the_form_error():
+    swing = ("spindle_encoder.deviation_frequency=[20.0]", "spindle_encoder.revolutions=60")
+    given = ("robust", "spindle_encoder.counts_per_revolution=4096", *swing)
+    seen = []
+    result = harness.run(load(*given), watch=seen.append)
+    (said,) = result.summary()["warnings"]
+    assert [event["message"] for event in seen if event["event"] == "warning"] == [said]
+    cured = harness.run(load(*given, f"sample_rate={rate_of(said)}"))
+    assert cured.summary()["warnings"] == []
+    assert max(cured.errors.largest[50:]) < 0.5 * max(result.errors.largest[50:])
+
+
+def test_margin_of_each_learning_controller_is_told():
+    """1 less the largest factor of the check; none of a law that tells no factor."""
+    cell = Cell(load("two_channel").nodes)
+    cell.check()
+    assert list(cell.margins) == ["learning_controller", "fine_controller"]
+    assert cell.margins == {name: 1.0 - factor for name, factor in cell.factors.items()}
+    peer = Cell(load("robust_cutting", "controller.stage=compound_controller").nodes)
+    peer.check()
+    assert peer.margins == {"controller": None}
