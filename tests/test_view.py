@@ -215,7 +215,7 @@ def test_every_curve_and_picture_has_a_view(turned, shown):
 
 
 def beside_the_part(types, **more):
-    """Views on the right, below the form error."""
+    """Views on the right, below the form error, or the tabs if there is no more."""
     return blueprint(types, **more).root_container.contents[-1].contents[-1].contents
 
 
@@ -264,7 +264,7 @@ def test_where_nothing_has_happened_there_are_neither_bands_nor_events(turned):
 
 def test_a_bag_without_a_tool_has_only_curves():
     types = {"/encoder": messages.ENCODER, "/x/state": messages.STATE, "/x/command": messages.SERVO}
-    names = [view.name for view in blueprint(types).root_container.contents[-1].contents]
+    names = [view.name for view in beside_the_part(types)]
     assert names == [
         "spindle speed [1/min]: measured blue, true orange",
         "slides [mm]",
