@@ -27,7 +27,8 @@ from lathe_rc.cli import main  # noqa: E402
 from lathe_rc.errors import LatheError  # noqa: E402
 from lathe_rc.view import rerun_part as parts  # noqa: E402
 from lathe_rc.view.rerun_blueprint import blueprint  # noqa: E402
-from lathe_rc.view.rerun_output import _free_port, end, viewer  # noqa: E402
+from lathe_rc.view.rerun_output import _free_port, viewer  # noqa: E402
+from lathe_rc.view.rerun_output import end as end_viewer  # noqa: E402
 from lathe_rc.view.rerun_pieces import Pieces  # noqa: E402
 from lathe_rc.view.rerun_revolutions import ANGLES, Revolutions  # noqa: E402
 from lathe_rc.view.rerun_scene import Scene  # noqa: E402
@@ -64,7 +65,7 @@ def listening(group):
     for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
             if os.getpgid(int(process.name)) == group:
-                inodes |= {os.readlink(file) for file in process.glob("fd/*")}
+                inodes |= {str(file.readlink()) for file in process.glob("fd/*")}
     rows = [line.split() for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()[1:]]
     return [row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in inodes]
 
@@ -459,7 +460,7 @@ def test_a_viewer_listens_on_this_computer_alone(kind, count, monkeypatch):
             assert process.poll() is None
             time.sleep(0.02)
     finally:
-        end(process)
+        end_viewer(process)
     assert {place.partition(":")[0] for place in found} == {"0100007F"}  # 127.0.0.1
 
 
