@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layouts for PlotJuggler and Foxglove draw what a recording of their demo holds, and no motion that it does not."""
+"""The layouts for PlotJuggler and Foxglove draw what a recording of their demo holds, and no other motion."""
 
 import json
 import math

@@ -133,8 +133,9 @@ def _form(form: Form, cycles: Mapping[str, Envelope], maps: int) -> FormSection:
         Picture(
             "Error map",
             figures.form_map(form),
-            "Radius of the part less desired radius over spindle angle and revolution; red: material left. The colours are "
-            f"linear around zero and logarithmic beyond the largest of the quietest quarter of revolutions.{grouped}",
+            "Radius of the part less desired radius over spindle angle and revolution; red: material left. The colours "
+            "are linear around zero and logarithmic beyond the largest of the quietest quarter of revolutions."
+            f"{grouped}",
             page,
             [charts.form_map(form, maps)],
         ),
