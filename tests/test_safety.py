@@ -273,7 +273,7 @@ def test_an_alarm_has_the_unit_of_its_limit():
     assert {*limits.values()} == {name for name in rows if name.endswith(("_limit", "force_low"))}
     written = {"m": ("µm", 1e6), "rad/s^2": ("rad/s²", 1.0)}
     units = {name: rows[limit].unit for name, limit in limits.items() if rows[limit].unit != "1"}
-    assert event_log.UNITS == {name: written.get(unit, (unit, 1.0)) for name, unit in units.items()}
+    assert {name: written.get(unit, (unit, 1.0)) for name, unit in units.items()} == event_log.UNITS
 
 
 def test_an_alarm_is_told_in_words_whatever_a_bag_says():
