@@ -304,6 +304,17 @@ class TestForm:
         assert said in form.refused
         assert form.first is None
 
+    def test_measures_what_comes_before_a_sample_that_is_not_finite(self):
+        """And says that it diverged until then."""
+        angle = 2 * np.pi * np.arange(2100) / 200
+        error = 1e-6 * 2.0 ** (angle // (2 * np.pi))
+        error[2050:] = np.nan
+        form = Form("/encoder", "/tool")
+        form.chunk(0, angle.size, {"/encoder": {"angle_true": angle}, "/tool": {"error": error}}, {})
+        form.finish()
+        assert form.refused == "samples that are not finite (after revolution 10)"
+        assert (form.last.numbers["revolution"], form.growth.diverges, form.growth.since) == (10, True, 2)
+
     def test_gives_up_a_revolution_that_never_ends(self):
         form = Form("/encoder", "/tool")
         for k in range(70):
