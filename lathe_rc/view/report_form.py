@@ -114,9 +114,11 @@ class Form:
 
     def _measure(self, margin: int) -> None:
         """Measure the complete revolutions that end ``margin`` samples or more before the newest, or one not finite."""
-        signals = [signal for signal in (self._angle, self._error, self._height) if signal.size]
-        broken = np.flatnonzero(~np.logical_and.reduce([np.isfinite(signal) for signal in signals])) if signals else []
-        if len(broken):
+        finite = np.isfinite(self._angle) & np.isfinite(self._error)
+        if self._height.size:
+            finite &= np.isfinite(self._height)
+        broken = np.flatnonzero(~finite)
+        if broken.size:
             margin, end = 0, int(broken[0])
             self._angle, self._error, self._height = self._angle[:end], self._error[:end], self._height[:end]
         try:
@@ -126,7 +128,7 @@ class Form:
                     pass
         except InputError as error:
             self._refuse(str(error))
-        if len(broken) and not self.refused:
+        if broken.size and not self.refused:
             self._refuse("samples that are not finite")
 
     def _refuse(self, reason: str) -> None:
