@@ -23,7 +23,7 @@ def shoot(recording: Path, home: Path, shot: Path) -> None:
     """Take a picture of the viewer, whose settings are in a folder."""
     # The mouse is in the middle of the screen, so beside the window.
     screen = ["xvfb-run", "-a", "-s", "-screen 0 4000x2600x24"]
-    viewer = [sys.executable, "-m", "rerun", "--new", "--window-size", f"{SIZE[0]}x{SIZE[1]}"]
+    viewer = [sys.executable, "-m", "rerun", "--new", "--bind", "127.0.0.1", "--window-size", f"{SIZE[0]}x{SIZE[1]}"]
     environ = os.environ | {"XDG_DATA_HOME": str(home)}
     command = ["timeout", "-k", "5", "300", *screen, *viewer, "--screenshot-to", str(shot), str(recording)]
     subprocess.run(command, env=environ, check=True)

@@ -20,16 +20,17 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lathe_rc import __version__, harness, messages, part, resources
-from lathe_rc.bag import reader
+from lathe_rc.bag import provenance, reader
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
+from lathe_rc.cell.budget import changing
 from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
 from lathe_rc.cell.scenario import load
 from lathe_rc.commands.report import report
 from lathe_rc.errors import InputError
 from lathe_rc.view import charts
 from lathe_rc.view import report as reporting
-from lathe_rc.view.report_figures import timing
-from lathe_rc.view.report_form import Form
+from lathe_rc.view.report_figures import colour_range, spectrum_range, timing
+from lathe_rc.view.report_form import Form, Revolution
 from lathe_rc.view.report_gather import gather
 from lathe_rc.view.report_host import DIAGNOSTICS, Host
 from lathe_rc.view.report_series import Envelope, MeanRows, Thinned
@@ -218,7 +219,19 @@ class TestVerdict:
             spindle_encoder={"revolutions": 24.2}, electrodynamic_actuator={"noise_rms": 1e-6}, tool={"tolerance": 1e-6}
         )
         told = self.told(noisy, tmp_path)
-        assert re.search(r"^\d+% of .* changes from revolution to revolution: noise", told.limits[0].text)
+        assert re.search(r"^\d+% of .* changes from revolution to revolution: noise\.$", told.limits[0].text)
+
+    @pytest.mark.parametrize(
+        ("name", "causes"),
+        [
+            ("two_channel", ["feed"]),
+            ("vibration", ["vibration"]),
+            ("robust", ["noise", "quantisation"]),
+        ],
+    )
+    def test_names_no_cause_that_the_scenario_does_not_contain(self, name, causes):
+        cell = load(resources.find(Path(f"{name}.yaml")))
+        assert changing(provenance.values_of({provenance.SCENARIO: cell.to_yaml()})) == causes
 
     def test_says_who_came_to_a_limit(self, tmp_path):
         limited = scenario(electrodynamic_actuator={"command_velocity": 5e-3})
@@ -291,6 +304,17 @@ class TestForm:
         assert said in form.refused
         assert form.first is None
 
+    def test_measures_what_comes_before_a_sample_that_is_not_finite(self):
+        """And says that it diverged until then."""
+        angle = 2 * np.pi * np.arange(2100) / 200
+        error = 1e-6 * 2.0 ** (angle // (2 * np.pi))
+        error[2050:] = np.nan
+        form = Form("/encoder", "/tool")
+        form.chunk(0, angle.size, {"/encoder": {"angle_true": angle}, "/tool": {"error": error}}, {})
+        form.finish()
+        assert form.refused == "samples that are not finite (after revolution 10)"
+        assert (form.last.numbers["revolution"], form.growth.diverges, form.growth.since) == (10, True, 2)
+
     def test_gives_up_a_revolution_that_never_ends(self):
         form = Form("/encoder", "/tool")
         for k in range(70):
@@ -298,6 +322,21 @@ class TestForm:
             form.chunk(0, 65536, {"/encoder": {"angle_true": angle}, "/tool": {"error": angle}}, {})
         assert "longer than" in form.refused
         assert form._angle.size == 0
+
+
+def test_a_fault_leaves_the_colours_of_the_rest_of_the_map():
+    rows = np.ones((40, 8))
+    rows[0], rows[20:] = 150.0, 500.0
+    assert colour_range(rows) == (500.0, 1.0)
+
+
+def test_a_spectrum_has_room_for_the_last_revolution_however_small():
+    first, last = (
+        Revolution({"revolution": k}, np.zeros(8), np.full(51, size)) for k, size in ((1, 1e-4), (60, 1e-12))
+    )
+    low, high = spectrum_range(SimpleNamespace(first=first, best=last, last=last))
+    assert low <= 1e-9  # [µm], of the last's 1e-6
+    assert high >= 100.0
 
 
 class TestSeries:

@@ -25,6 +25,7 @@ from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
 from lathe_rc.cell.stages.feed_drive import FeedDriveParameters, FeedDriveStage
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.supervisor import MEMBERS_LOST
+from lathe_rc.cell.stages.supervisor_parameters import SupervisorParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion
 from lathe_rc.errors import InputError, LatheError
@@ -263,10 +264,22 @@ def test_the_page_has_the_tables_of_the_code():
         assert table in page, "run: python figures/safety.py"
 
 
+def test_an_alarm_has_the_unit_of_its_limit():
+    """Of each monitor that has a limit among the parameters of the supervisor."""
+    limits = {"index_pulses": "index_limit", "error_growth": "growth_limit", "stability_margin": "margin_limit"}
+    limits |= {name: f"{name}_limit" for name in ("speed", "acceleration", "error", "following", "stroke", "effort")}
+    limits |= {"slide": "slide_limit", "force": "force_limit", "force_low": "force_low"}
+    rows = SupervisorParameters.rows()
+    assert {*limits.values()} == {name for name in rows if name.endswith(("_limit", "force_low"))}
+    written = {"m": ("µm", 1e6), "rad/s^2": ("rad/s²", 1.0)}
+    units = {name: rows[limit].unit for name, limit in limits.items() if rows[limit].unit != "1"}
+    assert {name: written.get(unit, (unit, 1.0)) for name, unit in units.items()} == event_log.UNITS
+
+
 def test_an_alarm_is_told_in_words_whatever_a_bag_says():
     values = {"state": 2, "reaction": 5, "monitor": "error", "subject": "tool", "value": 2.5e-5, "limit": 2e-5}
     said = event_log.text(Sparse("safety/status", messages.SAFETY_STATUS, 7, values))
-    assert said == "error tool 2.5e-05, limit 2e-05: retracting, retract"
+    assert said == "error tool 25 µm, limit 20 µm: retracting, retract"
     strange = event_log.text(Sparse("safety/status", messages.SAFETY_STATUS, 7, values | {"state": 200, "limit": 0.0}))
     assert strange == "error tool: ?, retract"
 

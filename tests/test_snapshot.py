@@ -34,6 +34,7 @@ from lathe_rc.cell.wire import Encoder
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import START_NS
+from lathe_rc.view.report import losses
 from lathe_rc.view.report_gather import gather
 
 CONFIG = Path(__file__).parents[1] / "config"
@@ -117,7 +118,8 @@ def test_the_commands_read_a_snapshot_as_a_bag(recorded):
     for path in recorded.snapshots:
         found = check(path)
         assert (found.exit_code, found.first, found.samples) == (0, told(path)["first_sample"], told(path)["samples"])
-        assert gather(path).complete
+        found = gather(path)
+        assert (found.complete, losses(found)) == (True, [])
         assert CliRunner().invoke(main, ["bag", "info", str(path), "--json"]).exit_code == 0
 
 

@@ -27,7 +27,8 @@ from lathe_rc.cli import main  # noqa: E402
 from lathe_rc.errors import LatheError  # noqa: E402
 from lathe_rc.view import rerun_part as parts  # noqa: E402
 from lathe_rc.view.rerun_blueprint import blueprint  # noqa: E402
-from lathe_rc.view.rerun_output import _free_port, end, viewer  # noqa: E402
+from lathe_rc.view.rerun_output import _free_port, viewer  # noqa: E402
+from lathe_rc.view.rerun_output import end as end_viewer  # noqa: E402
 from lathe_rc.view.rerun_pieces import Pieces  # noqa: E402
 from lathe_rc.view.rerun_revolutions import ANGLES, Revolutions  # noqa: E402
 from lathe_rc.view.rerun_scene import Scene  # noqa: E402
@@ -64,7 +65,7 @@ def listening(group):
     for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
             if os.getpgid(int(process.name)) == group:
-                inodes |= {os.readlink(file) for file in process.glob("fd/*")}
+                inodes |= {str(file.readlink()) for file in process.glob("fd/*")}
     rows = [line.split() for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()[1:]]
     return [row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in inodes]
 
@@ -215,7 +216,7 @@ def test_every_curve_and_picture_has_a_view(turned, shown):
 
 
 def beside_the_part(types, **more):
-    """Views on the right, below the form error."""
+    """Views on the right, below the form error, or the tabs if there is no more."""
     return blueprint(types, **more).root_container.contents[-1].contents[-1].contents
 
 
@@ -264,7 +265,7 @@ def test_where_nothing_has_happened_there_are_neither_bands_nor_events(turned):
 
 def test_a_bag_without_a_tool_has_only_curves():
     types = {"/encoder": messages.ENCODER, "/x/state": messages.STATE, "/x/command": messages.SERVO}
-    names = [view.name for view in blueprint(types).root_container.contents[-1].contents]
+    names = [view.name for view in beside_the_part(types)]
     assert names == [
         "spindle speed [1/min]: measured blue, true orange",
         "slides [mm]",
@@ -459,7 +460,7 @@ def test_a_viewer_listens_on_this_computer_alone(kind, count, monkeypatch):
             assert process.poll() is None
             time.sleep(0.02)
     finally:
-        end(process)
+        end_viewer(process)
     assert {place.partition(":")[0] for place in found} == {"0100007F"}  # 127.0.0.1
 
 

@@ -48,7 +48,7 @@ def _events(result: harness.Result) -> RichTable:
 
 
 def facts(result: harness.Result) -> list[str]:
-    """Whether the form error grows, whether the part is in tolerance, what was sent and lost, how fast, and who was refused."""
+    """Growth of the form error, tolerance, blocks, pace, and messages that were refused, a line each."""
     refused = [f"{count} messages refused from {sender}" for sender, count in result.refused.items()]
     surface = result.surface
     return [

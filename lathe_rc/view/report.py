@@ -134,8 +134,9 @@ def _form(form: Form, cycles: Mapping[str, Envelope], maps: int) -> FormSection:
         Picture(
             "Error map",
             figures.form_map(form),
-            "Radius of the part less desired radius over spindle angle and revolution; red: material left. The "
-            f"colours are linear around zero and logarithmic beyond the largest of the quietest quarter of revolutions.{grouped}",
+            "Radius of the part less desired radius over spindle angle and revolution; red: material left. The colours "
+            "are linear around zero and logarithmic beyond the largest of the quietest quarter of revolutions."
+            f"{grouped}",
             page,
             [charts.form_map(form, maps)],
         ),
@@ -236,7 +237,7 @@ def losses(told: Gathered) -> list[str]:
     host = told.host
     found = [f"reading stopped: {told.stopped}"] if told.stopped else []
     for topic, tally in islice(told.topics.items(), _MOST_ROWS):
-        if tally.open_end and not told.stopped:
+        if tally.open_end and not told.stopped and not told.complete:  # a snapshot ends before the run
             found.append(f"{topic} does not say that the run ends with its last block: the recording was cut off")
     found += [f"{name} lost {count} blocks" for name, count in host.lost_blocks.items()]
     found += host.errors

@@ -116,15 +116,27 @@ class Form:
                 self.surface = str(error)
 
     def _measure(self, margin: int) -> None:
-        """Measure the complete revolutions that end ``margin`` samples or more before the newest."""
+        """Measure the complete revolutions that end ``margin`` samples or more before the newest, or one not finite."""
+        finite = np.isfinite(self._angle) & np.isfinite(self._error)
+        if self._height.size:
+            finite &= np.isfinite(self._height)
+        broken = np.flatnonzero(~finite)
+        if broken.size:
+            margin, end = 0, int(broken[0])
+            self._angle, self._error, self._height = self._angle[:end], self._error[:end], self._height[:end]
         try:
             self._check()
             with np.errstate(over="ignore", invalid="ignore"):  # of absurd samples; they show in the numbers
                 while self._next(margin):
                     pass
         except InputError as error:
-            self.refused = f"{error} (after revolution {self._done})"
-            self._angle = self._error = self._height = np.empty(0)
+            self._refuse(str(error))
+        if broken.size and not self.refused:
+            self._refuse("samples that are not finite")
+
+    def _refuse(self, reason: str) -> None:
+        self.refused = f"{reason} (after revolution {self._done})"
+        self._angle = self._error = self._height = np.empty(0)
 
     def _check(self) -> None:
         """Refuse what would take memory or give no form.
@@ -133,8 +145,6 @@ class Form:
             InputError: says why.
         """
         step = np.diff(self._angle)
-        if not all(np.isfinite(signal).all() for signal in (self._angle, self._error, self._height)):
-            raise InputError("samples that are not finite")
         if step.size and not (step.min() >= 0.0 and step.max() < _TURN / 3):
             raise InputError("the angle falls, or rises by more than a third of a turn in a sample")
         if self._done == 0 and self._angle.size and not 0.0 <= self._angle[0] < _TURN:

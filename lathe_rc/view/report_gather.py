@@ -177,7 +177,7 @@ class Gathered:
 
     @property
     def missing(self) -> str:
-        """What there is not of encoder and tool."""
+        """Name the missing ones of encoder and tool."""
         kinds = {tally.type for tally in self.topics.values()}
         named = {"encoder": messages.ENCODER, "tool": messages.TOOL}
         return f"the bag has no {' and no '.join(name for name, kind in named.items() if kind not in kinds)}"
