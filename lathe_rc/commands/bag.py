@@ -99,7 +99,13 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> Non
             f"form error: {first['rms']:.4g} µm RMS in revolution {first['revolution']}, "
             f"{last['rms']:.4g} in {last['revolution']}"
         )
-    for key, text in told["about"].items():
+    _print_about(console, told["about"])
+    ctx.exit(_LOSSY if source.damage else 0)
+
+
+def _print_about(console: Console, about: Mapping[str, str]) -> None:
+    """Texts that a bag says of itself."""
+    for key, text in about.items():
         if key == provenance.SCENARIO:
             console.print("scenario:")
             console.print(Text("  " + text.strip().replace("\n", "\n  ")))
@@ -111,7 +117,6 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> Non
             console.print(Text(f"{key.removeprefix(provenance.FILE)}: a file, {len(text)} characters in base64"))
         else:
             console.print(Text(f"{key.removeprefix('lathe_rc.')}: {text}"))
-    ctx.exit(_LOSSY if source.damage else 0)
 
 
 def _date(log_ns: int) -> str | None:
