@@ -2,6 +2,7 @@
 """Bags: complete, in order, readable by others, and saved when the recorder dies."""
 
 import shutil
+import tracemalloc
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +21,7 @@ from rosbags.highlevel import AnyReader
 from lathe_rc import harness, messages
 from lathe_rc.bag import reader
 from lathe_rc.bag.repairing import recover
+from lathe_rc.bag.writing.mcap_file import McapFile
 from lathe_rc.errors import InputError
 
 EVENTS = {"events": ["revolution 1.5: freeze", "sample 7000: learn"]}
@@ -314,3 +316,25 @@ def test_run_without_a_bag_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run(recorder={})
     assert not list(tmp_path.iterdir())
+
+
+def test_memory_of_a_long_recording_grows_by_little_more_than_its_index(tmp_path):
+    """A recorder writes two chunks a second: 170 000 a day."""
+    file = McapFile(tmp_path / "long.mcap", chunk_size=2**20, compress=False)
+    schema = file.add_schema("std_msgs/msg/String", "string data")
+    channels = [file.add_channel(f"/topic_{number}", schema, "cdr", {}) for number in range(12)]
+
+    def write(chunks: int) -> None:
+        for stamp in range(chunks):
+            for channel in channels:
+                file.add_message(channel, stamp, b"0" * 100)
+            file.flush()
+
+    write(200)
+    tracemalloc.start()
+    before, _ = tracemalloc.get_traced_memory()
+    write(200)
+    after, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    file.finish()
+    assert (after - before) / 200 < 500  # [B] a chunk; an index entry has 200

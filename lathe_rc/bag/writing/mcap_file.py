@@ -179,7 +179,8 @@ class McapFile:
         self._compressor = zstandard.ZstdCompressor(level=_LEVEL) if compress else None
         self._schemas: list[bytes] = []
         self._channels: list[bytes] = []
-        self._chunks: list[ChunkIndex] = []
+        self._chunks = 0
+        self._chunk_index = bytearray()  # encoded: as objects, the chunks of a long run take ten times as much memory
         self._metadata: list[MetadataIndex] = []
         self._attachments: list[AttachmentIndex] = []
         self.counts: dict[int, int] = {}
@@ -198,7 +199,7 @@ class McapFile:
         self._size = 0
         self._singles: dict[int, list[int]] = {}  # log time and place of each message that is not in a row, by channel
         self._runs: list[_Run] = []
-        before = len(self._chunks)
+        before = self._chunks
         if before and before & (before - 1) == 0:  # see the top
             self._size += self._chunk.write(b"".join([*self._schemas, *self._channels]))
 
@@ -219,7 +220,7 @@ class McapFile:
 
     def _keep_room(self) -> None:
         """Hold as much of the disk as completing the file will take: then a full disk cannot make it unreadable."""
-        needed = _ROOM + _ROOM_PER_CHUNK * (len(self._chunks) + 1) + 4 * self._described
+        needed = _ROOM + _ROOM_PER_CHUNK * (self._chunks + 1) + 4 * self._described
         if needed > self._kept:
             needed += _ROOM
             with self._reserve.open("ab") as stream:
@@ -344,7 +345,8 @@ class McapFile:
             self.counts[channel] += len(index)
         self.first_ns = first if self.first_ns is None else min(first, self.first_ns)
         self.last_ns = last if self.last_ns is None else max(last, self.last_ns)
-        self._chunks.append(
+        self._chunks += 1
+        self._chunk_index += _encoded(
             ChunkIndex(
                 message_start_time=first,
                 message_end_time=last,
@@ -408,7 +410,7 @@ class McapFile:
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts=self.counts,
-            chunk_count=len(self._chunks),
+            chunk_count=self._chunks,
             message_count=sum(self.counts.values()),
             metadata_count=len(self._metadata),
             message_start_time=self.first_ns or 0,
@@ -419,7 +421,7 @@ class McapFile:
             Opcode.SCHEMA: b"".join(self._schemas),
             Opcode.CHANNEL: b"".join(self._channels),
             Opcode.STATISTICS: _encoded(statistics),
-            Opcode.CHUNK_INDEX: _encoded(*self._chunks),
+            Opcode.CHUNK_INDEX: bytes(self._chunk_index),
             Opcode.ATTACHMENT_INDEX: _encoded(*self._attachments),
             Opcode.METADATA_INDEX: _encoded(*self._metadata),
         }
