@@ -4,6 +4,7 @@
 import contextlib
 import itertools
 import json
+import os
 import resource
 import signal
 import subprocess
@@ -35,6 +36,19 @@ def scenario(shared: Values | None = None, **nodes: Values) -> Scenario:
     values["spindle_encoder"].setdefault("revolutions", 3.0)
     tables = {name: TABLES[part.get("stage", name)].read(name, part) for name, part in values.items()}
     return Scenario("test", tables)
+
+
+def listening(group: int) -> list[str]:
+    """Local addresses at which a group of processes listens, as /proc/net has them."""
+    sockets = set()
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has ended, or the file is closed by now
+            if os.getpgid(int(process.name)) == group:
+                for file in process.glob("fd/*"):
+                    with contextlib.suppress(OSError):
+                        sockets.add(str(file.readlink()))
+    rows = [line.split() for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()[1:]]
+    return [row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in sockets]
 
 
 def announced(cell: Scenario, *names: str) -> Cell:

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """``lathe view`` and the scene behind it: what Rerun is given is what was recorded."""
 
-import contextlib
 import importlib.util
-import os
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cells import scenario
+from cells import listening, scenario
 from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -57,17 +55,6 @@ def turned(tmp_path_factory):
     learning = {"events": ["revolution 9: freeze"]}
     harness.run(scenario(spindle_encoder={"revolutions": 12.3}, tool=given, learning_controller=learning), bag=bag)
     return bag, reader.read(bag)
-
-
-def listening(group):
-    """Local addresses at which a group of processes listens, as /proc/net has them."""
-    inodes = set()
-    for process in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            if os.getpgid(int(process.name)) == group:
-                inodes |= {str(file.readlink()) for file in process.glob("fd/*")}
-    rows = [line.split() for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()[1:]]
-    return [row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in inodes]
 
 
 class View:

@@ -153,6 +153,7 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[distribute
             cluster = distributed.LocalCluster(
                 n_workers=workers,
                 threads_per_worker=1,
+                host="127.0.0.1",  # a process that reaches a scheduler or a worker runs code there
                 dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
             )

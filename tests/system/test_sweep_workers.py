@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pyarrow.parquet
 import pytest
+from cells import listening
 
 from lathe_rc import harness
 from lathe_rc.cell import scenario
@@ -18,6 +19,7 @@ from lathe_rc.errors import LatheError
 from lathe_rc.sweep import row
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.space import Space
+from lathe_rc.sweep.workers import client_of
 
 pytestmark = pytest.mark.system
 
@@ -29,6 +31,13 @@ PISTON = Path(__file__).parents[2] / "config" / "piston.yaml"
 @pytest.fixture
 def piston():
     return scenario.load(PISTON, ["spindle_encoder.revolutions=20"])
+
+
+def test_scheduler_and_workers_of_this_machine_listen_to_it_alone():
+    with client_of(None, 1):
+        places = listening(os.getpgrp())
+    assert len(places) >= 4  # scheduler, dashboard, nanny, worker
+    assert {place.partition(":")[0] for place in places} == {"0100007F"}  # 127.0.0.1
 
 
 @contextlib.contextmanager
