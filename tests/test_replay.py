@@ -12,6 +12,7 @@ import rclpy
 import yaml
 from cells import refusals, scenario, started
 from geometry_msgs.msg import Point
+from mcap.writer import Writer as McapWriter
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
@@ -205,6 +206,49 @@ def test_what_cannot_be_replayed_is_refused(told, name):
     assert code == 2
     assert REFUSED[name][1] in said
     assert "Traceback" not in said
+
+
+@pytest.fixture(scope="module")
+def odd(tmp_path_factory):
+    """A latched topic, one of different publishers, a name that is none, JSON, and a message after 2038."""
+    path = tmp_path_factory.mktemp("odd") / "odd.mcap"
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start(profile="")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        latched, best = "- {reliability: reliable, durability: transient_local, depth: 1}\n", "- {reliability: 2}\n"
+        offers = {"/latched": latched, "/mixed": best + latched, "/tool/": "", "/late": "", "/json": ""}
+        encodings = {"/json": "json"}
+        numbers = {
+            topic: writer.register_channel(topic, encodings.get(topic, "cdr"), schema, {"offered_qos_profiles": text})
+            for topic, text in offers.items()
+        }
+        text = b"\0\1\0\0\2\0\0\0x\0"
+        for topic, log_ns in (("/latched", 0), ("/latched", 1), ("/mixed", 10**9), ("/mixed", 10**18), ("/tool/", 2)):
+            writer.add_message(numbers[topic], log_ns, text, log_ns)
+        writer.add_message(numbers["/late"], 2**62, text, 2**62)
+        writer.finish()
+    return path
+
+
+def test_a_bag_of_odd_topics_is_replayed_as_far_as_it_goes(domain, odd):
+    """Times and topics that are asked for count; a latched message from before the start comes; waits are announced."""
+    fast = ["--rate", "0", "--topics", "/latched", "--topics", "/mixed"]
+    commands = [
+        (["--end", "5", "--rate", "0"], 2, "/tool/: no name in ROS (topic name must not end with a forward slash)"),
+        ([*fast], 2, "log times up to 4611686018427387904 ns; /clock ends in 2038; leave them out by end"),
+        ([*fast, "--start", "0.5", "--end", "5"], 0, "2 messages sent"),
+        ([*fast, "--end", "5"], 0, "/mixed: its publishers offered different QoS; sent reliable and volatile"),
+        ([*fast, "--end", "5"], 0, "not sent: /json std_msgs/msg/String, 0 messages serialized as 'json', not 'cdr'"),
+    ]
+    ended = refusals(*(["replay", odd, *arguments] for arguments, _, _ in commands))
+    for (code, told), (_, wanted, said) in zip(ended, commands, strict=True):
+        assert code == wanted, told
+        assert said in told
+    with started("replay", odd, "--topics", "/mixed", "--start", "1", "--end", "2e9") as process:
+        waits = "the next message comes in 31.7 years; start = 1e+09 begins with it"
+        assert any(waits in line for line in process.stdout)
+        process.kill()
 
 
 def test_what_cannot_be_sent_is_refused(domain, tmp_path):

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.bag.reading.limits import MOST_ANNOUNCED
+from lathe_rc.bag.reading.limits import MOST_ANNOUNCED, TooMuchError
 from lathe_rc.jit import kernel
 
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 2, 3, 4, 5, 6, 15  # opcodes
@@ -72,7 +72,8 @@ def walk_part(part: bytes) -> Found:
     """The records of a part of a file, of which the last may be cut off.
 
     Raises:
-        ValueError: a message is shorter than its own head, or there are too many of the others.
+        ValueError: a message is shorter than its own head.
+        TooMuchError: there are more schemas and channels than a whole file may have.
     """
     data = np.frombuffer(part, np.uint8)
     # What a chunk says of itself is not believed: its records are counted.
@@ -80,7 +81,7 @@ def walk_part(part: bytes) -> Found:
     if count < 0:
         raise ValueError("a message is shorter than its head")
     if further > MOST_ANNOUNCED:
-        raise ValueError(f"more than {MOST_ANNOUNCED} schemas and channels")
+        raise TooMuchError(f"more than {MOST_ANNOUNCED} schemas and channels")
     messages, others = np.empty((count, 4), np.uint64), np.empty((further, 3), np.uint64)
     _walk(data, messages, others)
     return Found(messages, others, end)

@@ -23,3 +23,7 @@ MOST_DEPTH = 32  #: of its nesting
 EXPANSION = 1024  #: bytes of all messages by bytes of the files
 MOST_SMALL = 2**28  #: bytes of all messages, whatever the size of the files
 MOST_SMALL_MESSAGES = 2**20  #: messages, whatever the size of the files; beyond them one for each byte
+
+
+class TooMuchError(ValueError):
+    """A file would cost more than one of its size may; unlike damage, which ends a chunk, it ends the reading."""

@@ -22,7 +22,7 @@ from mcap.records import Footer, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
 
 from lathe_rc.bag.reading.chunk_messages import Found, Places, walk, walk_part
-from lathe_rc.bag.reading.limits import MOST_ANNOUNCED, MOST_BYTES, MOST_METADATA, MOST_TEXT
+from lathe_rc.bag.reading.limits import MOST_ANNOUNCED, MOST_BYTES, MOST_METADATA, MOST_TEXT, TooMuchError
 from lathe_rc.bag.reading.precheck import read_record
 from lathe_rc.bag.reading.storage import Batch, Channel, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget, read_chunk
@@ -272,14 +272,16 @@ class _Mcap:
                 start = place + begin - _RECORD.size
                 try:
                     whole = read_chunk(part[begin:end], start)
+                    self._budget.take(len(whole))
                     found = walk(whole)
+                except TooMuchError:
+                    raise
                 except ValueError as error:
                     self.damage(error)
                     continue
                 if np.any(found.others[:, 0] == Opcode.CHUNK):
                     self.damage(f"chunk in the chunk at byte {start}")
                     continue
-                self._budget.take(len(whole))
                 for inner, first, last in found.others.tolist():
                     if inner in (Opcode.SCHEMA, Opcode.CHANNEL):
                         self._announce(inner, whole[first:last])

@@ -9,7 +9,7 @@ import lz4.frame
 import zstandard
 from isal.isal_zlib import crc32
 
-from lathe_rc.bag.reading.limits import EXPANSION, MOST_BYTES, MOST_SMALL, MOST_SMALL_MESSAGES
+from lathe_rc.bag.reading.limits import EXPANSION, MOST_BYTES, MOST_SMALL, MOST_SMALL_MESSAGES, TooMuchError
 from lathe_rc.errors import shown
 
 _OVERHEAD = 2**16  # of compression, beyond 1/128 of what does not shrink [B]
@@ -32,13 +32,13 @@ class Budget:
         """Count bytes, and messages in them.
 
         Raises:
-            ValueError: they are more than files of this size have.
+            TooMuchError: they are more than files of this size have.
         """
         self._bytes -= size
         self._messages -= messages
         if self._bytes < 0 or self._messages < 0:
             what = f"{EXPANSION} times its size" if self._bytes < 0 else "a message for each of its bytes"
-            raise ValueError(f"it unpacks to more than {what}; no recording does")
+            raise TooMuchError(f"it unpacks to more than {what}; no recording does")
 
 
 def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
