@@ -38,7 +38,7 @@ _MOST = 2**30  # longest file of rows [B]
 
 @dataclass(frozen=True)
 class _Tuning:
-    """What is tuned; see `lathe_rc.sweep.tune`."""
+    """The request of a tuning; see `lathe_rc.sweep.tune`."""
 
     targets: list[str]
     free: dict[str, str | list[Value]]
