@@ -277,7 +277,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 
 
 class HarmError(AssertionError):
-    """What a command must not do."""
+    """Harm done by a command."""
 
 
 def _too_long(*_: object) -> None:
@@ -301,7 +301,7 @@ def limits() -> Iterator[None]:
 
 
 def _seal(folder: Path) -> dict[str, str]:
-    """What stands in a folder."""
+    """Hash of each file of a folder."""
     found = {}
     for path in sorted(folder.rglob("*")):
         content = path.read_bytes() if path.is_file() and not path.is_symlink() else b""
