@@ -121,7 +121,7 @@ def _written(folder: Path, random: Random) -> Path:
     with path.open("wb") as stream:
         writer = Writer(stream, **options)
         writer.start(profile=random.choice(("ros2", "", "ros1", "x" * 1000)))
-        channels = []
+        channels: list[int] = []
         for _ in range(random.choice((0, 1, 3, 3, 3, 100, 5000))):
             encoding = random.choice(("ros2msg", "ros2msg", "ros2idl", "jsonschema", ""))
             schema = writer.register_schema(random.choice(TYPES), encoding, random.choice(DEFINITIONS))
