@@ -121,7 +121,7 @@ def _written(folder: Path, random: Random) -> Path:
     with path.open("wb") as stream:
         writer = Writer(stream, **options)
         writer.start(profile=random.choice(("ros2", "", "ros1", "x" * 1000)))
-        channels = []
+        channels: list[int] = []
         for _ in range(random.choice((0, 1, 3, 3, 3, 100, 5000))):
             encoding = random.choice(("ros2msg", "ros2msg", "ros2idl", "jsonschema", ""))
             schema = writer.register_schema(random.choice(TYPES), encoding, random.choice(DEFINITIONS))
@@ -277,7 +277,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 
 
 class HarmError(AssertionError):
-    """What a command must not do."""
+    """Harm done by a command."""
 
 
 def _too_long(*_: object) -> None:
@@ -301,7 +301,7 @@ def limits() -> Iterator[None]:
 
 
 def _seal(folder: Path) -> dict[str, str]:
-    """What stands in a folder."""
+    """Hash of each file of a folder."""
     found = {}
     for path in sorted(folder.rglob("*")):
         content = path.read_bytes() if path.is_file() and not path.is_symlink() else b""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a refusal or a warning before a start names as a cure does cure."""
+"""The cures that a refusal or a warning before a start names do cure."""
 
 import re
 from pathlib import Path

@@ -177,10 +177,10 @@ FIRST = len(MCAP0_MAGIC + HEADER)
         (b"", SCHEMA + STATISTICS + channels(600, b"x" * 2000), "characters of quality of service"),
         (b"", SCHEMA + STATISTICS + channels(5000, b""), "more than 4096 topics"),
         (b"", SCHEMA + STATISTICS + 1000 * SCHEMA + record(11, bytes(2**20 + 1)), "statistics of 1048577 B"),
-        (b"", SCHEMA + STATISTICS + chunk_index(2**63, 100), "none can be there"),
+        (b"", SCHEMA + STATISTICS + chunk_index(2**63, 100), "none can be"),
         (chunk(), SCHEMA + STATISTICS + 2 * chunk_index(FIRST, len(chunk())), "two chunks at byte"),
-        (chunk(), SCHEMA + STATISTICS + chunk_index(FIRST, len(chunk()), size=2**40), "none can be there"),
-        (chunk(), SCHEMA + STATISTICS + chunk_index(FIRST, len(chunk()), packed=2**62), "none can be there"),
+        (chunk(), SCHEMA + STATISTICS + chunk_index(FIRST, len(chunk()), size=2**40), "none can be"),
+        (chunk(), SCHEMA + STATISTICS + chunk_index(FIRST, len(chunk()), packed=2**62), "none can be"),
         (
             3 * chunk(),
             (SCHEMA + statistics(3) + channel(b""))

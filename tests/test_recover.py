@@ -424,6 +424,60 @@ def test_copies_what_it_need_not_understand(tmp_path, profile):
     assert recover(tmp_path / "new", tmp_path / "again").saved == found.saved
 
 
+def test_log_of_a_killed_recorder_is_part_of_its_database(tmp_path):
+    """The messages stand in it alone; neither it nor the database is touched."""
+    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE)
+    file = tmp_path / "bag" / "bag.db3"
+    base = sqlite3.connect(file)
+    base.execute("PRAGMA journal_mode=WAL")
+    base.execute("UPDATE messages SET timestamp = timestamp + 1")
+    base.commit()
+    (tmp_path / "killed").mkdir()
+    for each in (file, file.with_name("bag.db3-wal")):
+        shutil.copy(each, tmp_path / "killed")
+    base.close()
+    before = {each.name: each.read_bytes() for each in (tmp_path / "killed").iterdir()}
+    with Source(tmp_path / "killed") as source:
+        assert list(source.messages()) == [(topic, log_ns + 1, data) for topic, log_ns, data in sent]
+    assert {each.name: each.read_bytes() for each in (tmp_path / "killed").iterdir()} == before
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_files_that_overlap_in_time_are_merged_by_it(tmp_path, plugin):
+    sent = strange_bag(tmp_path / "bag", plugin, CompressionMode.NONE)
+    file = next(file for file in (tmp_path / "bag").iterdir() if file.suffix != ".yaml")
+    shutil.copy(file, file.with_name(f"further{file.suffix}"))
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    with Source(tmp_path / "bag") as source:
+        assert list(source.messages()) == [message for message in sent for _ in range(2)]
+        part = list(source.messages({"/said"}, start_ns=10**9 + 1000, stop_ns=10**9 + 7000))
+    assert part == [message for message in sent[1:7] if message[0] == "/said" for _ in range(2)]
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_topics_in_other_serializations_are_named_and_the_rest_is_read(tmp_path, plugin):
+    others = reserialized(tmp_path / "bag", plugin)
+    with Source(tmp_path / "bag") as source:
+        assert list(source.messages()) == others
+    said = "not read: /said std_msgs/msg/String, 200 messages serialized as 'xdr', not 'cdr'"
+    for command in ("info", "check"):
+        found = lathe("bag", command, tmp_path / "bag")
+        assert found.exit_code == 0
+        assert said in found.stdout
+
+
+def reserialized(path, plugin):
+    """A bag with a topic that is not serialized as ROS does by default."""
+    sent = strange_bag(path, plugin, CompressionMode.NONE)
+    if plugin == StoragePlugin.SQLITE3:
+        with sqlite3.connect(next(path.glob("*.db3"))) as database:
+            database.execute("UPDATE topics SET serialization_format = 'xdr' WHERE name = '/said'")
+    else:
+        file = mcap_of(path)
+        file.write_bytes(file.read_bytes().replace(b"/said\x03\0\0\0cdr", b"/said\x03\0\0\0xdr"))
+    return [message for message in sent if message[0] != "/said"]
+
+
 @pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
 def test_another_serialization_is_copied_under_its_own_name(tmp_path, plugin):
     sent = strange_bag(tmp_path / "bag", plugin, CompressionMode.NONE)

@@ -52,7 +52,7 @@ class Loop(NamedTuple):
         return next((values for values in candidates if self.factor(values) <= allowed), None)
 
     def cures(self) -> list[str]:
-        """What makes a loop converge that does not, as parameters to set."""
+        """Parameters to set so that a loop converges that does not."""
         found: list[Mapping[str, Value]] = []
         for candidates in self.stage.cures(max(map(lag, self.responses))):
             cure = self.first(each for each in candidates if not any(each.keys() >= known.keys() for known in found))

@@ -47,7 +47,7 @@ _CLOCK_END = 2**31 * 10**9  # [ns] that it cannot tell any more
 # the order of their publication need not wait much longer for one that is late
 _PROMPT = 100_000_000
 _SETBACK = 1_000_000_000  # [ns] by which the computer's clock may be set back without harm
-_LONG = 10.0  # [s] of wall time until the next message that a user is told of
+_LONG = 10.0  # [s] of wall time until the next message that are announced
 _LOOK = 0.05  # [s] of wall time between looks at services and signals
 
 

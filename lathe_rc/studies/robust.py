@@ -284,7 +284,7 @@ def machine(frequency: float, damping: float, stiffness: float, delay: float) ->
 
 
 def model(frequency: float = 1.0, damping: float = 1.0, delay: float = 1.0) -> Values:
-    """What the law is told of it."""
+    """Parameters of the law: the drive as it is identified, in error by these factors."""
     factors = zip(_MODEL, TOLD, (frequency, damping, delay), strict=True)
     return {f"controller.{name}": value * factor for name, value, factor in factors}
 

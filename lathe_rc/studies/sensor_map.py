@@ -212,7 +212,7 @@ def _warned(parameters: SensorMapParameters, counts: int) -> bool:
     cell = Cell(cells.load(_OURS).nodes)
     nominal, law = cell.master.shared.nominal_speed, cell.stages["disturbance_controller"]
     assert isinstance(law, Learner), "it commands the drive"
-    return bool(law.warnings(nominal - parameters.deviation, nominal + parameters.deviation, counts))
+    return bool(law.encoder_warnings(nominal - parameters.deviation, nominal + parameters.deviation, counts))
 
 
 STUDY = Study(

@@ -19,7 +19,7 @@ NAME = "metadata.yaml"
 
 @dataclass(frozen=True)
 class Told:
-    """What metadata say of a topic."""
+    """Entry of a topic in the metadata."""
 
     type: str
     qos: tuple[Qos, ...]
@@ -28,7 +28,7 @@ class Told:
 
 @dataclass(frozen=True)
 class Metadata:
-    """What metadata say of a bag.
+    """Content of the metadata of a bag.
 
     Attributes:
         files: their names, each once.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all files of bags have in common: channels, and spans of messages that are read when their time comes."""
+"""Channels of the files of bags, and spans of messages that are read when their time comes."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

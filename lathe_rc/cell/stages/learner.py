@@ -76,7 +76,7 @@ class Learner(Stage):
         return "its parameters"
 
     def encoder_warnings(self, low: float, high: float, counts: int) -> list[str]:
-        """What makes the form worse than the law can do, and its cure, one line each; nothing is refused for it.
+        """Causes of a form worse than the law can turn, with their cures, one line each; nothing is refused for them.
 
         Args:
             low: least speed of the spindle [rad/s].
