@@ -2,7 +2,7 @@
 """Bags that are made to harm: bombs, wrong lengths, indexes, names, metadata, schemas, files that are none.
 
 Each maker takes a folder and a ``random.Random`` and returns the bag; `attack` calls a command with it, under limits,
-and says what must not be. tests/test_hostile_bags.py has a sample, tests/system/test_hostile_bags.py thousands.
+and says what must not be. tests/test_hostile_bags.py has a sample, tests/system/test_hostile_campaign.py thousands.
 """
 
 import contextlib

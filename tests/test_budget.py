@@ -198,7 +198,7 @@ def test_what_is_switched_off_is_what_the_cause_says():
 
 
 def test_a_q_that_cannot_be_flat_is_left_out_and_said_to_be():
-    unstable = {"lead_time": 0.8e-3, "q_time": 800e-6, "allow_unstable": True}
+    unstable = {"lead_time": 4e-3, "learning_gain": 1.9, "q_time": 800e-6, "allow_unstable": True}
     found = harness.budget(scenario(spindle_encoder={"revolutions": 12.0}, learning_controller=unstable))
     assert found.left_out == {"Q floor": "learning_controller converges with no flat Q"}
     assert found.causes == []

@@ -130,7 +130,7 @@ NOMINAL = 1000 * np.pi / 30
 def warnings(name, counts, *changes):
     cell = Cell(load(name, *changes).nodes)
     laws = (stage for stage in cell.stages.values() if isinstance(stage, Learner))
-    return [said for law in laws for said in law.warnings(*cell.master.speed_range(), counts)]
+    return [said for law in laws for said in law.encoder_warnings(*cell.master.speed_range(), counts)]
 
 
 def rate_of(said):
@@ -139,9 +139,10 @@ def rate_of(said):
 
 def test_counts_near_a_ratio_of_small_numbers_are_warned_of_and_no_others():
     law = Cell(load("robust").nodes).stages["disturbance_controller"]
-    assert [counts for counts in (*BAD, *GOOD, 0) if law.warnings(0.9 * NOMINAL, 1.1 * NOMINAL, counts)] == list(BAD)
-    assert not law.warnings(0.98 * NOMINAL, 1.02 * NOMINAL, 4096)  # its speeds stay beside the ratio
-    assert "near 1:" in law.warnings(0.98 * NOMINAL, 1.02 * NOMINAL, 3800)[0]
+    warned = [each for each in (*BAD, *GOOD, 0) if law.encoder_warnings(0.9 * NOMINAL, 1.1 * NOMINAL, each)]
+    assert warned == list(BAD)
+    assert not law.encoder_warnings(0.98 * NOMINAL, 1.02 * NOMINAL, 4096)  # its speeds stay beside the ratio
+    assert "near 1:" in law.encoder_warnings(0.98 * NOMINAL, 1.02 * NOMINAL, 3800)[0]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hostile bags: a sample of what tests/system/test_hostile_bags.py does thousands of times."""
+"""Hostile bags: a sample of what tests/system/test_hostile_campaign.py does thousands of times."""
 
 import errno
 from random import Random

@@ -54,7 +54,7 @@ def test_lateness_is_told_in_words_and_as_json(tmp_path):
     found = harness.run(scenario(spindle_encoder={"revolutions": 0.5}))
     late = Lateness(60, 2, 0.0123, {50: 61e-6, 95: 0.5e-3, 99: 2e-3}, 0.004)
     whole = harness.Result(**{**vars(found), "lateness": late})
-    assert outcome.facts(whole)[2:4] == [
+    assert outcome.facts(whole)[3:5] == [
         "2 of 60 blocks late; the schedule slipped by 0.004 s",
         "lateness: 50 % within 0.061 ms, 95 % within 0.5 ms, 99 % within 2 ms, worst 12.3 ms",
     ]

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+from lathe_rc.jit import cache_folder
 from lathe_rc.signals import profile_table
 from lathe_rc.signals.kept_table import kept
 from lathe_rc.signals.measured_profile import Measured, doubts, read_csv
@@ -354,7 +355,7 @@ def test_a_part_without_form_is_in_no_other_unit(tmp_path):
 def folder(tmp_path, monkeypatch):
     """Where tables are kept."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    return tmp_path / "tables"
+    return cache_folder() / "tables"
 
 
 def test_a_table_is_made_once_and_read_from_then_on(folder):

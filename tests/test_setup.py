@@ -93,7 +93,7 @@ def test_entry_has_nothing_that_an_old_python_cannot_parse():
 
 def test_path_with_a_space(tmp_path):
     copy = copy_to(tmp_path / "my lathe")
-    assert_refused(lathe(copy), copy, "my lathe", "' '")
+    assert_refused(lathe(copy, "setup"), copy, "my lathe", "' '")
 
 
 def test_compiler_missing(copy, tmp_path):
@@ -101,7 +101,7 @@ def test_compiler_missing(copy, tmp_path):
     tools.mkdir()
     for name in ("dirname", "readlink"):
         (tools / name).symlink_to(shutil.which(name))
-    assert_refused(lathe(copy, PATH=str(tools)), copy, "C++ compiler", "sudo apt install g++")
+    assert_refused(lathe(copy, "setup", PATH=str(tools)), copy, "C++ compiler", "sudo apt install g++")
 
 
 def test_venv_module_and_headers_missing(monkeypatch, tmp_path):

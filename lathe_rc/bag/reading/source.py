@@ -82,13 +82,24 @@ def files_of(path: Path) -> list[Path]:
     """The files with the messages of a bag, by name: those of a folder, or the one that is named.
 
     Raises:
-        InputError: a link in the folder leads out of it.
+        InputError: a file that is read is a link that leads out of the folder.
     """
     found = [path] if path.is_file() else [*path.glob("*")]
     for file in found:
-        if file != path and not file.resolve().is_relative_to(path.resolve()):
-            raise InputError(f"{file}: a link that leads out of the bag; allowed: the file itself in its place")
+        if file.suffix in _KINDS or file.name in (metadata.NAME, "digests.json"):
+            _refuse_link(file, path)
     return sorted(file for file in found if file.suffix in _KINDS and file.is_file())
+
+
+def _refuse_link(file: Path, bag: Path) -> None:
+    """Refuse a file that is a link out of its bag.
+
+    Raises:
+        InputError: it is one.
+    """
+    folder = Path(os.path.realpath(bag))  # unlike Path.resolve, it takes links that go round
+    if file != bag and not Path(os.path.realpath(file)).is_relative_to(folder):
+        raise InputError(f"{file}: a link that leads out of the bag; allowed: the file itself in its place")
 
 
 def name_of(path: Path) -> str:
@@ -148,6 +159,8 @@ class Source:
         if told:
             self.about, self._packed = told.about, told.packed
             files = [self.path / name for name in told.files]
+            for file in files:
+                _refuse_link(file, self.path)
         for file in files:
             try:
                 self._storages.append(self._storage(file))
