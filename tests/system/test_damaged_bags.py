@@ -5,6 +5,7 @@ from collections import Counter
 from random import Random
 
 import pytest
+from campaign import sized
 from cells import scenario
 from mcap.opcode import Opcode
 from mcap.writer import Writer as McapWriter
@@ -21,7 +22,7 @@ pytestmark = pytest.mark.system
 def test_every_damage_costs_no_more_than_the_chunks_that_it_hits(tmp_path, compression, kind):
     data = small_bag(tmp_path / "bag", compression)
     _, whole = saved_of(tmp_path / "bad.mcap", data)
-    for damaged in kind(data, 500, Random(11)):  # noqa: S311
+    for damaged in kind(data, sized(500), Random(11)):  # noqa: S311
         check_damage(tmp_path / "bad.mcap", whole, damaged)
 
 
@@ -32,7 +33,7 @@ def test_several_damages_at_once(tmp_path, complete):
     data = data if complete else data[: chunks_of(data)[-1][1]]
     salvage, whole = saved_of(tmp_path / "bad.mcap", data)
     random = Random(12)  # noqa: S311
-    for _ in range(200):
+    for _ in range(sized(200)):
         damaged = bytearray(data)
         for place in random.sample(range(8, len(data)), 8):
             damaged[place] ^= 1 << random.randrange(8)
@@ -53,7 +54,7 @@ def test_bag_of_a_cell(tmp_path):
     ends = [end for _, end in chunks_of(data)]
     counts = [len(saved_of(bad, data[:end])[1]) for end in ends]
     sizes = [later - earlier for earlier, later in zip([0, *counts], counts, strict=False)]
-    damages = [*flips(data, 60, Random(13)), *structured(data, 60, Random(14))]  # noqa: S311
+    damages = [*flips(data, sized(60), Random(13)), *structured(data, sized(60), Random(14))]  # noqa: S311
     for number, damaged in enumerate(damages):
         bad.write_bytes(damaged.data)
         found = recover(bad, tmp_path / f"new{number}")
@@ -78,7 +79,7 @@ def test_messages_outside_of_chunks(tmp_path):
     _, whole = saved_of(file, data)
     end = next(begin for opcode, begin, _ in records_of(data) if opcode == Opcode.DATA_END)
     random = Random(15)  # noqa: S311
-    for _ in range(500):
+    for _ in range(sized(500)):
         place = random.randrange(8, end)
         salvage, saved = saved_of(
             file, data[:place] + bytes([data[place] ^ 1 << random.randrange(8)]) + data[place + 1 :]

@@ -3,6 +3,7 @@
 
 import kept_files
 import pytest
+from campaign import sized
 
 pytestmark = pytest.mark.system
 
@@ -11,4 +12,4 @@ pytestmark = pytest.mark.system
 def test_no_flipped_bit_changes_a_value_in_silence(kind, tmp_path, monkeypatch, capsys):
     """250 bits of a file, of compiled code 50: the same values come of it, or one line names the file."""
     kept = kept_files.made(kind, monkeypatch, tmp_path)
-    kept_files.flip(kept, 50 if "compiled" in kind else 250, lambda: capsys.readouterr().err)
+    kept_files.flip(kept, sized(50 if "compiled" in kind else 250), lambda: capsys.readouterr().err)

@@ -7,12 +7,13 @@ import sys
 from random import Random
 
 import pytest
+from campaign import sized
 from hostile_bags import COMMANDS, LONGEST, MAKERS, MEMORY, attack
 
 pytestmark = pytest.mark.system
 
-_BAGS = 2000
-_GROUPS = 40
+_BAGS = sized(2000)
+_GROUPS = 20
 _BASE = 3 * 2**29  # address space of the program itself [B]
 _OTHERS = [name for name in COMMANDS if name not in ("check", "replay")]
 
@@ -36,7 +37,7 @@ def _bound():
     resource.setrlimit(resource.RLIMIT_CPU, (LONGEST, LONGEST))
 
 
-@pytest.mark.parametrize("seed", range(3000, 3000 + 2 * len(MAKERS)))
+@pytest.mark.parametrize("seed", range(3000, 3000 + sized(2 * len(MAKERS))))
 @pytest.mark.parametrize("command", ["replay", "check"])
 def test_programs_bear_hostile_bags(tmp_path, domain, seed, command):
     bag = _made(tmp_path, seed)
