@@ -18,6 +18,7 @@ from typing import BinaryIO, cast
 from lathe_rc.errors import InputError
 
 MOST = 2**26  #: longest file that is read whole [B]
+_PIECE = 2**20  # [B]
 _NO_FILE = "not a file"
 _MARK, _DIGITS = b"lathe_rc checksum ", 32
 ROOM = _MARK + _DIGITS * b"0"  #: for a checksum
@@ -33,13 +34,16 @@ def contents(path: Path, most: int = MOST) -> bytes:
     Raises:
         OSError: it cannot be read; EFBIG: it is longer than ``most`` bytes.
     """
+    found = bytearray()
     with open(path, "rb", opener=open_file) as stream:
-        found = stream.read(most + 1)
-    if found is None:  # it would have had to wait
+        # Python takes memory for all that a single read may give.
+        while piece := stream.read(min(_PIECE, most + 1 - len(found))):
+            found += piece
+    if piece is None:  # it would have had to wait
         raise OSError(errno.EINVAL, _NO_FILE)
     if len(found) > most:
         raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
-    return found
+    return bytes(found)
 
 
 def open_file(name: str, flags: int) -> int:

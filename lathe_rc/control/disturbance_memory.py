@@ -64,14 +64,13 @@ def smoothing(waves: float, points: int) -> Array:
     Raises:
         InputError: it is wider than a revolution.
     """
-    unit = _HALF * points / _TURN
-    deviation = unit / waves
+    deviation = _HALF * points / (_TURN * waves)
     reach = int(np.ceil(_TAIL * deviation))
     widest = (points - 1) // 4
     if reach > widest:
         raise InputError(
             f"{waves:g} waves per revolution: the filter is wider than a revolution; allowed: "
-            f"{np.ceil(_TAIL * unit / widest):.0f} waves or more"
+            f"{np.ceil(_TAIL * deviation * waves / widest):.0f} waves or more"
         )
     gauss = np.exp(-0.5 * (np.arange(-reach, reach + 1) / deviation) ** 2)
     gauss /= gauss.sum()

@@ -17,7 +17,7 @@ from lathe_rc.errors import LatheError
 pytestmark = pytest.mark.system
 
 
-@pytest.mark.parametrize("small_disk", ["3M"], indirect=True)
+@pytest.mark.parametrize("small_disk", ["4M"], indirect=True)
 @pytest.mark.parametrize(("mode", "compression"), [("offline", "zstd"), ("offline", "none"), ("processes", "none")])
 def test_a_full_disk_ends_the_recording_with_a_readable_bag(small_disk, mode, compression):
     bag = small_disk / "bag"
@@ -61,7 +61,7 @@ def test_a_disk_that_is_too_small_from_the_start_is_left_as_it_was(small_disk):
     assert not list(small_disk.iterdir())
 
 
-@pytest.mark.parametrize("small_disk", ["3M"], indirect=True)
+@pytest.mark.parametrize("small_disk", ["4M"], indirect=True)
 def test_a_full_disk_ends_a_recovery_without_half_a_bag(small_disk):
     fill(small_disk / "bag", {})
     with pytest.raises(LatheError, match="No space left on device"):

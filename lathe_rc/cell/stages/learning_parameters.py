@@ -126,7 +126,7 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         if self.q_filter not in (*Q_FILTERS.own, "fir"):
             make = cast("Callable[[float, int], QFilter]", Q_FILTERS[self.q_filter])
             with about(node, "q_filter"), code_of_others(repr(self.q_filter)):
-                made = make(self.q_time / self._point_time, self.cycle_points)
+                made = make(self._q_width, self.cycle_points)
                 check(made)
                 return made
         with about(node, *(("q_pass", "q_stop", "q_ripple") if self.q_filter == "fir" else ("q_time",))):
@@ -138,7 +138,12 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
     @property
     def _point_time(self) -> float:
         """Time in which the spindle passes a grid point at nominal speed [s]."""
-        return 2.0 * np.pi / (self.nominal_speed * self.points_per_revolution)
+        return float(1.0 / (self.nominal_speed * (self.points_per_revolution / (2 * np.pi))))
+
+    @property
+    def _q_width(self) -> float:
+        """``q_time`` at nominal speed [grid points]; multiplied in this order, on which the bits depend."""
+        return float(self.q_time * self.nominal_speed * (self.points_per_revolution / (2 * np.pi)))
 
     def _own_q(self) -> QFilter:
         """The Q filter, one of ours."""
@@ -146,7 +151,7 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         if self.q_filter == "fir":
             return _own_q(LowPass, self.q_pass * point, self.q_stop * point, self.q_ripple, self.cycle_points)
         make = cast("Callable[[float, int], QFilter]", Q_FILTERS[self.q_filter])
-        return _own_q(make, self.q_time / point, self.cycle_points)
+        return _own_q(make, self._q_width, self.cycle_points)
 
     def _q_that_fits(self) -> str:
         """The cure of a Q filter that the memory cannot hold: parameters near by that it can, in words."""
