@@ -13,7 +13,7 @@ import pyarrow.parquet
 import pytest
 from cells import listening
 
-from lathe_rc import harness
+from lathe_rc import allowed_code, harness
 from lathe_rc.cell import scenario
 from lathe_rc.errors import LatheError
 from lathe_rc.sweep import row
@@ -160,6 +160,7 @@ class Deadly(ElectrodynamicActuator):
 def test_a_cell_that_kills_its_workers_ends_the_sweep_in_a_line(tmp_path, monkeypatch):
     (tmp_path / "deadly.py").write_text(DEADLY)
     monkeypatch.chdir(tmp_path)
+    allowed_code.allow("deadly")
     piston = scenario.load(PISTON, ["spindle_encoder.revolutions=3", "electrodynamic_actuator.stage=deadly:Deadly"])
     space = Space(grid={"electrodynamic_actuator.damping": [0.78, 0.79, 0.8, 0.81, 0.75]})
     with pytest.raises(LatheError, match=r"workers died again and again over cells 4 to 4, .*what is computed is kept"):
