@@ -18,8 +18,14 @@ NAME = "metadata.yaml"
 
 
 @dataclass(frozen=True)
-class Told:
-    """Entry of a topic in the metadata."""
+class Topic:
+    """A topic of a bag.
+
+    Attributes:
+        type: message type.
+        qos: offered by the publishers.
+        count: messages.
+    """
 
     type: str
     qos: tuple[Qos, ...]
@@ -43,7 +49,7 @@ class Metadata:
     repeated: bool
     packed: bool
     span: tuple[int, int] | None
-    topics: Mapping[str, Told]
+    topics: Mapping[str, Topic]
     about: Mapping[str, str]
 
 
@@ -83,10 +89,10 @@ def read(folder: Path) -> Metadata:
     )
 
 
-def _topics(listed: list[object]) -> dict[str, Told]:
+def _topics(listed: list[object]) -> dict[str, Topic]:
     if len(listed) > MOST_TOPICS:
         raise ValueError(f"{NAME}: {len(listed)} topics; allowed: up to {MOST_TOPICS}")
-    topics: dict[str, Told] = {}
+    topics: dict[str, Topic] = {}
     for each in listed:
         told = _of(each, "topic_metadata", dict)
         name, kind = told.get("name"), told.get("type")
@@ -94,7 +100,7 @@ def _topics(listed: list[object]) -> dict[str, Told]:
         check_name(kind)
         offered = told.get("offered_qos_profiles", "")
         profiles = qos.of_text(offered) if isinstance(offered, str) else qos.of_list(offered)
-        topics[name] = Told(kind, profiles, _number(_of(each, "message_count", str)))
+        topics[name] = Topic(kind, profiles, _number(_of(each, "message_count", str)))
     return topics
 
 

@@ -7,9 +7,8 @@ import struct
 from typing import Any, BinaryIO
 
 import yaml
-from mcap.records import Channel
 
-from lathe_rc.bag.reading.limits import LONGEST_NAME, MOST_BYTES, MOST_DEPTH, MOST_EVENTS, MOST_TEXT, MOST_TOPICS
+from lathe_rc.bag.reading.limits import LONGEST_NAME, MOST_BYTES, MOST_DEPTH, MOST_EVENTS, MOST_TOPICS
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _YAML = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # makes texts alone: no dates, no objects
@@ -87,28 +86,6 @@ def check_name(name: object) -> None:
 def is_packed(head: bytes) -> bool:
     """Whether a file that begins like this is compressed as a whole, or what comes first is skipped by zstd."""
     return head.startswith(b"\x28\xb5\x2f\xfd") or (head[1:4] == b"\x2a\x4d\x18" and head[0] >> 4 == 5)
-
-
-class Qos:
-    """Counts the texts of quality of service, which rosbags reads one by one."""
-
-    def __init__(self) -> None:
-        self._bytes = self._topics = 0
-
-    def add(self, channel: Channel) -> None:
-        """Take the next.
-
-        Raises:
-            ValueError: there are too many, or one would grow when it is read.
-        """
-        text = channel.metadata.get("offered_qos_profiles", "")
-        self._bytes += len(text)
-        self._topics += 1
-        if self._topics > MOST_TOPICS:
-            raise ValueError(f"more than {MOST_TOPICS} topics")
-        if self._bytes > MOST_TEXT:
-            raise ValueError(f"more than {MOST_TEXT} characters of quality of service")
-        check_yaml(text, "offered_qos_profiles")
 
 
 def check_tables(base: sqlite3.Connection) -> None:

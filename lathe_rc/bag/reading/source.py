@@ -19,13 +19,12 @@ from pathlib import Path
 from types import TracebackType
 
 from mcap.writer import MCAP0_MAGIC
-from rosbags.interfaces import Qos
 from zstandard import ZstdError
 
 from lathe_rc.bag.reading import metadata, precheck
 from lathe_rc.bag.reading.limits import MOST_OPEN, MOST_TOPICS
 from lathe_rc.bag.reading.mcap_storage import open_mcap
-from lathe_rc.bag.reading.metadata import Metadata
+from lathe_rc.bag.reading.metadata import Metadata, Topic
 from lathe_rc.bag.reading.sqlite_storage import open_sqlite, with_journal
 from lathe_rc.bag.reading.storage import Batch, Message, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget, unpack, unpack_file, unpacked_size
@@ -40,21 +39,6 @@ _RECOVER = "; lathe bag recover saves the rest"
 _WRONG = (ValueError, OSError, struct.error, sqlite3.Error, ZstdError)  # what broken bytes and files lead to
 
 Read = tuple[Span, Mapping[int, str]]  # and its channels that are wanted
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A topic of a bag.
-
-    Attributes:
-        type: message type.
-        qos: offered by the publishers.
-        count: messages.
-    """
-
-    type: str
-    qos: tuple[Qos, ...]
-    count: int
 
 
 @dataclass(frozen=True)
