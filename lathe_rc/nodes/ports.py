@@ -2,13 +2,14 @@
 """Signal topics over DDS: quality of service, and the check of every block that comes in."""
 
 import importlib
+import importlib.util
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ament_index_python import has_resource
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from lathe_rc import messages
@@ -30,9 +31,19 @@ def message_class(msgtype: str) -> Any:
         ValueError: that is no name of a type.
     """
     package, kind, name = msgtype.split("/")
-    if package != messages.PACKAGE and not (package and has_resource("rosidl_interfaces", package)):
+    if package != messages.PACKAGE and not _holds_interfaces(package):
         raise ImportError(f"{package} is no package of interfaces here")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
+
+
+def _holds_interfaces(package: str) -> bool:
+    """Tell whether a package was made of message definitions: only those have this type support beside them.
+
+    ROS's own index of resources is not asked: in an environment of wheels nothing says where it is.
+    """
+    spec = importlib.util.find_spec(package) if package.isidentifier() else None
+    folders = (spec.submodule_search_locations or ()) if spec else ()
+    return any(any(Path(folder).glob(f"{package}_s__rosidl_typesupport_c*")) for folder in folders)
 
 
 def signal_qos(parameters: NodeParameters, topic: str = "") -> QoSProfile:

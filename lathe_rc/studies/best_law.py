@@ -44,8 +44,9 @@ class BestLawParameters(StudyParameters):
 
     points: Annotated[int, Ge(4), Le(2**16)] = parameter(256, "conditions for each encoder and law")
     encoder_counts: list[Annotated[int, Ge(1000), Le(2**31 - 1)]] = parameter(
-        [1000, 10_000, 100_000, 1_000_000], "per revolution"
+        [1000, 3840, 10_000, 100_000, 1_000_000], "per revolution; 3840 are one a sample at the nominal speed"
     )
+    seeds: Annotated[int, Ge(1), Le(100)] = parameter(3, "of noise and encoder, at each condition")
     lowest_wd: Annotated[float, Ge(10), Le(1000)] = parameter(10.0, "of the frequency of the deviation", "rad/s")
     highest_wd: Annotated[float, Ge(10), Le(1000)] = parameter(300.0, "of the same", "rad/s")
     largest_deviation: Annotated[float, Gt(0.005), Le(0.3)] = parameter(0.1, "of the nominal speed; from 0.005 on")
@@ -60,7 +61,8 @@ class BestLawResult:
 
     Attributes:
         parameters: of the study.
-        counts, frequency, amplitude, noise, model: of each condition, shape (conditions,) [1, rad/s, 1, nm, 1].
+        counts, frequency, amplitude, noise, model: of each condition, once for each seed of it in a row,
+            shape (conditions * seeds,) [1, rad/s, 1, nm, 1].
         error: by law, largest error of the last revolutions; infinite where it is refused or diverges [µm].
     """
 
@@ -86,8 +88,10 @@ class BestLawResult:
     def to_json(self) -> dict[str, Any]:
         """How often each law is the best, by encoder, and all conditions."""
         return {
-            "conditions": self.counts.size,
+            "conditions": self.counts.size // self.parameters.seeds,
+            "seeds": self.parameters.seeds,
             "best": {str(counts): self._shares(counts) for counts in self.parameters.encoder_counts},
+            "seeds_agree": {str(counts): self._agreed(counts) for counts in self.parameters.encoder_counts},
             "median_um": {str(counts): self._medians(counts) for counts in self.parameters.encoder_counts},
         }
 
@@ -96,6 +100,11 @@ class BestLawResult:
         best = [law for law, of in zip(self.best, self.counts, strict=True) if of == counts]
         found = Counter(best)
         return {law: 100.0 * found[law] / len(best) for law in self.rivals}
+
+    def _agreed(self, counts: int) -> float:
+        """How often all seeds of a condition have the same best law [%]."""
+        best = np.array(self.best)[self.counts == counts].reshape(-1, self.parameters.seeds)
+        return 100.0 * float(np.mean((best == best[:, :1]).all(axis=1)))
 
     def _medians(self, counts: int) -> dict[str, float]:
         return {law: float(np.median(error[self.counts == counts])) for law, error in self.error.items()}
@@ -110,7 +119,10 @@ class BestLawResult:
             comparison(
                 "Conditions in which a law errs least [%], by counts of the encoder",
                 columns,
-                [(law, *(f"{shares[c][law]:.0f}" for c in encoders)) for law in self.rivals],
+                [
+                    *((law, *(f"{shares[c][law]:.0f}" for c in encoders)) for law in self.rivals),
+                    (f"the same with all {self.parameters.seeds} seeds", *(f"{self._agreed(c):.0f}" for c in encoders)),
+                ],
             ),
             comparison(
                 "Median of the largest error [µm]",
@@ -195,6 +207,7 @@ def run(parameters: BestLawParameters, track: Track = untracked) -> BestLawResul
         # Laws that are told the speed beforehand are told the truth.
         ties={target.replace("spindle_encoder", "learning_controller"): target for target in (_FREQUENCY, _AMPLITUDE)},
         sample=f"sobol:{parameters.points}",
+        seeds=parameters.seeds,
     )
     columns = [_COUNTS, _FREQUENCY, _AMPLITUDE, _NOISE, _MODEL, "tool.max_errors"]
     (table,) = sweeps.table([("speed_deviation", base, space)], parameters.folder, columns, track)
