@@ -42,7 +42,7 @@ _DAMPING = "learning_controller.model_damping"
 class BestLawParameters(StudyParameters):
     """Conditions."""
 
-    points: Annotated[int, Ge(4), Le(2**16)] = parameter(256, "conditions for each encoder and law")
+    points: Annotated[int, Ge(4), Le(2**16)] = parameter(128, "conditions for each encoder and law")
     encoder_counts: list[Annotated[int, Ge(1000), Le(2**31 - 1)]] = parameter(
         [1000, 3840, 10_000, 100_000, 1_000_000], "per revolution; 3840 are one a sample at the nominal speed"
     )
