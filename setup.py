@@ -66,6 +66,8 @@ setup(
     package_data={
         "lathe_rc": [
             "py.typed",
+            "__init__.pyi",
+            "*/__init__.pyi",
             "nodes/*.xml",
             "msg_defs/msg/*.msg",
             "msg_defs/srv/*.srv",

@@ -3,7 +3,7 @@
 
 import re
 
-from lathe_rc.cell import batch
+import lathe_rc
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.studies import cells
 
@@ -27,7 +27,7 @@ def largest(name: str, counts: int, rate: int) -> float:
         )
         for later in STARTS
     ]
-    return max(float(out.kept.largest[54:62].max()) * 1e6 for out in batch.run(made, batch.Errors) if out.kept)
+    return max(float(out.kept.largest[54:62].max()) * 1e6 for out in lathe_rc.run_many(made) if out.kept)
 
 
 print(f"| {' | '.join(HEAD)} |\n|{' ---: |' * len(HEAD)}")

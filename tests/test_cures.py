@@ -83,7 +83,7 @@ def test_what_is_named_learns_where_what_was_refused_grows():
         load(*given, "spindle_encoder.revolutions=20", *changes)
         for changes in (["learning_controller.allow_unstable=true"], *cures(refused(*given)))
     ]
-    grown, *learned = (outcome.kept.rms for outcome in batch.run(made, batch.Errors, threads=1))
+    grown, *learned = (outcome.kept.rms for outcome in batch.run_many(made, batch.Errors, threads=1))
     assert grown[-1] > 2.0 * grown[0]
     assert all(errors[-1] < 0.1 * errors[0] for errors in learned)
 

@@ -190,7 +190,7 @@ def loaded(**values):
 
 def test_an_interrupted_cut_makes_the_speed_swing_in_every_host(tmp_path):
     cell = loaded()
-    found = hosts.digests(cell, tmp_path)
+    found = hosts.digests_by_host(cell, tmp_path)
     assert all(topics == found["offline"] for topics in found.values())
     speed = harness.run(cell).recording.dense["/encoder"]["speed_true"]
     assert 0.05 < np.ptp(speed[speed.size // 2 :]) < 5.0

@@ -114,7 +114,7 @@ def test_every_host_and_block_size_gives_the_same_bits(recorded, tmp_path, mode,
 
 def test_a_batch_gives_the_same_bits(recorded):
     keep = partial(batch.Topics, topics=["encoder", "tool", "safety", "safety/status"])
-    for outcome in batch.run([cell(), cell()], keep):
+    for outcome in batch.run_many([cell(), cell()], keep):
         assert outcome.kept.digests().items() <= recorded[1].digest.items()
 
 
@@ -497,7 +497,7 @@ import contextlib, io, json, sys
 from pathlib import Path
 from lathe_rc.bag import reader
 from lathe_rc.cli import main
-from lathe_rc.view.report import write
+from lathe_rc.view.report import write_report
 bag, folder = Path(sys.argv[1]), Path(sys.argv[2])
 codes = []
 for words in (["bag", "info", bag], ["bag", "check", bag],
@@ -507,8 +507,8 @@ for words in (["bag", "info", bag], ["bag", "check", bag],
             main([str(word) for word in words])
         except SystemExit as ended:
             codes.append(ended.code)
-write(bag, folder / "page.html")
-print(json.dumps([codes, reader.read(bag).digests()]))
+write_report(bag, folder / "page.html")
+print(json.dumps([codes, reader.read_bag(bag).digests()]))
 """
 
 

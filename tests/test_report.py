@@ -91,7 +91,7 @@ def turned(tmp_path_factory):
     harness.run(scenario(**nodes), bag=folder / "bag")
     done = CliRunner().invoke(report, [str(folder / "bag"), "-o", str(folder / "page.html")])
     assert done.exit_code == 0, done.output
-    return folder / "bag", reader.read(folder / "bag"), (folder / "page.html").read_text(encoding="utf-8")
+    return folder / "bag", reader.read_bag(folder / "bag"), (folder / "page.html").read_text(encoding="utf-8")
 
 
 class TestPage:
@@ -180,7 +180,7 @@ class TestPage:
 
     def test_is_the_same_every_time(self, turned):
         bag, _, page = turned
-        reporting.write(bag, bag.parent / "page.html")
+        reporting.write_report(bag, bag.parent / "page.html")
         assert (bag.parent / "page.html").read_text(encoding="utf-8") == page
 
 
@@ -198,7 +198,7 @@ class TestVerdict:
         assert told.verdict.text == re.sub("^i", "I", harness.run(cell).verdict.told()) + "."
         assert (told.verdict.mood, told.wrong) == ("good", [])
         page = tmp_path / "page.html"
-        reporting.write(tmp_path / "bag", page)
+        reporting.write_report(tmp_path / "bag", page)
         text = Page(page.read_text(encoding="utf-8")).text
         assert text.index("In tolerance (±2 µm)") < text.index("Nothing was lost") < text.index("Result")
 
@@ -521,7 +521,7 @@ def test_a_bag_of_something_else_has_a_page_too(tmp_path):
     writer = BagWriter(tmp_path / "bag", compression="none", chunk_size=2**16, about={})
     writer.add_topic("/chatter", messages.JOINTS, offered_qos(10, "volatile"))
     writer.close()
-    reporting.write(tmp_path / "bag", tmp_path / "page.html")
+    reporting.write_report(tmp_path / "bag", tmp_path / "page.html")
     assert "the bag has no encoder and no tool" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
@@ -552,11 +552,11 @@ def test_a_gap_is_told_and_what_came_before_is_shown(turned, tmp_path):
 def test_places_that_are_none_are_refused(turned, tmp_path, name, said):
     (tmp_path / "dir.html").mkdir()
     with pytest.raises(InputError, match=said):
-        reporting.write(turned[0], tmp_path / name)
+        reporting.write_report(turned[0], tmp_path / name)
 
 
 def test_what_is_no_bag_is_refused_and_leaves_no_page(tmp_path):
     (tmp_path / "x").mkdir()
     with pytest.raises(InputError):
-        reporting.write(tmp_path / "x", tmp_path / "page.html")
+        reporting.write_report(tmp_path / "x", tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()

@@ -143,7 +143,7 @@ def from_signals(
     """A loop from the signals of a recorded run.
 
     Args:
-        dense: of a `lathe_rc.cell.recording.Recording`, as `lathe_rc.bag.reader.read` gives it.
+        dense: of a `lathe_rc.cell.recording.Recording`, as `lathe_rc.bag.reader.read_bag` gives it.
         command: topic with the drive's command; its linearisation must be off.
         state: topic with the drive's state.
 

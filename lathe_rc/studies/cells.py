@@ -2,10 +2,9 @@
 """Running the scenarios of ``config/`` with changes."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import TypeVar
 
-from lathe_rc import harness, resources
+from lathe_rc import harness
 from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError
@@ -25,7 +24,7 @@ def load(name: str, shared: Values | None = None, **nodes: Values) -> Scenario:
     """A scenario of ``config/`` with shared parameters and parameters by node replaced."""
     changes = [f"{parameter}={_yaml(value)}" for parameter, value in (shared or {}).items()]
     changes += [f"{node}.{parameter}={_yaml(v)}" for node, table in nodes.items() for parameter, v in table.items()]
-    return scenario.load(resources.find(Path(f"{name}.yaml")), changes)
+    return scenario.load(name, changes)
 
 
 def run(name: str, shared: Values | None = None, **nodes: Values) -> harness.Result:
@@ -39,7 +38,7 @@ def kept(made: Sequence[Scenario], keep: batch.Make[K], track: Track) -> Iterato
     Raises:
         InputError: one is refused.
     """
-    outcomes = batch.run(made, keep)
+    outcomes = batch.run_many(made, keep)
     for _ in track(range(len(made))):
         outcome = next(outcomes)
         if isinstance(outcome.error, InputError):

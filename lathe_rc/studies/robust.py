@@ -115,7 +115,9 @@ class RobustParameters(StudyParameters):
     revolutions: Annotated[int, Ge(15), Le(1000)] = parameter(40, "length of a run; the last 10 are judged", "rev")
     tolerance_um: Annotated[float, Gt(0), Le(1000)] = parameter(1.0, "form tolerance, either way", "µm")
     conditions: list[Literal[tuple(CONDITIONS)]] = parameter(list(CONDITIONS), "which of them")  # type: ignore[valid-type]
-    quick: bool = parameter(default=False, doc=f"only {', '.join(_QUICK)}, only the first 5 drives, one seed, 30 revolutions")
+    quick: bool = parameter(
+        default=False, doc=f"only {', '.join(_QUICK)}, only the first 5 drives, one seed, 30 revolutions"
+    )
 
 
 @dataclass(frozen=True)
@@ -335,8 +337,7 @@ def run(parameters: RobustParameters, track: Track = untracked) -> RobustResult:
     }
     drives = drives_near(count)
     made = [
-        _cell(bases, *names).varied({"seed": seed})
-        for *names, seed in product(conditions, LAWS, drives, range(seeds))
+        _cell(bases, *names).varied({"seed": seed}) for *names, seed in product(conditions, LAWS, drives, range(seeds))
     ]
     shape = len(conditions), len(LAWS), len(drives), seeds
     largest, rms, settled, effort = np.full((4, *shape), np.nan)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lathe_rc import harness
+import lathe_rc
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.studies.study import Track
 
@@ -26,7 +26,7 @@ def table(
         folder: that keeps them, in one of their own each; empty: nothing is kept.
         columns: that are read; a target that a sweep does not vary has the scenario's value.
         track: shows the progress in cells.
-        options: see `lathe_rc.sweep.sweep.run`.
+        options: see `lathe_rc.run_sweep`.
     """
     from lathe_rc.sweep.workers import client_of
 
@@ -42,7 +42,7 @@ def table(
         place = Path(folder or temporary)
         found = []
         for name, scenario, space in asked:
-            swept = harness.sweep(scenario, space, place / name, client=client, watch=watch, **options)
+            swept = lathe_rc.run_sweep(scenario, space, place / name, client=client, watch=watch, **options)
             found.append(swept.table().select([name for name in columns if name in swept.folder.schema.names]))
         list(steps)
         return found

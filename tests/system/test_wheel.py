@@ -126,7 +126,7 @@ def test_it_runs_without_ros(alone):
 from pathlib import Path
 from lathe_rc import harness
 from lathe_rc.bag import reader
-print(reader.read(Path("B")).plot())
+print(reader.read_bag(Path("B")).plot())
 """
     assert "Figure" in alone.run("python", "-c", notebook)
 
