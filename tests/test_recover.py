@@ -575,7 +575,7 @@ def test_a_compressed_file_that_a_player_unpacked_beside_is_read_once(tmp_path):
 
 
 def test_a_file_that_the_metadata_do_not_name_is_told(tmp_path):
-    """A recorder that was killed wrote them last before its last file."""
+    """A recorder that was killed wrote them last before its last file; or a file was renamed."""
     sent = strange_bag(tmp_path / "bag", StoragePlugin.MCAP, CompressionMode.NONE)
     file = mcap_of(tmp_path / "bag")
     shutil.copy(file, file.with_name("later.mcap"))
@@ -583,6 +583,11 @@ def test_a_file_that_the_metadata_do_not_name_is_told(tmp_path):
     checked = lathe("bag", "check", tmp_path / "bag")
     assert (checked.exit_code, checked.stdout.splitlines()[0]) == (1, said)
     assert recover(tmp_path / "bag", tmp_path / "new").saved == 2 * len(sent)
+    file.unlink()
+    found = lathe("bag", "info", tmp_path / "bag")
+    assert (found.exit_code, "bag.mcap: there is no such file" in found.stderr) == (3, True)
+    assert "│      400 │" in found.stdout
+    assert "no such file); lathe bag recover saves the rest" in lathe("bag", "check", tmp_path / "bag").stderr
 
 
 FOREIGN = {

@@ -145,9 +145,18 @@ class Source:
         files = files_of(self.path) if self.path.is_dir() else [self.path]
         if told:
             self.about, self._packed = told.about, told.packed
-            files = [self.path / name for name in told.files]
+            named = told.files
+            others = [f for f in files if f.name not in named and f.name.removesuffix(".zstd") not in named]
+            files = [self.path / name for name in named]
             for file in files:
                 _refuse_link(file, self.path)
+            if not all(file.exists() for file in files):
+                files += others  # which may be the same, renamed: recover takes them as well
+            else:
+                self.contradictions += [
+                    f"{metadata.NAME} does not name {file.name}: not read; lathe bag recover saves its messages too"
+                    for file in others
+                ]
         for file in files:
             try:
                 self._storages.append(self._storage(file))
@@ -186,11 +195,6 @@ class Source:
             return None
         if told.repeated:
             self.contradictions.append(f"{metadata.NAME} names a file more than once")
-        self.contradictions += [
-            f"{metadata.NAME} does not name {file.name}: not read; lathe bag recover saves its messages too"
-            for file in files
-            if file.name not in told.files and file.name.removesuffix(".zstd") not in told.files
-        ]
         return told
 
     def _storage(self, path: Path, depth: int = 0) -> Storage:
