@@ -458,7 +458,9 @@ def test_what_a_write_ahead_log_does_not_give_is_told(tmp_path, kind):
     """The bytes of a log that give no message count as lost; a log of whole transactions loses nothing."""
     sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE, count=30)
     base = sqlite3.connect(tmp_path / "bag" / "bag.db3", isolation_level=None)
-    base.executescript("PRAGMA journal_mode=WAL; PRAGMA wal_autocheckpoint=0; PRAGMA cache_size=1")
+    base.executescript(
+        "PRAGMA synchronous=OFF; PRAGMA journal_mode=WAL; PRAGMA wal_autocheckpoint=0; PRAGMA cache_size=1"
+    )
     for number in range(20):
         base.execute(
             "INSERT INTO messages SELECT 31 + ?, topic_id, timestamp + 90000, data FROM messages WHERE id = 1",
