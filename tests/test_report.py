@@ -17,6 +17,7 @@ from cells import scenario
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.writer import Writer as McapWriter
 from numpy.testing import assert_allclose
 
 from lathe_rc import __version__, harness, messages, part, resources
@@ -496,6 +497,17 @@ def hostile(tmp_path_factory):
     writer.write("/diagnostics", 2 * 10**9, b"\xff" * 64)
     writer.close()
     return path
+
+
+def test_a_bag_that_is_of_no_cell_is_called_so(tmp_path):
+    file = tmp_path / "foreign.mcap"
+    with file.open("wb") as stream:
+        foreign = McapWriter(stream)
+        foreign.start()
+        foreign.finish()
+    done = CliRunner().invoke(report, [str(file), "-o", str(tmp_path / "page.html")])
+    assert done.exit_code == 0, done.output
+    assert done.stderr == "incomplete recording: the bag has no encoder and no tool\n"
 
 
 def test_a_hostile_bag_gives_a_harmless_page(hostile, tmp_path):

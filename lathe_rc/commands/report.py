@@ -21,5 +21,6 @@ def report(bag: Path, output: Path, *, budget: bool) -> None:
 
     told = reporting.write_report(bag, output, with_budget=budget)
     if not told.complete:
-        click.echo(f"incomplete recording{': ' + told.stopped if told.stopped else ''}", err=True)
+        why = told.stopped or ("" if told.samples else told.missing)
+        click.echo(f"incomplete recording{': ' + why if why else ''}", err=True)
     click.echo(f"report: {output}")
