@@ -5,9 +5,9 @@ import numpy as np
 import numpy.typing as npt
 
 import lathe_rc
+from lathe_papers.formulas.structures import Channel, steady_error
 from lathe_rc import messages
 from lathe_rc.analysis.metrology import POINTS, measure, undulations
-from lathe_rc.analysis.structures import Channel, steady_error
 from place import CONFIG
 
 loaded = lathe_rc.load(

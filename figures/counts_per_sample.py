@@ -4,8 +4,8 @@
 import re
 
 import lathe_rc
+from lathe_papers import cells
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.studies import cells
 
 STARTS = (0.0, 0.018, 0.037)  # [s] by which the deviation begins later: less than a revolution
 COUNTS = (2048, 4096, 8192)

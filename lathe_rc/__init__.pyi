@@ -2,9 +2,9 @@
 # The public face of lathe_rc, and the only list of it: `lathe_rc.public` imports from here. Other modules may change.
 
 from lathe_rc import messages as messages
+from lathe_rc import study as study
 from lathe_rc.bag.exporting.export import export_bag as export_bag
 from lathe_rc.bag.reader import read_bag as read_bag
-from lathe_rc.cell.batch import Topics as Topics
 from lathe_rc.cell.batch import run_many as run_many
 from lathe_rc.cell.budget import budget as budget
 from lathe_rc.cell.parameters import NodeParameters as NodeParameters

@@ -4,7 +4,6 @@
 import importlib.util
 import os
 from collections.abc import Iterator, Mapping
-from functools import partial
 from pathlib import Path
 
 from lathe_rc import harness
@@ -58,8 +57,7 @@ def _runs(scenario: Scenario, folder: Path) -> Iterator[tuple[str, Digests]]:
 
 def _in_a_batch(scenario: Scenario) -> Digests:
     cell = Cell(scenario.nodes)
-    keep = partial(batch.Topics, topics=[*cell.dense, *cell.sparse])
-    outcome = next(batch.run_many([scenario], keep))
+    outcome = next(batch.run_many([scenario], [*cell.dense, *cell.sparse]))
     if outcome.error is not None:
         raise outcome.error
     assert outcome.kept is not None, "it has not failed"

@@ -49,6 +49,7 @@ _KERNELS = (
     "cell/native.py",
     "cell/program.py",
     "cell/stages/*.py",
+    "../lathe_papers/formulas/*.py",
 )
 
 

@@ -23,8 +23,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
 
+from lathe_papers.formulas import step_fit
 from lathe_rc import files, harness, messages
-from lathe_rc.analysis import hysteresis_fit, reduced_order, step_fit
+from lathe_rc.analysis import hysteresis_fit, reduced_order
 from lathe_rc.bag import check, provenance, reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.repairing import recover

@@ -5,7 +5,7 @@ import gc
 import itertools
 import sys
 import weakref
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -55,9 +55,7 @@ def test_each_cell_has_the_digests_that_it_has_alone(cells):
     two_channel = load("two_channel", 4, *stable)
     scenarios = [two_channel.varied(cell) for cell in cells]
     topics = ["tool", "fine/command", "coarse/learning"]
-    for cell, outcome in zip(
-        scenarios, batch.run_many(scenarios, partial(batch.Topics, topics=topics), threads=3), strict=True
-    ):
+    for cell, outcome in zip(scenarios, batch.run_many(scenarios, topics, threads=3), strict=True):
         assert outcome.scenario is cell
         alone = harness.run(cell).digest
         assert outcome.kept.digests() == {f"/{topic}": alone[f"/{topic}"] for topic in sorted(topics)}
@@ -217,7 +215,7 @@ def test_a_cell_is_gone_when_nobody_holds_it(name):
 
 
 def test_a_topic_that_is_not_there_is_named():
-    (outcome,) = batch.run_many([load("piston", 1)], partial(batch.Topics, topics=["tool", "fine/state"]))
+    (outcome,) = batch.run_many([load("piston", 1)], ["tool", "fine/state"])
     assert str(outcome.error).startswith("no topic 'fine/state' in the cell; did you mean coarse/state?")
 
 

@@ -6,8 +6,8 @@ import pytest
 from cells import in_blocks, scenario
 from numpy.testing import assert_allclose
 
+from lathe_papers.formulas.spindle import speed_over_load
 from lathe_rc import harness, hosts
-from lathe_rc.analysis.spindle import speed_over_load
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.plants.spindle import Belt, LoadedSpindle, SpeedLoop

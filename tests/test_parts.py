@@ -9,7 +9,6 @@ import re
 import shutil
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +33,7 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety.monitors import Alarm, PlainMonitor
 from lathe_rc.signals.deviation_law import DeviationLaw
 from lathe_rc.signals.part_profile import PartProfile
-from lathe_rc.studies import STUDIES
+from lathe_rc.study import STUDIES
 
 DOCS = Path(__file__).parents[1] / "docs"
 FIGURES = DOCS.with_name("figures")
@@ -113,7 +112,7 @@ def test_every_host_and_block_size_gives_the_same_bits(recorded, tmp_path, mode,
 
 
 def test_a_batch_gives_the_same_bits(recorded):
-    keep = partial(batch.Topics, topics=["encoder", "tool", "safety", "safety/status"])
+    keep = ["encoder", "tool", "safety", "safety/status"]
     for outcome in batch.run_many([cell(), cell()], keep):
         assert outcome.kept.digests().items() <= recorded[1].digest.items()
 
@@ -461,7 +460,7 @@ def test_a_study_of_others_runs(installed, tmp_path, words):
     ("name", "says"),
     [
         ("nothing", "no study 'nothing'; allowed: invariance, "),
-        ("parts:Hann", "allowed: a lathe_rc.studies.study.Study"),
+        ("parts:Hann", "allowed: a lathe_rc.study.Study"),
         ("nowhere:STUDY", "cannot be imported: ModuleNotFoundError"),
     ],
 )

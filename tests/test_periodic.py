@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter1d
 
-from lathe_rc.analysis.hyperstability import NOMINAL, plant, popov_bound
-from lathe_rc.analysis.periodic_loop import PeriodicLoop, disturbance, steady_derivatives
+from lathe_papers.formulas.hyperstability import NOMINAL, plant, popov_bound
+from lathe_papers.formulas.periodic_loop import PeriodicLoop, disturbance, steady_derivatives
 from lathe_rc.control.periodic import PeriodicController, samples_in
 from lathe_rc.control.periodic_gains import PRESETS
 from lathe_rc.errors import InputError

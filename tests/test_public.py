@@ -18,7 +18,7 @@ MOST = 30
 #: without an example of their own: constants, errors, and what the example of another name shows
 SHOWN_ELSEWHERE = {
     *("DONE", "Input", "InputError", "LatheError", "LawParameters", "NodeParameters", "Now", "Output"),
-    *("PlantParameters", "Scenario", "Topics", "messages"),
+    *("PlantParameters", "Scenario", "messages", "study"),
 }
 EXAMPLES = {name: getattr(lathe_rc, name) for name in sorted({*lathe_rc.__all__} - SHOWN_ELSEWHERE)}
 EXAMPLES |= {"Scenario.varied": Scenario.varied, "Recording.frame": Recording.frame}

@@ -228,7 +228,7 @@ def named(module, name, *arguments):
         b"cposix\nmk\x0bdir\n.",  # found by benchmarks/fuzz.py: its bytes made two lines of the refusal
         pickle.dumps(Path()),
         pickle.dumps(np.zeros(3)),
-        named("lathe_rc.analysis.angle_domain", "np.f2py.subprocess.Popen", "true"),
+        named("lathe_papers.formulas.angle_domain", "np.f2py.subprocess.Popen", "true"),
         named("lathe_rc.bag.writing.writer", "BagWriter", "bag"),
     ],
 )

@@ -15,12 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lathe_rc
+from lathe_papers import best_law, drive_tolerance, speed_deviation
 from lathe_rc import harness
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
-from lathe_rc.studies import best_law, drive_tolerance, speed_deviation
 from lathe_rc.sweep import row, space, workers
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.space import Space

@@ -13,9 +13,10 @@ takes does not depend on how many they are.
 
 import os
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, Protocol, TypeVar, overload
 
 from lathe_rc import messages
@@ -70,27 +71,32 @@ def run_many(scenarios: Iterable[Scenario], *, threads: int | None = None) -> It
 
 @overload
 def run_many(
+    scenarios: Iterable[Scenario], keep: Sequence[str], *, threads: int | None = None
+) -> Iterator[Outcome[Recording]]: ...
+
+
+@overload
+def run_many(
     scenarios: Iterable[Scenario], keep: Make[K_co], *, threads: int | None = None
 ) -> Iterator[Outcome[K_co]]: ...
 
 
 def run_many(
-    scenarios: Iterable[Scenario], keep: Make[Any] | None = None, *, threads: int | None = None
+    scenarios: Iterable[Scenario], keep: Make[Any] | Sequence[str] | None = None, *, threads: int | None = None
 ) -> Iterator[Outcome[Any]]:
     """Run cells to their ends.
 
     Args:
         scenarios: of the cells; each needs a number of revolutions. They are asked for as their turn comes; variations
             of a `Scenario.named` are made in half the time.
-        keep: makes the sink that keeps something of a run: `partial(Topics, topics=...)`, or a `Keeper` of one's own;
-            None: `Errors`, the form error by revolution.
+        keep: the part of a run that is kept: None: its form error by revolution; relative topics: these, whole; or a
+            function that makes a `Keeper` for a cell and a number of samples.
         threads: that compute; None: one for each core.
 
     Yields:
         The outcomes, in the order of the scenarios. A cell that is refused, or that fails on the way, is one of them.
 
     Example:
-        >>> from functools import partial
         >>> import lathe_rc
         >>> piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=10"])
         >>> cells = [piston.varied({"learning_controller.lead_time": lead}) for lead in (1.425e-3, 1.3e-3, 3e-3)]
@@ -101,16 +107,17 @@ def run_many(
         1.425 ms: 0.545 µm RMS
         1.3 ms: 0.656 µm RMS
         3.0 ms: learning_controller: learning diverges with electrod
-        >>> (outcome,) = lathe_rc.run_many([piston], partial(lathe_rc.Topics, topics=["tool"]))
+        >>> (outcome,) = lathe_rc.run_many([piston], ["tool"])
         >>> len(outcome.kept.frame("/tool"))
         38395
     """
+    make = keep if callable(keep) else Errors if keep is None else partial(Topics, topics=keep)
     count = threads or os.cpu_count() or 1
     waiting: deque[Future[Outcome[Any]]] = deque()
     pool, idle = ThreadPoolExecutor(count), deque(Bench() for _ in range(count))
     try:
         for number, scenario in enumerate(scenarios):
-            waiting.append(pool.submit(_outcome, scenario, keep or Errors, idle))
+            waiting.append(pool.submit(_outcome, scenario, make, idle))
             # The first compiles what the others use.
             if number == 0 or len(waiting) > _AHEAD * count:
                 yield waiting.popleft().result()
@@ -180,7 +187,7 @@ class Errors:
 
 
 class Topics(Collector):
-    """Keeps some topics whole; `run_many` has an example.
+    """Keeps some topics whole.
 
     Args:
         cell: that runs.

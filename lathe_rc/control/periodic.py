@@ -14,7 +14,7 @@ What the paper has not, and what is on by default:
 
 - The memory is read through a Gaussian of standard deviation σ, symmetric in time: what it needs on both sides of
   t - T̄ is past. Without it the memory grows at frequencies where the factor of a period exceeds 1, see
-  `lathe_rc.analysis.hyperstability.learning_factor`.
+  `lathe_papers.formulas.hyperstability.learning_factor`.
 - Anti-windup: while (S(u) - u)·v < 0, I stands still and the memory stores what it read, limited to ±S0. The switch
   alone only slows winding up.
 """
@@ -336,7 +336,7 @@ class PeriodicController:
 
     @property
     def popov_bound(self) -> float:
-        """-η0 of eq. 15, see `lathe_rc.analysis.hyperstability.popov_bound`; falls during the first period [s]."""
+        """-η0 of eq. 15, see `lathe_papers.formulas.hyperstability.popov_bound`; falls during the first period [s]."""
         return float(self.state.values[_BOUND])
 
     @property
