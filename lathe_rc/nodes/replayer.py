@@ -34,7 +34,7 @@ from lathe_rc.cell.replayer import FILES, KIND, ReplayerParameters
 from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.errors import InputError, LatheError, at_most, shown
 from lathe_rc.names import instead
 from lathe_rc.nodes import alone, arguments
 from lathe_rc.nodes.ports import latched_qos, message_class
@@ -100,7 +100,7 @@ class Replayer:
         if round(start * 1e9) > span_ns or 0.0 < end <= start:
             raise InputError(
                 f"{KIND}.start = {start:g} s, end = {end:g} s: nothing to send; allowed: a start up to "
-                f"{span_ns * 1e-9:g} s, where the bag's last message is, and an end after it, or 0"
+                f"{at_most(span_ns * 1e-9)} s, where the bag's last message is, and an end after it, or 0"
             )
         self._start_ns = source.first_ns + round(start * 1e9)
         self._stop_ns = source.first_ns + round(end * 1e9) if end else source.last_ns + 1
