@@ -213,3 +213,6 @@ def test_a_delay_shorter_than_a_block_and_a_loop_that_oscillates_are_refused():
         harness.run(loaded(load_delay=63))
     with pytest.raises(InputError, match="speed loop of 200000 rad/s: largest pole"):
         make(Belt(2000.0, 0.0), SpeedLoop(200e3, 0.01))
+    with pytest.raises(InputError, match="a stiff belt needs damping"):
+        make(Belt(1e10, 0.0), SpeedLoop(30.0, 0.1))
+    make(Belt(1e10, 1.0), SpeedLoop(30.0, 0.1))

@@ -297,7 +297,8 @@ def test_a_law_beside_a_tachogram_is_refused():
 
 def test_a_run_beyond_the_end_of_a_law_is_refused():
     assert refusal("spindle_encoder", deviation_law_end=0.1, revolutions=3.0) == (
-        "spindle_encoder.deviation_law_end = 0.1 s: the run takes 0.16844 s; allowed: not before its end"
+        "spindle_encoder.deviation_law_end = 0.1 s: the run takes 0.16844 s at the speed there; allowed: not before "
+        "its end, which another speed moves (leave a margin)"
     )
 
 

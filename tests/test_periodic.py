@@ -265,7 +265,7 @@ def test_period_of_broken_steps_is_refused(period, step, nearest):
         ({}, {"limit": -2.0}, "limit = -2; allowed: above 0"),
         ({}, {"memory_filter": -0.1}, "memory_filter = -0.1; allowed: from 0"),
         ({}, {"measurement_step": -1e-4}, "measurement_step = -0.0001; allowed: from 0"),
-        ({}, {"memory_filter": 0.2}, "memory_filter = 0.2 s reaches 100 samples .* 100 samples .below 0.2 s"),
+        ({}, {"memory_filter": 0.2}, "memory_filter = 0.2 s reaches 100 samples .* 100 samples .up to 0.198 s"),
         ({}, {"ideal": np.zeros(99)}, "ideal input of shape .99,.; allowed: one value for each of 100 samples"),
     ],
 )

@@ -44,7 +44,7 @@ def test_the_example_in_its_help_runs(name, tmp_path, monkeypatch, capsys):
 def is_public(module: str, name: str) -> bool:
     """Tell whether ``from module import name`` uses what the ``__all__`` of a package lists."""
     package, _, last = module.rpartition(".")
-    if "." in package and last in importlib.import_module(package).__all__:
+    if package and last in importlib.import_module(package).__all__:
         return not name.startswith("_")  # of a public module
     return name in getattr(importlib.import_module(module), "__all__", ())
 

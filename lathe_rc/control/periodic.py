@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.control.periodic_gains import PeriodicGains, check_law
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, at_most
 from lathe_rc.jit import kernel
 from lathe_rc.signals.noise import quantise
 from lathe_rc.transfer import System, discretise, rest, step
@@ -254,7 +254,7 @@ class PeriodicController:
         if reach >= samples:
             raise InputError(
                 f"memory_filter = {sigma:g} s reaches {reach} samples to each side; allowed: less than the period, "
-                f"{samples} samples (below {period / _REACH:g} s)"
+                f"{samples} samples (up to {at_most((samples - 1) * step_s / _REACH)} s)"
             )
         if ideal is not None and ideal.shape != (samples,):
             raise InputError(f"ideal input of shape {ideal.shape}; allowed: one value for each of {samples} samples")

@@ -180,7 +180,7 @@ class Space:
 
 
 def _samples() -> str:
-    return "sobol:N, halton:N, latin:N or random:N"
+    return f"sobol:N, halton:N, latin:N or random:N, N from 1 up to {_MOST_POINTS}"
 
 
 def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArray[np.float64]]:
