@@ -252,10 +252,7 @@ def _ros(found: Mapping[str, Any]) -> list[str]:
     for name, sizes in cells.items():
         runs = {f"{size}, {each}": run for size, split in sizes.items() for each, run in split.items()}
         rates = {key: {what: value for what, value in run.items() if _is_figure(value)} for key, run in runs.items()}
-        nodes = {key: run["cpu_us_per_block"] for key, run in runs.items() if "cpu_us_per_block" in run}
         lines += [f"### {_named(name)}", "", *_together(f"ros.{name}", rates)]
-        if nodes:
-            lines += ["Processor time of each process [µs/block]:", "", *_together(f"ros.{name}.cpu", nodes)]
     return lines + _part("ros", {name: value for name, value in found.items() if name not in cells})
 
 
@@ -310,9 +307,8 @@ def page(result: Mapping[str, Any]) -> str:
         lines += _table(head, rows, texts=(0, 1, 5))
     for part in ("peers", "recorder", "viewer"):
         if part in result:
-            # The table above has all that is to say of the others.
+            # The table above has their figures.
             lines += [f"### {_TITLES[part]}", "", *_about(part)]
-            lines += _part(part, result[part], 4) if part == "recorder" else []
     if "growth" in result:
         lines += [f"## {_TITLES['growth']}", "", *_about("growth"), *_growth(result["growth"])]
     known = {*_TITLES, "commit", "machine", "quick"}

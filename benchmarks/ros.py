@@ -6,8 +6,8 @@ Cells of 5, 8 and 13 nodes (recorder included) run as fast as they can, one proc
 the 13 close within 64 samples, so they know no longer blocks. Of each run:
 
 - ``real_time_factor``: simulated over wall time from block 0 to the last block in the bag; the target beside it;
-- ``cpu_us_per_block``: processor time of each process in that span over the blocks of a topic, and
-  ``cpu_us_per_message``: of all together over all blocks of all topics;
+- ``cpu_us_per_message``: processor time of all processes together in that span over all blocks of all topics
+  (the stored result has it by process, too);
 - ``latency_per_hop_us``: with one block in flight, wall time of a block over the hops that it makes: spindle,
   controller, drive, tool, recorder, spindle again. It contains what the nodes compute.
 

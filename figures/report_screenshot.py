@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the pictures of report.md: the piston demo in real time, and its report in a browser, light, dark and narrow.
+"""Makes the pictures of view.md: the piston demo in real time, and its report in a browser, light, dark and narrow.
 
 With a bag as second argument, from that bag.
 """

@@ -90,7 +90,10 @@ def alone(kind):
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.sampled_from(sorted(KINDS.keys() - {"no such lead"})), min_size=3, max_size=8), st.booleans())
 def test_what_ran_before_on_a_bench_leaves_no_trace(kinds, named):
-    """In any order, also after cells that were refused, have diverged or failed, and whether or not stages are kept."""
+    """A cell of a batch has the bits that it has alone, whatever ran before it.
+
+    In any order, also after cells that were refused, have diverged or failed, and whether or not stages are kept.
+    """
     piston = load("piston", 3)
     piston = piston.named() if named else piston
     bench = batch.Bench()

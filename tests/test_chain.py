@@ -59,7 +59,10 @@ def test_what_comes_back_without_a_delay_cuts_a_chain(here, groups):
     ],
 )
 def test_what_is_read_of_a_member_that_nobody_knows_cuts_a_chain(unknown, here, groups):
-    """A member may need in each block what the chain has computed of that block."""
+    """Nodes of one process wait for a third-party member between them.
+
+    A member may need in each block what the chain has computed of that block.
+    """
     found = _groups(announced(full_cell(), *unknown), dict.fromkeys(here))
     assert list(map(sorted, found)) == list(map(sorted, groups))
 

@@ -259,7 +259,10 @@ def test_missing_scenario_is_refused_with_those_of_like_names(name, said):
 
 
 def test_a_run_that_no_memory_holds_is_refused_with_what_it_takes(folder):
-    """And nothing of it is begun, whatever the host."""
+    """A run that needs more than the free memory is refused with its need, before anything begins.
+
+    And nothing of it is begun, whatever the host.
+    """
     said = "spindle_encoder.revolutions = 1e+09: 3.84e+12 samples"
     for mode in ("offline", "processes"):
         refused = lathe("run", "cell.yaml", "--revolutions", "1e9", "--mode", mode, "--bag", "bag")
@@ -304,7 +307,10 @@ def test_scenario_without_one_of_its_nodes_is_refused(folder, missing):
 
 
 def test_spindle_alone_ends_in_order(folder):
-    """There is no form error without a tool: say so, or say nothing of it."""
+    """A spindle without members waits for no node, and its run ends in order.
+
+    There is no form error without a tool: say so, or say nothing of it.
+    """
     (folder / "cell.yaml").write_text("/spindle_encoder: {ros__parameters: {revolutions: 3.0}}")
     for option in ([], ["--json"]):
         result = lathe("run", "cell.yaml", *option)

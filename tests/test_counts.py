@@ -93,7 +93,10 @@ def test_lines_come_in_any_pieces(cuts):
 
 
 def test_a_terminal_is_read_raw_and_its_first_line_may_lack_its_beginning():
-    """Nothing is waited for; when the other end has gone the line has ended."""
+    """A terminal is read raw; its first line may lack its beginning.
+
+    Nothing is waited for; when the other end has gone the line has ended.
+    """
     ours, theirs = pty.openpty()
     reader = LineReader.open(os.ttyname(theirs), 115200)
     os.close(theirs)
@@ -400,7 +403,10 @@ def test_what_stands_still_is_turned_and_measured(tmp_path, counts):
 
 
 def test_a_bag_with_a_standstill_goes_through_every_command(tmp_path):
-    """The tachogram says how long the spindle stands; a re-simulation gives the events, too."""
+    """Every command takes the bag of a run with a standstill.
+
+    The tachogram says how long the spindle stands; a re-simulation gives the events, too.
+    """
     path, bag = tmp_path / "counts.csv", tmp_path / "bag"
     counts = still((50, 0), (80, 17), (20, 0), (80, 17))
     path.write_text("\n".join(["time_s,counts", *(f"{n / 1000},{count}" for n, count in enumerate(counts))]))

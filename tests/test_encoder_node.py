@@ -68,7 +68,10 @@ def lines(path):
 
 @pytest.mark.parametrize("mode", ["composed", "processes"])
 def test_a_serial_line_leads_a_cell_and_gives_the_bits_of_a_file_of_its_counts(tmp_path, mode):
-    """The received readings are in the bag: run again from that, every bit comes out."""
+    """A serial line leads a cell with the bits of a file of its counts; its bag is simulated again to the bit.
+
+    The received readings are in the bag: run again from that, every bit comes out.
+    """
     path = tmp_path / "counts.csv"
     write_counts(path, 0.2)
     with serial_line(lines(path)) as (line, watch, _):
@@ -81,7 +84,10 @@ def test_a_serial_line_leads_a_cell_and_gives_the_bits_of_a_file_of_its_counts(t
 
 
 def test_a_topic_leads_a_cell(tmp_path, ghost, domain):
-    """An angle within a revolution of the second joint, told by name; joint states without it are others'."""
+    """A topic of joint states leads a cell.
+
+    An angle within a revolution of the second joint, told by name; joint states without it are others'.
+    """
     path = tmp_path / "counts.csv"
     write_counts(path, 0.2)
     publisher = ghost.create_publisher(JointState, "/lathe/joints", 1000)
@@ -123,7 +129,10 @@ def test_a_topic_leads_a_cell(tmp_path, ghost, domain):
     ],
 )
 def test_when_the_encoder_is_lost_the_others_come_to_their_safe_state(tmp_path, rest, message):
-    """Missing and wrong readings are reported; the drive retracts while the spindle seems to keep its last speed."""
+    """A cell that has lost its real encoder goes to the safe state.
+
+    Missing and wrong readings are reported; the drive retracts while the spindle seems to keep its last speed.
+    """
     path, pipe = tmp_path / "counts.csv", tmp_path / "pipe"
     write_counts(path, 0.1)
     os.mkfifo(pipe)

@@ -134,7 +134,10 @@ def test_events_at_one_sample_happen_in_their_order():
 
 @pytest.mark.parametrize("law", ["variable", "constant_angle"])
 def test_frozen_memory_repeats_the_command_whatever_the_error(law):
-    """The feed along the piston changes the error in each revolution."""
+    """After the event freeze the command repeats, whatever the error.
+
+    The feed along the piston changes the error in each revolution.
+    """
     result = run(
         spindle_encoder={"revolutions": 8.0},
         learning_controller={"events": ["revolution 4: freeze"], "lead_law": law},

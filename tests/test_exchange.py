@@ -38,7 +38,10 @@ def spindle(monkeypatch):
 
 
 def test_a_member_that_completes_a_block_at_once_does_not_get_it_twice(spindle):
-    """It tells the spindle while the spindle is still at that very block."""
+    """A member that completes a block at once gets it once.
+
+    It tells the spindle while the spindle is still at that very block.
+    """
     seen = []
 
     def complete(delivery):
@@ -56,6 +59,7 @@ def test_a_member_that_completes_a_block_at_once_does_not_get_it_twice(spindle):
 
 
 def test_what_is_handed_over_is_not_written_to_again(spindle):
+    """Arrays that a node has handed to the nodes of its process never change."""
     blocks = []
     spindle.exchange.listen("/encoder", "/eager", blocks.append)
     spindle.trigger_activate()
@@ -66,7 +70,10 @@ def test_what_is_handed_over_is_not_written_to_again(spindle):
 
 
 def test_blocks_that_may_go_at_once_go_in_one_piece(spindle):
-    """Half of what the window lets go, so that others can begin with it."""
+    """Released blocks go to the nodes of the same process in one piece.
+
+    Half of what the window lets go, so that others can begin with it.
+    """
     runs = []
     spindle.exchange.listen("/encoder", "/eager", runs.append)
     spindle.together = 2

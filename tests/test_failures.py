@@ -234,7 +234,10 @@ def test_a_time_master_that_was_given_up_and_comes_back_says_so_and_computes_no_
 
 
 def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tmp_path):
-    """Under ros2 launch or by hand nobody ends them: they see that no sample follows, and the bag is closed."""
+    """Without the harness the members end when their time master has died.
+
+    Under ros2 launch or by hand nobody ends them: they see that no sample follows, and the bag is closed.
+    """
     told = told_after_the_death_of("spindle_encoder", tmp_path / "bag")
     said = [event["message"] for event in told if event["event"] == "abandoned"]
     assert said
@@ -244,6 +247,7 @@ def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tm
 
 
 def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_is_lost(monkeypatch, tmp_path):
+    """A process that does not end after a complete run is killed and named, and no sample is lost."""
     monkeypatch.setattr("lathe_rc.harness.processes._FAREWELL", 1.0)
     monkeypatch.setattr("lathe_rc.harness.processes._GRACE", 0.2)  # it writes no log that tells where it is
     bag, told = tmp_path / "bag", []
@@ -288,6 +292,7 @@ def test_who_does_not_end_after_the_safe_state_is_killed_and_named(monkeypatch, 
 
 
 def test_who_crashes_while_leaving_a_complete_run_is_named_and_nothing_is_lost(tmp_path):
+    """A process that crashes after a complete run is named, and no sample is lost."""
     told = []
     cell = harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=6.0"]), tmp_path / "bag", keep=True)
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
@@ -399,7 +404,10 @@ def test_the_command_ends_with_the_exit_code_of_its_node(domain, tmp_path):
 
 
 def test_the_nodes_themselves_refuse_a_cell_that_cannot_work(tmp_path):
-    """Without the harness's check, as under ros2 launch: the time master checks what its members announce."""
+    """The time master makes the checks before the start with the announced parameters.
+
+    Without the harness's check, as under ros2 launch: the time master checks what its members announce.
+    """
     scenario = load(PISTON, ["learning_controller.q_time=10e-6"])
     cell = harness.with_recorder(scenario, tmp_path / "bag", keep=True)
     diverges = pytest.raises(InputError, match=r"learning diverges with electrodynamic_actuator: sup\|Q - Z\|")
@@ -446,7 +454,10 @@ def wait_readable(descriptor: int) -> bool:
 
 @pytest.mark.parametrize("mode", ["offline", "composed", "processes"])
 def test_a_number_that_is_not_finite_ends_the_run_in_every_host_and_is_named(tmp_path, mode, recwarn):
-    """The command that the drive hears is 1e100 times what it was, four times."""
+    """A number that is not finite ends the run in every host, with the name of its source.
+
+    The command that the drive hears is 1e100 times what it was, four times.
+    """
     times = [f"revolution {turn}: coarse/command.position wrong scale=1e100" for turn in range(1, 5)]
     cell = load(
         PISTON, ["spindle_encoder.revolutions=10.0", "allow_faults=true", f"electrodynamic_actuator.faults={times}"]

@@ -177,7 +177,10 @@ DRIVE = "electrodynamic_actuator"
     ],
 )
 def test_a_member_is_known_if_its_stage_and_all_its_parameters_are(ghost, capfd, stage, parameters, why):
-    """Of others the topics count; why nobody knows them is said once."""
+    """A member is checked if its stage and all its parameters are known, else known by its topics alone.
+
+    Of others the topics count; why nobody knows them is said once.
+    """
     node = StageNode("tool", "tool", Reporter(), Exchange())
     topics = {"publishes": ["/coarse/state", "/drive/events"], "types": [messages.STATE, messages.EVENT]}
     member = Member(name="/drive", stage=stage, parameters=parameters, sparse=[False, True], **topics)

@@ -33,7 +33,10 @@ def test_no_duration_at_all_has_no_percentiles():
 
 
 def test_a_paced_run_tells_its_lateness_at_its_end():
-    """The numbers are whole and in order; their values depend on the machine."""
+    """A run with a pace prints at its end how late its blocks were.
+
+    The numbers are whole and in order; their values depend on the machine.
+    """
     result = harness.run(scenario(spindle_encoder={"revolutions": 1.0, "speed_factor": 1.0}), mode="composed")
     told = result.lateness
     assert told.blocks == result.blocks

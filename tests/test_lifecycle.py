@@ -144,6 +144,7 @@ def test_the_whole_state_machine_is_walked_and_the_cell_gives_its_bits(manager, 
 
 
 def test_who_is_shut_down_before_the_run_leaves_and_the_others_say_for_whom_they_wait(manager, domain, tmp_path):
+    """A node that is shut down before the run leaves, and the others name it as missing."""
     nodes = scenario(electrodynamic_actuator={"autostart": False})
     cell = harness.with_recorder(nodes, tmp_path / "bag", keep=True)
     with waiting(manager, domain, cell) as (processes, _):
@@ -170,6 +171,7 @@ def joins(node, name, state=Member.WIRED, **said):
 
 
 def test_who_waits_names_each_member_and_topic_that_is_missing(tool):
+    """A waiting node names each missing member and topic."""
     node, _ = tool
     topics = ["/coarse/state", "/encoder"]
     assert sorted(node.missing()) == ["a publisher of /coarse/state", "a publisher of /encoder", "a time master"]
@@ -210,6 +212,7 @@ def test_a_member_that_is_stopped_is_silent_whatever_dds_says_of_it(tool):
 
 
 def test_what_is_missing_is_told_now_and_then_until_it_is_there(tool):
+    """A waiting node repeats the names of missing members and topics, ever more seldom."""
     node, told = tool
     begun = node._tell_due - 2.0
     times = []
@@ -233,6 +236,7 @@ def test_who_stands_still_is_named_and_not_who_waits_for_it():
 
 
 def test_who_is_shut_down_in_the_middle_of_a_run_makes_the_cell_safe(manager, domain, tmp_path):
+    """A node that is shut down during a run makes the cell safe."""
     endless = scenario(spindle_encoder={"revolutions": 500.0, "speed_factor": 1.0})
     cell = harness.with_recorder(endless, tmp_path / "bag", keep=True)
     with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:

@@ -169,7 +169,10 @@ def test_angle_of_an_encoder_is_refused():
 @pytest.mark.parametrize("stands", [[0], [1], [400], [998, 999], [0, 700, 701, 1500], list(range(0, 2000, 2))])
 @pytest.mark.parametrize("samples", [1, 3, 50])
 def test_a_standstill_leaves_no_trace_in_the_form(stands, samples):
-    """Nor does what the tool does meanwhile, before it leaves the place; the step after it is as short as it may be."""
+    """A standstill leaves no trace in the form error.
+
+    Nor does what the tool does meanwhile, before it leaves the place; the step after it is as short as it may be.
+    """
     angle = steady(2) + 1e-9
     values = 10e-6 * np.sin(3 * angle)
     repeats = np.ones(angle.size, int)

@@ -137,6 +137,7 @@ def test_a_stranger_is_refused_and_changes_nothing(data, words):
 
 
 def test_who_was_heard_before_the_cell_is_forgotten():
+    """Senders from before the run are forgotten when the cell begins."""
     taken = BlockQueue("/encoder", messages.ENCODER, ToolParameters(block_size=SIZE), ["angle"])
     taken.add(block(400, source="/ghost"))
     taken.expect("/spindle")

@@ -233,6 +233,7 @@ def test_nobody_listens_for_lost_messages():
 
 
 def test_who_comes_late_learns_the_state_of_the_cell_and_its_members(ghost, domain, tmp_path):
+    """A late node receives the state of the cell and the announcements of its members."""
     watched = {"error_limit": 1e-12, "error_after": 0.0, "error_reaction": "warn"}
     slow = scenario(spindle_encoder={"revolutions": 1000.0, "speed_factor": 0.1}, supervisor=watched)
     cell = harness.with_recorder(slow, tmp_path / "bag", keep=True)

@@ -98,7 +98,10 @@ def test_a_command_that_is_retracted_and_given_back_never_jumps():
 
 @given(velocity=st.floats(-5.0, 5.0), position=st.floats(-1e-3, 1e-3), goal=st.floats(-1e-3, 1e-3), hold=st.booleans())
 def test_a_takeover_goes_no_further_the_wrong_way_than_it_takes_to_stop(velocity, position, goal, hold):
-    """Noise in a command looks like a velocity; carried on, one such sample took the tool 1 mm into the part."""
+    """A retraction goes the wrong way no farther than the bounds need to stop.
+
+    Noise in a command looks like a velocity; carried on, one such sample took the tool 1 mm into the part.
+    """
     bounds = Bounds(0.05, 50.0, 1e5)
     takeover = Takeover(bounds, goal, STEP)
     takeover.apply(position + velocity * STEP * np.array([-1.0, 0.0]))
@@ -261,7 +264,7 @@ def test_the_page_has_the_tables_of_the_code():
     printed = subprocess.run([sys.executable, script, "--static"], capture_output=True, text=True, check=True).stdout
     page = (CONFIG.parent / "docs" / "safety.md").read_text(encoding="utf-8")
     for table in printed.strip().split("\n\n"):
-        assert table in page, "run: python figures/safety.py"
+        assert table in page, "run: python figures/safety.py --static"
 
 
 def test_an_alarm_has_the_unit_of_its_limit():
@@ -747,7 +750,10 @@ def test_the_margin_that_is_published_is_that_of_the_newest_cycle():
 
 
 def test_the_margin_is_that_of_the_drive_as_it_is():
-    """A drive that is faster than was believed: the margin falls when that has been identified."""
+    """The published margin follows the identified drive.
+
+    A drive that is faster than was believed: the margin falls when that has been identified.
+    """
     faster = ["electrodynamic_actuator.natural_frequency=1200.0", "spindle_encoder.deviation_amplitude=[0.0]"]
     believed = "learning_controller.model_natural_frequency=1038.0"
     loaded = supervised(*faster, believed, "supervisor.margin_limit=[0.05]", "supervisor.error_limit=0.0")
@@ -863,7 +869,10 @@ def turned_soon():
 
 @pytest.mark.parametrize("outside", [[], ["supervisor", "cutting_process"]])
 def test_the_feed_reacts_alike_in_every_host(outside, turned_soon):
-    """The feed is held and goes on at the same samples, also where who watches and what is watched are processes."""
+    """The feed reacts at the same samples in every host.
+
+    The feed is held and goes on at the same samples, also where who watches and what is watched are processes.
+    """
     cell = soon()
     groups = [[name for name in cell.nodes if name not in outside], *([name] for name in outside)]
     assert harness.run(cell, mode="processes", groups=groups).digest == turned_soon.digest
@@ -946,5 +955,6 @@ def test_what_cannot_be_is_refused(overrides, said):
 
 
 def test_who_can_take_no_tool_out_cannot_retract():
+    """A cell with the reaction retract and no node that obeys it is refused."""
     with pytest.raises(InputError, match="no drive is named that takes the tool out"):
         harness.run(scenarios.load(CONFIG / "supervised_turning.yaml", ["supervisor.force_reaction=retract"]))

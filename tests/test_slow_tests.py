@@ -51,6 +51,18 @@ def test_the_paper_s_two():
     return report
 
 
+def test_promises_are_listed_from_docstrings_and_names(files, capsys):
+    assert slow_tests.promises(["_a"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "test_a.py",
+        "  TestFullCell::test_is_held: The force|edge is held.",
+        '  test_one: Not what "processes" do.',
+        "  test_the_paper_s_two: the paper's two",
+    ]
+    assert slow_tests.promises([]) == 0
+    assert "test_b.py" in capsys.readouterr().out.splitlines()
+
+
 def test_the_page_says_what_the_tests_say():
     assert slow_tests.wrong(slow_tests.PAGE.read_text(encoding="utf-8"), slow_tests.told()) == []
 

@@ -63,6 +63,7 @@ def test_a_process_has_the_folder_environment_log_and_line_of_who_asked(server, 
 
 @pytest.mark.parametrize(("script", "code"), [("exit 3", 3), ("kill -SEGV $$", -signal.SIGSEGV)])
 def test_how_a_process_ended_is_known(server, tmp_path, script, code):
+    """The harness learns from the operating system how a process has ended."""
     child = Shell(server, tmp_path / "log", script).child
     assert child.wait(PATIENCE) == code
     assert child.poll() == code
@@ -70,6 +71,7 @@ def test_how_a_process_ended_is_known(server, tmp_path, script, code):
 
 
 def test_who_is_stopped_and_continued_is_known(server, tmp_path):
+    """The harness learns from the operating system that a process is stopped or continued."""
     shell = Shell(server, tmp_path / "log", "echo; exec sleep 1000")
     assert shell.child.poll() is None
     with pytest.raises(subprocess.TimeoutExpired):

@@ -124,7 +124,10 @@ def test_a_file_begins_at_its_first_row_whatever_its_clock_shows(tmp_path, start
     ],
 )
 def test_a_tachogram_that_does_not_meet_the_run_is_told(tmp_path, changed, said):
-    """Before the start, and in the result."""
+    """A tachogram that is too short for the run is reported before the start and in the result.
+
+    Before the start, and in the result.
+    """
     (tmp_path / "speed.csv").write_text(FILE.replace("\n0.", "\n7."))
     events = []
     changed = {"tachogram_file": str(tmp_path / "speed.csv"), "revolutions": 2.0, **changed}
@@ -141,7 +144,10 @@ def test_a_file_beside_the_lists_is_refused(tmp_path):
 
 
 def test_a_recorded_speed_comes_back_within_the_tolerance(tmp_path):
-    """By the command; the run that follows the file has the recorded speed at every sample."""
+    """A tachogram of a bag keeps its tolerance, and the run that follows it has the recorded speed.
+
+    By the command; the run that follows the file has the recorded speed at every sample.
+    """
     first = harness.run(scenario(spindle_encoder=SWING), bag=tmp_path / "bag")
     path = tmp_path / "speed.csv"
     words = ["bag", "tachogram", str(tmp_path / "bag"), "-o", str(path), "--tolerance", "0.5", "--json"]

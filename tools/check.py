@@ -3,7 +3,7 @@
 
 --lint: the linters alone; --system: the tests that need packages or privileges of the machine, or more time than
 others; --coverage: also which branches of lathe_rc the tests take; --table: no tests, but docs/tests.md from the report
-of the last.
+of the last; --promises [WORD ...]: no tests, but what they promise, of all files or those with a word in their name.
 """
 
 import contextlib
@@ -105,6 +105,8 @@ def main(arguments: list[str]) -> int:
         return int(pytest.main(["-m", "system", "tests", *arguments]))
     if "--table" in arguments:
         return slow_tests.main()
+    if "--promises" in arguments:
+        return slow_tests.promises([word for word in arguments if word != "--promises"])
     if measure := "--coverage" in arguments:
         arguments.remove("--coverage")
     linters, verdicts = dict(LINTERS), list[str]()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""./lathe test --table: docs/tests.md, which promise each slow test holds and what that costs.
+"""./lathe test --table: docs/tests.md, the promise and the cost of each slow test; --promises: the promises of all.
 
 The times are those of the last ./lathe test, the promises those that stand at the tests: a docstring's first line, or
 else the test's name. What a test starts is read off its source and that of the helpers and fixtures in its file.
@@ -10,7 +10,7 @@ import json
 import re
 import sys
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree as ET
@@ -131,6 +131,11 @@ def _starts(test: Function, defined: Mapping[str, ast.stmt]) -> str:
     return ", ".join(kind for kind in (*_HOSTS, "programs") if kind in found)
 
 
+def _promise(name: Name, test: Function) -> str:
+    """Return the first line of a test's docstring, or else its name as a sentence."""
+    return (ast.get_docstring(test) or in_words(name)).splitlines()[0]
+
+
 def told() -> dict[Name, Told]:
     """Return what all tests say of themselves, those of tests/system apart."""
     found = {}
@@ -140,9 +145,25 @@ def told() -> dict[Name, Told]:
         for owner, test, node in _defined(tree):
             if isinstance(node, Function) and test.startswith("test_"):
                 name = Name(path.stem, owner, test)
-                said = (ast.get_docstring(node) or in_words(name)).splitlines()[0]
-                found[name] = Told(said, _starts(node, defined))
+                found[name] = Told(_promise(name, node), _starts(node, defined))
     return found
+
+
+def promises(words: Sequence[str]) -> int:
+    """Print the promises of the tests in the files with one of some words in their name, or of all.
+
+    Args:
+        words: none for all files, tests/system included.
+    """
+    for path in sorted(TESTS.rglob("test_*.py")):
+        if words and not any(word in path.stem for word in words):
+            continue
+        print(path.relative_to(TESTS).as_posix())
+        for owner, test, node in _defined(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, Function) and test.startswith("test_"):
+                name = Name(path.stem, owner, test)
+                print(f"  {owner}{'::' * bool(owner)}{test}: {_promise(name, node)}")
+    return 0
 
 
 # ---- what they took

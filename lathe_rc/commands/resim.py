@@ -142,7 +142,7 @@ def resim(
 ) -> None:
     """Run the cell of a BAG again behind its recorded spindle; unchanged, every bit must come out as recorded.
 
-    A BAG that holds no scenario needs --scenario; its drive can be identified without (docs/resim.md).
+    A BAG that holds no scenario needs --scenario; its drive can be identified without (docs/bags.md).
     """
     topics = _topics(topic)
     console = Console(highlight=False, soft_wrap=True)

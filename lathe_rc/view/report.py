@@ -313,7 +313,7 @@ def _origins(told: Gathered) -> Grid | None:
         for origin in found
     )
     columns = ("class of others", "of", "used by", "source")
-    return Grid(columns, _cut(rows, len(found)), "Source: its SHA-256.", "docs/parts.md", columns)
+    return Grid(columns, _cut(rows, len(found)), "Source: its SHA-256.", "docs/extending.md", columns)
 
 
 def _about(told: Gathered) -> Grid | None:

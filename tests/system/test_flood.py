@@ -22,7 +22,10 @@ def resident(pid):
 
 
 def test_a_flood_takes_no_memory(ghost, domain, tmp_path):
-    """While the cell goes slowly; the flood is nearly all that the nodes have to work on."""
+    """A flood of foreign messages takes no memory.
+
+    While the cell goes slowly; the flood is nearly all that the nodes have to work on.
+    """
     plain = scenario(spindle_encoder={"revolutions": 30.0, "speed_factor": 0.05})
     cell = harness.with_recorder(plain, tmp_path / "bag", keep=True)
     encoder = ghost.create_publisher(EncoderBlock, "/encoder", latched_qos(500))
