@@ -2,7 +2,7 @@
 """Limits of what is read of a bag: above all that real bags have, below what takes the memory or the hours of a reader.
 
 A file of some kilobytes may declare terabytes, so what it says of itself is compared with what it holds. With these a
-hostile file costs some hundred megabytes of memory, and time as a bag of its size may; docs/bags.md tells them.
+hostile file costs some hundred megabytes of memory, and time as a bag of its size may; docs/bags.md names the largest.
 """
 
 MOST_BYTES = 2**27  #: longest record, chunk or message: above images and point clouds; a reader holds some at once [B]
