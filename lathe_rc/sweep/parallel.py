@@ -14,8 +14,8 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
 from lathe_rc.sweep.effects import Axis, Samples
-from lathe_rc.sweep.figures import GOOD_TO_BAD, Goal, number, said
-from lathe_rc.view.charts import Rows, Spec
+from lathe_rc.sweep.figures import GOOD_TO_BAD, Goal, said
+from lathe_rc.view.charts import Rows, Spec, number
 
 _SCHEMA = "https://vega.github.io/schema/vega/v6.json"
 _GAP = 74  # [px] from axis to axis

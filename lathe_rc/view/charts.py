@@ -156,7 +156,7 @@ def chart(height: int, **parts: Any) -> Spec:
     return {"$schema": schema, "width": 640, "height": height, "autosize": fit, **parts}
 
 
-def number(value: float, digits: int = 4) -> float | None:
+def number(value: float, digits: int = 5) -> float | None:
     """As it goes into a page: short, and None for what is none."""
     return float(f"{value:.{digits}g}") if math.isfinite(value) else None
 

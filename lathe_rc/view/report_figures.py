@@ -328,7 +328,7 @@ def _lines(
         data={"values": data},
         transform=[{"calculate": "sqrt(datum.a * datum.b)" if log else "(datum.a + datum.b) / 2", "as": "m"}],
         encoding={
-            "x": quantity("u", across, scale=axis_scale(), axis={"grid": False, "format": "~r"}),
+            "x": quantity("u", across, scale=axis_scale(), axis={"grid": False, "format": "~r", "tickCount": 12}),
             "y": {"type": "quantitative", "title": up, "scale": axis_scale(log=log), "axis": axis},
             "color": _colours(places, legend=len(places) > 1),
         },
