@@ -24,8 +24,7 @@ from lathe_rc.bag import reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import LatheError
-from lathe_rc.view.rerun_heard import Backlog, Order
-from lathe_rc.view.rerun_live import Live
+from lathe_rc.view.rerun_live import Backlog, Live, Order
 from lathe_rc.view.rerun_output import Output
 from lathe_rc.view.rerun_pieces import Pieces
 from lathe_rc.view.rerun_signals import drawn

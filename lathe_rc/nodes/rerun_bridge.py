@@ -27,8 +27,7 @@ from lathe_rc.errors import LatheError
 from lathe_rc.nodes import alone, arguments
 from lathe_rc.nodes.lost_ports import LostPorts
 from lathe_rc.nodes.ports import message_class
-from lathe_rc.view.rerun_heard import Backlog
-from lathe_rc.view.rerun_live import Live, Shown
+from lathe_rc.view.rerun_live import Backlog, Live, Shown
 from lathe_rc.view.rerun_output import Output, require
 from lathe_rc.view.rerun_signals import drawn
 

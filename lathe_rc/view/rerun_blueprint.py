@@ -8,8 +8,7 @@ import rerun.blueprint as rrb
 from lathe_rc import messages
 from lathe_rc.event_log import LOGGED
 from lathe_rc.view import rerun_part as parts
-from lathe_rc.view.rerun_signals import CYCLES, DRIVE, ERROR, PLOTS, POSITION, curve_path, curves
-from lathe_rc.view.rerun_states import ROOT
+from lathe_rc.view.rerun_signals import CYCLES, DRIVE, ERROR, PLOTS, POSITION, STATES, curve_path, curves
 
 _LATEST_S, _LATEST_REVOLUTIONS = 0.3, 5  # before the time cursor, in plots of fast signals
 _FAST = {ERROR, POSITION, DRIVE}
@@ -129,7 +128,7 @@ def blueprint(types: Mapping[str, str], *, live: bool = False, silent: Collectio
     if tabs:
         rows.append(rrb.Tabs(*tabs, active_tab=0))
     if messages.SAFETY_STATUS in kinds or said & {*LOGGED}:
-        rows.append(rrb.StateTimelineView(origin=f"/{ROOT}", name="states of the supervisor, faults, limits met"))
+        rows.append(rrb.StateTimelineView(origin=f"/{STATES}", name="states of the supervisor, faults, limits met"))
     above = [rrb.Horizontal(*top, column_shares=[3, 2][: len(top)])] if top else []
     right = rrb.Vertical(*rows)
     below = rrb.Horizontal(left, right, column_shares=[4, 5]) if left else right
