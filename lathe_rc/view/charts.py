@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -67,18 +67,20 @@ def _light() -> Spec:
     return {**json.loads(text), "font": "sans-serif", "background": "white"}
 
 
-def page_template(path: Path) -> Template:
+def page_template(path: Path, **filters: Callable[[str], str]) -> Template:
     """The template in a file; others beside it can be included, and what pages have in common from here.
 
     What a bag or a sweep says in it ends no element.
     """
-    return Environment(
+    environment = Environment(
         loader=FileSystemLoader([path.parent, _HERE]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-    ).get_template(path.name)
+    )
+    environment.filters.update(filters)
+    return environment.get_template(path.name)
 
 
 @dataclass(eq=False)
@@ -98,6 +100,14 @@ class Charts:
     def add(self, name: str, specs: Mapping[str, Spec], first: str = "") -> None:
         """Add a figure, which goes into the element of this id."""
         self.specs[name], self.chosen[name] = dict(specs), first
+
+    def place(self, specs: Sequence[Spec]) -> list[str]:
+        """Add the parts of one more figure without a choice; returns the ids of their elements."""
+        count = len({name.split("-")[1] for name in self.specs})
+        places = [f"figure-{count}-{part}" for part in range(len(specs))]
+        for place, spec in zip(places, specs, strict=True):
+            self.add(place, {"": spec})
+        return places
 
     def _static(self, name: str) -> Spec:
         """The specification of a figure as it is shown first, on white paper."""

@@ -9,9 +9,10 @@ import json
 import shlex
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,28 +26,16 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place, replacing
 from lathe_rc.part import along_in_words
 from lathe_rc.view import report_figures as figures
-from lathe_rc.view.charts import Charts, Spec, page_template
+from lathe_rc.view.charts import Charts, page_template
 from lathe_rc.view.report_form import CUTOFF, Form
 from lathe_rc.view.report_gather import Gathered, gather
 from lathe_rc.view.report_series import Envelope
-from lathe_rc.view.report_verdict import hint, judged
+from lathe_rc.view.report_verdict import judged
 
 _LONGEST_SCENARIO = 200_000  # characters
 _LONGEST_TEXT = 300
 _MOST_ROWS = 200
 _RPM = 60.0 / (2.0 * np.pi)
-_METROLOGY, _CELL, _BAGS = "docs/metrology.md", "docs/cell.md", "docs/bags.md"
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure with what it shows and where its formula is; several specifications lie side by side."""
-
-    name: str
-    specs: Sequence[Spec]
-    caption: str
-    page: str
-    places: list[str] = field(default_factory=list)  # elements of the page, one a specification
 
 
 @dataclass(frozen=True)
@@ -55,19 +44,7 @@ class Grid:
 
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
-    caption: str
-    page: str
     texts: Sequence[str]
-
-
-@dataclass(frozen=True)
-class FormSection:
-    """The figures of one tool."""
-
-    tool: str
-    refused: str
-    metrics: Grid | None
-    figures: Sequence[Picture]
 
 
 def printable(text: str, longest: int = _LONGEST_TEXT) -> str:
@@ -81,12 +58,7 @@ def _number(value: float) -> str:
 
 
 def _grid(
-    columns: Sequence[str],
-    rows: Iterable[Sequence[str | float]],
-    caption: str,
-    page: str,
-    texts: Sequence[str] = (),
-    count: int = 0,
+    columns: Sequence[str], rows: Iterable[Sequence[str | float]], texts: Sequence[str] = (), count: int = 0
 ) -> Grid | None:
     """A table of the first rows, and how many more there are of ``count``; None without rows."""
     cells = [
@@ -95,10 +67,7 @@ def _grid(
     ]
     if count > len(cells):
         cells.append([f"… and {count - len(cells)} more"])
-    return Grid(columns, cells, caption, page, texts) if cells else None
-
-
-# --- the form
+    return Grid(columns, cells, texts) if cells else None
 
 
 def _metrics(form: Form) -> Grid | None:
@@ -108,93 +77,46 @@ def _metrics(form: Form) -> Grid | None:
         waves = f"{told['largest_upr']['upr']}: {_number(told['largest_upr']['amplitude'])}"
         values = (float(told[key]) for key in ("rms", "max", "peak_to_valley", "ront", "ronq"))
         rows.append([told["revolution"], name, *values, *map(float, told["centre"]), waves, float(told["ra"])])
-    return _grid(
-        ("revolution", "", "RMS", "max", "P-V", "RONt", "RONq", "centre x", "centre y", "largest UPR", "Ra"),
-        rows,
-        "In µm. RMS, max and P-V of the form error; RONt and RONq from the least-squares circle, with centre x, y; "
-        f"filters at {CUTOFF:.0f} UPR (undulations per revolution). Best is the smallest RMS of "
-        f"{form.rms.size} revolutions.",
-        _METROLOGY,
-        ("",),
-    )
+    columns = ("revolution", "", "RMS", "max", "P-V", "RONt", "RONq", "centre x", "centre y", "largest UPR", "Ra")
+    return _grid(columns, rows, ("",))
 
 
-def _form(form: Form, cycles: Mapping[str, Envelope], maps: int) -> FormSection:
-    """The figures of a tool; ``maps``: of the page."""
-    tool, refused = printable(form.tool), printable(form.refused)
+def _form(form: Form, cycles: Mapping[str, Envelope], maps: int, charts: Charts) -> dict[str, Any]:
+    """The section of a tool; ``maps``: of the page."""
     if form.first is None:
-        return FormSection(tool, refused or "the bag holds no complete revolution", None, ())
-    grouped = f" Each line is the mean of {form.map.group} revolutions." if form.map.group > 1 else ""
-    pictures = [
-        Picture(
-            "Error map",
-            [figures.form_map(form, maps)],
-            "Radius of the part less desired radius over spindle angle and revolution; red: material left. The colours "
-            "are linear around zero and logarithmic beyond the largest of the quietest quarter of revolutions."
-            f"{grouped}",
-            _METROLOGY,
-        ),
-        Picture(
-            "First and last revolution",
-            figures.polar(form),
-            "Radius deviation around the part, each in its own scale; dashed: the desired form.",
-            _METROLOGY,
-        ),
-        Picture(
-            "Error spectrum",
-            [figures.spectrum(form)],
-            "Amplitude A_n of r = Σ A_n·sin(nφ + ψ_n) by undulations per revolution n of the first, best and last "
-            "revolution.",
-            _METROLOGY,
-        ),
-        Picture(
-            "Convergence",
-            [figures.convergence(form, cycles)],
-            "RMS over the angle and largest magnitude of the true form error by revolution; dots: what each controller "
-            "measured in its own cycles, which begin and end elsewhere.",
-            f"{_METROLOGY}, docs/learning.md",
-        ),
-    ]
+        return {"form": form, "refused": form.refused or "the bag holds no complete revolution", "metrics": None}
+    drawn = {
+        "map": [figures.form_map(form, maps)],
+        "polar": figures.polar(form),
+        "spectrum": [figures.spectrum(form)],
+        "convergence": [figures.convergence(form, cycles)],
+    }
+    refused, told = form.refused, ""
     if isinstance(form.surface, Lay):
-        told = along_in_words(form.surface)
-        caption = f"{told[0].upper()}{told[1:]}. What nose and feed leave, by the tool's nose_radius."
-        pictures.append(Picture("Surface along the part", figures.along(form.surface), caption, _METROLOGY))
+        drawn["along"], told = figures.along(form.surface), along_in_words(form.surface)
     elif form.surface:
         refused = f"{refused} {form.surface}".strip()
-    return FormSection(tool, refused, _metrics(form), pictures)
+    places = {name: charts.place(specs) for name, specs in drawn.items()}
+    return {"form": form, "refused": refused, "metrics": _metrics(form), "along": None, "told": told, **places}
 
 
-# --- signals and the host
-
-
-def _signals(told: Gathered) -> Iterator[Picture]:
-    for own, name, unit, scale, page in (
+def _signals(told: Gathered, charts: Charts) -> Iterator[dict[str, Any]]:
+    for field, name, unit, scale, page in (
         ("speed_true", "Spindle speed", "speed [1/min]", _RPM, "docs/signals.md"),
         ("force", "Cutting force", "main cutting force [N]", 1.0, "docs/cutting.md"),
         ("wear", "Wear", "wear VB [µm]", 1e6, "docs/cutting.md"),
     ):
-        curves = {topic: series for (topic, each), series in told.curves.signals.items() if each == own and series.size}
+        curves = {topic: series for (topic, own), series in told.curves.signals.items() if own == field and series.size}
         if curves:
             low, high = (np.array([series.extremes for series in curves.values()]) * scale).T
-            caption = f"True values, {_number(float(low.min()))} to {_number(float(high.max()))}."
-            group = max(series.group for series in curves.values())
-            if group > 1:
-                caption += f" The band spans the extremes of {group} samples each, the line is its middle."
-            yield Picture(name, [figures.against_time(told, curves, unit, scale)], caption, page)
-
-
-def _timing(told: Gathered) -> Picture | None:
-    if not told.host.pace.size:
-        return None
-    return Picture(
-        "Pace, lateness and latency",
-        figures.timing(told.host, told.step_ns * 1e-9),
-        f"Pace: simulated time by wall time, in {told.host.pace.size} intervals between reports of the time master on "
-        "/diagnostics. Lateness: from the moment at which a block was due to that at which the time master let it go; "
-        "only where the speed is given. Latency: from there until the time master had heard that every member had "
-        "completed the block; members report several blocks at a time.",
-        _CELL,
-    )
+            yield {
+                "name": name,
+                "page": page,
+                "places": charts.place([figures.against_time(told, curves, unit, scale)]),
+                "low": _number(float(low.min())),
+                "high": _number(float(high.max())),
+                "group": max(series.group for series in curves.values()),
+            }
 
 
 def _nodes(told: Gathered) -> Grid | None:
@@ -209,9 +131,8 @@ def _nodes(told: Gathered) -> Grid | None:
         ]
         for name, node in told.host.nodes.items()
     )
-    caption = "From /diagnostics: the worst level of all reports, the rest as last reported."
     columns = ("node", "reports", "worst", "blocks", "lost", "message")
-    return _grid(columns, rows, caption, _CELL, ("node", "worst", "message"))
+    return _grid(columns, rows, ("node", "worst", "message"))
 
 
 def losses(told: Gathered) -> list[str]:
@@ -235,9 +156,6 @@ def losses(told: Gathered) -> list[str]:
     return [printable(text) for text in found]
 
 
-# --- the bag
-
-
 def _topics(told: Gathered) -> Grid | None:
     dense = messages.block_types()
     rows = (
@@ -256,17 +174,13 @@ def _topics(told: Gathered) -> Grid | None:
         for topic, tally in told.topics.items()
     )
     columns = ("topic", "type", "messages", "samples", "rate [1/s]", "from [s]", "to [s]", "kB")
-    caption = (
-        "Counted while reading. Rate: messages by simulated time between the first and the last; times are log times "
-        "since sample 0."
-    )
-    return _grid(columns, rows, caption, _BAGS, ("topic", "type"), len(told.topics))
+    return _grid(columns, rows, ("topic", "type"), len(told.topics))
 
 
 def _events(told: Gathered) -> Grid | None:
     rows = ([each.topic, each.sample, each.sample * told.step_ns * 1e-9, each.text] for each in told.curves.events)
     columns = ("topic", "sample", "time [s]", "action")
-    return _grid(columns, rows, "Time since sample 0.", _CELL, ("topic", "action"), told.curves.event_count)
+    return _grid(columns, rows, ("topic", "action"), told.curves.event_count)
 
 
 def _versions(told: Gathered) -> Grid | None:
@@ -276,14 +190,14 @@ def _versions(told: Gathered) -> Grid | None:
         return None
     columns = ("made with", "version")
     rows = [(name, str(version)) for name, version in given.items()] if isinstance(given, dict) else []
-    return _grid(columns, rows, "", _BAGS, columns, len(rows))
+    return _grid(columns, rows, columns, len(rows))
 
 
 def _origins(told: Gathered) -> Grid | None:
     found = origins(told.about)
     rows = ([origin.name, origin.package or "–", ", ".join(origin.used), origin.source] for origin in found)
     columns = ("class of others", "of", "used by", "source")
-    return _grid(columns, rows, "Source: its SHA-256.", "docs/parts.md", columns, len(found))
+    return _grid(columns, rows, columns, len(found))
 
 
 def _about(told: Gathered) -> Grid | None:
@@ -292,19 +206,13 @@ def _about(told: Gathered) -> Grid | None:
         for key, text in sorted(told.about.items())
         if key not in (SCENARIO, VERSIONS, ORIGINS)
     ]
-    return _grid(("key", "text"), rows, "Further metadata of the bag.", _BAGS, ("key", "text"), len(rows))
+    return _grid(("key", "text"), rows, ("key", "text"), len(rows))
 
 
 def _budget(found: Budget) -> Grid | None:
     rows = [[part.name, part.percent(), part.rms * 1e6, part.largest * 1e6] for part in found.rows]
     rows.append(["form error", "100.0", found.rms * 1e6, found.largest * 1e6])
-    caption = (
-        f"Form error of the last {found.revolutions} revolutions, from runs of the bag's scenario offline with causes "
-        "switched off: share in its power, and size of each part by itself. Causes, rest and interactions add up; "
-        f"pairs of causes are parts of the interactions, those below {TOLD:.0%} are left out."
-    )
-    caption += "".join(f" Not switched off: {name}: {printable(why)}." for name, why in found.left_out.items())
-    return _grid(("cause", "share [%]", "RMS [µm]", "max [µm]"), rows, caption, _METROLOGY, ("cause",))
+    return _grid(("cause", "share [%]", "RMS [µm]", "max [µm]"), rows, ("cause",))
 
 
 def _facts(told: Gathered) -> Iterator[tuple[str, str, str]]:
@@ -330,41 +238,39 @@ def render(told: Gathered, name: str, command: str, made_of: Budget | None = Non
         command: that makes the page again.
         made_of: what the form error is made of; None: nobody has asked.
     """
+    charts = Charts()
+    template = page_template(Path(__file__).with_name("report.html.j2"), printable=printable)
     with np.errstate(over="ignore", invalid="ignore"):
-        cycles = {f"{topic}: {own}": found for (topic, own), found in told.curves.cycles.items() if found.size}
-        forms = [_form(form, cycles, len(told.forms)) for form in told.forms]
-        signals, timing = list(_signals(told)), _timing(told)
-        if cycles and not any(form.figures for form in forms):
-            caption = "The controllers' own measurements, by cycle."
-            signals.append(Picture("Convergence", [figures.convergence(None, cycles)], caption, "docs/learning.md"))
-    shown = Charts()
-    pictures = [*(each for form in forms for each in form.figures), *signals, *([timing] if timing else [])]
-    for number, picture in enumerate(pictures):
-        for k, spec in enumerate(picture.specs):
-            picture.places.append(f"figure-{number}-{k}")
-            shown.add(picture.places[-1], {"": spec})
-    text: str = page_template(Path(__file__).with_name("report.html.j2")).render(
-        title=f"Report of {printable(name, 80)}",
-        command=printable(command),
-        version=__version__,
-        charts=shown,
-        judged=judged(told, losses(told), made_of),
-        budget_hint=hint(told, made_of),
-        facts=_facts(told),
-        missing=told.missing,
-        budget=_budget(made_of) if made_of else None,
-        forms=forms,
-        signals=signals,
-        timing=timing,
-        nodes=_nodes(told),
-        states=[printable(state) for state in told.host.states],
-        topics=_topics(told),
-        events=_events(told),
-        versions=_versions(told),
-        origins=_origins(told),
-        about=_about(told),
-        scenario=printable(told.about.get(SCENARIO, ""), _LONGEST_SCENARIO),
-    )
+        cycles = {f"{topic}: {field}": found for (topic, field), found in told.curves.cycles.items() if found.size}
+        forms = [_form(form, cycles, len(told.forms), charts) for form in told.forms]
+        signals = list(_signals(told, charts))
+        alone = cycles and not any(form["metrics"] for form in forms)
+        text: str = template.render(
+            title=f"Report of {printable(name, 80)}",
+            command=printable(command),
+            version=__version__,
+            charts=charts,
+            judged=judged(told, losses(told), made_of),
+            budget_hint=made_of is None and any(form.newest for form in told.forms[:1]),
+            facts=_facts(told),
+            missing=told.missing,
+            made_of=made_of,
+            least=TOLD,
+            budget=_budget(made_of) if made_of else None,
+            cutoff=f"{CUTOFF:.0f}",
+            forms=forms,
+            signals=signals,
+            cycles=charts.place([figures.convergence(None, cycles)]) if alone else None,
+            timing=charts.place(figures.timing(told.host, told.step_ns * 1e-9)) if len(told.host.pace) else None,
+            host=told.host,
+            nodes=_nodes(told),
+            topics=_topics(told),
+            events=_events(told),
+            versions=_versions(told),
+            origins=_origins(told),
+            about=_about(told),
+            scenario=printable(told.about.get(SCENARIO, ""), _LONGEST_SCENARIO),
+        )
     return text
 
 

@@ -392,7 +392,7 @@ def _histogram(name: str, counts: Samples, edges: Samples, axes: tuple[str, str]
 
 def timing(host: Host, step: float) -> list[Spec]:
     """Histograms of pace, and of lateness and latency of blocks where there are any; ``step`` in s."""
-    pace = _limited(host.pace.values()) * step
+    pace = _limited(np.array(host.pace)) * step
     low, high = (float(pace.min()), float(pace.max())) if pace.size else (0.0, 1.0)
     least = _ALMOST * max(abs(low), abs(high))
     if high - low <= least:  # paces that are all but the same need a range that can be cut into bins

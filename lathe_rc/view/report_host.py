@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recorded host topics: the state of the nodes, and how late the cell was."""
 
+import math
+from array import array
 from dataclasses import dataclass, field
 from typing import Any
 
 from lathe_rc import messages
 from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
-from lathe_rc.view.report_series import Thinned
 
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 TYPES = frozenset({DIAGNOSTICS, messages.CELL_STATE})
@@ -63,7 +64,7 @@ class Host:
         self.states: list[str] = []
         self.errors: list[str] = []
         self.unreadable = self.left_out = 0
-        self.pace = Thinned()
+        self.pace = array("d")
         self.lateness: dict[str, Durations] = {}
         self.latency: dict[str, Durations] = {}
         self._marks: dict[str, _Mark] = {}
@@ -126,7 +127,9 @@ class Host:
         self._marks[name] = mark
         if before is None or not before.blocks or mark.wall <= before.wall or mark.blocks <= before.blocks:
             return  # it was not running all that time
-        self.pace.add((mark.samples - before.samples) / (mark.wall - before.wall))
+        pace = (mark.samples - before.samples) / (mark.wall - before.wall)
+        if math.isfinite(pace):
+            self.pace.append(pace)
 
     @property
     def lost_blocks(self) -> dict[str, int]:

@@ -186,8 +186,3 @@ def _speed(told: Gathered) -> str:
             deviation = (high - low) / (high + low)
             return f"speed (which varies by ±{deviation:.1%})" if deviation >= _VARIES else ""
     return ""
-
-
-def hint(told: Gathered, made_of: Budget | None) -> bool:
-    """Whether a budget could tell more."""
-    return made_of is None and any(form.newest for form in told.forms[:1])
