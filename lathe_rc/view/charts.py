@@ -131,7 +131,13 @@ class Charts:
         if own.get("renderer") == "canvas":
             kind, image = "jpeg", vl_convert.vegalite_to_jpeg(spec, scale=1.5, quality=90)
         else:
-            kind, image = "svg+xml", vl_convert.vegalite_to_svg(spec).encode()
+            ids: dict[str, str] = {}  # Vega counts them through all figures of a process
+            svg = re.sub(
+                r"\bclip\d+",
+                lambda found: ids.setdefault(found[0], f"clip{len(ids)}"),
+                vl_convert.vegalite_to_svg(spec),
+            )
+            kind, image = "svg+xml", svg.encode()
         return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"
 
     @property

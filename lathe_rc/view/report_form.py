@@ -174,8 +174,7 @@ class Form:
         return True
 
     def _take(self, found: Measurement, whole: int) -> None:
-        for row in found.profile[:whole].reshape(whole, ACROSS, POINTS // ACROSS).mean(axis=-1):
-            self.map.add(row)
+        self.map.add(found.profile[:whole].reshape(whole, ACROSS, POINTS // ACROSS).mean(axis=-1))
         self.newest.extend(found.profile[max(0, whole - LAST) : whole].copy())
         rms = found.form.rms[:whole]
         self.rms.add(rms)

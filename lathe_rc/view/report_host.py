@@ -123,8 +123,7 @@ class Host:
         except (KeyError, ValueError):
             return
         self.lateness[name], self.latency[name] = durations
-        before = self._marks.get(name)
-        self._marks[name] = mark
+        before, self._marks[name] = self._marks.get(name), mark
         if before is None or not before.blocks or mark.wall <= before.wall or mark.blocks <= before.blocks:
             return  # it was not running all that time
         pace = (mark.samples - before.samples) / (mark.wall - before.wall)
