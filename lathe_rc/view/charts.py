@@ -120,14 +120,14 @@ class Charts:
         convert = vl_convert.vega_to_png if is_vega(spec) else vl_convert.vegalite_to_png
         return bytes(convert(spec, scale=scale))
 
-    def picture(self, name: str) -> str:
-        """A figure of Vega-Lite as a data URI: SVG, or JPEG where it has too many marks for that."""
+    def picture(self, name: str, beside: int) -> str:
+        """One of so many parts of a figure as a data URI: SVG, or JPEG where it has too many marks for that."""
         spec = self._static(name)
         own = spec.get("usermeta", {})
         if "square" in own:  # as charts.js draws it
             spec |= {"width": own["square"], "height": own["square"], "autosize": "pad"}
         else:
-            spec["width"] = _PAPER
+            spec["width"] = _PAPER // beside
         if own.get("renderer") == "canvas":
             kind, image = "jpeg", vl_convert.vegalite_to_jpeg(spec, scale=1.5, quality=90)
         else:
