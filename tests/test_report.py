@@ -321,7 +321,7 @@ class TestForm:
             angle = (k * 65536 + np.arange(65536.0)) * 1e-9
             form.chunk(0, 65536, {"/encoder": {"angle_true": angle}, "/tool": {"error": angle}}, {})
         assert "longer than" in form.refused
-        assert form._angle.size == 0
+        assert form._held.size == 0
 
 
 def test_a_fault_leaves_the_colours_of_the_rest_of_the_map():

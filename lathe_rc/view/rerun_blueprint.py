@@ -15,23 +15,19 @@ _FAST = {ERROR, POSITION, DRIVE}
 _COLOURS = ("blue", "orange", "green")  # as words, of the first curves of a plot
 
 
-def _so_far() -> list[rrb.VisibleTimeRange]:
-    """Everything up to the time cursor: rings that have been turned stay."""
+def _until_cursor(time: rrb.TimeRangeBoundary, revolution: rrb.TimeRangeBoundary) -> list[rrb.VisibleTimeRange]:
+    """What is seen at the time cursor, from these on."""
     end = rrb.TimeRangeBoundary.cursor_relative(seq=0)
-    return [
-        rrb.VisibleTimeRange(timeline, start=rrb.TimeRangeBoundary.infinite(), end=end)
-        for timeline in ("time", "revolution")
-    ]
-
-
-def _latest() -> list[rrb.VisibleTimeRange]:
-    """The range shortly before the time cursor: the plot takes its scale from that."""
-    starts = {
-        "time": rrb.TimeRangeBoundary.cursor_relative(seconds=-_LATEST_S),
-        "revolution": rrb.TimeRangeBoundary.cursor_relative(seq=-_LATEST_REVOLUTIONS),
-    }
-    end = rrb.TimeRangeBoundary.cursor_relative(seq=0)
+    starts = {"time": time, "revolution": revolution}
     return [rrb.VisibleTimeRange(timeline, start=start, end=end) for timeline, start in starts.items()]
+
+
+_EVER = rrb.TimeRangeBoundary.infinite()
+_SO_FAR = _until_cursor(_EVER, _EVER)  # rings that have been turned stay
+_LATEST = _until_cursor(  # a plot takes its scale from that
+    rrb.TimeRangeBoundary.cursor_relative(seconds=-_LATEST_S),
+    rrb.TimeRangeBoundary.cursor_relative(seq=-_LATEST_REVOLUTIONS),
+)
 
 
 def _plots(types: Mapping[str, str]) -> dict[str, rrb.TimeSeriesView]:
@@ -58,7 +54,7 @@ def _plots(types: Mapping[str, str]) -> dict[str, rrb.TimeSeriesView]:
             contents=paths[plot],
             name=named(plot, unit),
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=len(paths[plot]) > len(_COLOURS)),
-            time_ranges=_latest() if plot in _FAST else None,
+            time_ranges=_LATEST if plot in _FAST else None,
         )
         for plot, unit in PLOTS.items()
         if plot in paths
@@ -78,7 +74,7 @@ def _part() -> rrb.Vertical:
             ),
             line_grid=False,
             background=rrb.Background(color=(24, 27, 33)),
-            time_ranges=_so_far(),
+            time_ranges=_SO_FAR,
         ),
         rrb.TensorView(
             origin="/form_error/map",

@@ -65,7 +65,7 @@ class Scene:
         silent: Collection[str] = (),
     ) -> None:
         self._recording, self._step_ns = recording, step_ns
-        self._live, self._silent = live, silent
+        self._live, self._silent = live, {full(topic) for topic in silent}
         self._types: dict[str, str] = {}
         self._nominal: set[str] = set()  # supervisors whose first state is shown
         self._outlook = outlook or parts.Outlook()
@@ -144,25 +144,16 @@ class Scene:
                 plots.setdefault(curve.plot, []).append(path)
         for paths in plots.values():
             for path, colour in zip(paths, itertools.cycle(_PALETTE), strict=False):
-                self._static(
-                    path, rr.SeriesLines(names=names[path], colors=colour, widths=1.5, aggregation_policy="minmax")
-                )
+                line = rr.SeriesLines(names=names[path], colors=colour, widths=1.5, aggregation_policy="minmax")
+                self._static(path, line)
         if self._encoder and self._tool:
             self._static("machine", rr.ViewCoordinates.RIGHT_HAND_X_UP)
             self._static("machine/part/surface", rr.Mesh3D.from_fields(triangle_indices=parts.TRIANGLES))
-            chuck = rr.Cylinders3D(
-                lengths=[16.0],
-                radii=[1.15 * parts.RADIUS],
-                centers=[[0.0, 0.0, -9.0]],
-                colors=(120, 126, 138),
-                fill_mode="solid",
-            )
-            self._static("machine/part/chuck", chuck)
+            chuck = {"lengths": [16.0], "radii": [1.15 * parts.RADIUS], "centers": [[0.0, 0.0, -9.0]]}
+            self._static("machine/part/chuck", rr.Cylinders3D(**chuck, colors=(120, 126, 138), fill_mode="solid"))
             vertices, triangles = parts.TOOL
-            self._static(
-                "machine/tool/insert",
-                rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, albedo_factor=(230, 190, 60)),
-            )
+            insert = rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, albedo_factor=(230, 190, 60))
+            self._static("machine/tool/insert", insert)
             self._send_legend()
 
     def _send_legend(self) -> None:
@@ -171,16 +162,10 @@ class Scene:
         decade = np.isclose(dots, np.round(dots))
         z = np.linspace(0.0, parts.LENGTH, dots.size)
         positions = np.stack([np.full(dots.size, -1.35 * parts.RADIUS), np.zeros(dots.size), z], axis=1)
-        self._static(
-            "machine/scale",
-            rr.Points3D(
-                positions,
-                colors=parts.colours(10.0**dots * 1e-6),
-                radii=np.where(decade, 2.6, 1.7),
-                labels=[f"{10**dot:g} µm" if whole else "" for dot, whole in zip(dots.tolist(), decade, strict=True)],
-                show_labels=True,
-            ),
-        )
+        labels = [f"{10**dot:g} µm" if whole else "" for dot, whole in zip(dots.tolist(), decade, strict=True)]
+        radii, colours = np.where(decade, 2.6, 1.7), parts.colours(10.0**dots * 1e-6)
+        scale = rr.Points3D(positions, colors=colours, radii=radii, labels=labels, show_labels=True)
+        self._static("machine/scale", scale)
 
     def _static(self, path: str, what: rr.AsComponents) -> None:
         with _written():
@@ -256,16 +241,13 @@ class Scene:
             if (revolution.number - 1) % self._every == 0:
                 assert self._scale is not None
                 after = parts.edge(revolution, self._scale)
-                strips.append(parts.strip(self._edge or after, after))
+                strips += [self._edge or after, after]
                 self._edge = after
                 rings.append(revolution)
                 self._row(revolution)
         if rings:
-            columns = rr.Mesh3D.columns(
-                vertex_positions=np.concatenate([strip.vertices for strip in strips]),
-                vertex_normals=np.concatenate([strip.normals for strip in strips]),
-                vertex_colors=np.concatenate([strip.colours for strip in strips]),
-            )
+            vertices, normals, colours = map(np.concatenate, zip(*strips, strict=True))
+            columns = rr.Mesh3D.columns(vertex_positions=vertices, vertex_normals=normals, vertex_colors=colours)
             self._send("machine/part/surface", columns.partition([parts.STRIP] * len(rings)), *_when(rings))
 
     def _row(self, revolution: Revolution) -> None:
