@@ -2,10 +2,7 @@
 """``lathe report``: what the page says is what was turned, and nothing from a bag can harm it."""
 
 import base64
-import json
 import re
-from hashlib import sha256
-from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 from xml.etree import ElementTree as ET
@@ -18,6 +15,7 @@ from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from shown_page import ShownPage
 
 from lathe_rc import __version__, harness, messages, part, resources
 from lathe_rc.bag import provenance, reader
@@ -39,50 +37,6 @@ from lathe_rc.view.report_verdict import judged
 HOSTILE = "<script>alert(1)</script>$x_{$\u202e\x07"
 
 
-class Page(HTMLParser):
-    """A page's elements, texts and attributes."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.links, self.cells, self._cell, self._script = [], [], [], False, False
-        self.text, self.scripts, self.ids = "", [], []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.append(tag)
-        if ("http-equiv", "Content-Security-Policy") in attributes:
-            self.policy = dict(attributes)["content"]
-        self.ids += [value for name, value in attributes if name == "id"]
-        self._script = tag == "script"
-        if self._script:
-            self.scripts.append("")
-        self.links += [value for name, value in attributes if name in ("src", "href", "srcset", "action")]
-        self._cell = tag == "td"
-        if self._cell:
-            self.cells.append("")
-
-    def handle_endtag(self, tag):
-        self._cell = self._script = False
-
-    def handle_data(self, data):
-        if self._script:
-            self.scripts[-1] += data
-            return
-        self.text += data
-        if self._cell:
-            self.cells[-1] += data
-
-    @property
-    def figures(self):
-        """Specifications by place."""
-        return {name: specs[""] for name, specs in json.loads(self.scripts[0])["specs"].items()}
-
-    def may_run(self):
-        """The scripts that the page allows itself."""
-        hashes = set(re.findall(r"'sha256-([^']+)'", self.policy))
-        return [text for text in self.scripts if base64.b64encode(sha256(text.encode()).digest()).decode() in hashes]
-
-
 @pytest.fixture(scope="module")
 def turned(tmp_path_factory):
     """A bag of six revolutions with an event, its recording, and its page."""
@@ -98,7 +52,7 @@ class TestPage:
     def test_tells_the_numbers_of_the_first_best_and_last_revolution(self, turned):
         _, recording, page = turned
         found = part.measured(recording)
-        cells = Page(page).cells
+        cells = ShownPage(page).cells
         best = int(np.argmin(found.form.rms))
         for k, name in ((0, "first"), (best, "best"), (found.form.rms.size - 1, "last")):
             told = part.numbers(found, k)
@@ -110,7 +64,7 @@ class TestPage:
 
     def test_counts_every_topic(self, turned):
         _, recording, page = turned
-        cells = Page(page).cells
+        cells = ShownPage(page).cells
         for topic, signals in recording.dense.items():
             samples = next(iter(signals.values())).size
             row = cells[cells.index(topic) :][:4]
@@ -118,7 +72,7 @@ class TestPage:
         assert cells[cells.index("/coarse/learning") + 2] == str(len(recording.sparse["/coarse/learning"].stamps))
 
     def test_needs_nothing_else(self, turned):
-        page = Page(turned[2])
+        page = ShownPage(turned[2])
         assert all(link.startswith("data:") or link.removeprefix("#") in page.ids for link in page.links)
         body = turned[2][: turned[2].index("<script")]
         assert not re.search(r"https?:|@import|url\(", re.sub(r"base64,[^\"]+", "", body))
@@ -126,14 +80,14 @@ class TestPage:
         assert len(turned[2].encode()) < 3_000_000
 
     def test_runs_its_own_two_scripts_and_no_other(self, turned):
-        page = Page(turned[2])
+        page = ShownPage(turned[2])
         assert "unsafe" not in page.policy.partition("script-src")[2]
         assert page.may_run() == [charts.library(), *page.scripts[2:]]
         assert len(page.scripts) == 3  # the first is data
 
     def test_figures_to_enlarge_have_the_numbers_of_the_pictures(self, turned):
         """Each follows the schema of its language; the curve of the form error is that of the recording."""
-        specs = Page(turned[2]).figures
+        specs = {name: spec for name, choices in ShownPage(turned[2]).specs.items() for spec in choices.values()}
         assert len(specs) == 6  # the polar figure has two
         for spec in specs.values():
             alt.Chart.from_dict(spec)
@@ -163,17 +117,16 @@ class TestPage:
         assert page.count("docs/metrology.md") >= 5
 
     def test_says_what_was_not_recorded(self, turned):
-        text = " ".join(Page(turned[2]).text.split())
-        assert "nothing can be said of lateness and latency" in text
+        assert "nothing can be said of lateness and latency" in ShownPage(turned[2]).text
 
     def test_tells_scenario_and_versions(self, turned):
-        text = Page(turned[2]).text
+        text = ShownPage(turned[2]).text
         assert "revolutions: 6.2" in text
         assert f"lathe_rc{__version__}" in text
         assert "base64" not in text  # no files here
 
     def test_lists_events(self, turned):
-        cells = Page(turned[2]).cells
+        cells = ShownPage(turned[2]).cells
         index = turned[1].sparse["/learning_controller/events"].values["sample_index"][0]
         place = cells.index("freeze")
         assert cells[place - 3 : place] == ["/learning_controller/events", str(index), f"{index / 64000:.4g}"]
@@ -199,7 +152,7 @@ class TestVerdict:
         assert (told.verdict.mood, told.wrong) == ("good", [])
         page = tmp_path / "page.html"
         reporting.write(tmp_path / "bag", page)
-        text = Page(page.read_text(encoding="utf-8")).text
+        text = ShownPage(page.read_text(encoding="utf-8")).text
         assert text.index("In tolerance (±2 µm)") < text.index("Nothing was lost") < text.index("Result")
 
     def test_says_that_learning_is_not_over_and_when_it_would_be(self, tmp_path):
@@ -259,7 +212,7 @@ def test_surface_along_the_part_is_that_of_the_whole_run(tmp_path):
     assert_allclose(told.height, surface.height, rtol=0, atol=1e-15)
     done = CliRunner().invoke(report, [str(tmp_path / "bag"), "-o", str(tmp_path / "page.html")])
     assert done.exit_code == 0, done.output
-    page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
+    page = ShownPage((tmp_path / "page.html").read_text(encoding="utf-8"))
     assert "Along the part, last 8 revolutions at 100 µm/rev: Ra " in page.text
 
 
@@ -496,7 +449,7 @@ def test_a_hostile_bag_gives_a_harmless_page(hostile, tmp_path):
     assert done.exit_code == 0, done.output
     assert "incomplete recording" in done.stderr
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    page = Page(text)
+    page = ShownPage(text)
     assert page.may_run() == page.scripts[1:]
     assert len(page.scripts) == 3
     assert "b" in page.tags  # ours
