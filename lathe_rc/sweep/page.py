@@ -8,7 +8,7 @@ import math
 import re
 import shlex
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
 from pathlib import Path
@@ -158,28 +158,36 @@ def _limits(seen: Seen) -> str:
 
 def _sections(seen: Seen, done: Yield, drawn: Charts) -> dict[str, Any]:
     """The sections of the template for cells that have a goal, and the figures."""
-    effects = {goal.name: _effects_on(goal, seen.axes) for goal in seen.goals}
+    weighed = zip(seen.axes, _effects_on(seen.goal, seen.axes), strict=True)
+    axes = [axis for axis, _ in sorted(weighed, key=lambda each: _weight(*each))]
+    effects = {goal.name: _effects_on(goal, axes) for goal in seen.goals}
     mine = effects[seen.goal.name]
-    order = sorted(range(len(seen.axes)), key=lambda place: _weight(seen.axes[place], mine[place]))
-    axes = [seen.axes[place] for place in order]
     told = parallel_note = ""
     if axes:
         told = _choices(seen, axes, drawn)
-        names = [axis.name for axis in axes]
-        drawn.add("sensitivity", {"": figures.sensitivity(names, [mine[place] for place in order])})
+        drawn.add("sensitivity", {"": figures.sensitivity([axis.name for axis in axes], mine)})
         parallel_note = _parallel(seen, axes, drawn)
     drawn.add("yield", {"": figures.cumulative(done, seen.goal, seen.tolerance)})
-    shares = [mine[place].share for place in order if not seen.axes[place].tied]
-    rest = 1.0 - sum(share for share in shares if share is not None)
+    shares = [each.share for axis, each in zip(axes, mine, strict=True) if not axis.tied and each.share is not None]
+    goals = [goal for goal in seen.goals if any(found.share is not None for found in effects[goal.name])]
     return {
         "best": _best(seen),
         "choices": [axis.label for axis in axes[:_MOST_AXES]],
         "parameters": len(axes),
         "map_note": told,
         "parallel_note": parallel_note,
-        "effects": _effects(seen, effects, order),
+        "effects": {
+            "columns": ["parameter", *(f"{goal.name} (log)" if goal.log else goal.name for goal in goals)],
+            "rows": [
+                [
+                    f"{axis.name} (tied)" if axis.tied else axis.name,
+                    *(_told(effects[goal.name][place]) for goal in goals),
+                ]
+                for place, axis in enumerate(axes)
+            ],
+        },
         "exact": is_grid(seen.axes, seen.goal.values),
-        "rest": f"{round(rest, 3) + 0.0:.3f}" if any(share is not None for share in shares) else "",
+        "rest": f"{round(1.0 - sum(shares), 3) + 0.0:.3f}" if shares else "",
         "yields": list(_yields(seen, done)),
     }
 
@@ -193,15 +201,6 @@ def _weight(axis: Axis, found: Effect) -> tuple[bool, float, float]:
     """By which parameters are put in order, the one that matters most first; those that follow from others last."""
     share = -math.inf if found.share is None else found.share
     return axis.tied, -share, -abs(found.rank or 0.0)
-
-
-def _effects(seen: Seen, effects: Mapping[str, Sequence[Effect]], order: Sequence[int]) -> dict[str, Any]:
-    """The table of what each goal depends on."""
-    goals = [goal for goal in seen.goals if any(found.share is not None for found in effects[goal.name])]
-    columns = ["parameter", *(f"{goal.name} (log)" if goal.log else goal.name for goal in goals)]
-    names = [f"{axis.name} (tied)" if axis.tied else axis.name for axis in seen.axes]
-    rows = [[names[place], *(_told(effects[goal.name][place]) for goal in goals)] for place in order]
-    return {"columns": columns, "rows": rows}
 
 
 def _told(found: Effect) -> str:
