@@ -115,7 +115,7 @@ def places(axis: Axis, found: Bins) -> Rows:
     """Where the bins of an axis are, and what they are called."""
     index = np.arange(found.count)
     if axis.texts:
-        return rows(i=index, t=[axis.texts[place] for place in index])
+        return rows(i=index, t=list(axis.texts[: found.count]))
     if found.count == axis.distinct.size:
         names = [said(middle) for middle in found.mid]
     else:

@@ -275,7 +275,7 @@ def _yields(seen: Seen, done: Yield) -> Iterator[str]:
     if seen.tolerance is not None:
         low, high = done.interval(seen.tolerance)
         sure = f", of all that could be drawn {low:.2%} to {high:.2%} (95 % confidence)" if seen.is_sampled else ""
-        share = f"{done.share(seen.tolerance):.2%}"
-        yield f"{share} are within the tolerance of {seen.goal.told(seen.tolerance)}{sure}."
+        within = f"{done.share(seen.tolerance):.2%}"
+        yield f"{within} are within the tolerance of {seen.goal.told(seen.tolerance)}{sure}."
     if done.goal.size < done.cells:
         yield f"{done.cells - done.goal.size} cells without a result count as beyond every limit."

@@ -7,6 +7,7 @@ The axes lie one above the other, so that their names can be read on a narrow sc
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.ticker import LogLocator, MaxNLocator
@@ -119,17 +120,17 @@ def _axis(place: int, axis: Axis, ticks: int) -> list[Spec]:
     """The marks of an axis."""
     height, held, data = place * _GAP, f"brush_{place}", f"ticks_{place}"
     across = "=datum.u * width"
-    label = {"x": across, "y": height + 17, "align": "center", "text": {"field": "t"}}
+    label: dict[str, Any] = {"x": across, "y": height + 17, "align": "center", "text": {"field": "t"}}
     label["limit"] = f"=(width + {2 * _SIDE}) / {max(ticks, 1)} - 4"
-    name = {"x": 4 - _SIDE, "y": height - 17, "text": {"value": axis.label}}
-    reach = {"y": height - _REACH, "height": 2 * _REACH}
-    ends = (f"={held} ? {end}({held}[0], {held}[1]) * width : 0" for end in ("min", "max"))
+    name: dict[str, Any] = {"x": 4 - _SIDE, "y": height - 17, "text": {"value": axis.label}}
+    reach: dict[str, Any] = {"y": height - _REACH, "height": 2 * _REACH}
+    low, high = (f"={held} ? {end}({held}[0], {held}[1]) * width : 0" for end in ("min", "max"))
     return [
         _mark("rule", style="edge", x=0, x2="=width", y=height),
         _mark("rule", style="edge", data=data, x=across, y=height - 4, y2=height + 4),
         *(_mark("text", style=style, data=data, **label) for style in ("halo", "guide-label")),
         *(_mark("text", style=style, **name) for style in ("halo", "guide-title")),
-        _mark("rect", **dict(zip(("x", "x2"), ends, strict=True)), **reach, fill="#888888", fillOpacity=0.4),
+        _mark("rect", x=low, x2=high, **reach, fill="#888888", fillOpacity=0.4),
         _mark(
             "rect", interactive=True, x=-_SIDE, x2=f"=width + {_SIDE}", **reach, fill="transparent", cursor="ew-resize"
         ),

@@ -58,7 +58,7 @@ def _number(value: float) -> str:
 
 
 def _grid(
-    columns: Sequence[str], rows: Iterable[Sequence[str | float]], texts: Sequence[str] = (), count: int = 0
+    columns: Sequence[str], rows: Iterable[Sequence[object]], texts: Sequence[str] = (), count: int = 0
 ) -> Grid | None:
     """A table of the first rows, and how many more there are of ``count``; None without rows."""
     cells = [

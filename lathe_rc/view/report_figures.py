@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The figures of a report, as specifications of Vega-Lite; on a screen they can be enlarged."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -57,6 +56,15 @@ def _figure(height: int, *, usermeta: Mapping[str, Any] | None = None, **parts: 
     return chart(height, usermeta={"box": True, **(usermeta or {})}, **parts)
 
 
+def _rectangles(height: int, x: Spec, y: Spec, y2: Spec, colour: Spec, tooltip: Rows, **parts: Any) -> Spec:
+    """Rectangles from u to u2 across, and from y to y2."""
+    encoding = {"x": x, "x2": {"field": "u2"}, "y": y, "y2": y2, "color": colour, "tooltip": tooltip}
+    if colour["type"] == "quantitative":  # no gaps between the fields of a map
+        encoding["stroke"] = {key: value for key, value in colour.items() if key != "legend"}
+    mark = {"type": "rect", "clip": True, "strokeWidth": 1.2}
+    return _figure(height, params=[_BOX], mark=mark, encoding=encoding, **parts)
+
+
 def _colours(places: Mapping[str, int], symbol: str = "stroke", *, legend: bool) -> Spec:
     """Colours by label: those of the page, by their places."""
     domain = [f"_{place}" for place in range(_COLOURS)]
@@ -82,8 +90,13 @@ def colour_range(map_rows: Samples) -> tuple[float, float]:
 def _map(fields: Samples, across: Spec, up: Spec, colour: Spec) -> Spec:
     """A field for each number; across and up say where they begin, how large they are, and how their axis looks."""
     place = "(datum.k - 1)"
-    return _figure(
+    return _rectangles(
         340,
+        quantity("u", "spindle angle [°]", scale=axis_scale(ends=(0, 360)), axis=across["axis"]),
+        quantity("v", up["title"], scale=up["scale"], axis={"grid": False}),
+        {"field": "v2"},
+        colour,
+        tip(u="spindle angle [°]", v=up["title"], data=colour["title"]),
         data={"values": [number(value) for value in fields.ravel().tolist()]},
         transform=[
             {"window": [{"op": "row_number", "as": "k"}]},
@@ -92,17 +105,6 @@ def _map(fields: Samples, across: Spec, up: Spec, colour: Spec) -> Spec:
             {"calculate": f"{up['start']} + floor({place} / {fields.shape[1]}) * {up['step']}", "as": "v"},
             {"calculate": f"min(datum.v + {up['step']}, {up['end']})", "as": "v2"},
         ],
-        params=[_BOX],
-        mark={"type": "rect", "clip": True, "strokeWidth": 1.2},
-        encoding={
-            "x": quantity("u", "spindle angle [°]", scale=axis_scale(ends=(0, 360)), axis=across["axis"]),
-            "x2": {"field": "u2"},
-            "y": quantity("v", up["title"], scale=up["scale"], axis={"grid": False}),
-            "y2": {"field": "v2"},
-            "color": colour,
-            "stroke": {key: value for key, value in colour.items() if key != "legend"},
-            "tooltip": tip(u="spindle angle [°]", v=up["title"], data=colour["title"]),
-        },
         usermeta={"renderer": "canvas"},
     )
 
@@ -185,8 +187,12 @@ def _polar(revolution: Revolution, colour: int) -> Spec:
     ticks = [*list(rings)[:2], f"{size:.3g} µm"]
     texts = at(np.array(list(rings.values())), 1.17, t=ticks)
     texts += at(2.42, eighths[:8], t=[f"{degrees:.0f}°" for degrees in np.rad2deg(eighths[:8])])
-    form = at(_INSIDE + deviation / size, angle, l="form", k=angle, a=np.rad2deg(angle), d=deviation)
-    circles = [row for name, radius in rings.items() for row in at(np.full(turn.size, radius), turn, l=name, k=turn)]
+    form = at(_INSIDE + deviation / size, angle, l="form", k=np.arange(angle.size), a=np.rad2deg(angle), d=deviation)
+    circles = [
+        row
+        for name, radius in rings.items()
+        for row in at(np.full(turn.size, radius), turn, l=name, k=np.arange(turn.size))
+    ]
     where = {"scale": axis_scale(ends=(-2.55, 2.55)), "axis": None}
     dash = {"domain": list(rings), "range": [[1, 3], [4, 3], [1, 3]]}
     line = {"type": "line", "clip": True}
@@ -255,48 +261,53 @@ def spectrum(form: Form) -> Spec:
         bars += rows(n=order, u=left, u2=left + width, v=value, l=label)
     colours = {label: places[label.partition(" revolution")[0].split(", ")[-1]] for label in shown}
     ends = (low, high) if high else ()
-    return _figure(
+    return _rectangles(
         260,
+        quantity("u", "undulations per revolution", scale=axis_scale(ends=(0.4, 50.6)), axis={"grid": False}),
+        quantity("v", "amplitude [µm]", scale=axis_scale(log=bool(high), ends=ends)),
+        {"datum": number(low)},
+        _colours(colours, "square", legend=True),
+        tip(n="undulations per revolution", v="amplitude [µm]"),
         data={"values": bars},
-        params=[_BOX],
-        mark={"type": "rect", "clip": True},
-        encoding={
-            "x": quantity("u", "undulations per revolution", scale=axis_scale(ends=(0.4, 50.6)), axis={"grid": False}),
-            "x2": {"field": "u2"},
-            "y": quantity("v", "amplitude [µm]", scale=axis_scale(log=bool(high), ends=ends)),
-            "y2": {"datum": number(low)},
-            "color": _colours(colours, "square", legend=True),
-            "tooltip": tip(n="undulations per revolution", v="amplitude [µm]"),
-        },
     )
 
 
 # --- curves
 
 
-@dataclass(frozen=True)
-class _Curve:
-    """An envelope: where, lowest and highest, shape (n,) each; its colour, and whether it is drawn as dots."""
-
-    where: Samples
-    low: Samples
-    high: Samples
-    colour: int
-    dots: bool = False
+_Drawn = Mapping[str, tuple[Envelope, int, bool]]  # by name: series, place of its colour, and whether it is dots
+_Scaled = Callable[[Samples], Samples]
 
 
 def _lines(
-    curves: Mapping[str, _Curve], across: str, up: str, *, height: int, log: bool = False, limit: float = 0.0
+    curves: _Drawn,
+    scaled: tuple[_Scaled, _Scaled],
+    titles: tuple[str, str],
+    *,
+    height: int,
+    log: bool,
+    limit: float = 0.0,
 ) -> Spec:
     """Lines by name, each with a band where it stands for several values; a limit as a dashed one.
 
     Of what has no place on a logarithmic axis nothing is drawn.
+
+    Args:
+        curves: see there.
+        scaled: places and values, to the units of the axes.
+        titles: of the axes.
+        height: [px].
+        log: values are on a logarithmic axis.
+        limit: 0: none.
     """
+    across, up = titles
     data: Rows = []
-    for label, curve in curves.items():
-        kept = (curve.low > 0.0) | (not log)
-        place, low, high = (values[kept] for values in (curve.where, curve.low, curve.high))
-        data += rows(u=place, a=low, b=high, l=label, dot=curve.dots)
+    for label, (series, _, dots) in curves.items():
+        place, low, high = (
+            scale(each) for scale, each in zip((scaled[0], scaled[1], scaled[1]), series.curve(), strict=True)
+        )
+        kept = (low > 0.0) | (not log)
+        data += rows(u=place[kept], a=low[kept], b=high[kept], l=label, dot=dots)
     tooltip = tip(u=across, a="lowest", b="highest")
     line = {"type": "line", "clip": True, "strokeWidth": 1.4, "point": {"size": 12} if len(data) <= 400 else False}
     layer: Rows = [
@@ -307,8 +318,8 @@ def _lines(
             "encoding": {"y": quantity("a", up), "y2": {"field": "b"}},
         },
     ]
-    dots = {"type": "point", "filled": True, "size": 16, "clip": True}
-    for drawn, mark in (("!datum.dot", line), *([("datum.dot", dots)] if any(row["dot"] for row in data) else [])):
+    point = {"type": "point", "filled": True, "size": 16, "clip": True}
+    for drawn, mark in (("!datum.dot", line), *([("datum.dot", point)] if any(row["dot"] for row in data) else [])):
         encoding = {"y": {"field": "m"}, "tooltip": tooltip}
         layer.append({"transform": [{"filter": drawn}], "mark": mark, "encoding": encoding})
     if limit > 0.0:
@@ -322,7 +333,7 @@ def _lines(
             {"data": data_, "mark": text, "encoding": {"x": end, "text": {"field": "t"}, **where}},
         ]
     axis = {"format": ".4~g", "tickCount": 5}
-    places = {label: curve.colour for label, curve in curves.items()}
+    places = {label: colour for label, (_, colour, _) in curves.items()}
     return _figure(
         height,
         data={"values": data},
@@ -342,12 +353,9 @@ def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> Spec:
     drawn = {label: (series, colour, False) for label, (series, colour) in own.items() if series.size}
     for colour, (name, series) in enumerate(list(cycles.items())[:_OTHERS], start=1):
         drawn[_plain(name)] = series, colour, True
-    curves = {}
-    for label, (series, colour, dots) in drawn.items():
-        place, low, high = series.curve()
-        curves[label] = _Curve(place + 1, um(low), um(high), colour, dots)
     limit = form.tolerance * 1e6 if form else 0.0
-    return _lines(curves, "revolution or cycle", "error [µm]", height=280, log=True, limit=limit)
+    titles = "revolution or cycle", "error [µm]"
+    return _lines(drawn, (lambda place: place + 1, um), titles, height=280, log=True, limit=limit)
 
 
 def against_time(told: Gathered, signals: Mapping[str, Envelope], unit: str, scale: float) -> Spec:
@@ -359,11 +367,9 @@ def against_time(told: Gathered, signals: Mapping[str, Envelope], unit: str, sca
         unit: of the axis, with its quantity.
         scale: from the signals' unit to that one.
     """
-    curves = {}
-    for colour, (name, series) in enumerate(signals.items()):
-        place, low, high = series.curve()
-        curves[_plain(name)] = _Curve(told.at(place), _limited(low) * scale, _limited(high) * scale, colour)
-    return _lines(curves, "time since sample 0 [s]", unit, height=220)
+    drawn = {_plain(name): (series, colour, False) for colour, (name, series) in enumerate(signals.items())}
+    scaled = told.at, lambda values: _limited(values) * scale
+    return _lines(drawn, scaled, ("time since sample 0 [s]", unit), height=220, log=False)
 
 
 # --- histograms
@@ -373,20 +379,15 @@ def _histogram(name: str, counts: Samples, edges: Samples, axes: tuple[str, str]
     """Counts of bins: shape (bins,), their edges (bins + 1,), and what the axes say."""
     across, up = axes
     scale = axis_scale(log=log, ends=(edges[0], edges[-1]))
-    return _figure(
+    return _rectangles(
         220,
+        quantity("u", across, scale=scale, axis={"grid": False, "format": "~r"}),
+        quantity("v", up, scale={"zero": True}),
+        {"value": "height"},
+        _colours({name: colour}, legend=False),
+        tip(u="from", u2="to", v=up),
         title=name,
         data={"values": rows(u=edges[:-1], u2=edges[1:], v=counts.astype(int), l=name)},
-        params=[_BOX],
-        mark={"type": "rect", "clip": True},
-        encoding={
-            "x": quantity("u", across, scale=scale, axis={"grid": False, "format": "~r"}),
-            "x2": {"field": "u2"},
-            "y": quantity("v", up, scale={"zero": True}),
-            "y2": {"value": "height"},
-            "color": _colours({name: colour}, legend=False),
-            "tooltip": tip(u="from", u2="to", v=up),
-        },
     )
 
 

@@ -148,7 +148,7 @@ class _Run:
             raise LatheError(f"{block.source} sends a step of 0 ns")
         self._recording, file = open_recording(block.run_id or "run")
         self._step_ns = block.step_ns
-        self._say = lambda text: say(f"run {block.run_id or '(no id)'}{text}")
+        self._name, self._say = f"run {block.run_id or '(no id)'}", say
         self._scene = Scene(self._recording, types, block.step_ns, rate=rate, live=True)
         self._size = math.ceil(PIECE * 1e9 / block.step_ns / self._scene.window) * self._scene.window
         self._pieces = Pieces(types, self._size, self)
@@ -176,7 +176,7 @@ class _Run:
         if not self._begun:
             self._begun = True
             late = f" from {self._pieces.first * self._step_ns * 1e-9:.2f} s on" if self._pieces.first else ""
-            self._say(f" is shown{late}")
+            self._say(f"{self._name} is shown{late}")
         self._tell(first)
         self._scene.chunk(first, samples, dense, sparse)
 
@@ -187,7 +187,7 @@ class _Run:
             piece, at = (samples * self._step_ns * 1e-9 for samples in (self._size, index))
             text = f"left out, wholly or in part: {missing} pieces of {piece:.3g} s, by {at:.2f} s"
             self._scene.note(index, text)
-            self._say(f": {text}")
+            self._say(f"{self._name}: {text}")
 
     def close(self) -> Shown:
         """Show what is left, and end the recording."""
@@ -203,7 +203,7 @@ class _Run:
             self._recording.disconnect()
         shown.revolutions = self._scene.revolutions
         unheard = "" if shown.complete else "; its end was not heard"
-        self._say(f": {shown.revolutions} revolutions shown, {shown.left_out} pieces left out{unheard}")
+        self._say(f"{self._name}: {shown.revolutions} revolutions shown, {shown.left_out} pieces left out{unheard}")
         return shown
 
 

@@ -7,6 +7,7 @@ Timelines are ``time``, simulated time from sample 0, and ``revolution``, from 1
 import contextlib
 import itertools
 from collections.abc import Collection, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -149,7 +150,7 @@ class Scene:
         if self._encoder and self._tool:
             self._static("machine", rr.ViewCoordinates.RIGHT_HAND_X_UP)
             self._static("machine/part/surface", rr.Mesh3D.from_fields(triangle_indices=parts.TRIANGLES))
-            chuck = {"lengths": [16.0], "radii": [1.15 * parts.RADIUS], "centers": [[0.0, 0.0, -9.0]]}
+            chuck: dict[str, Any] = {"lengths": [16.0], "radii": [1.15 * parts.RADIUS], "centers": [[0.0, 0.0, -9.0]]}
             self._static("machine/part/chuck", rr.Cylinders3D(**chuck, colors=(120, 126, 138), fill_mode="solid"))
             vertices, triangles = parts.TOOL
             insert = rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, albedo_factor=(230, 190, 60))
