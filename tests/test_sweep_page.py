@@ -185,7 +185,7 @@ class TestPage:
 
     def test_counts_what_came_of_the_cells_with_their_reasons(self, grid):
         """Two leads of nine are refused; their reasons differ in a number alone, so they are one row."""
-        rows = grid[2].rows("What the cells came to")
+        rows = grid[2].rows("Outcomes")
         assert [row[:3] for row in rows] == [["done", "98", "77.8%"], ["refused", "28", "22.2%"]]
         assert rows[1][3] == "cell 98: learning_controller: grows 0.00275 times a cycle; allowed: below 1"
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a report, gathered in one pass over the bag, in memory that grows by 8 bytes a revolution."""
+"""The figures of a report, gathered in one pass over the bag.
+
+Memory grows by 8 bytes a revolution and a report of the time master.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
