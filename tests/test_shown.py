@@ -11,7 +11,6 @@ from cells import SCENARIOS, run, scenario
 from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.cell.scenario import Scenario, load
-from lathe_rc.drawing import form
 from lathe_rc.errors import InputError
 
 LONGEST = 200  # characters of a line that a prompt shows
