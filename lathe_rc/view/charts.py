@@ -133,7 +133,7 @@ class Charts:
         else:
             ids: dict[str, str] = {}  # Vega counts them through all figures of a process
             svg = re.sub(
-                r"\bclip\d+",
+                r'(?<= id=")clip\d+|(?<=url\(#)clip\d+',
                 lambda found: ids.setdefault(found[0], f"clip{len(ids)}"),
                 vl_convert.vegalite_to_svg(spec),
             )
