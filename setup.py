@@ -33,6 +33,8 @@ NODES = [
     "supervisor",
     "recorder",
 ]
+PAPERS = sorted((HERE / "lathe_papers").glob("*.py"))
+STUDIES = [path.stem for path in PAPERS if "\nSTUDY = " in path.read_text(encoding="utf-8")]
 ALONE = ["container", "replayer", "rerun_bridge", "topic_recorder"]
 
 
@@ -61,11 +63,13 @@ setup(
     long_description=(HERE / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
-    packages=find_packages(include=["lathe_rc", "lathe_rc.*"]),
+    packages=find_packages(include=["lathe_rc", "lathe_rc.*", "lathe_papers", "lathe_papers.*"]),
     # lathe_rc/msg_defs is a link to msg_defs: importlib.resources finds the messages in every installation
     package_data={
         "lathe_rc": [
             "py.typed",
+            "__init__.pyi",
+            "*/__init__.pyi",
             "nodes/*.xml",
             "msg_defs/msg/*.msg",
             "msg_defs/srv/*.srv",
@@ -89,6 +93,7 @@ setup(
             "lathe = lathe_rc.cli:main",
             *(f"{node} = lathe_rc.nodes.executables:{node}" for node in (*NODES, *ALONE)),
         ],
+        "lathe_rc.studies": [f"{study.replace('_', '-')} = lathe_papers.{study}:STUDY" for study in STUDIES],
     },
     zip_safe=False,
 )

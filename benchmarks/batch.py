@@ -51,7 +51,7 @@ def _whole(name: str, count: int) -> float:
 
     def go() -> None:
         nonlocal failed
-        failed = sum(outcome.error is not None for outcome in batch.run(variations(name, count), batch.Errors))
+        failed = sum(outcome.error is not None for outcome in batch.run_many(variations(name, count), batch.Errors))
 
     time = seconds(go)
     assert not failed, "all of them work"

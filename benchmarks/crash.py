@@ -51,7 +51,7 @@ def kill(folder: Path, factor: float, after: float) -> tuple[int, int, float]:
         except LatheError:
             cell.stop()
     recover.mend(bag)
-    saved = min(signals["angle"].size for signals in [reader.read(bag).dense["/encoder"]])
+    saved = min(signals["angle"].size for signals in [reader.read_bag(bag).dense["/encoder"]])
     known = [moment for moment, samples in told if samples <= saved]
     return told[-1][1], saved, killed - (known[-1] if known else told[0][0])
 

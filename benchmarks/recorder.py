@@ -302,7 +302,7 @@ def measure(*, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
         compressions: tuple[Compression, ...] = ("none", "zstd")
         bag = folder / "read"
         _node(bag, what, "zstd")()  # this also compiles
-        reader.read(bag)
+        reader.read_bag(bag)
         for compression in compressions:
             say(f"  writing, compression {compression}")
             result[f"write_{compression}"] = _write(folder, what, compression, rounds)

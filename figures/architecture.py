@@ -19,7 +19,7 @@ class Layer(NamedTuple):
 #: Who is in a layer imports from it and from those below.
 LAYERS = (
     Layer("the command line", {"commands": "lathe run, sweep, view, report, …"}),
-    Layer("Python", {"studies": "tables and figures of the papers", "harness": "runs a scenario, scores it"}),
+    Layer("Python", {"harness": "runs a scenario, scores it"}),
     Layer("hosts", {"nodes": "ROS 2 nodes, processes, DDS", "sweep": "variations, tuning, on all cores"}),
     Layer("to look at", {"view": "report, figures, Rerun, notebooks"}),
     Layer("recordings", {"bag": "MCAP: record, read, check, recover, simulate again"}),
@@ -36,7 +36,7 @@ LAYERS = (
     Layer("signals", {"signals": "speed, encoder, form"}),
 )
 #: Arrows within a layer.
-BESIDE = (("studies", "harness"), ("drawing", "analysis"), ("plants", "control"))
+BESIDE = (("drawing", "analysis"), ("plants", "control"))
 
 LEFT, WIDTH, RIGHT = 112, 640, 4
 HEIGHT, GAP, SPACE = 50, 22, 36  # of a box, between layers, between boxes

@@ -4,13 +4,13 @@
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc import harness, messages
+import lathe_rc
+from lathe_papers.formulas.structures import Channel, steady_error
+from lathe_rc import messages
 from lathe_rc.analysis.metrology import POINTS, measure, undulations
-from lathe_rc.analysis.structures import Channel, steady_error
-from lathe_rc.cell import scenario
 from place import CONFIG
 
-loaded = scenario.load(
+loaded = lathe_rc.load(
     CONFIG / "piston.yaml",
     [
         "spindle_encoder.deviation_amplitude=[0.0]",
@@ -40,7 +40,7 @@ def envelope(waves: int, terms: list[npt.NDArray[np.float64]]) -> npt.NDArray[np
     return np.asarray(middle * terms[0] - 1j * first * terms[1] - second * terms[2] / 2)
 
 
-result = harness.run(loaded)
+result = lathe_rc.run(loaded)
 angle = result.recording.of_type(messages.ENCODER)["angle_true"]
 ran = measure(angle, result.recording.of_type(messages.TOOL)["error"], highest=2).undulations.amplitude
 

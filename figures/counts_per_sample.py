@@ -3,9 +3,9 @@
 
 import re
 
-from lathe_rc.cell import batch
+import lathe_rc
+from lathe_papers import cells
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.studies import cells
 
 STARTS = (0.0, 0.018, 0.037)  # [s] by which the deviation begins later: less than a revolution
 COUNTS = (2048, 4096, 8192)
@@ -27,7 +27,7 @@ def largest(name: str, counts: int, rate: int) -> float:
         )
         for later in STARTS
     ]
-    return max(float(out.kept.largest[54:62].max()) * 1e6 for out in batch.run(made, batch.Errors) if out.kept)
+    return max(float(out.kept.largest[54:62].max()) * 1e6 for out in lathe_rc.run_many(made) if out.kept)
 
 
 print(f"| {' | '.join(HEAD)} |\n|{' ---: |' * len(HEAD)}")

@@ -1,21 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draws img/lay.png of metrology.md."""
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.figure import Figure
 
-from lathe_rc import harness, resources
+import lathe_rc
 from lathe_rc.analysis.metrology import Lay, lay
-from lathe_rc.cell import scenario
 from place import PICTURES
 
 BLUE, GREY = "#1f6f8b", "#777777"
 NOSE, FEED = 0.8e-3, 0.1e-3
 
 changes = ["spindle_encoder.revolutions=14", f"tool.nose_radius={NOSE}"]
-found = harness.run(scenario.load(resources.find(Path("piston.yaml")), changes)).surface
+found = lathe_rc.run(lathe_rc.load("piston", changes)).surface
 assert isinstance(found, Lay), "it is fed"
 turns = np.arange(14)[:, None] + np.arange(64) / 64
 errorless = lay(np.zeros(turns.shape), FEED * turns, NOSE)

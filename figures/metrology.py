@@ -5,15 +5,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 
-from lathe_rc import harness, messages
+import lathe_rc
+from lathe_rc import messages
 from lathe_rc.analysis.metrology import measure
-from lathe_rc.cell import scenario
 from place import CONFIG, PICTURES
 
 CUTOFF = 50.0  # [UPR]
 SHOWN = {4: "#c0392b", 60: "#1f6f8b"}  # revolutions
 
-loaded = scenario.load(
+loaded = lathe_rc.load(
     CONFIG / "piston.yaml",
     [
         "tool.profile=harmonics",
@@ -24,7 +24,7 @@ loaded = scenario.load(
         "spindle_encoder.revolutions=60",
     ],
 )
-recording = harness.run(loaded).recording
+recording = lathe_rc.run(loaded).recording
 part = measure(
     recording.of_type(messages.ENCODER)["angle_true"],
     recording.of_type(messages.TOOL)["error"],

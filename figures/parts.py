@@ -10,12 +10,12 @@ import scipy
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from lathe_rc.cell.parameters import parameter
+from lathe_rc import parameter
 from lathe_rc.control.q_filter import Array, Weights
 from lathe_rc.safety.monitors import Alarm, PlainMonitor
 from lathe_rc.signals.deviation_law import DeviationLaw
 from lathe_rc.signals.part_profile import PartProfile
-from lathe_rc.studies.study import Study, StudyParameters, Track, comparison, untracked
+from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 
 class Hann(Weights):

@@ -7,7 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from lathe_rc import harness, messages
+import lathe_rc
+from lathe_rc import messages
 from lathe_rc.analysis.hysteresis_fit import Loop, identify
 from lathe_rc.cell import scenario
 from lathe_rc.cell.parameters import SharedParameters
@@ -98,7 +99,7 @@ for damping in (0.299, 0.292):
         print(f"| {name} | {' | '.join(f'{c:.4f}' for c in cells)} |")
 print(f"| bend of the piezo over $x_1$, $m/M = 0.1$ | {' | '.join(f'{bend(w):.4f}' for w in TABLE)} |")
 
-parallel = scenario.load(CONFIG / "direct_compensation.yaml", ["spindle_encoder.revolutions=60"])
+parallel = lathe_rc.load(CONFIG / "direct_compensation.yaml", ["spindle_encoder.revolutions=60"])
 shared = parallel.shared.model_dump(include=set(SharedParameters.model_fields))
 direct = {"fine_use_command": False, "fine_use_reference": True, "fine_compensates": ["coarse"]}
 print("\n| arrangement | RMS form error in revolution 60 |")
@@ -110,7 +111,7 @@ for ratio in (None, 0.0, 0.1):
         values = {**shared, **direct, "mass_ratio": ratio}
         nodes["series_drive"] = SeriesDriveParameters.read("series_drive", values)
         title = f"series, m/M = {ratio:g}"
-    result = harness.run(scenario.Scenario("series", nodes))
+    result = lathe_rc.run(scenario.Scenario("series", nodes))
     print(f"| {title} | {result.errors.rms[-1] * 1e9:.2f} nm |")
 
 frequencies = np.geomspace(50.0, 20e3, 400)

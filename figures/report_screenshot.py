@@ -11,8 +11,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from lathe_rc import harness, resources
-from lathe_rc.cell import scenario
+import lathe_rc
 from lathe_rc.view import report
 from place import PICTURES
 
@@ -48,8 +47,8 @@ with tempfile.TemporaryDirectory() as folder:
         bag = Path(sys.argv[2])
     else:
         overrides = ["spindle_encoder.revolutions=200", "spindle_encoder.speed_factor=1.0"]
-        harness.run(scenario.load(resources.find(Path("piston.yaml")), overrides), mode="processes", bag=bag)
-    report.write(bag, page)
+        lathe_rc.run(lathe_rc.load("piston", overrides), mode="processes", bag=bag)
+    report.write_report(bag, page)
     # The page names its command; the folder in it will be gone.
     page.write_text(page.read_text(encoding="utf-8").replace(f"{folder}/", ""), encoding="utf-8")
     save(shot(page, WIDE), "report")

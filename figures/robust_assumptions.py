@@ -5,11 +5,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lathe_papers import cells, robust
 from lathe_rc.analysis.learning import Complex
 from lathe_rc.cell.cures import Loop
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.studies import cells, robust
-from lathe_rc.studies.study import untracked
+from lathe_rc.study import untracked
 
 SEEDS = range(5)
 OWN_FORM = {"controller.harmonic_order": [2], "controller.harmonic_amplitude": [225e-6]}

@@ -5,8 +5,8 @@ import sys
 
 import numpy as np
 
-from lathe_rc import harness, messages
-from lathe_rc.cell import scenario
+import lathe_rc
+from lathe_rc import messages
 from lathe_rc.safety.faults import KINDS
 from lathe_rc.safety.state_machine import MEANING, Reaction, State, table
 from place import CONFIG
@@ -114,7 +114,7 @@ def states() -> list[str]:
 def noticed(name: str, node: str, fault: str, revolution: int) -> str:
     """A row of the table of faults: one run."""
     overrides = [f"{node}.faults=['revolution {revolution}: {fault}']"]
-    result = harness.run(scenario.load(CONFIG / f"{name}.yaml", overrides))
+    result = lathe_rc.run(lathe_rc.load(CONFIG / f"{name}.yaml", overrides))
     recording = result.recording
     lost = str(sum(result.samples - next(iter(signals.values())).size for signals in recording.dense.values()))
     events = recording.sparse[f"/{node}/events"].values

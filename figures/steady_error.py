@@ -4,15 +4,15 @@
 import numpy as np
 from scipy.integrate import trapezoid
 
-from lathe_rc import harness, messages
-from lathe_rc.cell import scenario
+import lathe_rc
+from lathe_rc import messages
 from lathe_rc.cell.wiring import Cell
 from place import CONFIG
 
 WAVES = [2, 5, 10, 15, 20]
 AMPLITUDE = 10e-6  # [m]
 
-loaded = scenario.load(
+loaded = lathe_rc.load(
     CONFIG / "piston.yaml",
     [
         "spindle_encoder.deviation_amplitude=[0.0]",
@@ -28,7 +28,7 @@ drive = cell.stages["electrodynamic_actuator"].drive.plant.response
 loop = cell.stages["learning_controller"].loop(drive)
 speed = loaded.shared.nominal_speed
 
-result = harness.run(loaded)
+result = lathe_rc.run(loaded)
 last = slice(*result.errors.starts[-2:])
 angle = result.recording.of_type(messages.ENCODER)["angle_true"][last]
 error = result.recording.of_type(messages.TOOL)["error"][last]

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from lathe_rc.analysis.tuning import LEAD_LAG, LIMITS, PLAIN, START, Tuning, nearest, smallest_deviation
+from lathe_papers.formulas.tuning import LEAD_LAG, LIMITS, PLAIN, START, Tuning, nearest, smallest_deviation
 
 
 def row(name: str, spread: str, tuning: Tuning) -> str:
@@ -26,4 +26,4 @@ for factor, name in ((1.1, "1.1"), (4 / 3, "4/3"), (1.6, "1.6"), (2.0, "2")):
     print(row("smallest, lead-lag", name, found))
     if name == "4/3":
         lead_lag = found
-print(f"\nas in lathe_rc/analysis/tuning.py: plain {plain == PLAIN}, lead-lag {lead_lag == LEAD_LAG}")
+print(f"\nas in lathe_papers/formulas/tuning.py: plain {plain == PLAIN}, lead-lag {lead_lag == LEAD_LAG}")

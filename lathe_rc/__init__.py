@@ -1,9 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The control cell of a CNC lathe for non-circular turning, offline and as ROS 2 nodes."""
+"""The control cell of a CNC lathe for non-circular turning, offline and as ROS 2 nodes.
 
+    import lathe_rc
+
+    piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=20"])
+    result = lathe_rc.run(piston, bag="piston_bag")
+    print(result.errors.rms[-1], result.digest)
+
+Its names are listed in ``__init__.pyi``; docs/api.md shows them.
+"""
+
+import importlib
 import os
+from typing import Any
 
 __version__ = "0.1.0"
 
 # The matrices here are small. Threads of BLAS that wait for the next one keep the cores busy that other nodes need.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def __getattr__(name: str) -> Any:
+    public = importlib.import_module("lathe_rc.public")  # only then, so that to import lathe_rc stays quick
+    return public.attribute(__name__, name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__getattr__("__all__")])

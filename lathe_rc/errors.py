@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors that a user can do something about; each is one line, whatever it quotes, and has an exit code."""
 
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from typing import ClassVar
 
 
@@ -34,3 +35,17 @@ def shown(text: object, longest: int = 200) -> str:
     """The message of a library or a file: the beginning of its first line, in characters that print."""
     first = (str(text).strip().splitlines() or [type(text).__name__])[0]
     return "".join(letter if letter.isprintable() else "\ufffd" for letter in first[:longest])
+
+
+def at_most(value: float, digits: int = 6) -> str:
+    """The text of an upper limit, rounded down where it is rounded: what a refusal names is allowed itself."""
+    text = f"{value:.{digits}g}"
+    rounded = Context(digits, ROUND_FLOOR).create_decimal(Decimal(value))
+    return text if float(text) <= value else f"{float(rounded):.{digits}g}"
+
+
+def at_least(value: float, digits: int = 6) -> str:
+    """The text of a lower limit, rounded up where it is rounded, see `at_most`."""
+    text = f"{value:.{digits}g}"
+    rounded = Context(digits, ROUND_CEILING).create_decimal(Decimal(value))
+    return text if float(text) >= value else f"{float(rounded):.{digits}g}"

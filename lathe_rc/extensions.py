@@ -102,7 +102,7 @@ class Offers(Mapping[str, V], Generic[V]):
 
     def offered_by(self, name: str) -> str:
         """Distribution and version of what an installed package offers; empty: nobody does, or it is ours."""
-        if name in self.own or name not in _offered(self.group):
+        if name in self.own or name not in _offered(self.group) or is_ours(_offered(self.group)[name].module):
             return ""
         return _distribution(_offered(self.group)[name].dist)
 
@@ -230,11 +230,11 @@ def search_path() -> str:
 
 
 def is_ours(module: str) -> bool:
-    """Whether a module is one of lathe_rc: the folder of compiled code changes with its source.
+    """Tell whether a module is of this distribution: the folder of compiled code changes with its source.
 
     The source of others is not looked at there; what is kept of their steps is, see `lathe_rc.cell.native`.
     """
-    return module.startswith("lathe_rc.")
+    return module.startswith(("lathe_rc.", "lathe_papers."))
 
 
 @cache
@@ -267,8 +267,11 @@ def source_hash(module: str, *, imports: bool = False) -> str:
 
 
 _INSTALLED = sysconfig.get_path("purelib")
-#: modules whose versions do not change within a set-up; the first has a hash of its own
-COMMON = {"lathe_rc", "numpy", "scipy", "numba", "annotated_types", "pydantic", *sys.stdlib_module_names}
+#: modules whose versions do not change within a set-up; the first two have a hash of their own
+COMMON = {
+    *("lathe_rc", "lathe_papers", "numpy", "scipy", "numba", "annotated_types", "pydantic"),
+    *sys.stdlib_module_names,
+}
 
 
 def _files(top: str) -> list[Path]:

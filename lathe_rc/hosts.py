@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same cell in every host: the test of a stage of one's own.
-
-found = digests(scenario.load(Path("my_law.yaml")), tmp_path)
-assert all(topics == found["offline"] for topics in found.values())
-"""
+"""The same cell in every host: the test of a stage that a user has written."""
 
 import importlib.util
+import os
 from collections.abc import Iterator, Mapping
-from functools import partial
 from pathlib import Path
 
 from lathe_rc import harness
@@ -22,8 +18,8 @@ Digests = Mapping[str, str]  #: of each signal topic
 _OTHER_BLOCK = 23  # samples: divides neither a revolution nor a second
 
 
-def digests(scenario: Scenario, folder: Path) -> dict[str, Digests]:
-    """Run a scenario in every host that this machine has.
+def digests_by_host(scenario: Scenario, folder: str | os.PathLike[str]) -> dict[str, Digests]:
+    """Return the digests of a scenario's signals in every host that this machine has: equal, unless a stage is wrong.
 
     Args:
         scenario: short: it runs seven times.
@@ -35,14 +31,21 @@ def digests(scenario: Scenario, folder: Path) -> dict[str, Digests]:
 
     Raises:
         LatheError: a run has failed.
+
+    Example:
+        >>> import lathe_rc
+        >>> piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=2"])
+        >>> found = lathe_rc.digests_by_host(piston, ".")
+        >>> all(digests == found["offline"] for digests in found.values())
+        True
     """
-    return dict(_runs(scenario, folder))
+    return dict(_runs(scenario, Path(folder)))
 
 
 def _runs(scenario: Scenario, folder: Path) -> Iterator[tuple[str, Digests]]:
     bag = folder / "offline"
     yield "offline", harness.run(scenario, mode="offline", bag=bag).digest
-    yield "bag", reader.read(bag).digests()
+    yield "bag", reader.read_bag(bag).digests()
     yield "simulated again", resim.resimulate(bag).digest
     other = scenario.varied({"block_size": _OTHER_BLOCK})
     yield f"blocks of {_OTHER_BLOCK}", harness.run(other, mode="offline").digest
@@ -54,8 +57,7 @@ def _runs(scenario: Scenario, folder: Path) -> Iterator[tuple[str, Digests]]:
 
 def _in_a_batch(scenario: Scenario) -> Digests:
     cell = Cell(scenario.nodes)
-    keep = partial(batch.Topics, topics=[*cell.dense, *cell.sparse])
-    outcome = next(batch.run([scenario], keep))
+    outcome = next(batch.run_many([scenario], [*cell.dense, *cell.sparse]))
     if outcome.error is not None:
         raise outcome.error
     assert outcome.kept is not None, "it has not failed"

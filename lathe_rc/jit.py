@@ -49,6 +49,7 @@ _KERNELS = (
     "cell/native.py",
     "cell/program.py",
     "cell/stages/*.py",
+    "../lathe_papers/formulas/*.py",
 )
 
 
@@ -197,6 +198,14 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     Neither reassociation nor contraction is allowed (``fastmath`` off), so the same arithmetic gives the
     same bits whatever the length of the block. Division by zero gives inf or NaN as in NumPy. Other threads have the
     interpreter meanwhile.
+
+    Example:
+        >>> import lathe_rc
+        >>> @lathe_rc.kernel
+        ... def clipped(value: float, limit: float) -> float:
+        ...     return min(max(value, -limit), limit)
+        >>> clipped(3.0, 2.0)
+        2.0
     """
     return cast("Callable[P, R]", _compiled(function, nogil=True))
 

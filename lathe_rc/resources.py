@@ -23,7 +23,9 @@ def scenario(path: Path) -> Path:
         InputError: there is none; says which have names like that. Or a name is that of one in the current folder and
             of one that comes with lathe_rc.
     """
-    if not path.exists() and not path.suffix:
+    # A folder of that name, such as one of lathe new, is no scenario.
+    folder = path.is_dir() and bool(path.name.strip(".")) and find(path.with_suffix(".yaml")).exists()
+    if not path.suffix and (folder or not path.exists()):
         path = path.with_suffix(".yaml")
         ours = next((folder / path for folder in config_folders() if (folder / path).exists()), None)
         if path.exists() and ours and not path.samefile(ours):

@@ -23,8 +23,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
 
+from lathe_papers.formulas import step_fit
 from lathe_rc import files, harness, messages
-from lathe_rc.analysis import hysteresis_fit, reduced_order, step_fit
+from lathe_rc.analysis import hysteresis_fit, reduced_order
 from lathe_rc.bag import check, provenance, reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.repairing import recover
@@ -279,7 +280,7 @@ def _strange(path: Path, plugin: StoragePlugin, mode: CompressionMode) -> None:
 
 def _read_bag(path: Path) -> None:
     """All that reads a bag but the re-simulation and the page."""
-    for read in (check.check, reader.read, gather, lambda bag: recover.recover(bag, bag.with_name("saved"))):
+    for read in (check.check, reader.read_bag, gather, lambda bag: recover.recover(bag, bag.with_name("saved"))):
         with refusals():
             read(path)
     with refusals(), Source(path) as source:
@@ -453,7 +454,7 @@ def _reports(data: bytes) -> None:
     """The whole page of a damaged bag, figures and all."""
     with _folder() as folder, refusals():
         (folder / "fuzz.mcap").write_bytes(data)
-        report.write(folder / "fuzz.mcap", folder / "page.html")
+        report.write_report(folder / "fuzz.mcap", folder / "page.html")
 
 
 TARGETS: Mapping[str, Target] = {

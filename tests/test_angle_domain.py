@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
-from lathe_rc.analysis.angle_domain import (
+from lathe_papers.formulas.angle_domain import (
     COEFFICIENTS,
     AngleDomain,
     Harmonic,

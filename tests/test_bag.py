@@ -103,7 +103,7 @@ def test_mcap_reads_every_sample(recorded):
 
 def test_our_reader_finds_the_same_digests(recorded):
     result, path = recorded.result, recorded.path
-    assert reader.read(path).digests() == result.digest
+    assert reader.read_bag(path).digests() == result.digest
 
 
 def test_sparse_messages_are_all_there(recorded):
@@ -225,7 +225,7 @@ def test_what_is_no_bag_is_refused(tmp_path, make):
     if make in ("empty file", "junk"):
         file_of(bag).write_bytes(b"junk" * 100 if make == "junk" else b"")
     with pytest.raises(InputError, match="bag: not a readable bag"):
-        reader.read(bag)
+        reader.read_bag(bag)
 
 
 # --- recovery
@@ -269,7 +269,7 @@ def test_every_complete_chunk_of_a_cut_bag_is_saved(recorded, tmp_path_factory, 
     assert recover.mend(broken).saved == expected
     assert read_by_mcap(broken) == recorded.messages[:expected]
     assert len(read_by_rosbags(broken)) == expected
-    saved = reader.read(broken)
+    saved = reader.read_bag(broken)
     for topic, signals in saved.dense.items():
         whole = result.recording.dense[topic]
         assert same(signals, {name: whole[name][: signals[name].size] for name in signals})

@@ -5,7 +5,7 @@ import gc
 import itertools
 import sys
 import weakref
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -55,9 +55,7 @@ def test_each_cell_has_the_digests_that_it_has_alone(cells):
     two_channel = load("two_channel", 4, *stable)
     scenarios = [two_channel.varied(cell) for cell in cells]
     topics = ["tool", "fine/command", "coarse/learning"]
-    for cell, outcome in zip(
-        scenarios, batch.run(scenarios, partial(batch.Topics, topics=topics), threads=3), strict=True
-    ):
+    for cell, outcome in zip(scenarios, batch.run_many(scenarios, topics, threads=3), strict=True):
         assert outcome.scenario is cell
         alone = harness.run(cell).digest
         assert outcome.kept.digests() == {f"/{topic}": alone[f"/{topic}"] for topic in sorted(topics)}
@@ -123,7 +121,7 @@ def test_stages_of_all_kinds_are_set_back(path):
 
 def test_errors_are_those_of_a_run():
     scenarios = [load("piston", 5), load("full_cell", 3), load("interrupted_cut", 3)]
-    piston, full, round_part = (outcome.kept for outcome in batch.run(scenarios, batch.Errors))
+    piston, full, round_part = (outcome.kept for outcome in batch.run_many(scenarios, batch.Errors))
     for cell, kept in ((scenarios[0], piston), (scenarios[1], full)):
         alone = harness.run(cell).errors
         for name in ("rms", "largest", "peak_to_valley", "starts"):
@@ -183,7 +181,7 @@ def test_a_cell_that_cannot_work_is_an_outcome_and_the_others_go_on():
         {"spindle_encoder.revolutions": 0.0},
         {},
     ]
-    good, refused, diverged, endless, again = batch.run([piston.varied(each) for each in changes], batch.Errors)
+    good, refused, diverged, endless, again = batch.run_many([piston.varied(each) for each in changes], batch.Errors)
     assert np.array_equal(good.kept.rms, again.kept.rms)
     assert isinstance(refused.error, InputError)
     assert "learning diverges" in str(refused.error)
@@ -195,7 +193,7 @@ def test_a_cell_that_cannot_work_is_an_outcome_and_the_others_go_on():
 
 def test_cells_are_made_when_their_turn_comes():
     piston, asked = load("piston", 1), itertools.count()
-    outcomes = batch.run((piston.varied({"seed": next(asked)}) for _ in range(1000)), batch.Errors, threads=2)
+    outcomes = batch.run_many((piston.varied({"seed": next(asked)}) for _ in range(1000)), batch.Errors, threads=2)
     assert [next(outcomes).scenario.shared.seed for _ in range(3)] == [0, 1, 2]
     outcomes.close()
     assert next(asked) < 20
@@ -217,7 +215,7 @@ def test_a_cell_is_gone_when_nobody_holds_it(name):
 
 
 def test_a_topic_that_is_not_there_is_named():
-    (outcome,) = batch.run([load("piston", 1)], partial(batch.Topics, topics=["tool", "fine/state"]))
+    (outcome,) = batch.run_many([load("piston", 1)], ["tool", "fine/state"])
     assert str(outcome.error).startswith("no topic 'fine/state' in the cell; did you mean coarse/state?")
 
 

@@ -9,6 +9,7 @@ from cells import SCENARIOS, scenario
 from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
+import lathe_rc
 from lathe_rc import harness
 from lathe_rc.analysis.budget import Decomposition
 from lathe_rc.analysis.tolerance import LAST
@@ -102,7 +103,7 @@ ADDING = [
 
 def budget(name, revolutions, *overrides):
     (path,) = (path for path in SCENARIOS if path.stem == name)
-    return harness.budget(scenarios.load(path, [f"spindle_encoder.revolutions={revolutions}", *overrides]))
+    return lathe_rc.budget(scenarios.load(path, [f"spindle_encoder.revolutions={revolutions}", *overrides]))
 
 
 @pytest.mark.parametrize("given", ADDING, ids=lambda given: f"{given[0]}{len(given) - 2 or ''}")
@@ -132,7 +133,7 @@ def test_force_and_load_are_causes_where_drive_and_spindle_feel_them():
 
 def test_it_speaks_of_the_form_error_of_the_last_revolutions():
     cell = scenario(spindle_encoder={"revolutions": 15.0, **SWING})
-    errors, found = harness.run(cell).errors, harness.budget(cell)
+    errors, found = harness.run(cell).errors, lathe_rc.budget(cell)
     assert found.revolutions == LAST
     assert found.rms == pytest.approx(np.sqrt(np.mean(errors.rms[-LAST:] ** 2)), rel=1e-4)
     assert found.largest == pytest.approx(errors.largest[-LAST:].max(), rel=1e-3)
@@ -147,7 +148,7 @@ def test_the_part_of_q_is_the_steady_error_of_the_formula():
     stage = wired.stages["learning_controller"]
     ((drive, _),) = wired.learned(stage)
     left = stage.loop(drive).steady_error(np.array(orders, dtype=float), cell.shared.nominal_speed)
-    (q_floor,) = harness.budget(cell).causes
+    (q_floor,) = lathe_rc.budget(cell).causes
     assert q_floor.name == "Q floor"
     assert q_floor.rms == pytest.approx(amplitude * np.sqrt(np.sum(np.abs(left) ** 2) / 2), rel=1e-3)
 
@@ -163,7 +164,7 @@ def test_the_part_of_the_lead_is_the_slope_times_the_angle_that_it_misses():
     }
     swing = {"deviation_amplitude": [0.05], "deviation_frequency": [frequency], "deviation_start": 15 * 0.06}
     cell = scenario(spindle_encoder={"revolutions": 40.0, **swing}, learning_controller=given)
-    parts = {part.name: part.rms for part in harness.budget(cell).causes}
+    parts = {part.name: part.rms for part in lathe_rc.budget(cell).causes}
     missed = 0.05 * cell.shared.nominal_speed * lead_time / np.sqrt(2)
     assert parts["lead"] == pytest.approx(2 * oval / np.sqrt(2) * missed, rel=0.1)
 
@@ -199,7 +200,7 @@ def test_what_is_switched_off_is_what_the_cause_says():
 
 def test_a_q_that_cannot_be_flat_is_left_out_and_said_to_be():
     unstable = {"lead_time": 4e-3, "learning_gain": 1.9, "q_time": 800e-6, "allow_unstable": True}
-    found = harness.budget(scenario(spindle_encoder={"revolutions": 12.0}, learning_controller=unstable))
+    found = lathe_rc.budget(scenario(spindle_encoder={"revolutions": 12.0}, learning_controller=unstable))
     assert found.left_out == {"Q floor": "learning_controller converges with no flat Q"}
     assert found.causes == []
     assert found.rest.share == pytest.approx(1.0)

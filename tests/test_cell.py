@@ -80,7 +80,7 @@ def test_a_stopped_process_changes_no_bit(offline, nodes, window, tmp_path):
             os.kill(processes.pids[node], signal.SIGCONT)
             seen.wait_for("continued", node=node)
         processes.wait_for_end()
-    assert reader.read(tmp_path / "bag").digests() == offline
+    assert reader.read_bag(tmp_path / "bag").digests() == offline
 
 
 STRANGER = """
@@ -123,7 +123,7 @@ def test_a_stranger_that_listens_from_the_start_changes_no_bit(offline, tmp_path
                 assert stranger.stdout.readline() == b"heard\n"
             finally:
                 stranger.kill()
-    assert reader.read(tmp_path / "bag").digests() == offline
+    assert reader.read_bag(tmp_path / "bag").digests() == offline
 
 
 def signal_messages(bag: Path) -> list[tuple[str, int, bytes]]:
@@ -178,6 +178,6 @@ def test_events_by_service_are_recorded_at_the_index_that_was_promised(ghost, do
     assert "allowed: freeze, learn, clear" in answers[3].message
     assert answers[3].sample_index == 0
     assert "no such target for it; allowed for off: " in answers[4].message
-    events = reader.read(tmp_path / "bag").sparse["/learning_controller/events"]
+    events = reader.read_bag(tmp_path / "bag").sparse["/learning_controller/events"]
     assert events.values["action"] == asked[:3]
     assert events.values["sample_index"] == promised

@@ -280,7 +280,7 @@ def test_a_command_that_memory_does_not_suffice_for_says_so(monkeypatch):
     def read(path):
         raise MemoryError("Unable to allocate 29.1 TiB")
 
-    monkeypatch.setattr("lathe_rc.bag.reader.read", read)
+    monkeypatch.setattr("lathe_rc.bag.reader.read_bag", read)
     failed = lathe("measure", "bag")
     assert failed.exit_code == 1
     assert failed.stderr == "lathe: not enough memory (Unable to allocate 29.1 TiB)\n"

@@ -132,7 +132,7 @@ def test_cuts_change_nothing(lengths, law, lead_law):
 
 
 def test_lead_lag_without_a_lag_is_refused():
-    with pytest.raises(InputError, match="lag_time = 0 s with correction lead_lag; allowed: above 0"):
+    with pytest.raises(InputError, match="lag = 0 s with correction lead_lag; allowed: above 0"):
         Correction(CorrectionLaw.LEAD_LAG, WN, ZETA)
 
 

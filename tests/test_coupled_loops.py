@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis.coupled_loops import CONNECTIONS, faster, loops, plant, with_errors
-from lathe_rc.analysis.coupled_simulation import STEP, CoupledSimulation
+from lathe_papers.formulas.coupled_loops import CONNECTIONS, faster, loops, plant, with_errors
+from lathe_papers.formulas.coupled_simulation import STEP, CoupledSimulation
 from lathe_rc.analysis.pid_tuning import closed_loop, response
 from lathe_rc.control.decoupler import FULL_W1, LEAK, PAPER, REALISTIC, Channels, gain, lags
 from lathe_rc.control.pid import FORCE, POSITION

@@ -6,13 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from lathe_rc import harness
+from lathe_rc import harness, resources
+from lathe_rc.analysis.reduced_order import ChannelStep, fit_inverse
 from lathe_rc.cell import batch
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, at_least, at_most
+from lathe_rc.transfer import TransferFunction
 
 CONFIG = Path(__file__).parents[1] / "config"
 FAST = ("nominal_rpm=3000.0",)
@@ -83,7 +87,7 @@ def test_what_is_named_learns_where_what_was_refused_grows():
         load(*given, "spindle_encoder.revolutions=20", *changes)
         for changes in (["learning_controller.allow_unstable=true"], *cures(refused(*given)))
     ]
-    grown, *learned = (outcome.kept.rms for outcome in batch.run(made, batch.Errors, threads=1))
+    grown, *learned = (outcome.kept.rms for outcome in batch.run_many(made, batch.Errors, threads=1))
     assert grown[-1] > 2.0 * grown[0]
     assert all(errors[-1] < 0.1 * errors[0] for errors in learned)
 
@@ -119,6 +123,102 @@ def test_feedback_delay_that_is_allowed_fits_into_the_cycle(name, node, rpm):
     ]
     cell = Cell(load(name, *changes, f"{node}.allow_unstable=true", "electrodynamic_actuator.max_velocity=1e3").nodes)
     cell.check()
+
+
+# --- limits that are computed, and rounded where they are told
+
+
+@given(st.floats(1e-12, 1e12), st.integers(2, 6))
+def test_told_limits_are_allowed_themselves(limit, digits):
+    assert limit * (1.0 - 10.0 ** (1 - digits)) <= float(at_most(limit, digits)) <= limit
+    assert limit <= float(at_least(limit, digits)) <= limit * (1.0 + 10.0 ** (1 - digits))
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter", "beyond", "changes", "before"),
+    [
+        ("periodic", "position_controller.memory_filter", 10.0, (), r"up to "),
+        ("periodic", "position_controller.memory_filter", 9.0, ("position_controller.period=7.777",), r"up to "),
+        ("force_turning", "cutting_process.lag", 1e-12, ("sample_rate=40000",), r"at least "),
+        ("two_channel", "piezo_actuator.amplifier_lag", 1e-12, ("sample_rate=40000",), r"at least "),
+        (
+            "piston",
+            "tool.polygon_corner_radius",
+            0.5,
+            ("tool.profile=polygon", "tool.polygon_inscribed_radius=0.0123456789"),
+            "inscribed radius ",
+        ),
+        (
+            "vibration",
+            "vibration.line_frequency",
+            [3e5],
+            ("vibration.line_amplitude=[1e-6]", "vibration.random_rms=0.0"),
+            "below ",
+        ),
+    ],
+)
+def test_the_limit_that_is_named_is_allowed(name, parameter, beyond, changes, before):
+    said = refused(name, *changes, f"{parameter}={beyond!r}")
+    limit = float(re.search(rf"allowed: .*{before}([\d.e+-]*\d)", said)[1])
+    value = [limit] if isinstance(beyond, list) else limit
+    Cell(load(name, *changes, f"{parameter}={value!r}").nodes)
+
+
+def test_the_lag_that_is_named_suits_the_record():
+    time = np.arange(64) / 48_000  # a step that is no short number
+    model, measured = TransferFunction((1.0,), (1e-4, 1.0)), ChannelStep(time, 1.0 - np.exp(-time / 1e-4))
+    with pytest.raises(InputError) as refusal:
+        fit_inverse(model, measured, least_lag=1e-6)
+    fit_inverse(model, measured, least_lag=float(re.search(r"--lag ([\d.e-]*\d)", str(refusal.value))[1]))
+
+
+def test_revolutions_that_are_named_are_in_the_file(tmp_path):
+    counts = tmp_path / "counts.csv"
+    rows = [
+        f"{k * 1e-3:.3f},{round(4096 * k / 59.9 + 0.4)}" for k in range(4000)
+    ]  # 66.7606 revolutions, and a bit less
+    counts.write_text("\n".join(["time_s,counts", *rows]), encoding="utf-8")
+    file = tmp_path / "cell.yaml"
+    file.write_text("/encoder_device: {ros__parameters: {source: file, counts_per_revolution: 4096}}", encoding="utf-8")
+
+    def device(revolutions):
+        changes = [f"encoder_device.revolutions={revolutions!r}", f"encoder_device.counts_file={counts}"]
+        return Cell(scenarios.load(file, changes).nodes).master
+
+    with pytest.raises(InputError) as refusal:
+        device(1000.0)
+    device(float(re.search(r"after ([\d.]+) revolutions", str(refusal.value))[1]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "culprit"),
+    [
+        (("deviation_amplitude=[1.2]", "deviation_frequency=[1.0]"), "nominal_rpm and its deviations: spindle speed"),
+        (("revolutions=1e15",), "revolutions = 1e+15, "),
+    ],
+)
+def test_a_speed_that_falls_to_0_is_laid_to_its_deviations(changes, culprit):
+    assert culprit in refused("speed_deviation", *(f"spindle_encoder.{change}" for change in changes))
+
+
+def test_a_set_point_is_read_in_its_own_unit(tmp_path):
+    """The header that a refusal names is that of the controller: a force is no position."""
+    for name, node, own, other in (
+        ("approach", "position_controller", "position_um", "force_n"),
+        ("force_turning", "force_controller", "force_n", "position_um"),
+    ):
+        for column in (own, other):
+            (tmp_path / f"{column}.csv").write_text(f"time_s,{column}\n0,1\n1,2\n", encoding="utf-8")
+        given_file = [f"{node}.trajectory=csv", f"{node}.trajectory_file={tmp_path}"]
+        assert refused(name, given_file[0], f"{given_file[1]}/{other}.csv").endswith(f"allowed: time_s,{own}")
+        Cell(load(name, given_file[0], f"{given_file[1]}/{own}.csv").nodes)
+
+
+def test_a_folder_does_not_hide_a_scenario_of_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "piston").mkdir()
+    assert resources.scenario(Path("piston")) == CONFIG / "piston.yaml"
+    assert resources.scenario(Path()) == Path()
 
 
 # --- counts per sample

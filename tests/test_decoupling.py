@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from lathe_papers.decoupling import STUDY
+from lathe_papers.decoupling_runs import disturbance
 from lathe_rc.cli import main
-from lathe_rc.studies.decoupling import STUDY
-from lathe_rc.studies.decoupling_runs import disturbance
 
 SHORT = {"seconds": 4.0}
 

@@ -25,7 +25,7 @@ from lathe_rc.signals import speed
 from lathe_rc.signals.encoder import Encoder
 from lathe_rc.signals.profile import Piston
 from lathe_rc.signals.profile_table import derivatives_at, deviation_along, height_along, tabulated
-from lathe_rc.studies import STUDIES
+from lathe_rc.study import STUDIES
 
 CONFIG = Path(__file__).parents[1] / "config"
 STEP = 1 / 64000
@@ -42,7 +42,7 @@ def load(name, *changes):
 def results(made):
     """Recordings of encoder and tool, and the controllers as they are at the end."""
     found = []
-    for outcome in batch.run(made, functools.partial(batch.Topics, topics=["encoder", "tool"]), threads=1):
+    for outcome in batch.run_many(made, ["encoder", "tool"], threads=1):
         assert outcome.error is None, outcome.error
         found.append((outcome.kept.of_type(messages.ENCODER), outcome.kept.of_type(messages.TOOL)))
     return found
@@ -253,7 +253,7 @@ def test_what_is_refused_does_diverge():
     with pytest.raises(InputError, match=r"diverges with loaded_drive: sup\|factor of a revolution\| = "):
         Cell(load("robust_cutting").varied(wrong).nodes).check()
     grown = load("robust_cutting", "controller.allow_unstable=true").varied({**wrong, "controller.stop_ratio": 2.0})
-    (outcome,) = batch.run([grown], batch.Errors)
+    (outcome,) = batch.run_many([grown], batch.Errors)
     assert "the error grows" in str(outcome.error)
 
 

@@ -152,7 +152,7 @@ def test_when_the_encoder_is_lost_the_others_come_to_their_safe_state(tmp_path, 
     assert (safe["lost"], safe["end"]) == ([], safe["sample"] + 12_800)
     found = check(tmp_path / "bag")
     assert (found.wrong, found.lost) == ([], [])
-    recording = reader.read(tmp_path / "bag")
+    recording = reader.read_bag(tmp_path / "bag")
     assert {signals.size for fields in recording.dense.values() for signals in fields.values()} == {safe["end"]}
     speed = recording.dense["/encoder"]["speed"]
     assert np.ptp(speed[-10_000:]) < 1e-6 * speed[-1]

@@ -29,7 +29,7 @@ def recorded(tmp_path_factory):
     """A bag and what is in it."""
     bag = tmp_path_factory.mktemp("export") / "bag"
     harness.run(scenario(**EVENT), bag=bag)
-    return bag, reader.read(bag)
+    return bag, reader.read_bag(bag)
 
 
 def lathe(*arguments):

@@ -120,7 +120,7 @@ def test_the_death_of_a_member_ends_in_the_safe_state(node, told_late, monkeypat
     (safe,) = [event for event in events if event["event"] == "safe"]
     assert safe["lost"] == [f"/{node}"]
     assert safe["end"] == safe["sample"] + 6400
-    recording = reader.read(bag)
+    recording = reader.read_bag(bag)
     assert {signals.size for fields in recording.dense.values() for signals in fields.values()} == {safe["end"]}
     state = recording.of_type(messages.STATE)
     if node == "electrodynamic_actuator":
@@ -162,7 +162,7 @@ def test_a_member_that_fails_by_an_error_ends_in_the_safe_state(mode, groups, tm
     (complete,) = [event["monotonic_ns"] for event in events if event["event"] == "complete"]
     left = [event["monotonic_ns"] for event in events if event["event"] == "exit"]
     assert all(complete < moment for moment in left), "who leaves in mid-traffic may take a lock of DDS with it"
-    recording = reader.read(bag)
+    recording = reader.read_bag(bag)
     assert {signals.size for fields in recording.dense.values() for signals in fields.values()} == {safe["end"]}
     assert recording.of_type(messages.STATE)["position"][-1] == pytest.approx(0.3e-3, abs=1e-6)
     assert "members_lost" in recording.sparse["/safety/status"].values["monitor"]
@@ -259,7 +259,7 @@ def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_i
         with pytest.raises(LatheError, match="no node has reported anything for 1 s"):
             processes.wait_for("cycle")
     assert [event["node"] for event in told if event["event"] == "stuck"] == ["held"]
-    assert reader.read(bag).digests() == harness.run(load(PISTON, ["spindle_encoder.revolutions=6.0"])).digest
+    assert reader.read_bag(bag).digests() == harness.run(load(PISTON, ["spindle_encoder.revolutions=6.0"])).digest
 
 
 def test_who_does_not_end_after_the_safe_state_is_killed_and_named(monkeypatch, tmp_path):

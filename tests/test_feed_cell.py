@@ -212,6 +212,7 @@ def test_slow_controllers_compute_at_multiples_of_their_divisor():
         (["position_controller.link_gain=-1.0"], "position_controller.link_gain = -1.0; allowed:"),
         (["position_controller.law=periodic_hyperstable", "position_controller.period=0.0001"], "period"),
         (["position_controller.predistortion_file=/nowhere.csv"], "/nowhere.csv"),
+        (["position_controller.link=paper", "position_controller.link_gain=20.0"], "feedback_delay, link: "),
     ],
 )
 def test_bad_servos_are_refused_in_one_line(changes, told):

@@ -127,7 +127,7 @@ def test_nodes_in_plain_rclpy_take_part_in_a_cell(domain, tmp_path, foreign, tog
         log = "\n".join(processes._log("spindle_encoder"))
         assert [line for name in foreign for line in SAID[name] if line not in log] == []
         assert (CONVERGES in log) == (foreign == ["electrodynamic_actuator"])
-    recording = reader.read(tmp_path / "bag")
+    recording = reader.read_bag(tmp_path / "bag")
     errors = recording.dense["/tool"]["error"]
     by_revolution = form_errors(recording.dense["/encoder"]["angle_true"], errors).rms
     assert by_revolution[-1] < 0.05 * by_revolution[0]

@@ -86,13 +86,13 @@ def test_without_pandas_a_frame_is_an_arrow_table_of_the_same(result, without_pa
 
 
 def test_a_bag_gives_the_frames_of_its_run(result):
-    recording = reader.read(result.bag)
+    recording = reader.read_bag(result.bag)
     for topic in recording.types:
         pd.testing.assert_frame_equal(recording.frame(topic), result.frame(topic), check_exact=True)
 
 
 def test_a_snapshot_keeps_samples_times_and_revolutions(result):
-    recording = reader.read(result.snapshots[0])
+    recording = reader.read_bag(result.snapshots[0])
     part, whole = recording.frame("/tool"), result.frame("/tool")
     assert recording.first == part["sample"].iloc[0] > 0
     pd.testing.assert_frame_equal(part, whole.loc[part.index[0] : part.index[-1]], check_exact=True)
@@ -104,7 +104,7 @@ def test_a_snapshot_keeps_samples_times_and_revolutions(result):
 
 
 def test_a_run_without_a_spindle_has_no_revolutions(result):
-    recording = reader.read(result.bag)
+    recording = reader.read_bag(result.bag)
     kinds = {topic: kind for topic, kind in recording.types.items() if topic != "/encoder"}
     rest = {topic: signals for topic, signals in recording.dense.items() if topic in kinds}
     alone = type(recording)(kinds, rest, recording.sparse, recording.step_ns)

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis import hyperstability as hs
-from lathe_rc.analysis.periodic_loop import disturbance, steady_derivatives, transient
+from lathe_papers.formulas import hyperstability as hs
+from lathe_papers.formulas.periodic_loop import disturbance, steady_derivatives, transient
 from lathe_rc.control.periodic_gains import PRESETS
 from lathe_rc.signals.example_002 import PERIOD, fill_disturbance, fill_reference
 

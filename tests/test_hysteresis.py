@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose
 
+from lathe_papers.formulas.vibration import describing_function
 from lathe_rc.analysis.hysteresis_fit import Loop, from_signals, identify, read_csv
-from lathe_rc.analysis.vibration import describing_function
 from lathe_rc.errors import InputError
 from lathe_rc.plants.hysteresis import (
     LINEAR,

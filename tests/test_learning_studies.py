@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from lathe_papers.formulas.tuning import LIMITS
+from lathe_papers.speed_deviation import LAWS
 from lathe_rc import cli
-from lathe_rc.analysis.tuning import LIMITS
 from lathe_rc.commands.study import read
-from lathe_rc.studies import STUDIES
-from lathe_rc.studies.speed_deviation import LAWS
+from lathe_rc.study import STUDIES
 
 
 @functools.cache

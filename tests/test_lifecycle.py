@@ -140,7 +140,7 @@ def test_the_whole_state_machine_is_walked_and_the_cell_gives_its_bits(manager, 
     for node, lines in said.items():
         found = [line.rpartition("]: ")[2] for line in lines if f"[{node}]" in line and " -> " in line]
         assert found == [*LOGGED, "active -> inactive", "inactive -> active"]
-    assert reader.read(tmp_path / "bag").digests() == harness.run(alone).digest
+    assert reader.read_bag(tmp_path / "bag").digests() == harness.run(alone).digest
 
 
 def test_who_is_shut_down_before_the_run_leaves_and_the_others_say_for_whom_they_wait(manager, domain, tmp_path):

@@ -113,7 +113,7 @@ def test_a_run_and_its_repetition_are_a_recording_each(turned, tmp_path):
     assert (first.file.name, first.complete, first.left_out) == ("live.rrd", False, 1)  # cut amid a round of blocks
     assert (second.file.name, second.complete, second.left_out) == ("live-2.rrd", True, 0)
     assert (first.revolutions < 12, second.revolutions) == (True, 12)
-    recording = reader.read(bag)
+    recording = reader.read_bag(bag)
     view = View(second.file)
     assert view.column("/events", "TextLog:text") == [["learning_controller/events: freeze"]]
     assert view.scalars("/learning/coarse/learning")[1].tolist() == recording.sparse["/coarse/learning"].values["cycle"]
@@ -139,7 +139,7 @@ def test_who_is_too_slow_leaves_out_whole_pieces_and_says_so(turned, tmp_path):
     backlog.close()
     watched.hear(backlog)
     (shown,) = watched.end()
-    samples = reader.read(bag).of_type(messages.TOOL)["error"] * 1e6
+    samples = reader.read_bag(bag).of_type(messages.TOOL)["error"] * 1e6
     view = View(shown.file)
     time, _, value = view.scalars("/signals/tool/error")
     assert_array_equal(value, samples[time // STEP_NS])
@@ -250,7 +250,7 @@ def test_a_running_cell_is_shown_as_its_bag(offline, tmp_path):
             begin()
             processes.wait_for_end()
         run, _ = told(bridge)
-    recording = reader.read(tmp_path / "bag")
+    recording = reader.read_bag(tmp_path / "bag")
     assert recording.digests() == offline
     samples = recording.of_type(messages.TOOL)["error"] * 1e6
     expected = {"first": 0, "end": samples.size, "revolutions": int(LENGTH), "left_out": 0, "complete": True}
@@ -286,7 +286,7 @@ def test_a_bridge_that_is_stuck_delays_no_member(offline, tmp_path):
         for bridge in bridges:
             bridge.send_signal(signal.SIGINT)
         (goes_on, left_out), (until_the_end, cut) = map(told, bridges)
-    recording = reader.read(tmp_path / "bag")
+    recording = reader.read_bag(tmp_path / "bag")
     assert recording.digests() == offline
     samples = recording.of_type(messages.TOOL)["error"] * 1e6
     for folder, run in zip(folders, (goes_on, until_the_end), strict=True):

@@ -6,8 +6,8 @@ import pytest
 from cells import in_blocks, scenario
 from numpy.testing import assert_allclose
 
+from lathe_papers.formulas.spindle import speed_over_load
 from lathe_rc import harness, hosts
-from lathe_rc.analysis.spindle import speed_over_load
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.plants.spindle import Belt, LoadedSpindle, SpeedLoop
@@ -190,7 +190,7 @@ def loaded(**values):
 
 def test_an_interrupted_cut_makes_the_speed_swing_in_every_host(tmp_path):
     cell = loaded()
-    found = hosts.digests(cell, tmp_path)
+    found = hosts.digests_by_host(cell, tmp_path)
     assert all(topics == found["offline"] for topics in found.values())
     speed = harness.run(cell).recording.dense["/encoder"]["speed_true"]
     assert 0.05 < np.ptp(speed[speed.size // 2 :]) < 5.0
@@ -213,3 +213,6 @@ def test_a_delay_shorter_than_a_block_and_a_loop_that_oscillates_are_refused():
         harness.run(loaded(load_delay=63))
     with pytest.raises(InputError, match="speed loop of 200000 rad/s: largest pole"):
         make(Belt(2000.0, 0.0), SpeedLoop(200e3, 0.01))
+    with pytest.raises(InputError, match="a stiff belt needs damping"):
+        make(Belt(1e10, 0.0), SpeedLoop(30.0, 0.1))
+    make(Belt(1e10, 1.0), SpeedLoop(30.0, 0.1))

@@ -435,8 +435,9 @@ def test_only_the_last_revolutions_that_were_fed_one_way_count():
     for still in (np.zeros_like(height), height[:2]):
         with pytest.raises(InputError, match="revolutions that were fed one way; allowed: 3 or more"):
             lay(profile[: still.shape[0]], still, NOSE)
-    with pytest.raises(InputError, match=r"feed of 0\.0001 m/rev and a nose of 4e-05 m; allowed: a feed"):
-        lay(profile, height, 0.4 * FEED)
+    for radius, told in ((0.4 * FEED, "4e-05"), (0.5 * FEED, "5e-05")):
+        with pytest.raises(InputError, match=rf"feed of 0\.0001 m/rev and a nose of {told} m; allowed: .* below twice"):
+            lay(profile, height, radius)
 
 
 def test_run_and_bag_tell_the_roughness_along_the_part(tmp_path, monkeypatch):

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lathe_papers import cells
 from lathe_rc import harness
 from lathe_rc.cell import scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
-from lathe_rc.studies import cells
 
 CONFIG = Path(__file__).parents[1] / "config"
 STRUCTURES = ("one_channel", "direct_compensation", "two_coarse", "two_channel")

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter1d
 
-from lathe_rc.analysis.hyperstability import NOMINAL, plant, popov_bound
-from lathe_rc.analysis.periodic_loop import PeriodicLoop, disturbance, steady_derivatives
+from lathe_papers.formulas.hyperstability import NOMINAL, plant, popov_bound
+from lathe_papers.formulas.periodic_loop import PeriodicLoop, disturbance, steady_derivatives
 from lathe_rc.control.periodic import PeriodicController, samples_in
 from lathe_rc.control.periodic_gains import PRESETS
 from lathe_rc.errors import InputError
@@ -265,7 +265,7 @@ def test_period_of_broken_steps_is_refused(period, step, nearest):
         ({}, {"limit": -2.0}, "limit = -2; allowed: above 0"),
         ({}, {"memory_filter": -0.1}, "memory_filter = -0.1; allowed: from 0"),
         ({}, {"measurement_step": -1e-4}, "measurement_step = -0.0001; allowed: from 0"),
-        ({}, {"memory_filter": 0.2}, "memory_filter = 0.2 s reaches 100 samples .* 100 samples .below 0.2 s"),
+        ({}, {"memory_filter": 0.2}, "memory_filter = 0.2 s reaches 100 samples .* 100 samples .up to 0.198 s"),
         ({}, {"ideal": np.zeros(99)}, "ideal input of shape .99,.; allowed: one value for each of 100 samples"),
     ],
 )

@@ -106,7 +106,7 @@ def test_fastest_keeps_both_margins():
     assert loop.gain_margin >= 4.0
     assert loop.phase_margin == pytest.approx(1.0, abs=1e-3)
     assert loop.phase_frequency > evaluate(FULL_W1, FORCE).phase_frequency
-    with pytest.raises(InputError, match="no crossover from 30 to 60 rad/s has margins"):
+    with pytest.raises(InputError, match=r"30 to 60 rad/s has margins .* or a shorter delay"):
         fastest(FULL_W1, band=(30.0, 60.0), phase_margin=1.0, gain_margin=8.0)
 
 

@@ -393,6 +393,7 @@ KINDS = {
     "code": ("my_msgs/msg/Odd", "ros2msg", b"string X=\"'''+__import__('os').abort()+'''\"\n", "cdr", {}),
     "JSON": ("Odo", "jsonschema", b'{"type": "object"}', "json", {}),
     "protobuf": ("foxglove.Log", "protobuf", b"\n\x03abc", "protobuf", {}),
+    "no name": ("", "", b"", "cdr", {}),
     "ROS 1": ("std_msgs/String", "ros1msg", b"string data\n", "ros1", {"md5sum": "99", "latching": "1"}),
     "no schema": (None, "json", {}),
     "no schema, CDR": (None, "cdr", {}),
@@ -440,6 +441,191 @@ def test_log_of_a_killed_recorder_is_part_of_its_database(tmp_path):
     with Source(tmp_path / "killed") as source:
         assert list(source.messages()) == [(topic, log_ns + 1, data) for topic, log_ns, data in sent]
     assert {each.name: each.read_bytes() for each in (tmp_path / "killed").iterdir()} == before
+
+
+LOGS = {
+    "whole": lambda log: log,
+    "cut": lambda log: log[:-5000],
+    "flipped": lambda log: log[:50_000] + bytes([log[50_000] ^ 1]) + log[50_001:],
+    "salt flipped": lambda log: log[:17] + bytes([log[17] ^ 1]) + log[18:],
+    "another file": lambda _log: b"no log at all" * 500,
+    "not written to the end": lambda log: log,
+}
+
+
+@pytest.mark.parametrize("kind", LOGS)
+def test_what_a_write_ahead_log_does_not_give_is_told(tmp_path, kind):
+    """The bytes of a log that give no message count as lost; a log of whole transactions loses nothing."""
+    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE, count=30)
+    base = sqlite3.connect(tmp_path / "bag" / "bag.db3", isolation_level=None)
+    base.executescript(
+        "PRAGMA synchronous=OFF; PRAGMA journal_mode=WAL; PRAGMA wal_autocheckpoint=0; PRAGMA cache_size=1"
+    )
+    for number in range(20):
+        base.execute(
+            "INSERT INTO messages SELECT 31 + ?, topic_id, timestamp + 90000, data FROM messages WHERE id = 1",
+            (number,),
+        )
+        sent.append((sent[0][0], sent[0][1] + 90_000, sent[0][2]))
+    if kind == "not written to the end":
+        base.executescript("BEGIN; UPDATE messages SET data = zeroblob(5000)")
+    (tmp_path / "killed").mkdir()
+    shutil.copy(tmp_path / "bag" / "bag.db3", tmp_path / "killed")
+    log = LOGS[kind]((tmp_path / "bag" / "bag.db3-wal").read_bytes())
+    (tmp_path / "killed" / "bag.db3-wal").write_bytes(log)
+    base.close()
+    lost = kind != "whole"
+    found = recover(tmp_path / "killed", tmp_path / "new")
+    assert (found.lossy, bool(found.lost_bytes)) == (lost, lost)
+    assert found.saved == 50 if kind in ("whole", "not written to the end") else 30 <= found.saved < 50
+    assert read_by_others(tmp_path / "new") == sent[: found.saved]
+    checked = lathe("bag", "check", tmp_path / "killed")
+    told = f"{found.lost_bytes} B of its write-ahead log are broken, or were not written to the end"
+    assert f"(bag.db3: {told}); lathe bag recover saves the rest" in checked.stderr or not lost
+    assert (checked.exit_code, lathe("bag", "info", tmp_path / "killed").exit_code) == ((2, 3) if lost else (1, 0))
+
+
+@pytest.fixture
+def broken_off(tmp_path):
+    """A database that was being written, with its rollback journal; and what it held before."""
+    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE)
+    base = sqlite3.connect(tmp_path / "bag" / "bag.db3", isolation_level=None)
+    base.executescript("PRAGMA cache_size=1; BEGIN; UPDATE messages SET timestamp = 7, data = zeroblob(3000)")
+    (tmp_path / "killed").mkdir()
+    for file in (tmp_path / "bag").glob("*.db3*"):
+        shutil.copy(file, tmp_path / "killed")
+    base.close()
+    return tmp_path / "killed" / "bag.db3-journal", sent
+
+
+def test_a_write_that_was_broken_off_is_taken_back(broken_off, tmp_path):
+    journal, sent = broken_off
+    with Source(journal.parent) as source:
+        assert list(source.messages()) == sent
+    assert recover(journal.parent, tmp_path / "new").saved == len(sent)
+
+
+def test_a_journal_that_names_a_further_file_is_refused_and_the_file_stays(broken_off, tmp_path):
+    """SQLite would look for the file, and remove it."""
+    journal, _ = broken_off
+    named = tmp_path / "named"
+    named.write_bytes(b"mine")
+    name = bytes(named)
+    tail = struct.pack(">I", 0) + name + struct.pack(">II", len(name), sum(name)) + b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
+    journal.write_bytes(journal.read_bytes() + tail)
+    with pytest.raises(InputError, match="it names a further journal"):
+        Source(journal.parent)
+    assert recover(journal.parent, tmp_path / "new").lossy
+    assert named.read_bytes() == b"mine"
+
+
+def test_a_log_that_is_a_link_is_refused(broken_off, tmp_path):
+    """A bag reads nothing outside of its folder; a database that the user names by a link has its logs elsewhere."""
+    journal, sent = broken_off
+    (tmp_path / "linked.db3").symlink_to(journal.with_name("bag.db3"))
+    with Source(tmp_path / "linked.db3") as source:
+        assert list(source.messages()) == sent
+    journal.rename(tmp_path / "outside")
+    journal.symlink_to(tmp_path / "outside")
+    for command in ("info", "check", "recover"):
+        refused = lathe("bag", command, journal.parent)
+        assert (refused.exit_code, "bag.db3-journal: a link" in refused.stderr) == (2, True)
+
+
+OVERLAPS = {
+    "backwards": ([[90, 95], [40, 60, 80], [0, 50]], {}),
+    "nested": ([range(0, 100, 3), range(40, 50)], {"chunk_size": 100}),
+    "equal times": ([[0, 0, 5, 5], [0, 5, 5, 10]], {}),
+    "touching": ([[0, 5], [5, 10], [10, 10]], {}),
+    "unsorted": ([[50, 10, 90, 30, 0], [95, 5, 55]], {"chunk_size": 60}),
+    "without chunks": ([[50, 10, 90], [20, 80, 0]], {"use_chunking": False}),
+    "an empty one": ([[], [3, 1], [2]], {}),
+    "one of years": ([[0, 2**64 - 1], [3, 5], [4]], {}),
+}
+
+
+@pytest.mark.parametrize("kind", OVERLAPS)
+def test_files_that_overlap_in_any_way_are_merged_by_time(tmp_path, kind):
+    files, options = OVERLAPS[kind]
+    path = tmp_path / "bag"
+    path.mkdir()
+    for number, times in enumerate(files):
+        with (path / f"{number}.mcap").open("wb") as stream:
+            writer = McapWriter(stream, **options)
+            writer.start("ros2")
+            channel = writer.register_channel("/x", "cdr", writer.register_schema("my_msgs/msg/X", "", b""))
+            for log_ns in times:
+                writer.add_message(channel, log_ns, b"%d" % number, log_ns)
+            writer.finish()
+    # Of equal times, the order of the files and that within them.
+    sent = sorted([(t, b"%d" % n) for n, times in enumerate(files) for t in times], key=lambda said: said[0])
+    assert recover(path, tmp_path / "new").saved == len(sent)
+    for bag in (path, tmp_path / "new"):
+        with Source(bag) as source:
+            assert [(log_ns, data) for _, log_ns, data in source.messages()] == sent
+
+
+def test_a_compressed_file_that_a_player_unpacked_beside_is_read_once(tmp_path):
+    sent = strange_bag(tmp_path / "bag", StoragePlugin.MCAP, CompressionMode.FILE)
+    file = next((tmp_path / "bag").glob("*.zstd"))
+    file.with_suffix("").write_bytes(zstandard.decompress(file.read_bytes(), max_output_size=2**24))
+    assert check(tmp_path / "bag").exit_code == 0
+    assert recover(tmp_path / "bag", tmp_path / "new").saved == len(sent)
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    with Source(tmp_path / "bag") as source:
+        assert list(source.messages()) == sent
+
+
+def test_a_file_that_the_metadata_do_not_name_is_told(tmp_path):
+    """A recorder that was killed wrote them last before its last file; or a file was renamed."""
+    sent = strange_bag(tmp_path / "bag", StoragePlugin.MCAP, CompressionMode.NONE)
+    file = mcap_of(tmp_path / "bag")
+    shutil.copy(file, file.with_name("later.mcap"))
+    said = "metadata.yaml does not name later.mcap: not read; lathe bag recover saves its messages too"
+    checked = lathe("bag", "check", tmp_path / "bag")
+    assert (checked.exit_code, checked.stdout.splitlines()[0]) == (1, said)
+    assert recover(tmp_path / "bag", tmp_path / "new").saved == 2 * len(sent)
+    file.unlink()
+    found = lathe("bag", "info", tmp_path / "bag")
+    assert (found.exit_code, "bag.mcap: there is no such file" in found.stderr) == (3, True)
+    assert "│      400 │" in found.stdout
+    assert "no such file); lathe bag recover saves the rest" in lathe("bag", "check", tmp_path / "bag").stderr
+
+
+FOREIGN = {
+    "ROS 1": (("ros1", ("std_msgs/String", "ros1msg", b"string data")), "std_msgs/String"),
+    "protobuf": (("protobuf", ("foxglove.Log", "protobuf", b"\n\x03abc")), "foxglove.Log"),
+    "without schema": (("cbor", None), ""),
+    "upper case": (("CDR", ("std_msgs/msg/String", "ros2msg", b"string data")), "std_msgs/msg/String"),
+    "without a name": (("", ("", "", b"")), ""),
+    "of no type": (("cdr", None), ""),
+    "two types": (("cdr", ("std_msgs/msg/Int32", "ros2msg", b"int32 data")), "std_msgs/msg/Int32"),
+}
+
+
+@pytest.mark.parametrize("topic", ["/other", "/said"])
+@pytest.mark.parametrize("kind", FOREIGN)
+def test_what_is_not_of_ros_2_hides_nothing_of_it(tmp_path, kind, topic):
+    """Beside a topic of ROS 2, or under its name; alone, it is refused as what it is."""
+    (encoding, schema), name = FOREIGN[kind]
+    for alone in (False, True):
+        file = tmp_path / f"{alone}.mcap"
+        with file.open("wb") as stream:
+            writer = McapWriter(stream)
+            writer.start("another")
+            known = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+            text = () if alone else ((writer.register_channel("/said", "cdr", known), b"\0\1\0\0\1\0\0\0\0"),)
+            number = writer.register_schema(*schema) if schema else 0
+            for channel, data in (*text, (writer.register_channel(topic, encoding, number), b"?")):
+                writer.add_message(channel, 10**9, data, 10**9)
+            writer.finish()
+        found = recover(file, tmp_path / f"new {alone}")
+        assert (found.saved, found.lossy) == (2 - alone, False)
+        read = alone or topic == "/other" if kind == "two types" else False
+        checked = lathe("bag", "check", file)
+        assert checked.exit_code == (2 if alone and not read else 0)
+        told = f"{topic} {name}".strip() + ", 1 messages "
+        assert read or (f"no topic that can be read ({told}" if alone else f"not read: {told}") in checked.output
 
 
 @pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])

@@ -79,7 +79,7 @@ def test_every_refusal_names_node_and_parameter(kind):
         ("spindle_encoder", {"revolutions": 9.0, "tachogram_time": [0.0], "tachogram_deviation": [-2.0]}, "revolution"),
         ("spindle_encoder", {"faults": ["second 1e300: encoder.angle stuck"]}, "faults = 'second 1e300: fault encoder"),
         ("learning_controller", {"events": ["second 1e300: freeze"]}, "events = 'second 1e300: freeze'; allowed"),
-        ("spindle_encoder", {"revolutions": 1e30}, "revolutions = 1e+30: that takes up to "),
+        ("spindle_encoder", {"revolutions": 1e30}, "revolutions = 1e+30, nominal_rpm and its deviations: that takes "),
         ("piezo_actuator", {"play_weights": [0.1]}, "play_thresholds, play_weights, play_proportional: plays: 10 thr"),
         ("series_drive", {"fine_play_weights": [0.1]}, "fine_play_thresholds, fine_play_weights, "),
         ("series_drive", {"fine_use_command": False}, "fine_use_command, fine_use_reference, fine_compensates: "),

@@ -159,7 +159,7 @@ def test_a_cell_goes_on_among_foreign_messages(ghost, domain, tmp_path):
         seen.until(lambda events: expected <= {refused_by_a_node(event) for event in events})
         os.kill(processes.pids["electrodynamic_actuator"], signal.SIGCONT)
         processes.wait_for_end()
-    assert reader.read(tmp_path / "bag").digests() == harness.run(cell).digest
+    assert reader.read_bag(tmp_path / "bag").digests() == harness.run(cell).digest
     assert expected <= set(processes.refused)
     values = {pair.key: pair.value for pair in diagnostics(tmp_path / "bag")["/learning_controller"].values}
     assert "from /nan of run 'test' on /tool" in values["refused"]
@@ -179,7 +179,7 @@ def test_a_cell_begins_in_a_flood_of_announcements(ghost, domain, tmp_path):
         Seen(processes).until(in_the_flood)
         begin()
         processes.wait_for_end()
-    assert reader.read(tmp_path / "bag").digests() == harness.run(cell).digest
+    assert reader.read_bag(tmp_path / "bag").digests() == harness.run(cell).digest
     assert processes.refused["/x of run 'elsewhere' on /members"] > 256
 
 

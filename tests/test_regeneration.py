@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis.regeneration import Regeneration, lobes
+from lathe_papers.formulas.regeneration import Regeneration, lobes
 from lathe_rc.errors import InputError
 from lathe_rc.plants.cutting import CuttingProcess
 from lathe_rc.plants.cutting_force import SpecificForce

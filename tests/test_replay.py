@@ -24,7 +24,9 @@ from std_srvs.srv import Trigger
 
 from lathe_rc import harness
 from lathe_rc.bag.check import check
+from lathe_rc.bag.reading import qos
 from lathe_rc.bag.reading.source import Source
+from lathe_rc.nodes import replayed_qos, replayer
 
 COUNT = 1500
 
@@ -236,7 +238,12 @@ def test_a_bag_of_odd_topics_is_replayed_as_far_as_it_goes(domain, odd):
     fast = ["--rate", "0", "--topics", "/latched", "--topics", "/mixed"]
     commands = [
         (["--end", "5", "--rate", "0"], 2, "/tool/: no name in ROS (topic name must not end with a forward slash)"),
-        ([*fast], 2, "log times up to 4611686018427387904 ns; /clock ends in 2038; leave them out by end"),
+        (
+            ["--topics", "/late"],
+            2,
+            "/late: log time 4611686018427387904 ns; /clock ends in 2038; replayer.end = 21474836",
+        ),
+        (fast, 0, "4 messages sent"),
         ([*fast, "--start", "0.5", "--end", "5"], 0, "2 messages sent"),
         ([*fast, "--end", "5"], 0, "/mixed: its publishers offered different QoS; sent reliable and volatile"),
         ([*fast, "--end", "5"], 0, "not sent: /json std_msgs/msg/String, 0 messages serialized as 'json', not 'cdr'"),
@@ -246,15 +253,45 @@ def test_a_bag_of_odd_topics_is_replayed_as_far_as_it_goes(domain, odd):
         assert code == wanted, told
         assert said in told
     with started("replay", odd, "--topics", "/mixed", "--start", "1", "--end", "2e9") as process:
-        waits = "the next message comes in 31.7 years; start = 1e+09 begins with it"
+        waits = "the next message comes in 31.7 years; start = 1000000000 begins with it"
         assert any(waits in line for line in process.stdout)
         process.kill()
+
+
+@pytest.mark.parametrize("time_ns", [0, 999, 1_499_000_000, 1_700_000_000_123_456_789, 1_700_000_128_700_000_000])
+def test_the_start_that_is_told_is_no_later_than_its_message(time_ns):
+    """As a number it was up to 5 s later: of nine digits, and in binary."""
+    assert 0 <= time_ns - replayer._ns(float(replayer._seconds(time_ns))) < 1000
+
+
+LATCHED = "- {durability: transient_local, depth: 2"
+OFFERS = {
+    "infinite or not told": (f"{LATCHED}}}\n{LATCHED}, deadline: {{sec: 9223372036, nsec: 854775807}}}}", True, 4),
+    "other deadlines": (f"{LATCHED}, deadline: {{sec: 1, nsec: 0}}}}\n{LATCHED}}}", True, 4),
+    "other lifespans": (f"{LATCHED}, lifespan: {{sec: 1, nsec: 0}}}}\n{LATCHED}}}", True, 4),
+    "other liveliness": (f"{LATCHED}, liveliness: 1}}\n{LATCHED}, liveliness: 3}}", True, 4),
+    "partial": (f"{LATCHED}}}\n{LATCHED}, reliability: reliable}}", True, 4),
+    "by number": ("- {durability: 1, reliability: 1, history: 1, depth: 3}", True, 3),
+    "all are kept": (f"{LATCHED}, history: keep_all}}", True, 512),
+    "all are kept, by number": ("- {durability: 1, history: 2, depth: 0}", True, 512),
+    "latched and volatile": (f"{LATCHED}}}\n- {{durability: volatile}}", False, None),
+    "best effort and reliable": (f"{LATCHED}}}\n{LATCHED}, reliability: best_effort}}", False, None),
+}
+
+
+@pytest.mark.parametrize("kind", OFFERS)
+def test_publishers_differ_only_in_what_one_publisher_cannot_offer(kind):
+    text, latched, kept = OFFERS[kind]
+    recorded = qos.of_text(text)
+    assert replayed_qos.differ(recorded) is not latched
+    assert (replayed_qos.of(recorded).durability == DurabilityPolicy.TRANSIENT_LOCAL) is latched
+    assert kept is None or replayed_qos.kept(recorded) == kept
 
 
 def test_what_cannot_be_sent_is_refused(domain, tmp_path):
     store = get_typestore(Stores.ROS2_JAZZY)
     cases = [
-        (2**31 * 10**9, bytes(12), [], "log times up to 2147483648000000000 ns; /clock ends in 2038"),
+        (2**31 * 10**9, bytes(12), [], "log time 2147483648000000000 ns; /clock ends in 2038; name other topics"),
         (1, bytes(12), ["--topics", "/clock"], "/clock is the replayer's own and tells the log times of the bag"),
         (1, b"junk" * 1000, [], "/other: message 1 that is sent is none of its type"),
     ]

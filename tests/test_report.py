@@ -14,6 +14,7 @@ from cells import scenario
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.writer import Writer as McapWriter
 from numpy.testing import assert_allclose
 from shown_page import ShownPage
 
@@ -45,7 +46,7 @@ def turned(tmp_path_factory):
     harness.run(scenario(**nodes), bag=folder / "bag")
     done = CliRunner().invoke(report, [str(folder / "bag"), "-o", str(folder / "page.html")])
     assert done.exit_code == 0, done.output
-    return folder / "bag", reader.read(folder / "bag"), (folder / "page.html").read_text(encoding="utf-8")
+    return folder / "bag", reader.read_bag(folder / "bag"), (folder / "page.html").read_text(encoding="utf-8")
 
 
 class TestPage:
@@ -102,7 +103,7 @@ class TestPage:
 
     def test_figures_are_whole_svg_without_links(self, turned):
         images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', turned[2])
-        assert len(images) == 5  # map, polar, spectrum, convergence, speed
+        assert len(images) == 5  # two polar ones, spectrum, convergence, speed; the map is a JPEG
         for image in images:
             root = ET.fromstring(base64.b64decode(image))  # noqa: S314 - made here
             assert root.tag == "{http://www.w3.org/2000/svg}svg"
@@ -133,7 +134,7 @@ class TestPage:
 
     def test_is_the_same_every_time(self, turned):
         bag, _, page = turned
-        reporting.write(bag, bag.parent / "page.html")
+        reporting.write_report(bag, bag.parent / "page.html")
         assert (bag.parent / "page.html").read_text(encoding="utf-8") == page
 
 
@@ -151,7 +152,7 @@ class TestVerdict:
         assert told.verdict.text == re.sub("^i", "I", harness.run(cell).verdict.told()) + "."
         assert (told.verdict.mood, told.wrong) == ("good", [])
         page = tmp_path / "page.html"
-        reporting.write(tmp_path / "bag", page)
+        reporting.write_report(tmp_path / "bag", page)
         text = ShownPage(page.read_text(encoding="utf-8")).text
         assert text.index("In tolerance (±2 µm)") < text.index("Nothing was lost") < text.index("Result")
 
@@ -444,6 +445,17 @@ def hostile(tmp_path_factory):
     return path
 
 
+def test_a_bag_that_is_of_no_cell_is_called_so(tmp_path):
+    file = tmp_path / "foreign.mcap"
+    with file.open("wb") as stream:
+        foreign = McapWriter(stream)
+        foreign.start()
+        foreign.finish()
+    done = CliRunner().invoke(report, [str(file), "-o", str(tmp_path / "page.html")])
+    assert done.exit_code == 0, done.output
+    assert done.stderr == "incomplete recording: the bag has no encoder and no tool\n"
+
+
 def test_a_hostile_bag_gives_a_harmless_page(hostile, tmp_path):
     done = CliRunner().invoke(report, [str(hostile), "-o", str(tmp_path / "page.html")])
     assert done.exit_code == 0, done.output
@@ -467,7 +479,7 @@ def test_a_bag_of_something_else_has_a_page_too(tmp_path):
     writer = BagWriter(tmp_path / "bag", compression="none", chunk_size=2**16, about={})
     writer.add_topic("/chatter", messages.JOINTS, offered_qos(10, "volatile"))
     writer.close()
-    reporting.write(tmp_path / "bag", tmp_path / "page.html")
+    reporting.write_report(tmp_path / "bag", tmp_path / "page.html")
     assert "the bag has no encoder and no tool" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
@@ -498,11 +510,11 @@ def test_a_gap_is_told_and_what_came_before_is_shown(turned, tmp_path):
 def test_places_that_are_none_are_refused(turned, tmp_path, name, said):
     (tmp_path / "dir.html").mkdir()
     with pytest.raises(InputError, match=said):
-        reporting.write(turned[0], tmp_path / name)
+        reporting.write_report(turned[0], tmp_path / name)
 
 
 def test_what_is_no_bag_is_refused_and_leaves_no_page(tmp_path):
     (tmp_path / "x").mkdir()
     with pytest.raises(InputError):
-        reporting.write(tmp_path / "x", tmp_path / "page.html")
+        reporting.write_report(tmp_path / "x", tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()

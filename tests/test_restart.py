@@ -120,7 +120,7 @@ def test_a_killed_controller_goes_on_in_another_process_to_the_bit(tmp_path):
     cell, killer = load(CONFIG / "supervised.yaml", kept), Killer(OWN, [30_000, 90_000])
     result = harness.run(cell, mode="processes", bag=tmp_path / "bag", watch=killer)
     assert result.digest == harness.run(cell).digest
-    assert reader.read(tmp_path / "bag").digests() == result.digest
+    assert reader.read_bag(tmp_path / "bag").digests() == result.digest
     assert check_bag(tmp_path / "bag").exit_code == 0
     assert [event["member"] for event in killer.all("dead")] == [f"/{OWN}"] * 2
     window = cell.nodes[OWN].window
@@ -164,7 +164,7 @@ def test_an_event_that_was_asked_for_is_kept_when_a_state_of_before_is_written(g
     expected = harness.run(load(CONFIG / "piston.yaml", [
         "spindle_encoder.revolutions=20.0", f"{OWN}.events=['sample {promised}: freeze']",
     ]))  # fmt: skip
-    assert reader.read(tmp_path / "bag").digests() == expected.digest
+    assert reader.read_bag(tmp_path / "bag").digests() == expected.digest
 
 
 @pytest.mark.parametrize("restarts", [True, False])
@@ -228,7 +228,7 @@ def named(module, name, *arguments):
         b"cposix\nmk\x0bdir\n.",  # found by benchmarks/fuzz.py: its bytes made two lines of the refusal
         pickle.dumps(Path()),
         pickle.dumps(np.zeros(3)),
-        named("lathe_rc.analysis.angle_domain", "np.f2py.subprocess.Popen", "true"),
+        named("lathe_papers.formulas.angle_domain", "np.f2py.subprocess.Popen", "true"),
         named("lathe_rc.bag.writing.writer", "BagWriter", "bag"),
     ],
 )

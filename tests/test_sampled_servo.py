@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis import sampled_loop
-from lathe_rc.analysis.sampled_loop import STEPS, measures, periods_to_settle, report, step_response
+from lathe_papers import sampled_servo
+from lathe_papers.formulas import sampled_loop
+from lathe_papers.formulas.sampled_loop import STEPS, measures, periods_to_settle, report, step_response
+from lathe_papers.sampled_servo_numbers import DESIRED, RATIOS, SampledServoParameters, first_crossing
 from lathe_rc.cli import main
 from lathe_rc.control.sampled_link import NONE, Link, SampledDrive, closed_loop, paper, ripple_free, towards
-from lathe_rc.studies import sampled_servo
-from lathe_rc.studies.sampled_servo_numbers import DESIRED, RATIOS, SampledServoParameters, first_crossing
 
 DRIVE = SampledDrive(6.25, 0.08, 0.16)
 ROUNDING = 1e-9

@@ -9,12 +9,12 @@ from click.testing import CliRunner
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from lathe_papers.formulas.hyperstability import NOMINAL, corners
+from lathe_papers.formulas.periodic_example import Case, limited_ideal_error, simulate
 from lathe_rc import cli
-from lathe_rc.analysis.hyperstability import NOMINAL, corners
-from lathe_rc.analysis.periodic_example import Case, limited_ideal_error, simulate
 from lathe_rc.control.periodic_gains import PRESETS
 from lathe_rc.errors import InputError
-from lathe_rc.studies import STUDIES
+from lathe_rc.study import STUDIES
 
 STEP, COARSEST = 0.005, 0.01  # [s]
 STUDY = STUDIES["saturation"]

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
+from lathe_papers.formulas.responses import in_series
 from lathe_rc import messages
-from lathe_rc.analysis.responses import in_series
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.stage import compile_kernels
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters

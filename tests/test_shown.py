@@ -64,7 +64,7 @@ def spindle_alone():
 
 
 def test_a_recording_lists_its_topics_with_units(result):
-    recording = reader.read(result.bag)
+    recording = reader.read_bag(result.bag)
     assert repr(recording) == repr(result.recording)
     assert len(repr(recording)) < LONGEST
     told = {row[0]: row[1:] for row in rows(recording._repr_html_())}
@@ -111,7 +111,7 @@ class TestPlot:
         assert len(form.get_lines()) == 2
 
     def test_of_a_bag_is_that_of_its_run(self, result):
-        assert reader.read(result.bag).plot("test")._repr_png_() == result.plot()._repr_png_()
+        assert reader.read_bag(result.bag).plot("test")._repr_png_() == result.plot()._repr_png_()
 
     def test_is_shown_by_a_notebook_without_pyplot(self, result):
         assert result.plot()._repr_png_().startswith(b"\x89PNG")
@@ -120,7 +120,7 @@ class TestPlot:
         recorder = {"mode": "both", "pre": 0.03, "post": 0.15, "triggers": ["*: freeze"]}
         events = {"events": ["sample 9000: freeze"]}
         cell = scenario(spindle_encoder={"revolutions": 5.0}, learning_controller=events, recorder=recorder)
-        snapshot = reader.read(harness.run(cell, bag=tmp_path / "bag").snapshots[0])
+        snapshot = reader.read_bag(harness.run(cell, bag=tmp_path / "bag").snapshots[0])
         _, over_angle, curve = snapshot.plot().axes
         assert curve.get_lines()[0].get_xdata().tolist() == [3, 4]
         assert over_angle.get_lines()[0].get_label().startswith("revolution 3: ")

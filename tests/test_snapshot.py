@@ -433,6 +433,7 @@ def test_flood_of_events_is_refused_by_name(tmp_path):
             {"pre": 60.0, "memory": 2**20},
             r"recorder.pre = 60 s takes \d+ B of memory, \d+ B for 64 samples .* allows pre = 0\.\d+ s: shorten pre or",
         ),
+        ({"pre": 0.0, "memory": 2**16}, r"memory = 65536 B allows none: raise memory to \d+ B or more"),
         ({"triggers": ["tol: *"]}, r"recorder.triggers = 'tol: \*': no node 'tol' in the cell; did you mean tool\?"),
         ({"triggers": ["freeze"]}, r"triggers = 'freeze'; allowed: a pattern of NODE: ACTION, like '\*: freeze'"),
         ({"faults": ["second 1: bag off"]}, r"faults = .*: a recorder has none; allowed: none \(see triggers"),

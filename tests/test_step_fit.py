@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import trapezoid
 from scipy.signal import step as scipy_step
 
-from lathe_rc.analysis.step_fit import (
+from lathe_papers.formulas.step_fit import (
     Delay,
     FirstOrder,
     SecondOrder,

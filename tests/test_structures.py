@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis.responses import in_series, lead, lead_lag, second_order, smoothing
-from lathe_rc.analysis.structures import (
+from lathe_papers.formulas.responses import in_series, lead, lead_lag, second_order, smoothing
+from lathe_papers.formulas.structures import (
     Channel,
     contraction,
     cycles,

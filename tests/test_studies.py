@@ -14,19 +14,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis.loaded import compliance
-from lathe_rc.analysis.regeneration import Regeneration
-from lathe_rc.analysis.step_fit import SecondOrder
+from lathe_papers import angle_domain, drive_models, invariance
+from lathe_papers.angle_domain import AngleDomainParameters
+from lathe_papers.drive_models import DriveModelsParameters
+from lathe_papers.formulas.invariance import FirstOrderInvariance
+from lathe_papers.formulas.loaded import compliance
+from lathe_papers.formulas.regeneration import Regeneration
+from lathe_papers.formulas.step_fit import SecondOrder
+from lathe_papers.invariance import InvarianceParameters
 from lathe_rc.cli import main
 from lathe_rc.commands import study as commands_study
 from lathe_rc.commands.study import read
-from lathe_rc.control.invariance import FirstOrderInvariance
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.signals import speed
-from lathe_rc.studies import STUDIES, angle_domain, drive_models, invariance
-from lathe_rc.studies.angle_domain import AngleDomainParameters
-from lathe_rc.studies.drive_models import DriveModelsParameters
-from lathe_rc.studies.invariance import InvarianceParameters
+from lathe_rc.study import STUDIES
 from lathe_rc.transfer import TransferFunction
 
 KEYS = {

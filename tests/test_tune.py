@@ -13,6 +13,7 @@ from click.testing import CliRunner
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
+import lathe_rc
 from lathe_rc import cli, harness, resources
 from lathe_rc.analysis.pid_tuning import evaluate
 from lathe_rc.cell import batch, scenario
@@ -126,7 +127,7 @@ class TestAsking:
     def test_a_search_that_cannot_be_is_refused_before_anything_is_written(self, piston, tmp_path, more, said):
         goals = more.pop("goals", ["tool.max_error"])
         with pytest.raises(InputError, match=said):
-            harness.tune(piston, FREE, goals, tmp_path / "x", **more)
+            lathe_rc.tune(piston, FREE, goals, tmp_path / "x", **more)
         assert not (tmp_path / "x").exists()
 
 
@@ -173,7 +174,7 @@ class TestScore:
 def tuned(piston, client, tmp_path_factory):
     """A search that nothing interrupted."""
     folder = tmp_path_factory.mktemp("tune") / "whole"
-    return harness.tune(
+    return lathe_rc.tune(
         piston, FREE, ["tool.rms_error"], folder, subjects=["margin>=0.1"], trials=20, batch=4, client=client
     )
 
@@ -204,7 +205,7 @@ class TestSearch:
 
     def test_the_same_call_computes_nothing_and_gives_the_same(self, tuned, piston, client):
         events = []
-        again = harness.tune(
+        again = lathe_rc.tune(
             piston,
             FREE,
             ["tool.rms_error"],
@@ -238,7 +239,7 @@ class TestSearch:
                 raise KeyboardInterrupt
 
         def go():
-            return harness.tune(
+            return lathe_rc.tune(
                 piston,
                 FREE,
                 ["tool.rms_error"],
@@ -259,7 +260,7 @@ class TestSearch:
 
     def test_more_trials_go_on_from_those_that_are_there(self, tuned, piston, client, tmp_path):
         for trials in (4, 8):
-            found = harness.tune(
+            found = lathe_rc.tune(
                 piston,
                 FREE,
                 ["tool.rms_error"],
@@ -277,7 +278,7 @@ class TestSearch:
         """Both programs end with the same trials and the same best."""
 
         def go(trials, watch=sweep.ignore):
-            return harness.tune(
+            return lathe_rc.tune(
                 piston, FREE, ["margin"], tmp_path / "x", trials=trials, batch=4, client=client, watch=watch
             )
 
@@ -310,7 +311,7 @@ class TestSearch:
             write(tuning, trial, path)
 
         monkeypatch.setattr(Tuning, "write", locked)
-        harness.tune(piston, FREE, ["tool.rms_error"], tmp_path / "x", trials=2, client=client)
+        lathe_rc.tune(piston, FREE, ["tool.rms_error"], tmp_path / "x", trials=2, client=client)
         assert written
 
     @pytest.mark.parametrize(
@@ -355,9 +356,9 @@ class TestSearch:
     def test_a_folder_holds_one_tuning_and_no_sweep(self, tuned, piston, client):
         path = tuned.folder.path
         with pytest.raises(InputError, match="holds a tuning; allowed: a new folder"):
-            harness.sweep(piston, Space(grid={LEAD: [1e-3]}), path, client=client)
+            lathe_rc.run_sweep(piston, Space(grid={LEAD: [1e-3]}), path, client=client)
         with pytest.raises(InputError, match=r'holds a tuning with goals \["tool.rms_error"\], not \["margin"\]'):
-            harness.tune(piston, FREE, ["margin"], path, client=client)
+            lathe_rc.tune(piston, FREE, ["margin"], path, client=client)
 
     def test_choices_and_whole_numbers_are_searched(self, piston, client, tmp_path):
         free = {
@@ -366,7 +367,7 @@ class TestSearch:
             "learning_controller.soft_start": [0.0, 1.0],
             "learning_controller.feedback_delay": "2000:3200",
         }
-        found = harness.tune(piston, free, ["tool.rms_error"], tmp_path / "x", trials=8, client=client)
+        found = lathe_rc.tune(piston, free, ["tool.rms_error"], tmp_path / "x", trials=8, client=client)
         values = found.trials[-1].values
         assert [type(values[target]) for target in free] == [str, int, float, int]
         assert found.start.score.feasible
@@ -375,7 +376,7 @@ class TestSearch:
     @pytest.mark.parametrize("sampler", ["cmaes", "nsga2"])
     def test_other_samplers_go_on_where_they_were_stopped(self, piston, client, tmp_path, sampler):
         def go(folder, trials):
-            return harness.tune(
+            return lathe_rc.tune(
                 piston, FREE, ["tool.rms_error"], tmp_path / folder, sampler=sampler, trials=trials, client=client
             )
 
@@ -385,7 +386,7 @@ class TestSearch:
         assert whole.best.score.costs < whole.start.score.costs
 
     def test_two_goals_give_a_front_and_a_file_of_each(self, piston, client, tmp_path):
-        found = harness.tune(piston, FREE, ["tool.rms_error", "-margin"], tmp_path / "x", trials=24, client=client)
+        found = lathe_rc.tune(piston, FREE, ["tool.rms_error", "-margin"], tmp_path / "x", trials=24, client=client)
         front = found.front
         assert len(front) > 1
         for trial in front:
@@ -400,7 +401,7 @@ class TestSearch:
 
     def test_the_goal_over_plants_is_that_of_the_worst(self, piston, client, tmp_path):
         over = Space(sampled={"electrodynamic_actuator.natural_frequency": "uniform:90%:110%"}, sample="sobol:4")
-        found = harness.tune(piston, FREE, ["tool.rms_error"], tmp_path / "x", over=over, trials=3, client=client)
+        found = lathe_rc.tune(piston, FREE, ["tool.rms_error"], tmp_path / "x", over=over, trials=3, client=client)
         errors = found.sweep.table().column("tool.rms_error").to_pylist()
         assert len(errors) == 12
         for trial in found.trials:
@@ -412,7 +413,7 @@ class TestSearch:
 
     def test_a_cell_without_a_tool_is_tuned_by_what_is_measured_in_its_last_revolution(self, client, tmp_path):
         cut = load("interrupted_cut", 4, f"{PID[0]}=1e-3")
-        found = harness.tune(cut, {PID[0]: "1e-4:0.05:log"}, [ERROR], tmp_path / "x", trials=3, client=client)
+        found = lathe_rc.tune(cut, {PID[0]: "1e-4:0.05:log"}, [ERROR], tmp_path / "x", trials=3, client=client)
         again = harness.run(found.sweep.scenario(2))
         kept = found.sweep.row(2)
         assert row.digest(again.recording, found.folder.measures) == kept["digest"]
@@ -482,7 +483,7 @@ def test_the_robust_setting_of_the_page_is_twice_as_good_on_the_worst_plant_as_t
 
     def worst(setting):
         cells = (two_channel.varied({**setting, **plant}) for plant in plants.cells(two_channel))
-        return max(outcome.kept.largest[-1] for outcome in batch.run(cells, batch.Errors))
+        return max(outcome.kept.largest[-1] for outcome in batch.run_many(cells, batch.Errors))
 
     assert worst(robust) < 0.5 * worst(nominal)
 

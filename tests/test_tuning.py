@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis.responses import lead, lead_lag
-from lathe_rc.analysis.structures import cycles, steady_error, supremum
-from lathe_rc.analysis.tuning import (
+from lathe_papers.formulas.responses import lead, lead_lag
+from lathe_papers.formulas.structures import cycles, steady_error, supremum
+from lathe_papers.formulas.tuning import (
     FREQUENCIES,
     HIGHEST,
     LEAD_LAG,

@@ -54,7 +54,7 @@ def turned(tmp_path_factory):
     given = {"profile": "harmonics", "harmonic_order": [1, 3], "harmonic_amplitude": [20e-6, 50e-6], "feed": 1e-4}
     learning = {"events": ["revolution 9: freeze"]}
     harness.run(scenario(spindle_encoder={"revolutions": 12.3}, tool=given, learning_controller=learning), bag=bag)
-    return bag, reader.read(bag)
+    return bag, reader.read_bag(bag)
 
 
 class View:

@@ -24,6 +24,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
+from lathe_rc.command_list import COMMANDS
 from workplace import ROOT
 
 SCENARIOS = sorted(path.stem for path in (ROOT / "config").glob("*.yaml"))
@@ -45,10 +46,11 @@ class Case(NamedTuple):
 
     @property
     def name(self) -> str:
+        """Group and command line."""
         return f"{self.group}: lathe {' '.join(self.words)}"
 
 
-def cases(hosts: bool) -> Iterator[Case]:
+def cases(*, hosts: bool) -> Iterator[Case]:
     """All cases; a bag that a case reads was recorded by an earlier one of its group."""
     for name in SCENARIOS:
         yield Case(name, ["run", name, "--revolutions", "25", "--bag", "B", "--json"], ["B/digests.json"])
@@ -89,10 +91,6 @@ def cases(hosts: bool) -> Iterator[Case]:
         yield Case("refusals", [*words[0].split(), "missing"])
 
 
-COMMANDS = (
-    *("bag", "budget", "completion", "container", "demo", "export", "fit", "measure", "new", "node", "policy", "record"),
-    *("reference", "replay", "report", "resim", "run", "study", "sweep", "tune", "view"),
-)
 REFUSED = (
     ["learning_controller.lead_time=2.2e-3"],
     ["learning_controller.q_time=0.0"],
@@ -170,7 +168,7 @@ def main() -> int:
         base = Path(temporary) / "tree"
         subprocess.run(["git", "worktree", "add", "--quiet", "--detach", base, options.commit], cwd=ROOT, check=True)
         try:
-            chosen = [case for case in cases(options.hosts) if options.only in case.group]
+            chosen = [case for case in cases(hosts=options.hosts) if options.only in case.group]
             count = wrong = 0
             for case, diff in differences(base, Path(temporary) / "work", chosen):
                 count += 1

@@ -14,7 +14,7 @@ import yaml
 
 from workplace import ROOT
 
-FOLDERS = ("docs", "lathe_rc", "msg_defs", "tests", "tools")
+FOLDERS = ("docs", "lathe_papers", "lathe_rc", "msg_defs", "tests", "tools")
 RULES = ROOT / "tools" / "prose.yaml"
 # These say nothing of their content.
 MODULES = {"both", "happened", "leftovers", "offered", "played", "story", "strangers", "trust", "walk", "watch"}

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, at_most
 from lathe_rc.plants.hysteresis import THRESHOLDS, PrandtlIshlinskii, check_thresholds, plays
 from lathe_rc.signals.table import read_table
 
@@ -100,8 +100,8 @@ def identify(loop: Loop, stroke: float, thresholds: Array = THRESHOLDS) -> Ident
     if idle.size:
         raise InputError(
             f"hysteresis loop: a range of {(high - low) * stroke * 1e6:.4g} µm does not take a play of "
-            f"{idle[0] * stroke * 1e6:.4g} µm to each side along; allowed: a wider loop, or thresholds below "
-            f"{whole / 2.0:.4g} of the stroke"
+            f"{idle[0] * stroke * 1e6:.4g} µm to each side along; allowed: a wider loop, a smaller stroke, or "
+            f"thresholds below {at_most(whole / 2.0, 4)} of the stroke"
         )
     side = 1.0 if command[0] > (low + high) / 2.0 else -1.0
     known = plays(thresholds, command[0] - side * thresholds, command)
@@ -143,7 +143,7 @@ def from_signals(
     """A loop from the signals of a recorded run.
 
     Args:
-        dense: of a `lathe_rc.cell.recording.Recording`, as `lathe_rc.bag.reader.read` gives it.
+        dense: of a `lathe_rc.cell.recording.Recording`, as `lathe_rc.bag.reader.read_bag` gives it.
         command: topic with the drive's command; its linearisation must be off.
         state: topic with the drive's state.
 

@@ -207,10 +207,11 @@ def feed_mark(feed: float, nose_radius: float) -> float:
     Raises:
         InputError: a nose that would leave material between revolutions, or none.
     """
-    if not 0.0 < abs(feed) <= 2.0 * nose_radius < np.inf:
+    # Where noses only just touch, rounding decides if a place between them is cut.
+    if not 0.0 < abs(feed) < 2.0 * nose_radius * (1.0 - 1e-9) < np.inf:
         raise InputError(
-            f"feed of {feed:g} m/rev and a nose of {nose_radius:g} m; allowed: a feed other than 0 and up to twice the "
-            "nose's radius"
+            f"feed of {feed:g} m/rev and a nose of {nose_radius:g} m; allowed: a feed other than 0 and below twice "
+            "the nose's radius"
         )
     return float(nose_radius - np.sqrt(nose_radius**2 - feed**2 / 4.0))
 

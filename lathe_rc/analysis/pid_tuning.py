@@ -178,5 +178,6 @@ def fastest(
             return gains
     raise InputError(
         f"tuning: no crossover from {band[0]:g} to {band[1]:g} rad/s has margins of "
-        f"{np.degrees(phase_margin):.4g}° and {gain_margin:g}; allowed: a lower band or smaller margins"
+        f"{np.degrees(phase_margin):.4g}° and {gain_margin:g}; allowed: a lower band, smaller margins or a "
+        "shorter delay"
     )

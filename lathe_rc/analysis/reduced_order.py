@@ -20,7 +20,7 @@ import numpy.typing as npt
 import scipy
 
 from lathe_rc.control.decoupler import LAG, inverse
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, at_least
 from lathe_rc.signals.table import read_table
 from lathe_rc.transfer import Hold, LinearSystem, TransferFunction
 
@@ -202,7 +202,7 @@ def fit_inverse(model: TransferFunction, measured: ChannelStep, *, least_lag: fl
     if measured.step > least_lag:
         raise InputError(
             f"inverse: response in steps of {measured.step:g} s, lags from {least_lag:g} s; "
-            f"allowed: steps up to the least lag (--lag {measured.step:g}, or a finer record)"
+            f"allowed: steps up to the least lag (--lag {at_least(measured.step)}, or a finer record)"
         )
     start = inverse(model, least_lag)
     missing = len(model.denominator) - len(model.numerator)

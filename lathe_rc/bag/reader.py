@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading bags of the cell back, whole."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -30,17 +31,14 @@ class _Whole:
             self.sparse.setdefault(topic, []).extend(found)
 
 
-def read(path: Path) -> Recording:
+def read_bag(path: str | os.PathLike[str]) -> Recording:
     """All signal topics of a bag; memory for all of it is needed, see `lathe_rc.bag.reading.stream` otherwise.
 
     Example:
-        >>> from pathlib import Path
-        >>> from lathe_rc import harness, resources
-        >>> from lathe_rc.bag import reader
-        >>> from lathe_rc.cell import scenario
-        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=3"])
-        >>> result = harness.run(piston, bag=Path("piston_bag"))
-        >>> recording = reader.read(Path("piston_bag"))
+        >>> import lathe_rc
+        >>> piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=3"])
+        >>> result = lathe_rc.run(piston, bag="piston_bag")
+        >>> recording = lathe_rc.read_bag("piston_bag")
         >>> recording.digests() == result.digest
         True
         >>> figure = recording.plot("three revolutions")
@@ -51,7 +49,7 @@ def read(path: Path) -> Recording:
         LatheError: a block is missing or repeated.
     """
     whole = _Whole()
-    header = feed(path, [whole])
+    header = feed(Path(path), [whole])
     dense, sparse = {}, {}
     for topic, msgtype in header.types.items():
         if msgtype in messages.block_types():

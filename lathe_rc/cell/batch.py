@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many cells at once, all through the same compiled program, on all cores.
 
-    piston = scenario.load(Path("config/piston.yaml"))
+    piston = lathe_rc.load("piston")
     cells = (piston.varied({"learning_controller.learning_gain": gain}) for gain in (0.25, 0.5, 1.0))
-    for outcome in run(cells, Errors):
+    for outcome in lathe_rc.run_many(cells):
         print(outcome.kept.rms[-1])
 
 A cell gets the bits that it gets alone, though it shares with the one before what does not differ: see `Bench`. Nothing
@@ -13,10 +13,11 @@ takes does not depend on how many they are.
 
 import os
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from functools import partial
+from typing import Any, Generic, Protocol, TypeVar, overload
 
 from lathe_rc import messages
 from lathe_rc.analysis.form_errors import FormErrors, RunningErrors
@@ -64,42 +65,59 @@ class Outcome(Generic[K_co]):
     error: LatheError | None = None
 
 
-def run(scenarios: Iterable[Scenario], keep: Make[K_co], *, threads: int | None = None) -> Iterator[Outcome[K_co]]:
+@overload
+def run_many(scenarios: Iterable[Scenario], *, threads: int | None = None) -> Iterator[Outcome[FormErrors]]: ...
+
+
+@overload
+def run_many(
+    scenarios: Iterable[Scenario], keep: Sequence[str], *, threads: int | None = None
+) -> Iterator[Outcome[Recording]]: ...
+
+
+@overload
+def run_many(
+    scenarios: Iterable[Scenario], keep: Make[K_co], *, threads: int | None = None
+) -> Iterator[Outcome[K_co]]: ...
+
+
+def run_many(
+    scenarios: Iterable[Scenario], keep: Make[Any] | Sequence[str] | None = None, *, threads: int | None = None
+) -> Iterator[Outcome[Any]]:
     """Run cells to their ends.
 
     Args:
         scenarios: of the cells; each needs a number of revolutions. They are asked for as their turn comes; variations
             of a `Scenario.named` are made in half the time.
-        keep: what to keep of each: `Errors`, `partial(Topics, topics=...)`, or a keeper of one's own.
+        keep: the part of a run that is kept: None: its form error by revolution; relative topics: these, whole; or a
+            function that makes a `Keeper` for a cell and a number of samples.
         threads: that compute; None: one for each core.
 
     Yields:
         The outcomes, in the order of the scenarios. A cell that is refused, or that fails on the way, is one of them.
 
     Example:
-        >>> from functools import partial
-        >>> from pathlib import Path
-        >>> from lathe_rc import resources
-        >>> from lathe_rc.cell import batch, scenario
-        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=10"])
+        >>> import lathe_rc
+        >>> piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=10"])
         >>> cells = [piston.varied({"learning_controller.lead_time": lead}) for lead in (1.425e-3, 1.3e-3, 3e-3)]
-        >>> for outcome in batch.run(cells, batch.Errors):
+        >>> for outcome in lathe_rc.run_many(cells):
         ...     lead = outcome.scenario.nodes["learning_controller"].lead_time
         ...     told = outcome.error or f"{outcome.kept.rms[-1] * 1e6:.3f} µm RMS"
         ...     print(f"{lead * 1e3} ms: {told}"[:60])
         1.425 ms: 0.545 µm RMS
         1.3 ms: 0.656 µm RMS
         3.0 ms: learning_controller: learning diverges with electrod
-        >>> (outcome,) = batch.run([piston], partial(batch.Topics, topics=["tool"]))
+        >>> (outcome,) = lathe_rc.run_many([piston], ["tool"])
         >>> len(outcome.kept.frame("/tool"))
         38395
     """
+    make = keep if callable(keep) else Errors if keep is None else partial(Topics, topics=keep)
     count = threads or os.cpu_count() or 1
-    waiting: deque[Future[Outcome[K_co]]] = deque()
+    waiting: deque[Future[Outcome[Any]]] = deque()
     pool, idle = ThreadPoolExecutor(count), deque(Bench() for _ in range(count))
     try:
         for number, scenario in enumerate(scenarios):
-            waiting.append(pool.submit(_outcome, scenario, keep, idle))
+            waiting.append(pool.submit(_outcome, scenario, make, idle))
             # The first compiles what the others use.
             if number == 0 or len(waiting) > _AHEAD * count:
                 yield waiting.popleft().result()

@@ -2,6 +2,7 @@
 """Keeping the signals of an offline run in memory."""
 
 import contextlib
+import math
 import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -40,7 +41,7 @@ def check_room(cell: Cell) -> None:
     if needed > free:
         turns = master.parameters.revolutions
         most = turns * free / needed
-        most_said = f"{most:,.0f}" if most > 10.0 else f"{most:.2g}"
+        most_said = f"{math.floor(most)}" if most > 10.0 else f"{most:.2g}"
         raise InputError(
             f"{master.name}.revolutions = {turns:g}: {cell.expected_samples:.4g} samples of all signals take "
             f"{needed / 2**30:,.1f} GiB of memory, {free / 2**30:,.1f} GiB are free; allowed: up to "

@@ -35,7 +35,15 @@ def parameter(default: Any, doc: str, unit: str = "1", *, path: bool = False, dr
     ``drive`` marks what a controller takes for a quantity of the drive that it commands, by the name of the quantity in
     `NodeParameters.drive_models`: where a scenario does not give it, it is the drive's (`lathe_rc.cell.models`).
 
-    Ranges stand in the annotation, e.g. ``Annotated[float, Gt(0)]``.
+    Ranges stand in the annotation.
+
+    Example:
+        >>> from typing import Annotated
+        >>> from annotated_types import Gt
+        >>> from lathe_rc import LawParameters, parameter
+        >>> class Gains(LawParameters):
+        ...     learning_gain: Annotated[float, Gt(0)] = parameter(1.0, "part of the error that a revolution learns")
+        ...     lead_time: float = parameter(0.0, "lead of the memory", "s")
     """
     doc = f"{doc}; not given in a scenario: that of the drive" if drive else doc
     return Field(default=default, description=doc, json_schema_extra={"unit": unit, "path": path, "drive": drive})

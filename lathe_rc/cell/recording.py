@@ -56,11 +56,9 @@ class Recording:
         first: sample that the arrays begin with; 0 but in a snapshot.
 
     Example:
-        >>> from pathlib import Path
-        >>> from lathe_rc import harness, resources
-        >>> from lathe_rc.cell import scenario
-        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=3"])
-        >>> recording = harness.run(piston).recording
+        >>> import lathe_rc
+        >>> piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=3"])
+        >>> recording = lathe_rc.run(piston).recording
         >>> recording
         <Recording: 9 topics, 10785 samples (0.169 s), 3 revolutions, form error 150.8 to 1.166 µm RMS>
         >>> print(f"{recording.dense['/tool']['error'].min() * 1e6:.1f} µm")
@@ -131,11 +129,9 @@ class Recording:
             InputError: there is no such topic.
 
         Example:
-            >>> from pathlib import Path
-            >>> from lathe_rc import harness, resources
-            >>> from lathe_rc.cell import scenario
-            >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=3"])
-            >>> tool = harness.run(piston).recording.frame("/tool")
+            >>> import lathe_rc
+            >>> piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=3"])
+            >>> tool = lathe_rc.run(piston).recording.frame("/tool")
             >>> (tool["error"].abs() * 1e6).groupby(tool["revolution"]).max().round(1).to_dict()
             {1: 232.7, 2: 13.4, 3: 4.0}
             >>> tool.attrs["units"]["error"]

@@ -6,6 +6,7 @@ Longer than 400 lines: a scenario's way from its text to its tables, and back.
 
 import hashlib
 import json
+import os
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -103,7 +104,7 @@ def _quoted(value: Value) -> object:
 
 @dataclass(frozen=True, repr=False)
 class Scenario:
-    """A cell, described.
+    """A cell, described; `load` and `varied` have examples.
 
     Attributes:
         name: the file's name without its ending.
@@ -237,10 +238,8 @@ class Scenario:
             InputError: one line for the first thing that is wrong.
 
         Example:
-            >>> from pathlib import Path
-            >>> from lathe_rc import resources
-            >>> from lathe_rc.cell import scenario
-            >>> piston = scenario.load(resources.find(Path("piston.yaml")))
+            >>> import lathe_rc
+            >>> piston = lathe_rc.load("piston")
             >>> shorter = piston.varied({"learning_controller.lead_time": 1.3e-3, "block_size": 128})
             >>> piston.nodes["learning_controller"].lead_time, shorter.nodes["learning_controller"].lead_time
             (0.001425, 0.0013)
@@ -466,12 +465,16 @@ def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mappi
 
 
 def load(
-    path: Path, overrides: Iterable[str] = (), *, complete: bool = False, copies: Mapping[str, Path] | None = None
+    path: str | os.PathLike[str],
+    overrides: Iterable[str] = (),
+    *,
+    complete: bool = False,
+    copies: Mapping[str, Path] | None = None,
 ) -> Scenario:
     """Read a scenario.
 
     Args:
-        path: ROS 2 parameter file.
+        path: ROS 2 parameter file, or the name of a scenario that comes with lathe_rc, such as ``piston``.
         overrides: ``NODE.PARAM=VALUE``, or ``PARAM=VALUE`` for shared parameters, applied in order.
         complete: what the file leaves out has its default, as in those of `Scenario.to_yaml`; otherwise models of
             drives that are not given are those of the drives, see `lathe_rc.cell.models`.
@@ -482,19 +485,17 @@ def load(
         InputError: one line for the first thing that is wrong.
 
     Example:
-        >>> from pathlib import Path
-        >>> from lathe_rc import resources
-        >>> from lathe_rc.cell import scenario
-        >>> path = resources.find(Path("piston.yaml"))  # here, or among those that come with lathe_rc
-        >>> piston = scenario.load(path, ["spindle_encoder.revolutions=20", "block_size=128"])
+        >>> import lathe_rc
+        >>> piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=20", "block_size=128"])
         >>> piston
         <Scenario piston: spindle_encoder, learning_controller, electrodynamic_actuator, tool, recorder>
         >>> piston.nodes["spindle_encoder"].revolutions, piston.shared.block_size
         (20.0, 128)
-        >>> scenario.load(path, ["tol.feed=1.0"])
+        >>> lathe_rc.load("piston", ["tol.feed=1.0"])
         Traceback (most recent call last):
         lathe_rc.errors.InputError: --set 'tol.feed=1.0': no node 'tol' in the scenario; did you mean tool?
     """
+    path = resources.scenario(Path(path)) if copies is None else Path(path)
     nodes = read(path, overrides, copies)
     shared = nodes.pop(_EVERYONE, {})
     SharedParameters.read(_EVERYONE, shared)

@@ -129,6 +129,26 @@ class Stage(ABC):
         tells: events come about by themselves that only `process` knows of.
         own_inputs: number of inputs that `process` gets; one more may tell the spindle angle to the events.
         step: compiled, or in Python; None: the stage has its own `process`.
+
+    Example:
+        >>> import numpy as np
+        >>> from lathe_rc import DONE, Input, NodeParameters, Output, Stage, messages, parameter
+        >>> class HalfParameters(NodeParameters):
+        ...     share: float = parameter(0.5, "of the command")
+        >>> def step(memory, first, start, inputs, flags, outputs):
+        ...     outputs[0][start:] = memory * inputs[0][start:]
+        ...     return inputs[0].size, DONE
+        >>> class Half(Stage):
+        ...     Parameters = HalfParameters
+        ...     step = staticmethod(step)
+        ...
+        ...     def __init__(self, name, parameters):
+        ...         super().__init__(name, parameters)
+        ...         self.memory = parameters.share
+        ...         self.declare(
+        ...             inputs=[Input("coarse/command", messages.COMMAND, ("position",))],
+        ...             outputs=[Output("coarse/half", messages.COMMAND)],
+        ...         )
     """
 
     kind: ClassVar[str]

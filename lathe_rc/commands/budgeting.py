@@ -4,7 +4,7 @@
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from lathe_rc import harness
+import lathe_rc
 from lathe_rc.analysis.budget import Budget
 from lathe_rc.cell.scenario import Scenario
 
@@ -15,4 +15,4 @@ def shown(scenario: Scenario) -> Budget:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("runs of the budget", total=None)
-        return harness.budget(scenario, watch=lambda done, known: bar.update(task, completed=done, total=known))
+        return lathe_rc.budget(scenario, watch=lambda done, known: bar.update(task, completed=done, total=known))

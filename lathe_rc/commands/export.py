@@ -31,5 +31,5 @@ def export(bag: Path, kinds: tuple[str, ...], output: Path | None, topics: tuple
     name = name_of(bag).removesuffix(".mcap")
     place = output or Path(f"{name}.npz" if kind == "npz" else f"{name}-{kind}")
     wanted = [topic.strip() for text in topics for topic in text.split(",") if topic.strip()]
-    done = exporting.export(bag, place, kind, wanted)
+    done = exporting.export_bag(bag, place, kind, wanted)
     click.echo(f"{len(done.rows)} topics, {sum(done.rows.values())} rows: {done.place}")

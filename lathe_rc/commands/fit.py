@@ -41,7 +41,7 @@ def hysteresis(measured: Path, stroke: float, command_topic: str, state_topic: s
     MEASURED is a CSV file with command_um,displacement_um, or a bag of a drive that ran with linearisation: none.
     """
     if measured.is_dir():
-        loop = hysteresis_fit.from_signals(reader.read(measured).dense, command_topic, state_topic)
+        loop = hysteresis_fit.from_signals(reader.read_bag(measured).dense, command_topic, state_topic)
     else:
         loop = hysteresis_fit.read_csv(measured)
     found = hysteresis_fit.identify(loop, stroke)

@@ -93,7 +93,7 @@ def measure(
     bag: Path, revolutions: str, cutoff: float, nose_radius: float | None, profile: Path | None, *, as_json: bool
 ) -> None:
     """Measure the part that a recorded run has turned: form error, roundness, roughness by revolution."""
-    recording = reader.read(bag)
+    recording = reader.read_bag(bag)
     found = part.measured(recording, cutoff=cutoff)
     surface = _surface(bag, recording, found, nose_radius)
     chosen = _chosen(revolutions, found.form.rms.size)

@@ -19,7 +19,8 @@ def report(bag: Path, output: Path, *, budget: bool) -> None:
     """Tell what a recording holds on one page: result, figures, what was lost; it opens without network."""
     from lathe_rc.view import report as reporting
 
-    told = reporting.write(bag, output, with_budget=budget)
+    told = reporting.write_report(bag, output, with_budget=budget)
     if not told.complete:
-        click.echo(f"incomplete recording{': ' + told.stopped if told.stopped else ''}", err=True)
+        why = told.stopped or ("" if told.samples else told.missing)
+        click.echo(f"incomplete recording{': ' + why if why else ''}", err=True)
     click.echo(f"report: {output}")

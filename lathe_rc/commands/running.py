@@ -64,10 +64,10 @@ def run(
         if value is not None and mode == "offline":
             raise InputError(f"{option} {value} with --mode offline; allowed: --mode processes or composed")
     if require_tolerance and not part.tolerances(loaded):
-        tools = loaded.of_kind("tool") or ["tool"]
+        tools = loaded.of_kind("tool")
+        cure = f", or --set {tools[0]}.tolerance=2e-6" if tools else f" ({loaded.name} has no tool)"
         raise InputError(
-            f"--require-tolerance without {tools[0]}.tolerance; allowed: a scenario that has one, or --set "
-            f"{tools[0]}.tolerance=2e-6"
+            f"--require-tolerance without {(tools or ['tool'])[0]}.tolerance; allowed: a scenario that has one{cure}"
         )
     if figure:
         picture.check_place(figure)
@@ -95,7 +95,8 @@ def run(
         files = {name: path for name, path in (("profile", profile), ("figure", figure)) if path}
         outcome.show(result, files, told=told, budget=found)
     if require_tolerance and result.verdict and not result.verdict.in_tolerance:
-        hint = "" if found else f"; lathe budget {scenario} tells why"
+        alike = " with the same --set" if overrides else ""
+        hint = "" if found else f"; lathe budget {scenario}{alike} tells why"
         raise LatheError(f"{loaded.name} is {result.verdict.told()}; allowed: no more than the tolerance{hint}")
 
 

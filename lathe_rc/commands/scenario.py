@@ -2,9 +2,7 @@
 """The scenario of a command: how its argument and options are read."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
-from lathe_rc import resources
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import Scenario
 
@@ -23,11 +21,11 @@ def load(
     Raises:
         InputError: there is none, or it cannot be.
     """
-    loaded = scenarios.load(resources.scenario(Path(name)), overrides)
+    loaded = scenarios.load(name, overrides)
     asked = {"revolutions": revolutions, "speed_factor": speed_factor}
     given = {name: value for name, value in asked.items() if value is not None}
     changes = [f"{node}.{n}={v!r}" for node in loaded.masters for n, v in given.items()]
-    return scenarios.load(resources.scenario(Path(name)), [*overrides, *changes]) if changes else loaded
+    return scenarios.load(name, [*overrides, *changes]) if changes else loaded
 
 
 def split(scenario: Scenario, groups: Sequence[str]) -> list[list[str]] | None:

@@ -15,8 +15,7 @@ from lathe_rc.cell.parameters import Row, Value
 from lathe_rc.commands import options, picture
 from lathe_rc.errors import InputError
 from lathe_rc.names import instead
-from lathe_rc.studies import STUDIES
-from lathe_rc.studies.study import Result, Study, StudyParameters
+from lathe_rc.study import STUDIES, Result, Study, StudyParameters
 
 
 def _value(row: Row, text: str) -> object:

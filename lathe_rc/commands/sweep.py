@@ -19,8 +19,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.sweep import row
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.space import Space, given
-from lathe_rc.sweep.sweep import Models, Sweep
-from lathe_rc.sweep.sweep import run as sweep_run
+from lathe_rc.sweep.sweep import Models, Sweep, run_sweep
 
 if TYPE_CHECKING:
     from lathe_rc.sweep.page import Written
@@ -152,7 +151,7 @@ def run(
     progress = Watch(Console(stderr=True), quiet=as_json)
     try:
         with progress:
-            found = sweep_run(
+            found = run_sweep(
                 loaded,
                 space,
                 place,
@@ -204,7 +203,7 @@ class Watch:
         self._bar.update(self._task, description=text)
 
     def __call__(self, event: Mapping[str, Any]) -> None:
-        """Take an event of `lathe_rc.sweep.sweep.run`."""
+        """Take an event of `lathe_rc.run_sweep`."""
         if event["event"] == "began":
             self.cells, self.done = event["cells"], event["computed"]
             there = f", {self.done} of them are there already" if self.done else ""

@@ -12,7 +12,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from lathe_rc import harness
+import lathe_rc
 from lathe_rc.commands import options
 from lathe_rc.commands import scenario as scenarios
 from lathe_rc.commands.sweep import INTERRUPTED, Watch, check_crew, measured, pairs, space_of
@@ -107,7 +107,7 @@ def tune(
     progress = _Watch(Console(stderr=True), quiet=as_json)
     try:
         with progress:
-            found = harness.tune(
+            found = lathe_rc.tune(
                 loaded,
                 pairs("--free", free, "NODE.PARAM=LOW:HIGH, =LOW:HIGH:log or =A,B,C"),
                 goals,
@@ -145,7 +145,7 @@ class _Watch(Watch):
         self.told = 0
 
     def __call__(self, event: Mapping[str, Any]) -> None:
-        """Take an event of `lathe_rc.sweep.tune.run`."""
+        """Take an event of `lathe_rc.tune`."""
         if event["event"] == "waiting":
             self.describe("another program computes the last trials")
             return

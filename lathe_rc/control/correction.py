@@ -56,7 +56,7 @@ class Correction:
 
     def __post_init__(self) -> None:
         if self.law is CorrectionLaw.LEAD_LAG and not self.lag > 0.0:
-            raise InputError(f"lag_time = {self.lag:g} s with correction lead_lag; allowed: above 0")
+            raise InputError(f"lag = {self.lag:g} s with correction lead_lag; allowed: above 0")
 
     @property
     def inverse(self) -> tuple[float, float]:

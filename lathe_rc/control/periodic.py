@@ -14,7 +14,7 @@ What the paper has not, and what is on by default:
 
 - The memory is read through a Gaussian of standard deviation σ, symmetric in time: what it needs on both sides of
   t - T̄ is past. Without it the memory grows at frequencies where the factor of a period exceeds 1, see
-  `lathe_rc.analysis.hyperstability.learning_factor`.
+  `lathe_papers.formulas.hyperstability.learning_factor`.
 - Anti-windup: while (S(u) - u)·v < 0, I stands still and the memory stores what it read, limited to ±S0. The switch
   alone only slows winding up.
 """
@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.control.periodic_gains import PeriodicGains, check_law
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, at_most
 from lathe_rc.jit import kernel
 from lathe_rc.signals.noise import quantise
 from lathe_rc.transfer import System, discretise, rest, step
@@ -254,7 +254,7 @@ class PeriodicController:
         if reach >= samples:
             raise InputError(
                 f"memory_filter = {sigma:g} s reaches {reach} samples to each side; allowed: less than the period, "
-                f"{samples} samples (below {period / _REACH:g} s)"
+                f"{samples} samples (up to {at_most((samples - 1) * step_s / _REACH)} s)"
             )
         if ideal is not None and ideal.shape != (samples,):
             raise InputError(f"ideal input of shape {ideal.shape}; allowed: one value for each of {samples} samples")
@@ -336,7 +336,7 @@ class PeriodicController:
 
     @property
     def popov_bound(self) -> float:
-        """-η0 of eq. 15, see `lathe_rc.analysis.hyperstability.popov_bound`; falls during the first period [s]."""
+        """-η0 of eq. 15, see `lathe_papers.formulas.hyperstability.popov_bound`; falls during the first period [s]."""
         return float(self.state.values[_BOUND])
 
     @property

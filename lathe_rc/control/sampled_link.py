@@ -290,8 +290,8 @@ class SampledLink:
         largest = largest_pole(self.drive, self.link, delay)
         if largest >= 1.0:
             raise InputError(
-                f"sampled link: law {law} with K = {gain:g} 1/s, T1 = {lag:g} s, T = {self.drive.period:g} s is "
-                f"unstable (pole at {largest:.4g}); allowed: K·T below 2, or the law ripple_free"
+                f"sampled link: {law} with K = {gain:g} 1/s, T1 = {lag:g} s, T = {self.drive.period:g} s is "
+                f"unstable (pole at {largest:.4g}); allowed: K·T below 2, or ripple_free"
             )
         self.table = HeldLink(table(self.link, limit), rest(self.link), divisor, np.zeros(2))
 

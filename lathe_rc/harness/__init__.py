@@ -14,18 +14,14 @@ from lathe_rc.harness.processes import Processes
 from lathe_rc.harness.recorded import with_recorder
 from lathe_rc.harness.result import Mode, Result
 from lathe_rc.harness.runner import run
-from lathe_rc.harness.variations import budget, sweep, tune
 
 __all__ = [
     "Event",
     "Mode",
     "Processes",
     "Result",
-    "budget",
     "free_domain",
     "how_it_ended",
     "run",
-    "sweep",
-    "tune",
     "with_recorder",
 ]

@@ -48,11 +48,9 @@ class Result:
         lateness: of the blocks; None if there was no pace to keep, as offline or with a ``speed_factor`` of 0.
 
     Example:
-        >>> from pathlib import Path
-        >>> from lathe_rc import harness, resources
-        >>> from lathe_rc.cell import scenario
-        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=20"])
-        >>> result = harness.run(piston)
+        >>> import lathe_rc
+        >>> piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=20"])
+        >>> result = lathe_rc.run(piston)
         >>> result
         <Result of piston: offline, 20 revolutions, form error 150.8 to 0.5639 µm RMS, no bag>
         >>> print(f"at most {result.errors.largest[-1] * 1e6:.3f} µm in the last revolution")

@@ -5,6 +5,7 @@ What writes and reads bags is imported where there is one: a run without a bag d
 """
 
 import contextlib
+import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +34,7 @@ def run(
     *,
     mode: Mode = "offline",
     groups: Sequence[Sequence[str]] | None = None,
-    bag: Path | None = None,
+    bag: str | os.PathLike[str] | None = None,
     watch: Callable[[Event], None] = ignore,
     domain: int | None = None,
     namespace: str = "/",
@@ -62,13 +63,11 @@ def run(
         LossyRunError: a free-running cell lost blocks.
 
     Example:
-        >>> from pathlib import Path
-        >>> from lathe_rc import harness, resources
-        >>> from lathe_rc.cell import scenario
-        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=3"])
-        >>> harness.run(piston, bag=Path("piston_bag"))
+        >>> import lathe_rc
+        >>> piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=3"])
+        >>> lathe_rc.run(piston, bag="piston_bag")
         <Result of piston: offline, 3 revolutions, form error 150.8 to 1.166 µm RMS, bag piston_bag>
-        >>> harness.run(piston, bag=Path("piston_bag"))
+        >>> lathe_rc.run(piston, bag="piston_bag")
         Traceback (most recent call last):
         lathe_rc.errors.InputError: piston_bag exists; a bag is never overwritten...
     """
@@ -80,11 +79,12 @@ def run(
     for event, told in (("unchecked", cell.unchecked), ("warning", cell.warnings)):
         for what in told:
             watch({"event": event, "node": cell.master.name, "message": what})
-    if bag is not None:
+    place = Path(bag) if bag is not None else None
+    if place is not None:
         from lathe_rc.bag.writing.writer import refuse_existing
 
-        refuse_existing(bag)
-    result = _run(scenario, cell, mode, groups, bag, watch, domain, checked(namespace), start)
+        refuse_existing(place)
+    result = _run(scenario, cell, mode, groups, place, watch, domain, checked(namespace), start)
     result = replace(result, unchecked=cell.unchecked, warnings=cell.warnings, margins=cell.margins)
     if result.bag is not None:
         from lathe_rc.bag.check import write_digests
@@ -132,7 +132,7 @@ def _run(
             for path in ([kept] if kept else []) + _bags_in(folder):
                 recover.mend(path)
             raise
-        recording = reader.read(place)
+        recording = reader.read_bag(place)
         return Result(
             scenario=scenario,
             mode="grouped" if mode == "processes" and len(split) < len(complete.nodes) else mode,

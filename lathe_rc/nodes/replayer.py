@@ -6,6 +6,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from decimal import Decimal
 from functools import partial
 from itertools import chain
 from operator import itemgetter
@@ -19,8 +20,7 @@ from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rosbags.interfaces import Qos, QosDurability, QosReliability
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
@@ -36,10 +36,10 @@ from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.names import instead
-from lathe_rc.nodes import alone, arguments
+from lathe_rc.nodes import alone, arguments, replayed_qos
 from lathe_rc.nodes.ports import latched_qos, message_class
+from lathe_rc.nodes.replayed_qos import DEPTH
 
-_DEPTH = 512  # of the queues: so many may be under way before readers must have acknowledged
 _ACKNOWLEDGED = 30.0  # [s] for a reader to take what was sent to it
 _CLOCK, _STATE = "/clock", "/cell_state"
 _CLOCK_END = 2**31 * 10**9  # [ns] that it cannot tell any more
@@ -49,24 +49,6 @@ _PROMPT = 100_000_000
 _SETBACK = 1_000_000_000  # [ns] by which the computer's clock may be set back without harm
 _LONG = 10.0  # [s] of wall time until the next message that are announced
 _LOOK = 0.05  # [s] of wall time between looks at services and signals
-
-
-def _qos(recorded: Sequence[Qos]) -> QoSProfile:
-    """As the topic was offered; reliable and volatile if nothing is known, or its publishers differ, as in rosbag2."""
-    first = recorded[0] if recorded and not _mixed(recorded) else None
-    best_effort = first is not None and first.reliability == QosReliability.BEST_EFFORT
-    latched = first is not None and first.durability == QosDurability.TRANSIENT_LOCAL
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=_DEPTH,
-        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
-
-
-def _mixed(recorded: Sequence[Qos]) -> bool:
-    """Whether publishers of a topic offered different things; history and depth are their own affair."""
-    return len({each._replace(history=recorded[0].history, depth=0) for each in recorded}) > 1
 
 
 class Replayer:
@@ -97,17 +79,19 @@ class Replayer:
             count = len(self._topics)
             raise InputError(f"{parameters.bag}: {count} topics; allowed: up to {MOST_SENT}, named by --topics")
         start, end, span_ns = parameters.start, parameters.end, source.last_ns - source.first_ns
-        if round(start * 1e9) > span_ns or 0.0 < end <= start:
+        if _ns(start) > span_ns or 0.0 < end <= start:
             raise InputError(
-                f"{KIND}.start = {start:g} s, end = {end:g} s: nothing to send; allowed: a start up to "
-                f"{span_ns * 1e-9:g} s, where the bag's last message is, and an end after it, or 0"
+                f"{KIND}.start = {start:.16g} s, end = {end:.16g} s: nothing to send; allowed: a start up to "
+                f"{_seconds(span_ns)} s, where the bag's last message is, and an end after it, or 0"
             )
-        self._start_ns = source.first_ns + round(start * 1e9)
-        self._stop_ns = source.first_ns + round(end * 1e9) if end else source.last_ns + 1
-        if min(self._stop_ns - 1, source.last_ns) >= _CLOCK_END:
-            raise InputError(
-                f"{parameters.bag}: log times up to {source.last_ns} ns; {_CLOCK} ends in 2038; leave them out by end"
-            )
+        self._start_ns = source.first_ns + _ns(start)
+        self._stop_ns = source.first_ns + _ns(end) if end else source.last_ns + 1
+        for topic, log_ns, _ in source.messages(
+            self._topics, start_ns=max(self._start_ns, _CLOCK_END), stop_ns=self._stop_ns
+        ):
+            room = _CLOCK_END - source.first_ns
+            cure = f"{KIND}.end = {_seconds(room)} s leaves them out" if room > _ns(start) else "name other topics"
+            raise InputError(f"{parameters.bag}: {topic}: log time {log_ns} ns; {_CLOCK} ends in 2038; {cure}")
         self._classes = {topic: self._class(topic) for topic in sorted(self._topics)}
         self.paused = False
         self.sent = 0
@@ -124,9 +108,7 @@ class Replayer:
         self._master, self._window = "", 0  # of a cell: the topic whose blocks count, and how many may be under way
         self._blocks = self._recorded = 0
         # Reliable and with a queue, unlike other clocks: readers may want every time.
-        self._publishers: dict[str, Publisher] = {
-            _CLOCK: node.create_publisher(Clock, _CLOCK, QoSProfile(depth=_DEPTH))
-        }
+        self._publishers: dict[str, Publisher] = {_CLOCK: node.create_publisher(Clock, _CLOCK, QoSProfile(depth=DEPTH))}
         self._waiting: dict[str, int] = {_CLOCK: 0}  # messages of a topic that may not have been acknowledged
         self._sent_ns = self._settled_ns = 0  # wall time of the newest message, and when all were acknowledged
 
@@ -169,12 +151,12 @@ class Replayer:
 
     def _publish(self, node: Node, topic: str) -> None:
         recorded = self._source.topics[topic].qos
-        if _mixed(recorded):
+        if replayed_qos.differ(recorded):
             self._node.get_logger().warning(
                 f"{topic}: its publishers offered different QoS; sent reliable and volatile"
             )
         try:
-            self._publishers[topic] = node.create_publisher(self._classes[topic], topic, _qos(recorded))
+            self._publishers[topic] = node.create_publisher(self._classes[topic], topic, replayed_qos.of(recorded))
         except InvalidTopicNameException as error:
             reason = shown(error).removeprefix("Invalid topic name: ").rstrip(":")
             raise InputError(f"{topic}: no name in ROS ({reason}); name others with --topics") from None
@@ -270,8 +252,9 @@ class Replayer:
         """Latched messages from before the start, as many as their publishers kept: a late reader had them too."""
         kept: dict[str, deque[Message]] = {}
         for topic in sorted(self._topics):
-            if _qos(recorded := self._source.topics[topic].qos).durability == DurabilityPolicy.TRANSIENT_LOCAL:
-                kept[topic] = deque(maxlen=min(sum(max(each.depth, 1) for each in recorded), _DEPTH))
+            recorded = self._source.topics[topic].qos
+            if replayed_qos.of(recorded).durability == DurabilityPolicy.TRANSIENT_LOCAL:
+                kept[topic] = deque(maxlen=replayed_qos.kept(recorded))
         size = 0
         for message in self._source.messages(set(kept), stop_ns=self._start_ns):
             messages = kept[message[0]]
@@ -290,9 +273,9 @@ class Replayer:
                 origin, began = log_ns, time.monotonic()
             due = began + (log_ns - origin) * 1e-9 / rate if rate else 0.0
             if (wait := due - time.monotonic()) > _LONG:
-                offset = (log_ns - self._source.first_ns) * 1e-9
+                offset = _seconds(log_ns - self._source.first_ns)
                 self._node.get_logger().warning(
-                    f"{topic}: the next message comes in {_span(wait)}; start = {offset:.9g} begins with it"
+                    f"{topic}: the next message comes in {_span(wait)}; start = {offset} begins with it"
                 )
             began += self._wait_until(due)
             if log_ns != told:
@@ -320,7 +303,7 @@ class Replayer:
             raise InputError(f"{topic}: message {self.sent + 1} that is sent is none of its type") from None
         self._sent_ns = time.time_ns()
         self._waiting[topic] += 1
-        if self._waiting[topic] >= _DEPTH // 2:
+        if self._waiting[topic] >= DEPTH // 2:
             self._acknowledged(topic)
 
     def _wait_until(self, due: float) -> float:
@@ -361,6 +344,17 @@ class Replayer:
         if self._waiting[topic] and not self._publishers[topic].wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED)):
             raise LatheError(f"{topic}: a reader has taken nothing for {_ACKNOWLEDGED:.0f} s")
         self._waiting[topic] = 0
+
+
+def _ns(seconds: float) -> int:
+    """A time in ns to the digits that were given: a binary number of 1.7e9 s is 238 ns coarse."""
+    return int(Decimal(repr(seconds)) * 10**9)
+
+
+def _seconds(time_ns: int) -> str:
+    """Seconds, cut to whole µs, that `_ns` takes as they stand."""
+    seconds, rest = divmod(time_ns // 1000, 10**6)
+    return f"{seconds}.{rest:06d}".rstrip("0").rstrip(".")
 
 
 def _span(seconds: float) -> str:

@@ -143,10 +143,9 @@ class CuttingProcess:
         flank: Flank | None = None,
         step: float,
     ) -> None:
-        if not (lag == 0.0 or step / 1000.0 <= lag < np.inf):
-            raise InputError(
-                f"cutting: lag {lag:g} s at a step of {step:g} s; allowed: 0 or at least {step / 1000.0:g} s"
-            )
+        least = float(f"{step / 1000.0:g}")  # the one that is said, to the bit
+        if not (lag == 0.0 or least <= lag < np.inf):
+            raise InputError(f"cutting: lag {lag:g} s at a step of {step:g} s; allowed: 0 or at least {least:g} s")
         if not 0.0 <= overlap <= 1.0:
             raise InputError(f"cutting: overlap {overlap:g}; allowed: 0 (no regeneration) up to 1")
         if grid < 16:

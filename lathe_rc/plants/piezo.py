@@ -121,8 +121,9 @@ def _extend_along(stack: StackTable, state: Array, set_point: Array, extension: 
 
 def _lag(time: float, step: float, method: Discretisation) -> DiscretePlant:
     """1/(1 + p·time), times in s."""
-    if time < step / 1000.0:
-        raise InputError(f"lag of {time:g} s at a step of {step:g} s; allowed: 0 or at least {step / 1000.0:g} s")
+    least = float(f"{step / 1000.0:g}")  # the one that is said, to the bit
+    if time < least:
+        raise InputError(f"lag of {time:g} s at a step of {step:g} s; allowed: at least {least:g} s, or none")
     return discretise(np.array([[-1.0 / time]]), np.array([1.0 / time]), 0.0, step, method)
 
 

@@ -199,7 +199,7 @@ class LoadedSpindle:
         if not radius_of_poles < 1.0:
             raise InputError(
                 f"speed loop of {loop.bandwidth:g} rad/s: largest pole {radius_of_poles:.6g}; allowed: below 1 (less "
-                "bandwidth, a longer integral time, or a belt that is stiffer or damps more)"
+                "bandwidth or a longer integral time; a stiff belt needs damping)"
             )
 
     def _largest_pole(self) -> float:

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, at_most
 
 Array = npt.NDArray[np.float64]
 
@@ -100,7 +100,7 @@ class Polygon:
         if not 0.0 < self.corner_radius <= self.inscribed_radius:
             raise InputError(
                 f"polygon: corner radius {self.corner_radius:g} m; allowed: above 0 and at most the inscribed "
-                f"radius {self.inscribed_radius:g} m"
+                f"radius {at_most(self.inscribed_radius)} m"
             )
 
     @property

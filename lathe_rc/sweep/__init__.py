@@ -4,3 +4,5 @@
 `space` says which cells, `row` what is kept of one, `folder` where the rows are, `workers` who computes them, `sweep`
 puts them together; `tune` searches with them.
 """
+
+__all__ = ["page"]

@@ -81,6 +81,13 @@ class Space:
         seeds: cells that differ in their seed alone, from that of the scenario on, for each of the others.
         given: cells one by one, values by target.
         sample_seed: of the sample itself.
+
+    Example:
+        >>> import lathe_rc
+        >>> lead = "learning_controller.lead_time"
+        >>> space = lathe_rc.Space(grid={lead: "1e-3:2e-3:5"}, sampled={"tool.feed": "80%:120%"}, sample="sobol:8")
+        >>> space.count(lathe_rc.load("piston"))
+        40
     """
 
     grid: Mapping[str, str | Sequence[Value]] = field(default_factory=dict)
@@ -173,7 +180,7 @@ class Space:
 
 
 def _samples() -> str:
-    return "sobol:N, halton:N, latin:N or random:N"
+    return f"sobol:N, halton:N, latin:N or random:N, N from 1 up to {_MOST_POINTS}"
 
 
 def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArray[np.float64]]:

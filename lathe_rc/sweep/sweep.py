@@ -2,6 +2,7 @@
 """A sweep from its space to its table; see `run`."""
 
 import hashlib
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -76,10 +77,10 @@ def ignore(event: Mapping[str, Any]) -> None:
     """Watch nothing."""
 
 
-def run(
+def run_sweep(
     scenario: Scenario,
     space: Space,
-    folder: Path,
+    folder: str | os.PathLike[str],
     *,
     measures: Sequence[str] = (),
     models: Models = "follow",
@@ -109,20 +110,17 @@ def run(
         LatheError: workers died, or the disk is full; what was computed is kept.
 
     Example:
-        >>> from pathlib import Path
-        >>> from lathe_rc import harness, resources
-        >>> from lathe_rc.cell import scenario
-        >>> from lathe_rc.sweep.space import Space
-        >>> piston = scenario.load(resources.find(Path("piston.yaml")), ["spindle_encoder.revolutions=10"])
-        >>> space = Space(grid={"learning_controller.lead_time": [1.3e-3, 1.425e-3, 3e-3]})
-        >>> harness.sweep(piston, space, Path("leads"))
+        >>> import lathe_rc
+        >>> piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=10"])
+        >>> space = lathe_rc.Space(grid={"learning_controller.lead_time": [1.3e-3, 1.425e-3, 3e-3]})
+        >>> lathe_rc.run_sweep(piston, space, "leads")
         <Sweep of piston in leads: 2 done, 1 refused>
     """
     asked = [row.measure(text, scenario) for text in measures]
     space = Space(**space.to_json())
     scenario = scenario.with_models_given() if models == "nominal" else scenario
     space.check(scenario)
-    kept = Folder.begin(folder, scenario, space, asked)
+    kept = Folder.begin(Path(folder), scenario, space, asked)
     with kept.locked():
         there, total = kept.keys(), space.count(scenario)
         left = total - sum(1 for job in _jobs(kept, space) if job.key in there) if there else total

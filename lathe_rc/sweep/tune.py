@@ -9,6 +9,7 @@ DIR, the rest        see `lathe_rc.sweep.folder`: cell n of trial m is the row m
 """
 
 import json
+import os
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -32,11 +33,11 @@ _PAUSE = 0.2  # [s] before looking again whether other processes have computed t
 SAMPLERS = ("tpe", "cmaes", "nsga2")
 
 
-def run(
+def tune(
     scenario: Scenario,
     free: Mapping[str, str | Sequence[Value]],
     goals: Sequence[str],
-    folder: Path,
+    folder: str | os.PathLike[str],
     *,
     subjects: Sequence[str] = (),
     over: Space | None = None,
@@ -68,10 +69,10 @@ def run(
         batch: trials that are asked for before the first of them is told.
         ask_formulas: let trial 1 be what `lathe_rc.sweep.formulas` gives, if it is within the ranges.
         measures: further columns, ``TOPIC.FIELD:STATISTIC``.
-        scheduler: see `lathe_rc.sweep.sweep.run`, as the next two.
+        scheduler: see `lathe_rc.run_sweep`, as the next two.
         workers: processes of this machine.
         client: of Dask, in place of both.
-        watch: called with the events of `lathe_rc.sweep.sweep.run`, ``began`` with the trials that are there, and with
+        watch: called with the events of `lathe_rc.run_sweep`, ``began`` with the trials that are there, and with
             ``told`` (tuning: all trials so far), after each batch, and ``waiting``, again and again, while the last
             trials are those of other programs.
 
@@ -80,13 +81,11 @@ def run(
         LatheError: workers died, or the disk is full; what was computed is kept.
 
     Example:
-        >>> from pathlib import Path
-        >>> from lathe_rc import harness, resources
-        >>> from lathe_rc.cell import scenario
+        >>> import lathe_rc
         >>> start = ["spindle_encoder.revolutions=10", "learning_controller.lead_time=1.0e-3"]
-        >>> piston = scenario.load(resources.find(Path("piston.yaml")), start)
+        >>> piston = lathe_rc.load("piston", start)
         >>> free = {"learning_controller.lead_time": "0.8e-3:1.6e-3"}
-        >>> tuning = harness.tune(piston, free, ["tool.rms_error"], Path("lead"), subjects=["margin>=0.05"], trials=8)
+        >>> tuning = lathe_rc.tune(piston, free, ["tool.rms_error"], "lead", subjects=["margin>=0.05"], trials=8)
         >>> tuning
         <Tuning of piston in lead: 8 trials, tool.rms_error = ... in trial ...>
     """
@@ -112,7 +111,7 @@ def run(
         "batch": batch,
         "formulas": ask_formulas,
     }
-    kept = Folder.begin(folder, scenario, None, wanted.measures, json.loads(json.dumps(told)))
+    kept = Folder.begin(Path(folder), scenario, None, wanted.measures, json.loads(json.dumps(told)))
     state = Study(kept)
     with state.present() as me:
         asked = state.ask(me, trials)

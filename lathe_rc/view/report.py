@@ -6,6 +6,7 @@ print.
 """
 
 import json
+import os
 import shlex
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -274,7 +275,7 @@ def render(told: Gathered, name: str, command: str, made_of: Budget | None = Non
     return text
 
 
-def write(bag: Path, page: Path, *, with_budget: bool = False) -> Gathered:
+def write_report(bag: str | os.PathLike[str], page: str | os.PathLike[str], *, with_budget: bool = False) -> Gathered:
     """Write the report of a bag; an older one of the same name is replaced once the new one is whole.
 
     Args:
@@ -285,7 +286,13 @@ def write(bag: Path, page: Path, *, with_budget: bool = False) -> Gathered:
     Raises:
         InputError: not a bag, or no place for a page; with a budget, a bag without a scenario that can run offline.
         LatheError: the disk does not take it, or a run of the budget failed.
+
+    Example:
+        >>> import lathe_rc
+        >>> result = lathe_rc.run(lathe_rc.load("piston", ["spindle_encoder.revolutions=2"]), bag="piston_bag")
+        >>> report = lathe_rc.write_report("piston_bag", "piston.html")
     """
+    bag, page = Path(bag), Path(page)
     if page.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"-o {page}; allowed: a file name that ends in .html")
     check_place("-o", page)

@@ -55,4 +55,4 @@ def test_a_flood_takes_no_memory(ghost, domain, tmp_path):
         processes.wait_for_end()
     assert grown < 64e6
     assert sum(processes.refused.values()) > 1000
-    assert reader.read(tmp_path / "bag").digests() == harness.run(plain).digest
+    assert reader.read_bag(tmp_path / "bag").digests() == harness.run(plain).digest

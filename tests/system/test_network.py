@@ -111,7 +111,7 @@ def processes(request, wire, tmp_path):
 @pytest.mark.parametrize("wire", [(0.0, 0.0), (0.02, 0.005)], indirect=True, ids=["clean", "loss"])
 def test_a_cell_over_two_machines_gives_the_same_bits(wire, processes, tmp_path):
     processes.wait_for_end()
-    assert reader.read(tmp_path / "bag").digests() == harness.run(CELL).digest
+    assert reader.read_bag(tmp_path / "bag").digests() == harness.run(CELL).digest
     assert wire.carried > 1000
 
 
@@ -121,7 +121,7 @@ def test_a_cut_wire_that_is_mended_costs_nothing_but_time(wire, processes, tmp_p
     assert processes.wait_for("stall", node="spindle_encoder")["member"].removeprefix("/") in FAR
     wire.loss = 0.0
     processes.wait_for_end()
-    assert reader.read(tmp_path / "bag").digests() == harness.run(CELL).digest
+    assert reader.read_bag(tmp_path / "bag").digests() == harness.run(CELL).digest
 
 
 def test_when_the_wire_stays_cut_the_silent_are_named_and_the_bag_is_readable(wire, processes, tmp_path):

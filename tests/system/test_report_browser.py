@@ -67,7 +67,7 @@ def page(tmp_path_factory):
     """The report of a short run of the full cell, which has every figure but those of timing."""
     folder = tmp_path_factory.mktemp("page")
     harness.run(load(ROOT / "config" / "full_cell.yaml", ["spindle_encoder.revolutions=6"]), bag=folder / "bag")
-    report.write(folder / "bag", folder / "report.html")
+    report.write_report(folder / "bag", folder / "report.html")
     return folder / "report.html"
 
 

@@ -13,7 +13,8 @@ import pyarrow.parquet
 import pytest
 from cells import listening
 
-from lathe_rc import allowed_code, harness
+import lathe_rc
+from lathe_rc import allowed_code
 from lathe_rc.cell import scenario
 from lathe_rc.errors import LatheError
 from lathe_rc.sweep import row
@@ -86,7 +87,7 @@ def test_a_worker_dies_and_another_one_comes(piston, tmp_path):
                     start(worker(scheduler))
                 done += event["statuses"].total()
 
-        found = harness.sweep(piston, space, tmp_path / "rows", scheduler=scheduler, watch=watch)
+        found = lathe_rc.run_sweep(piston, space, tmp_path / "rows", scheduler=scheduler, watch=watch)
     assert first.wait() == -signal.SIGKILL
     rows = found.table().to_pylist()
     assert [each["cell"] for each in rows] == list(range(CELLS))
@@ -164,5 +165,5 @@ def test_a_cell_that_kills_its_workers_ends_the_sweep_in_a_line(tmp_path, monkey
     piston = scenario.load(PISTON, ["spindle_encoder.revolutions=3", "electrodynamic_actuator.stage=deadly:Deadly"])
     space = Space(grid={"electrodynamic_actuator.damping": [0.78, 0.79, 0.8, 0.81, 0.75]})
     with pytest.raises(LatheError, match=r"workers died again and again over cells 4 to 4, .*what is computed is kept"):
-        harness.sweep(piston, space, tmp_path / "rows", workers=1)
+        lathe_rc.run_sweep(piston, space, tmp_path / "rows", workers=1)
     assert Folder(tmp_path / "rows").table()["cell"].to_pylist() == [0, 1, 2, 3]

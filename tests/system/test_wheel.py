@@ -57,7 +57,7 @@ def test_wheel_holds_the_package_its_data_and_nothing_else(dist):
     names = set(zipfile.ZipFile(wheel).namelist())
     data = f"lathe_rc-{__version__}.data/data/share"
     shared = {"package.xml", *files("config"), *files("launch")}
-    expected = {name for name in files("lathe_rc") if not name.startswith("lathe_rc/msg_defs/")}
+    expected = {name for name in files("lathe_rc") if not name.startswith("lathe_rc/msg_defs/")} | files("lathe_papers")
     expected |= {f"lathe_rc/{name}" for name in MESSAGES}
     expected |= {f"{data}/lathe_rc/{name}" for name in shared}
     expected |= {f"{data}/ament_index/resource_index/packages/lathe_rc"}
@@ -126,7 +126,7 @@ def test_it_runs_without_ros(alone):
 from pathlib import Path
 from lathe_rc import harness
 from lathe_rc.bag import reader
-print(reader.read(Path("B")).plot())
+print(reader.read_bag(Path("B")).plot())
 """
     assert "Figure" in alone.run("python", "-c", notebook)
 

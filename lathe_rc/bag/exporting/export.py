@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exporting the signal topics of a bag, in memory that does not grow with its length."""
 
+import os
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -132,7 +133,9 @@ def _refuse_existing(place: Path) -> None:
         raise InputError(f"{place} exists; an export never overwrites: name another place or remove it")
 
 
-def export(bag: Path, place: Path, kind: str, topics: Sequence[str] = ()) -> Exported:
+def export_bag(
+    bag: str | os.PathLike[str], place: str | os.PathLike[str], kind: str, topics: Sequence[str] = ()
+) -> Exported:
     """Write signal topics of a bag to other files; all or nothing.
 
     Args:
@@ -144,7 +147,13 @@ def export(bag: Path, place: Path, kind: str, topics: Sequence[str] = ()) -> Exp
     Raises:
         InputError: the place exists, a topic does not, or the bag is none.
         LatheError: the bag is not whole, or the disk does not take the files.
+
+    Example:
+        >>> import lathe_rc
+        >>> result = lathe_rc.run(lathe_rc.load("piston", ["spindle_encoder.revolutions=2"]), bag="piston_bag")
+        >>> exported = lathe_rc.export_bag("piston_bag", "piston.npz", "npz", ["/tool"])
     """
+    bag, place = Path(bag), Path(place)
     _refuse_existing(place)
     if not place.absolute().parent.is_dir():
         raise InputError(f"{place}: no such folder {place.absolute().parent}; make it first")

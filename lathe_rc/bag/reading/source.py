@@ -25,7 +25,7 @@ from lathe_rc.bag.reading import metadata, precheck
 from lathe_rc.bag.reading.limits import MOST_OPEN, MOST_TOPICS
 from lathe_rc.bag.reading.mcap_storage import open_mcap
 from lathe_rc.bag.reading.metadata import Metadata, Topic
-from lathe_rc.bag.reading.sqlite_storage import open_sqlite, with_journal
+from lathe_rc.bag.reading.sqlite_storage import open_sqlite
 from lathe_rc.bag.reading.storage import Batch, Message, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget, unpack, unpack_file, unpacked_size
 from lathe_rc.cell.block import Block
@@ -65,6 +65,8 @@ class Unread:
 def files_of(path: Path) -> list[Path]:
     """The files with the messages of a bag, by name: those of a folder, or the one that is named.
 
+    Of a compressed file and the copy that a player unpacked, the first.
+
     Raises:
         InputError: a file that is read is a link that leads out of the folder.
     """
@@ -72,7 +74,8 @@ def files_of(path: Path) -> list[Path]:
     for file in found:
         if file.suffix in _KINDS or file.name in (metadata.NAME, "digests.json"):
             _refuse_link(file, path)
-    return sorted(file for file in found if file.suffix in _KINDS and file.is_file())
+    packed = {file.with_suffix("") for file in found if file.suffix == ".zstd"}
+    return sorted(file for file in found if file.suffix in _KINDS and file not in packed and file.is_file())
 
 
 def _refuse_link(file: Path, bag: Path) -> None:
@@ -142,9 +145,18 @@ class Source:
         files = files_of(self.path) if self.path.is_dir() else [self.path]
         if told:
             self.about, self._packed = told.about, told.packed
-            files = [self.path / name for name in told.files]
+            named = told.files
+            others = [f for f in files if f.name not in named and f.name.removesuffix(".zstd") not in named]
+            files = [self.path / name for name in named]
             for file in files:
                 _refuse_link(file, self.path)
+            if not all(file.exists() for file in files):
+                files += others  # which may be the same, renamed: recover takes them as well
+            else:
+                self.contradictions += [
+                    f"{metadata.NAME} does not name {file.name}: not read; lathe bag recover saves its messages too"
+                    for file in others
+                ]
         for file in files:
             try:
                 self._storages.append(self._storage(file))
@@ -194,7 +206,7 @@ class Source:
         if head.startswith(MCAP0_MAGIC):
             return open_mcap(path)
         if head == _SQLITE:
-            return open_sqlite(with_journal(path, self._folder()))
+            return open_sqlite(path, self._folder())
         if not precheck.is_packed(head):
             raise ValueError("a bag of ROS 1" if head.startswith(b"#ROSBAG") else "not an MCAP or SQLite file")
         if depth:

@@ -3,6 +3,7 @@
 
 import contextlib
 import json
+import os
 import shutil
 import sqlite3
 from collections.abc import Iterator, Mapping
@@ -15,31 +16,67 @@ from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_TOPICS
 from lathe_rc.bag.reading.precheck import check_tables
 from lathe_rc.bag.reading.storage import Batch, Channel, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget
-from lathe_rc.errors import shown
+from lathe_rc.errors import InputError, shown
 
 _LAST = 2**63 - 1  # number that SQLite knows
+_LOG_HEAD, _FRAME_HEAD = 32, 24  # of a write-ahead log [B]; both have the same two random numbers while a frame counts
+_JOURNAL = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"  # at the end of a rollback journal that names another
 _WRONG = (ValueError, sqlite3.Error, OverflowError)  # what broken bytes lead to
 
 
-def with_journal(path: Path, folder: Path) -> Path:
-    """A database with the messages that only its write-ahead log has: itself, or a copy in ``folder`` if there are any.
+def with_journal(path: Path, folder: Path) -> tuple[Path, int]:
+    """A database with the messages that only its logs have: itself, or a copy in ``folder`` if there are any.
 
-    A recorder that was killed leaves them there. The log is worked into the copy, as the first writer would do to the
-    database. A rollback journal is not looked at: it may name a file of any folder, which SQLite then removes.
+    A recorder that was killed leaves a write-ahead log or a rollback journal, which the next writer works into the
+    database; here that is the copy.
+
+    Returns:
+        The database, and the bytes of the write-ahead log that give nothing: broken, or of no whole transaction.
 
     Raises:
+        InputError: a log is a link.
+        ValueError: a journal names another file.
         OSError: the copy cannot be made.
         sqlite3.Error: the database is broken.
     """
-    log = path.with_name(f"{path.name}-wal")
-    if not log.is_file() or not log.stat().st_size:
-        return path
+    beside = Path(os.path.realpath(path))  # where SQLite has them
+    found = [beside.with_name(f"{beside.name}-{kind}") for kind in ("wal", "journal")]
+    logs = [log for log in found if log.is_file() and log.stat().st_size]
+    for log in logs:
+        if log.is_symlink():
+            raise InputError(f"{log}: a link; allowed: the file itself in its place")
+        if log.name.endswith("-journal") and _names_another(log):  # which SQLite would remove
+            raise ValueError(f"{log.name}: it names a further journal; no recorder writes such")
+    if not logs:
+        return path, 0
     copy = folder / path.name
     shutil.copyfile(path, copy)
-    shutil.copyfile(log, folder / log.name)
+    for log in logs:
+        shutil.copyfile(log, folder / f"{path.name}{log.name.removeprefix(beside.name)}")
     with contextlib.closing(sqlite3.connect(copy)) as base:
+        _, frames, _ = base.execute("PRAGMA wal_checkpoint").fetchone()
         base.execute("PRAGMA journal_mode=DELETE").fetchall()
-    return copy
+    return copy, _left(logs[0], frames) if logs[0].name.endswith("-wal") else 0
+
+
+def _names_another(journal: Path) -> bool:
+    with journal.open("rb") as stream:
+        stream.seek(max(journal.stat().st_size - len(_JOURNAL), 0))
+        return stream.read() == _JOURNAL
+
+
+def _left(log: Path, frames: int) -> int:
+    """Bytes of a write-ahead log behind its good frames; older ones, which it overwrites, do not count."""
+    end = log.stat().st_size
+    if frames <= 0:
+        return end
+    with log.open("rb") as stream:
+        head = stream.read(_LOG_HEAD)
+        size, left = int.from_bytes(head[8:12], "big") + _FRAME_HEAD, 0
+        for place in range(_LOG_HEAD + frames * size, end, size):
+            stream.seek(place + 8)
+            left += min(size, end - place) if stream.read(8) == head[16:24] else 0
+    return left
 
 
 def connect(path: Path) -> sqlite3.Connection:
@@ -69,9 +106,14 @@ class _Table(Span):
                 yield Batch(data, topics, np.array([[number, log_ns, 0, len(data)]], np.uint64))
 
 
-def open_sqlite(path: Path) -> Storage:
-    """The topics of a database, and one span with its messages."""
+def open_sqlite(path: Path, folder: Path) -> Storage:
+    """The topics of a database, and one span with its messages; a copy of it may come into the folder.
+
+    Raises:
+        InputError, ValueError, OSError, sqlite3.Error: see `with_journal`.
+    """
     storage = Storage()
+    path, left = with_journal(path, folder)
     try:
         with contextlib.closing(connect(path)) as base:
             check_tables(base)
@@ -80,10 +122,16 @@ def open_sqlite(path: Path) -> Storage:
     except _WRONG as error:
         storage.damage.append(shown(error))
         first = last = 0
+    storage.damage += [left_over(left)] if left else []
     storage.damage = [f"{path.name}: {what}" for what in storage.damage]
     storage.first_ns, storage.last_ns = first, last
     storage.spans.append(_Table(storage.first_ns, storage.last_ns, 0, frozenset(storage.channels), path))
     return storage
+
+
+def left_over(size: int) -> str:
+    """In words: bytes of a write-ahead log that give nothing."""
+    return f"{size} B of its write-ahead log are broken, or were not written to the end"
 
 
 def _read_topics(base: sqlite3.Connection, storage: Storage) -> None:

@@ -27,7 +27,7 @@ from lathe_rc.bag.reading import metadata, precheck, qos
 from lathe_rc.bag.reading.limits import MOST_METADATA, MOST_TEXT, MOST_TOPICS
 from lathe_rc.bag.reading.sound_records import SoundRecords, Told
 from lathe_rc.bag.reading.source import files_of
-from lathe_rc.bag.reading.sqlite_storage import connect, with_journal
+from lathe_rc.bag.reading.sqlite_storage import connect, left_over, with_journal
 from lathe_rc.bag.reading.unpacking import unpack, unpack_file, unpacked_size
 from lathe_rc.bag.repairing.damaged_database import known_definition, readable_rows, select
 from lathe_rc.bag.writing.mcap_file import channel_content, schema_content
@@ -295,7 +295,10 @@ class Salvage:
 
     def _database(self, file: Path, folder: Path) -> Iterator[Message]:
         try:
-            with closing(connect(with_journal(file, folder))) as base:
+            database, left = with_journal(file, folder)
+            if left:
+                self._lose(file, left_over(left), left)
+            with closing(connect(database)) as base:
                 with suppress(sqlite3.DatabaseError):  # of a broken page; the others are read below
                     precheck.check_tables(base)
                 topics, strange = self._sqlite_topics(file, base), 0
@@ -396,7 +399,7 @@ class _Definitions:
             if schema is None:
                 self._sound.told(f"{name}: schema {channel.schema_id} is described nowhere", 0)
             else:
-                kind = Schema.read(ReadDataStream(BytesIO(schema))).name
+                kind = Schema.read(ReadDataStream(BytesIO(schema))).name or _SCHEMALESS
                 precheck.check_name(kind)
         self._salvage.count(len(content) + len(schema or b""))
         digest = channel.metadata.get("topic_type_hash", "")

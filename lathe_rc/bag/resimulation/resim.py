@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lathe_rc import messages, resources
+from lathe_rc import messages
 from lathe_rc.bag import check, provenance
 from lathe_rc.bag.reading.recorded import Recorded
 from lathe_rc.bag.reading.source import Source
@@ -187,7 +187,7 @@ def resimulate(
         recorded = Recorded(source, topics or {})
         original = None if scenario is not None else _of_bag(recorded, source, Path(folder), overrides)
         if scenario is not None:
-            chosen = scenarios.load(resources.scenario(scenario), overrides)
+            chosen = scenarios.load(scenario, overrides)
         else:
             assert original is not None, "it is the other source of a scenario"
             _refuse_overrides(original, overrides)

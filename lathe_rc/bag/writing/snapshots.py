@@ -20,7 +20,7 @@ from lathe_rc.bag.writing.mcap_file import RowPlan
 from lathe_rc.bag.writing.rows import Dense, Plan
 from lathe_rc.bag.writing.writer import BagWriter, refuse_existing
 from lathe_rc.cell.recorder import RecorderParameters
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import InputError, LatheError, at_most
 from lathe_rc.messages import START_NS
 from lathe_rc.names import instead
 
@@ -118,11 +118,13 @@ class Snapshots:
         row = Plan(topics, table.run_id, table.step_ns, table.block_size).template.size
         rows = -(-self._pre // table.block_size) + _SPARE_ROWS + _IN_FLIGHT
         if rows * row > table.memory:
-            most = max(table.memory // row - _SPARE_ROWS - _IN_FLIGHT, 0) * table.block_size * table.step
+            most = (table.memory // row - _SPARE_ROWS - _IN_FLIGHT) * table.block_size * table.step
+            allowed = f"allows pre = {at_most(most, 3)} s: shorten pre or raise memory"
+            if most < 0.0:
+                allowed = f"allows none: raise memory to {(_SPARE_ROWS + _IN_FLIGHT) * row} B or more"
             raise InputError(
                 f"{self._name}.pre = {table.pre:g} s takes {rows * row} B of memory, {row} B for {table.block_size} "
-                f"samples of all topics; {self._name}.memory = {table.memory} B allows pre = {most:.3g} s: "
-                "shorten pre or raise memory"
+                f"samples of all topics; {self._name}.memory = {table.memory} B {allowed}"
             )
         return rows * row
 

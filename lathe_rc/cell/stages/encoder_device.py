@@ -12,7 +12,7 @@ from lathe_rc import messages, resources
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Joint, Output, Sparse
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import InputError, LatheError, at_most
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.signals.counts import CountedAngle, CsvReader
 
@@ -129,7 +129,7 @@ class EncoderDevice(TimeMaster):
 
     def _too_short(self, what: str) -> str:
         return (
-            f"{what} ends at {self.counted.time:.6g} s, after {self.counted.angle / _TURN:.6g} revolutions; "
+            f"{what} ends at {self.counted.time:.6g} s, after {at_most(self.counted.angle / _TURN)} revolutions; "
             f"{self.name}.revolutions = {self.parameters.revolutions:g}, allowed: up to that, or 0 for all there is"
         )
 
@@ -183,7 +183,7 @@ class EncoderDevice(TimeMaster):
                     f"{self.name}: nobody knows when {where} will be reached; allowed with source = "
                     f"{self.parameters.source}: events by second or sample"
                 )
-            raise InputError(f"{self.name}: an event at {where}; allowed: up to {self.counted.angle / _TURN:.6g}")
+            raise InputError(f"{self.name}: an event at {where}; allowed: up to {at_most(self.counted.angle / _TURN)}")
         return found
 
     def speed_range(self) -> tuple[float, float]:

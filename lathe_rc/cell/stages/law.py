@@ -1,23 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A control law of one's own: a class with its formula, sample by sample, and nothing of ports, blocks and events.
-
-class Memory(NamedTuple):
-    gain: float
-    sum: Array
-
-@kernel                                     # or nothing: then it is plain Python, slower, with the same bits
-def sample(memory: Memory, now: Now) -> float:
-    if now.learning:
-        memory.sum[0] += memory.gain * now.error
-    return memory.sum[0]
-
-class Integral(Law):
-    Parameters = IntegralParameters         # its table, derived from LawParameters
-    sample = staticmethod(sample)
-
-    def start(self) -> Memory:
-        return Memory(self.parameters.gain, np.zeros(1))
-"""
+"""Control laws as plug-ins: a class with its formula, sample by sample, and nothing of ports, blocks and events."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -193,6 +175,27 @@ class Law(Sampled, Learner):
         parameters: its table.
         law: its memory.
         senses: it reads the measured position of the drive that it commands.
+
+    Example:
+        >>> import numpy as np
+        >>> from lathe_rc import Law, LawParameters, Now, kernel, parameter
+        >>> from typing import NamedTuple
+        >>> class IntegralParameters(LawParameters):
+        ...     gain: float = parameter(0.01, "of a sample")
+        >>> class Memory(NamedTuple):
+        ...     gain: float
+        ...     sum: np.ndarray
+        >>> @kernel  # or nothing: then it is plain Python, slower, with the same bits
+        ... def sample(memory: Memory, now: Now) -> float:
+        ...     if now.learning:
+        ...         memory.sum[0] += memory.gain * now.error
+        ...     return memory.sum[0]
+        >>> class Integral(Law):
+        ...     Parameters = IntegralParameters
+        ...     sample = staticmethod(sample)
+        ...
+        ...     def start(self) -> Memory:
+        ...         return Memory(self.parameters.gain, np.zeros(1))
     """
 
     Parameters = LawParameters

@@ -47,7 +47,7 @@ class LoadedSpindleParameters(SpindleEncoderParameters):
             InputError: a speed loop that oscillates.
         """
         belt = Belt(self.belt_stiffness, self.belt_damping) if self.belt_stiffness else None
-        with about(node, "speed_bandwidth", "speed_integral_time", "belt_stiffness"):
+        with about(node, "speed_bandwidth", "speed_integral_time", "belt_stiffness", "belt_damping"):
             return LoadedSpindle(
                 inertia=self.inertia,
                 motor_inertia=self.motor_inertia,

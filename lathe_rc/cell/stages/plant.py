@@ -1,22 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive of one's own: a class with its equation, sample by sample, and nothing of ports, blocks and events.
-
-class Memory(NamedTuple):
-    pole: float
-    position: Array
-
-@kernel                                     # or nothing: then it is plain Python, slower, with the same bits
-def sample(memory: Memory, command: float) -> tuple[float, float, float]:
-    memory.position[0] += memory.pole * (command - memory.position[0])
-    return memory.position[0], 0.0, 0.0     # position [m], velocity [m/s], effort [N or V]
-
-class FirstOrder(Plant):
-    Parameters = FirstOrderParameters       # its table, derived from PlantParameters
-    sample = staticmethod(sample)
-
-    def start(self) -> Memory:
-        return Memory(1.0 - np.exp(-self.parameters.step / self.parameters.lag), np.zeros(1))
-"""
+"""Drives as plug-ins: a class with its equation, sample by sample, and nothing of ports, blocks and events."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -148,6 +131,26 @@ class Plant(Sampled, SingleDrive):
 
     Attributes:
         plant: its memory.
+
+    Example:
+        >>> import numpy as np
+        >>> from lathe_rc import Plant, PlantParameters, kernel, parameter
+        >>> from typing import NamedTuple
+        >>> class LagParameters(PlantParameters):
+        ...     lag: float = parameter(1e-3, "time constant", "s")
+        >>> class Memory(NamedTuple):
+        ...     pole: float
+        ...     position: np.ndarray
+        >>> @kernel  # or nothing: then it is plain Python, slower, with the same bits
+        ... def sample(memory: Memory, command: float) -> tuple[float, float, float]:
+        ...     memory.position[0] += memory.pole * (command - memory.position[0])
+        ...     return memory.position[0], 0.0, 0.0  # position [m], velocity [m/s], effort [N or V]
+        >>> class FirstOrder(Plant):
+        ...     Parameters = LagParameters
+        ...     sample = staticmethod(sample)
+        ...
+        ...     def start(self) -> Memory:
+        ...         return Memory(1.0 - np.exp(-self.parameters.step / self.parameters.lag), np.zeros(1))
     """
 
     Parameters = PlantParameters

@@ -277,7 +277,7 @@ class PositionController(Stage):
             )
         if parameters.law == "sampled_link":
             known = parameters.link == "ripple_free" and parameters.link_knows_delay
-            with about(self.name, "link_gain", "link_lag", "divisor", "feedback_delay"):
+            with about(self.name, "link_gain", "link_lag", "divisor", "feedback_delay", "link"):
                 return SampledLink(
                     parameters.link,
                     gain=parameters.link_gain,

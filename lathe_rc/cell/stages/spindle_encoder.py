@@ -79,7 +79,7 @@ class SpindleEncoder(TimeMaster):
         super().__init__(name, parameters)
         self._law = self.law = parameters.speed_law(name)
         if parameters.revolutions:
-            with about(name, f"revolutions = {parameters.revolutions:g}"):
+            with about(name, f"revolutions = {parameters.revolutions:g}", "nominal_rpm and its deviations"):
                 end = 2 * np.pi * parameters.revolutions + self._lag()
                 self.samples = self._law.samples_until(end, parameters.step)
         self._check_end()
@@ -103,8 +103,8 @@ class SpindleEncoder(TimeMaster):
         parameters, seconds = self.parameters, (self.samples or 0) * self.shared.step
         if parameters.deviation_law and seconds > parameters.deviation_law_end:
             raise InputError(
-                f"{self.name}.deviation_law_end = {parameters.deviation_law_end:g} s: the run takes {seconds:.5g} s; "
-                "allowed: not before its end"
+                f"{self.name}.deviation_law_end = {parameters.deviation_law_end:g} s: the run takes {seconds:.5g} s at "
+                "the speed there; allowed: not before its end, which another speed moves (leave a margin)"
             )
 
     def warnings(self, seconds: float) -> list[str]:

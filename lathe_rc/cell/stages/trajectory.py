@@ -17,8 +17,6 @@ from lathe_rc.messages import MAX_BLOCK, Samples
 from lathe_rc.signals.example_002 import fill_reference
 from lathe_rc.signals.table import read_table
 
-_COLUMNS = {"time_s,position_um": 1e-6, "time_s,force_n": 1.0}
-
 
 class TrajectoryParameters(NodeParameters):
     """Set point over time."""
@@ -74,9 +72,11 @@ class Trajectory:
             if not parameters.trajectory_file:
                 raise InputError(f"{node}.trajectory_file is empty; name the CSV file of the trajectory")
             path = resources.find(Path(parameters.trajectory_file))
+            force = type(parameters).rows()["set_point"].unit == "N"
+            column, scale = ("force_n", 1.0) if force else ("position_um", 1e-6)
             with about(node, "trajectory_file"):
-                header, rows = read_table(path, [name.split(",") for name in _COLUMNS], "trajectory")
-            times, values = rows[:, 0].tolist(), (rows[:, 1] * _COLUMNS[",".join(header)]).tolist()
+                _, rows = read_table(path, [("time_s", column)], "trajectory")
+            times, values = rows[:, 0].tolist(), (rows[:, 1] * scale).tolist()
         if len(values) != len(times):
             raise InputError(
                 f"{node}.set_point, set_point_time: {len(values)} values and {len(times)} times; give as many of each"

@@ -10,7 +10,7 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, at_most
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
 from lathe_rc.signals import vibration
@@ -80,8 +80,8 @@ class Vibration(Stage):
         for whose, lines in (("line_frequency", given), ("random_high", drawn)):
             if lines[1].max(initial=0.0) >= nyquist:
                 raise InputError(
-                    f"{name}.{whose}: vibration at {lines[1].max():g} rad/s; allowed: below {nyquist:g} rad/s, half "
-                    "the sample rate"
+                    f"{name}.{whose}: vibration at {lines[1].max():g} rad/s; allowed: below {at_most(nyquist)} rad/s, "
+                    "half the sample rate"
                 )
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         self.declare(

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Running the scenarios of ``config/`` with changes."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeVar
+
+from lathe_rc import harness
+from lathe_rc.cell import batch, scenario
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.errors import InputError
+from lathe_rc.study import Track
+
+Values = Mapping[str, object]
+K = TypeVar("K")
+
+
+def _yaml(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value).replace("'", '"') if isinstance(value, list) else str(value)
+
+
+def load(name: str, shared: Values | None = None, **nodes: Values) -> Scenario:
+    """A scenario of ``config/`` with shared parameters and parameters by node replaced."""
+    changes = [f"{parameter}={_yaml(value)}" for parameter, value in (shared or {}).items()]
+    changes += [f"{node}.{parameter}={_yaml(v)}" for node, table in nodes.items() for parameter, v in table.items()]
+    return scenario.load(name, changes)
+
+
+def run(name: str, shared: Values | None = None, **nodes: Values) -> harness.Result:
+    """Run it offline."""
+    return harness.run(load(name, shared, **nodes))
+
+
+def kept(made: Sequence[Scenario], keep: batch.Make[K], track: Track) -> Iterator[K | None]:
+    """Run many; what a keeper keeps of each, in their order, None of one that failed on its way.
+
+    Raises:
+        InputError: one is refused.
+    """
+    outcomes = batch.run_many(made, keep)
+    for _ in track(range(len(made))):
+        outcome = next(outcomes)
+        if isinstance(outcome.error, InputError):
+            raise outcome.error
+        yield outcome.kept

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cost of a tolerance of drives: one controller, many drives of a batch.
+
+The controllers keep the models and settings of the scenario. Natural frequency, damping and delay of every drive are
+drawn independently, normal about the scenario's value, with the tolerance as the standard deviation. A drive with
+which learning would diverge is refused, and counts as one that never comes below any error. It is a sweep; see
+docs/sweeps.md.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from annotated_types import Ge, Gt, Le
+
+from lathe_papers import cells, sweeps
+from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stages.drive import Drive
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from rich.table import Table as RichTable
+
+Array = npt.NDArray[np.float64]
+
+_DRAWN = ("natural_frequency", "damping", "delay")
+_SHARES = (0.5, 0.95, 0.99)
+
+
+class DriveToleranceParameters(StudyParameters):
+    """Cell, tolerances, and how many drives of each."""
+
+    scenario: Literal["piston", "two_channel"] = parameter("two_channel", "what is turned")
+    tolerance: list[Annotated[float, Gt(0), Le(0.3)]] = parameter(
+        [0.01, 0.02, 0.05, 0.1, 0.15], "standard deviations of natural frequency, damping and delay, in parts of them"
+    )
+    drives: Annotated[int, Ge(16), Le(2**16)] = parameter(512, "of each tolerance; a power of two is spread best")
+    revolutions: Annotated[float, Ge(5), Le(1000)] = parameter(40.0, "of each run; the last counts", "rev")
+    folder: str = parameter("", "keeps the rows, and goes on from them; empty: nothing is kept")
+
+
+@dataclass(frozen=True)
+class DriveToleranceResult:
+    """Errors by tolerance.
+
+    Attributes:
+        parameters: of the study.
+        nominal: largest error of the last revolution with the scenario's own drives [µm].
+        error: of each drive, rising; infinite where learning would diverge, shape (tolerances, drives) [µm].
+    """
+
+    parameters: DriveToleranceParameters
+    nominal: float
+    error: Array
+
+    def _at(self, share: float) -> Array:
+        """Error that so many of the drives stay below, by tolerance [µm]."""
+        place = int(np.ceil(share * self.error.shape[1])) - 1
+        return np.asarray(self.error[:, place])
+
+    def to_json(self) -> dict[str, Any]:
+        """Errors that 50, 95 and 99 % stay below; None where more than the rest diverge."""
+        return {
+            "tolerance": self.parameters.tolerance,
+            "nominal_um": self.nominal,
+            **{
+                f"{100 * share:g}_percent_um": [float(e) if np.isfinite(e) else None for e in self._at(share)]
+                for share in _SHARES
+            },
+            "refused": np.isinf(self.error).sum(axis=1).tolist(),
+        }
+
+    def table(self) -> "RichTable":
+        """The same in words."""
+        columns = ("tolerance (1σ)", *(f"{100 * share:g} % below [µm]" for share in _SHARES), "refused [%]")
+        at = [self._at(share) for share in _SHARES]
+        rows = [("none", *(f"{self.nominal:.3g}" for _ in _SHARES), "0")]
+        for place, tolerance in enumerate(self.parameters.tolerance):
+            told = [f"{errors[place]:.3g}" if np.isfinite(errors[place]) else "diverges" for errors in at]
+            refused = 100.0 * np.isinf(self.error[place]).mean()
+            rows.append((f"{100 * tolerance:g} %", *told, f"{refused:.3g}"))
+        title = f"{self.parameters.scenario}: largest error of the last revolution over {self.parameters.drives} drives"
+        return comparison(title, columns, rows)
+
+    def draw(self, figure: "Figure") -> None:
+        """Share of the drives below an error, and the error that 50, 95 and 99 % stay below."""
+        left, right = figure.subplots(1, 2)
+        shares = 100.0 * np.arange(1, self.error.shape[1] + 1) / self.error.shape[1]
+        for place, tolerance in enumerate(self.parameters.tolerance):
+            finite = np.isfinite(self.error[place])
+            left.semilogx(self.error[place][finite], shares[finite], label=f"{100 * tolerance:g} %", color=f"C{place}")
+        left.axvline(self.nominal, color="#7f7f7f", ls=":", label="the scenario's own")
+        left.set(xlabel="largest form error of the last revolution [µm]", ylabel="drives below [%]")
+        left.legend(title="tolerance (1σ)", fontsize=8, title_fontsize=8)
+        for place, share in enumerate(_SHARES):
+            errors = self._at(share)
+            shown = np.isfinite(errors)
+            percent = 100.0 * np.array(self.parameters.tolerance)
+            right.loglog(
+                percent[shown], errors[shown], "o-", label=f"{100 * share:g} % of the drives", color=f"C{place}"
+            )
+        right.axhline(self.nominal, color="#7f7f7f", ls=":", label="the scenario's own")
+        right.set(xlabel="tolerance of the drives (1σ) [%]", ylabel="form error that they stay below [µm]")
+        right.legend(fontsize=8)
+        right.set_xticks(100.0 * np.array(self.parameters.tolerance))
+        for axis in (left.xaxis, right.xaxis, right.yaxis):
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter("")
+        for axes in (left, right):
+            axes.grid(visible=True, which="both", alpha=0.25)
+
+
+def _drawn(scenario: Scenario) -> list[str]:
+    """The parameters that differ from drive to drive."""
+    drives = [name for name, stage in Cell(scenario.nodes).stages.items() if isinstance(stage, Drive)]
+    return [
+        f"{node}.{name}"
+        for node in drives
+        for name in _DRAWN
+        if name in type(scenario.nodes[node]).rows() and scenario.value(f"{node}.{name}")
+    ]
+
+
+def run(parameters: DriveToleranceParameters, track: Track = untracked) -> DriveToleranceResult:
+    """Compute the study."""
+    from lathe_rc.sweep.space import Space
+
+    base = cells.load(parameters.scenario, spindle_encoder={"revolutions": parameters.revolutions})
+    spaces = [Space(given=[{"seed": base.shared.seed}])]
+    for tolerance in parameters.tolerance:
+        laws = dict.fromkeys(_drawn(base), f"normal:{100.0 * tolerance!r}%")
+        spaces.append(Space(sampled=laws, sample=f"sobol:{parameters.drives}"))
+    # A folder of its own each: nothing else distinguishes the rows of one from another's.
+    asked = [(f"tolerance-{number}", base, space) for number, space in enumerate(spaces)]
+    own, *found = sweeps.table(asked, parameters.folder, ["tool.max_error"], track, models="nominal")
+    errors = [
+        sorted(np.inf if error is None else error * 1e6 for error in table["tool.max_error"].to_pylist())
+        for table in found
+    ]
+    return DriveToleranceResult(parameters, own["tool.max_error"].to_pylist()[0] * 1e6, np.array(errors))
+
+
+STUDY = Study(
+    "drive-tolerance",
+    "what a tolerance of drives costs a controller that knows the nominal one",
+    DriveToleranceParameters,
+    run,
+    size=(11.0, 4.2),
+)

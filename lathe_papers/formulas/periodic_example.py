@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs of the example of paper 002: a drive of its box, from rest, period by period."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_papers.formulas.hyperstability import plant, required_input
+from lathe_papers.formulas.periodic_loop import PeriodicLoop, disturbance, steady_derivatives, transient
+from lathe_rc.control.periodic import PeriodicController, samples_in
+from lathe_rc.control.periodic_gains import PRESETS, PeriodicGains
+from lathe_rc.signals.example_002 import PERIOD
+from lathe_rc.transfer import LinearSystem
+
+Array = npt.NDArray[np.float64]
+
+SHOWN = 3  #: periods in the curves
+_POINTS = 250  # of each of them
+_SETTLING = 4  # periods in which the drive alone settles
+
+
+def times(step: float) -> Array:
+    """Of the samples of the first period [s]; ``step`` in s.
+
+    Raises:
+        InputError: the period is no whole number of steps.
+    """
+    return np.asarray(np.arange(samples_in(PERIOD, step)) * step, dtype=np.float64)
+
+
+def ideal_input(drives: Array, time: Array) -> Array:
+    """u° of each drive, shape (m, 5), in a steady period, shape (m, n); ``time`` in s, shape (n,)."""
+    return required_input(drives, steady_derivatives(time), disturbance(time))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """The parameters that distinguish a run.
+
+    Attributes:
+        periods: to run.
+        step: [s].
+        s0: limit.
+        memory_filter: σ [s].
+        anti_windup: False for the paper's switch.
+        quantisation: of y and u; 0 for none.
+        gains: of the law.
+    """
+
+    periods: int
+    step: float
+    s0: float = 2.0
+    memory_filter: float = 0.1
+    anti_windup: bool = True
+    quantisation: float = 0.0
+    gains: PeriodicGains = PRESETS["published"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A run.
+
+    Attributes:
+        period_max_error: largest |r - y| in each period, shape (periods,).
+        period_integral: eq. 15 at the end of each period, shape (periods,) [s].
+        curves: time, r, y, S(u), f of the first periods, shape (5, points) [s, 1].
+        controller: after the last period.
+    """
+
+    period_max_error: Array
+    period_integral: Array
+    curves: Array
+    controller: PeriodicController
+
+
+def simulate(case: Case, drive: Array) -> Outcome:
+    """Run the example from rest.
+
+    Args:
+        case: what to run.
+        drive: K, a1 ... a4, shape (5,).
+
+    Raises:
+        InputError: the period is no whole number of steps, or the law refuses a number.
+    """
+    time = times(case.step)
+    controller = PeriodicController(
+        case.gains,
+        period=PERIOD,
+        limit=case.s0,
+        step_s=case.step,
+        memory_filter=case.memory_filter,
+        anti_windup=case.anti_windup,
+        measurement_step=case.quantisation,
+        command_step=case.quantisation,
+        ideal=ideal_input(drive[None], time)[0],
+    )
+    loop = PeriodicLoop(controller, plant(drive))
+    steady, load = steady_derivatives(time)[0], disturbance(time + case.step / 2.0)
+    errors, integrals = np.empty((2, case.periods))
+    output, command = np.empty((2, time.size))
+    curves = []
+    for period in range(case.periods):
+        at = time + period * PERIOD
+        wanted = steady + transient(at)
+        loop.block(period * time.size, wanted, load, output, command)
+        errors[period] = np.abs(wanted - output).max()
+        integrals[period] = controller.popov_integral
+        if period < SHOWN:
+            every = max(time.size // _POINTS, 1)
+            curves.append(np.stack((at, wanted, output, command, disturbance(at)))[:, ::every])
+    return Outcome(errors, integrals, np.concatenate(curves, axis=1), controller)
+
+
+def limited_ideal_error(drive: Array, limit: float, step: float) -> float:
+    """Largest steady |r - y| of a drive that gets u°, limited to ±``limit``; ``step`` in s."""
+    time = times(step)
+    load, wanted = disturbance(time), steady_derivatives(time)[0]
+    machine, output = LinearSystem(plant(drive), step), np.empty(time.size)
+    given = ideal_input(drive[None], time)[0].clip(-limit, limit) + load
+    for _ in range(_SETTLING):
+        machine.block(given, output)
+    return float(np.abs(wanted - output).max())

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models of a drive from its measured step response (paper 000, Fig. 4, eqs 18 and 19).
+
+    first order                1/(1 + p·T0)                               (18)
+    delay                      e^{-p·T0}                                  (19)
+    second order               1/(1 + 2ζp/ωn + p²/ωn²)                    what the paper recommends next
+    second order with delay    e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²)
+
+All have Wi(0) = 1, as in the paper. A fit makes the mean square of the residual over time least.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from lathe_papers.formulas.responses import second_order
+from lathe_rc.errors import InputError
+from lathe_rc.signals.table import read_table
+
+Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class StepResponse:
+    """A measured response to a step of 1 at time 0.
+
+    Args:
+        time: increasing [s], shape (n,), n from 8.
+        response: relative to the step [1], shape (n,); ends near 1.
+
+    Raises:
+        InputError: it is no such response.
+    """
+
+    time: Array
+    response: Array
+
+    def __post_init__(self) -> None:
+        time, response = self.time, self.response
+        if time.size != response.size or time.size < 8:
+            raise InputError(f"step response: {time.size} times, {response.size} values; allowed: 8 or more of each")
+        if not (np.all(np.isfinite(time)) and np.all(np.isfinite(response))):
+            raise InputError("step response: not all numbers are finite; remove those that are not")
+        falling = np.flatnonzero(np.diff(time) <= 0.0)
+        if falling.size:
+            a, b = time[falling[0]], time[falling[0] + 1]
+            raise InputError(f"step response: time {a:g} s is followed by {b:g} s; allowed: increasing times")
+        if time[-1] <= 0.0 or abs(time[0]) > 0.1 * time[-1]:
+            raise InputError(
+                f"step response: from {time[0]:g} to {time[-1]:g} s; allowed: from near 0, where the step is, to "
+                "where the drive has settled"
+            )
+        if not 0.8 <= response[-1] <= 1.2:
+            raise InputError(
+                f"step response: ends at {response[-1]:g}; allowed: near 1 (divide by the height of the step, and "
+                "record until the drive has settled)"
+            )
+
+    def residual(self, model: "Model") -> Array:
+        """The model's residual, weighted so that its sum of squares is the mean square over time."""
+        between = np.diff(self.time)
+        weight = (np.append(between, 0.0) + np.append(0.0, between)) / 2.0
+        return np.asarray((model.step(self.time) - self.response) * np.sqrt(weight / weight.sum()))
+
+    def rms(self, model: "Model") -> float:
+        """RMS over time of what the model misses [1]."""
+        return float(np.sqrt(np.sum(self.residual(model) ** 2)))
+
+
+class Model(Protocol):
+    """A drive with Wi(0) = 1."""
+
+    def step(self, time: Array) -> Array:
+        """Response to a unit step at time 0; ``time`` in s, shape (n,)."""
+
+    def response(self, frequency: Array) -> Complex:
+        """Wi(jω); ``frequency`` in rad/s, shape (n,)."""
+
+
+@dataclass(frozen=True)
+class FirstOrder:
+    """1/(1 + p·T0) (paper 000, eq. 18); ``time_constant`` in s."""
+
+    time_constant: float
+
+    def step(self, time: Array) -> Array:
+        """See `Model`."""
+        return -np.expm1(-np.maximum(time, 0.0) / self.time_constant)
+
+    def response(self, frequency: Array) -> Complex:
+        """See `Model`."""
+        return np.asarray(1.0 / (1.0 + 1j * frequency * self.time_constant))
+
+
+@dataclass(frozen=True)
+class Delay:
+    """e^{-p·T0} (paper 000, eq. 19); ``delay`` T0 in s."""
+
+    delay: float
+
+    def step(self, time: Array) -> Array:
+        """See `Model`."""
+        return np.where(time >= self.delay, 1.0, 0.0)
+
+    def response(self, frequency: Array) -> Complex:
+        """See `Model`."""
+        return np.asarray(np.exp(-1j * frequency * self.delay))
+
+
+@dataclass(frozen=True)
+class SecondOrder:
+    """e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²); ωn in rad/s, τ in s."""
+
+    natural_frequency: float
+    damping: float
+    delay: float = 0.0
+
+    def step(self, time: Array) -> Array:
+        """See `Model`; any damping."""
+        t = np.maximum(time - self.delay, 0.0) * self.natural_frequency
+        # Poles -ζ ± d in units of ωn. At d = 0 the quotient below is 0/0; a d this small changes nothing.
+        d = np.sqrt(complex(self.damping**2 - 1.0))
+        if abs(d) < 1e-6:
+            d = 1e-6 + 0.0j
+        slow, fast = np.exp((d - self.damping) * t), np.exp((-d - self.damping) * t)
+        return np.asarray(1.0 - ((slow + fast) / 2.0 + self.damping * (slow - fast) / (2.0 * d)).real)
+
+    def response(self, frequency: Array) -> Complex:
+        """See `Model`."""
+        return second_order(frequency, self.natural_frequency, self.damping, self.delay)
+
+
+M = TypeVar("M", bound=Model)
+
+
+def _best(measured: StepResponse, build: Callable[[Array], M], low: Array, high: Array, starts: Iterable[Array]) -> M:
+    """The best of least-squares fits of ``build(x)`` with ``x`` in bounds from several starts, shape (k,) each."""
+
+    def residual(x: Array) -> Array:
+        return measured.residual(build(x))
+
+    found = [
+        scipy.optimize.least_squares(residual, np.clip(start, low, high), bounds=(low, high), xtol=1e-12, ftol=1e-12)
+        for start in starts
+    ]
+    return build(min(found, key=lambda fit: float(fit.cost)).x)
+
+
+def _half(measured: StepResponse) -> Array:
+    """When the response rises through 1/2 [s], at least once; straight between its points."""
+    time, rest = np.append(0.0, measured.time), np.append(-0.5, measured.response - 0.5)
+    at = np.flatnonzero((rest[:-1] < 0.0) & (rest[1:] >= 0.0))
+    return np.asarray(time[at] - rest[at] * (time[at + 1] - time[at]) / (rest[at + 1] - rest[at]))
+
+
+def fit_delay(measured: StepResponse) -> Delay:
+    """Least-squares fit of eq. 19.
+
+    The mean square changes with T0 as 2h(T0) - 1, so its least value is where the response rises through 1/2.
+    """
+    return min((Delay(float(time)) for time in _half(measured)), key=measured.rms)
+
+
+def fit_first_order(measured: StepResponse) -> FirstOrder:
+    """Least-squares fit of eq. 18."""
+    end, nearest = measured.time[-1], np.diff(measured.time).min()
+    return _best(
+        measured,
+        lambda x: FirstOrder(float(np.exp(x[0]))),
+        np.log([nearest / 100.0]),
+        np.log([end * 10.0]),
+        [np.log([max(_half(measured)[0], nearest)])],
+    )
+
+
+def fit_second_order(measured: StepResponse, *, delayed: bool) -> SecondOrder:
+    """Least-squares fit of second order, with or without a delay."""
+    end, nearest = measured.time[-1], np.diff(measured.time).min()
+    half = max(float(_half(measured)[0]), nearest)
+
+    def build(x: Array) -> SecondOrder:
+        return SecondOrder(float(np.exp(x[0])), float(np.exp(x[1])), float(x[2]) * half if delayed else 0.0)
+
+    size = 3 if delayed else 2
+    low = np.array([np.log(0.1 / end), np.log(0.01), 0.0])[:size]
+    high = np.array([np.log(100.0 / nearest), np.log(100.0), end / half])[:size]
+    # Half of the step is reached at about (1 + 0.7ζ)/ωn after the delay.
+    starts = [
+        np.array([np.log((1.0 + 0.7 * damping) / (half * (1.0 - part))), np.log(damping), part])[:size]
+        for damping in (0.3, 1.0, 3.0)
+        for part in ((0.0, 0.3, 0.7) if delayed else (0.0,))
+    ]
+    return _best(measured, build, low, high, starts)
+
+
+def read_csv(path: Path) -> StepResponse:
+    """Read a step response from a CSV file.
+
+    Columns ``time_ms`` [ms], from the step on, and ``response``, relative to the step.
+
+    Raises:
+        InputError: the file is missing or malformed, or holds no step response.
+    """
+    _, rows = read_table(path, [("time_ms", "response")], "step response")
+    try:
+        return StepResponse(rows[:, 0] * 1e-3, rows[:, 1])
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None

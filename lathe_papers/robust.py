@@ -1,0 +1,374 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws under a speed, a force and a drive that vary: which of them hold.
+
+The cell of ``config/robust_cutting.yaml`` under one condition after the other, each with the drive that the laws are
+told and with drives whose natural frequency, damping, stiffness and delay differ from it: at all corners, and between.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from annotated_types import Ge, Gt, Le
+from rich.console import Group
+from rich.table import Table as RichTable
+
+from lathe_papers import cells
+from lathe_rc.cell.parameters import Value, parameter
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.compound_controller import CompoundController
+from lathe_rc.cell.stages.drive import Drive
+from lathe_rc.cell.stages.learner import Learner
+from lathe_rc.cell.stages.resonant_controller import ResonantController
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.messages import Signals
+from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = npt.NDArray[np.float64]
+Values = Mapping[str, Value]
+
+_TURN = 2.0 * np.pi
+_LAST = 10  # revolutions that are judged
+_SPREAD = 0.2  # of the drives, relative
+TOLD = (1038.0, 0.804, 0.36e-3)  # natural frequency [rad/s], damping and delay [s] that the laws are told
+_MASS = 1.2  # [kg] of it
+_MODEL = ("model_natural_frequency", "model_damping", "model_delay")
+_FREQUENCIES = np.geomspace(1.0, 3e4, 4000)  # [rad/s] at which a margin is looked for
+
+# Parameters of spindle and cut that a condition leaves as they are in the scenario, where everything happens at once.
+_STEADY: Values = {"spindle_encoder.random_rms": 0.0}
+_WHOLE: Values = {"loaded_drive.cut_gap_start": [], "loaded_drive.cut_gap_width": []}
+_EVEN: Values = {
+    "loaded_drive.cut_run_out_amplitude": [0.0],
+    "loaded_drive.cut_hard_spot_factor": [1.0],
+    "loaded_drive.cut_wear_per_second": 0.0,
+}
+
+
+def _swinging(frequency: float) -> Values:
+    swing = {"deviation_amplitude": [0.1], "deviation_frequency": [frequency]}
+    return {**_STEADY, **_WHOLE, **_EVEN, **{f"spindle_encoder.{name}": value for name, value in swing.items()}}
+
+
+CONDITIONS: dict[str, Values] = {
+    "nominal": {**_STEADY, **_WHOLE, **_EVEN},
+    "speed 10.7": _swinging(10.7),
+    "speed 106": _swinging(106.0),
+    "speed 213": _swinging(213.0),
+    "speed random": {**_WHOLE, **_EVEN},
+    "one keyway": {
+        **_STEADY, **_EVEN, "loaded_drive.cut_gap_start": [0.5], "loaded_drive.cut_gap_width": [0.35],
+    },
+    "three keyways": {**_STEADY, **_EVEN},
+    "uneven, worn": {**_STEADY, **_WHOLE},
+    "slowed by cut": {**_STEADY, **_EVEN},
+    "all at once": {},
+}  # fmt: skip
+_SLOWED = "slowed by cut"  # three keyways, and a spindle that the cut slows in between
+_SPINDLE: cells.Values = {"stage": "loaded_spindle", "inertia": 0.03, "motor_inertia": 0.01, "torque_limit": 10.0}
+_QUICK = ("nominal", "speed 213", "three keyways", "all at once")
+
+_INVERSE: cells.Values = {
+    "correction": "second_order_inverse_dynamic",
+    "correction_model": "identified",
+    "lead_law": "variable_second_order",
+    "lead_time": TOLD[2],
+    "q_time": 40e-6,
+    "soft_start": 1.0,
+    "acceleration_window": 64,
+}
+_ANY: cells.Values = {"allow_unstable": True, "stop_ratio": 0.0}  # what diverges is told by its error
+_LEARNING: cells.Values = {**_ANY, "stage": "learning_controller", "identify": False}
+#: by name: parameters of the node ``controller``
+LAWS: dict[str, cells.Values] = {
+    "000": {**_LEARNING, "lead_time": 2e-3, "q_time": 130e-6},
+    "001": {**_LEARNING, "lead_time": 1.425e-3, "q_time": 67e-6},
+    "adapt.": {**_LEARNING, **_INVERSE, "identify": True},
+    "comp.": {
+        **_ANY, "stage": "compound_controller",
+        # tuned for drives that it is not told: more has to come from the error
+        "proportional": 1.9, "integral": 28.0, "derivative": 1.4e-4, "derivative_bandwidth": 19_000.0,
+    },
+    "told": {**_ANY, "stage": "compound_controller"},
+    "AFC": {**_ANY, "stage": "resonant_controller"},
+    "DOB": {**_ANY, "learning_gain": 0.0, "identify": False},
+    "ours": _ANY,
+}  # fmt: skip
+_KNOWS = "told"  # the law that is told each drive
+_COLOURS = ("#b7950b", "#e08e0b", "#111111", "#c0392b", "#7d3c98", "#2874a6", "#148f77", "#1e8449")
+
+
+class RobustParameters(StudyParameters):
+    """How many drives, how long, and what counts as good."""
+
+    plants: Annotated[int, Ge(1), Le(1000)] = parameter(
+        32, "drives beside the one that is told: the 16 corners of ±20 %, and random ones within"
+    )
+    seeds: Annotated[int, Ge(1), Le(100)] = parameter(3, "of noise, encoder and random speed; the worst counts")
+    revolutions: Annotated[int, Ge(15), Le(1000)] = parameter(40, "length of a run; the last 10 are judged", "rev")
+    tolerance_um: Annotated[float, Gt(0), Le(1000)] = parameter(1.0, "form tolerance, either way", "µm")
+    conditions: list[Literal[tuple(CONDITIONS)]] = parameter(list(CONDITIONS), "which of them")  # type: ignore[valid-type]
+    quick: bool = parameter(
+        default=False, doc=f"only {', '.join(_QUICK)}, only the first 5 drives, one seed, 30 revolutions"
+    )
+
+
+@dataclass(frozen=True)
+class RobustResult:
+    """The error of each law under each condition; arrays of shape (conditions, laws, drives), the told drive first.
+
+    Each value is that of the seed where it is largest.
+
+    Attributes:
+        conditions, laws: their names.
+        seeds: how many.
+        tolerance: [µm].
+        largest, rms: form error of the last ten revolutions where there is material [µm]; NaN where a run was stopped.
+        settled: revolution from which on the error stays within the tolerance; inf: it does not.
+        effort: RMS current of the drive [A].
+        margin: of the loop, shape (laws, drives): 1 - sup|factor of a revolution| of a law that learns, least |1 + L|
+            of one that acts in time.
+        curves: by law, largest error by revolution under the last condition for its worst drive [µm].
+    """
+
+    conditions: list[str]
+    laws: list[str]
+    seeds: int
+    tolerance: float
+    largest: Array
+    rms: Array
+    settled: Array
+    effort: Array
+    margin: Array
+    curves: list[Array]
+
+    def to_json(self) -> dict[str, Any]:
+        """Per condition and law: with the told drive, and with the worst; None where a run was stopped."""
+        found: dict[str, Any] = {"conditions": self.conditions, "laws": self.laws, "seeds": self.seeds}
+        found["tolerance_um"] = self.tolerance
+        for name, values in (
+            ("largest_um", self.largest),
+            ("rms_um", self.rms),
+            ("revolutions", self.settled),
+            ("effort_a", self.effort),
+        ):
+            found[name] = {"told": _finite(values[..., 0]), "worst": _finite(_worst(values))}
+        found["margin"] = {"told": _finite(self.margin[:, 0]), "worst": _finite(self.margin.min(axis=-1))}
+        return found
+
+    def table(self) -> Group:
+        """One table a quantity."""
+        tables: list[RichTable | str] = []
+        worst = f"worst of {self.largest.shape[-1]} drives"
+        seeds = f", worst of {self.seeds} seeds" if self.seeds > 1 else ""
+        for title, values in (
+            ("Largest form error of the last 10 revolutions [µm], told drive", self.largest[..., 0]),
+            (f"Largest form error of the last 10 revolutions [µm], {worst}", _worst(self.largest)),
+            ("RMS form error [µm], told drive", self.rms[..., 0]),
+            (f"RMS form error [µm], {worst}", _worst(self.rms)),
+            (f"Revolutions until within ±{self.tolerance:g} µm, {worst}; -: not at all", _worst(self.settled)),
+            (f"Effort: RMS current [A], {worst}", _worst(self.effort)),
+        ):
+            rows = [(name, *map(_figure, row)) for name, row in zip(self.conditions, values, strict=True)]
+            tables += [comparison(title + seeds, ("condition", *self.laws), rows), ""]
+        rows = [
+            (name, *(f"{value:.2f}" for value in row))
+            for name, row in (("told drive", self.margin[:, 0]), (worst, self.margin.min(axis=-1)))
+        ]
+        return Group(*tables, comparison("Margin of the loop, before anything is identified", ("", *self.laws), rows))
+
+    def draw(self, figure: "Figure") -> None:
+        """Largest errors by condition, and by revolution under the last one; both for the worst drive."""
+        bars, course = figure.subplots(1, 2, width_ratios=(3, 2))
+        worst, width = _worst(self.largest), 0.8 / len(self.laws)
+        for k, (law, colour) in enumerate(zip(self.laws, _COLOURS, strict=True)):
+            places = np.arange(len(self.conditions)) + (k - (len(self.laws) - 1) / 2) * width
+            bars.bar(places, worst[:, k], width, color=colour, label=law)
+            course.semilogy(self.curves[k], color=colour, lw=1.2, label=law)
+        bars.set(yscale="log", ylabel="largest form error [µm], worst drive")
+        bars.set_xticks(range(len(self.conditions)), self.conditions, rotation=25, ha="right", fontsize=8)
+        course.set(xlabel="revolution", ylabel="largest form error [µm]")
+        course.set_title(f"{self.conditions[-1]}, worst drive of each law", fontsize=10)
+        for axes in (bars, course):
+            axes.axhline(self.tolerance, color="black", lw=0.8, ls="--")
+            axes.grid(visible=True, alpha=0.3)
+            axes.legend(fontsize=7, ncols=2)
+
+
+def _worst(values: Array) -> Array:
+    """Over the last axis, drives or seeds; a run that was stopped is the worst."""
+    return np.asarray(np.where(np.isnan(values).any(axis=-1), np.nan, values.max(axis=-1)))
+
+
+def _finite(values: Array) -> list[Any]:
+    return [_finite(row) if row.ndim else (float(row) if np.isfinite(row) else None) for row in values]
+
+
+def _figure(value: float) -> str:
+    if not np.isfinite(value):
+        return "-"
+    if value == int(value):
+        return str(int(value))
+    return f"{value:.2f}" if value < 10.0 else f"{value:.1f}" if value < 100.0 else f"{value:.0f}"
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """Kept results of a run: largest error by revolution [µm], RMS of the last ones [µm], RMS current [A]."""
+
+    largest: Array
+    rms: float
+    effort: float
+
+    def settled(self, tolerance: float) -> float:
+        """The revolution from which on the error stays within a tolerance [µm]; inf: it does not."""
+        out = np.flatnonzero(~(self.largest <= tolerance))
+        first = int(out[-1]) + 1 if out.size else 0
+        return float(first) if first < self.largest.size else np.inf
+
+
+class Judge:
+    """Keeps what is judged of a run: only where there is material.
+
+    Args:
+        cell: that runs.
+        samples: of the run.
+    """
+
+    heard = ("encoder.angle_true", "tool.error", "coarse/state.effort")
+
+    def __init__(self, cell: Cell, samples: int) -> None:
+        drive: Any = cell.stages["loaded_drive"].shared
+        self._gaps = list(zip(drive.cut_gap_start, drive.cut_gap_width, strict=True))
+        self._angle, self._error, self._current = np.empty((3, samples))
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        part = slice(first, first + samples)
+        self._angle[part] = dense["encoder"]["angle_true"]
+        self._error[part] = dense["tool"]["error"]
+        self._current[part] = dense["coarse/state"]["effort"]
+
+    def kept(self) -> _Judged:
+        """See `lathe_rc.cell.batch.Keeper`; of the complete revolutions."""
+        error = np.abs(self._error) * 1e6
+        for start, width in self._gaps:
+            error[np.mod(self._angle - start, _TURN) < width] = 0.0
+        revolution = np.floor(self._angle / _TURN)
+        starts = np.searchsorted(revolution, np.arange(revolution[-1] + 1))
+        largest = np.maximum.reduceat(error[: starts[-1]], starts[:-1])
+        last = error[starts[-1 - _LAST] : starts[-1]]
+        return _Judged(
+            largest, float(np.sqrt(np.mean(last[last > 0.0] ** 2))), float(np.sqrt(np.mean(self._current**2)))
+        )
+
+
+def drives_near(count: int) -> list[tuple[float, float, float, float]]:
+    """Factors of natural frequency, damping, stiffness and delay; the told drive first."""
+    ends = (1.0 - _SPREAD, 1.0 + _SPREAD)
+    corners = [*product(ends, repeat=4)]
+    # Of few, opposite ones.
+    corners = [corners[k] for k in (3, 12, 5, 10, 15, 0, 6, 9, 1, 2, 4, 7, 8, 11, 13, 14)]
+    random = np.random.default_rng(0).uniform(*ends, size=(max(count - len(corners), 0), 4)).tolist()
+    return [(1.0, 1.0, 1.0, 1.0), *[*corners, *map(tuple, random)][:count]]
+
+
+def machine(frequency: float, damping: float, stiffness: float, delay: float) -> Values:
+    """A drive by factors of the one that the laws are told."""
+    natural_frequency, own_damping, own_delay = TOLD
+    return {
+        "loaded_drive.coarse_natural_frequency": natural_frequency * frequency,
+        "loaded_drive.coarse_damping": own_damping * damping,
+        "loaded_drive.coarse_delay": own_delay * delay,
+        # the force bends the drive by its stiffness, which is the mass times the square of the natural frequency
+        "loaded_drive.coarse_moving_mass": _MASS * stiffness / frequency**2,
+    }
+
+
+def model(frequency: float = 1.0, damping: float = 1.0, delay: float = 1.0) -> Values:
+    """Parameters of the law: the drive as it is identified, in error by these factors."""
+    factors = zip(_MODEL, TOLD, (frequency, damping, delay), strict=True)
+    return {f"controller.{name}": value * factor for name, value, factor in factors}
+
+
+def _cell(
+    bases: Mapping[tuple[str, bool], Scenario], condition: str, law: str, drive: tuple[float, float, float, float]
+) -> Scenario:
+    frequency, damping, _, delay = drive
+    told = model(frequency, damping, delay) if law == _KNOWS else model()
+    return bases[law, condition == _SLOWED].varied({**CONDITIONS[condition], **machine(*drive), **told})
+
+
+def _margin(scenario: Scenario) -> float:
+    """Margin of the law's loop, as in `RobustResult.margin`."""
+    cell = Cell(scenario.nodes)
+    law, drive = cell.stages["controller"], cell.stages["loaded_drive"]
+    assert isinstance(law, Learner), "it commands the drive"
+    assert isinstance(drive, Drive), "it is one"
+    response, nominal = drive.responses()["coarse/command"], scenario.shared.nominal_speed
+    margins = []
+    for speed in (0.9 * nominal, nominal, 1.1 * nominal):
+        if isinstance(law, CompoundController | ResonantController):
+            margins.append(float(np.abs(1.0 + law.open_loop(response, _FREQUENCIES, speed)).min()))
+        elif (worst := law.worst(response, speed)) is not None:
+            margins.append(1.0 - worst[0])
+    return min(margins)
+
+
+def run(parameters: RobustParameters, track: Track = untracked) -> RobustResult:
+    """Compute the study."""
+    conditions, count, revolutions = parameters.conditions, parameters.plants, parameters.revolutions
+    seeds = parameters.seeds
+    if parameters.quick:
+        conditions, count, revolutions = [name for name in conditions if name in _QUICK], min(count, 4), 30
+        seeds = 1
+    length = {"revolutions": float(revolutions)}
+    bases = {
+        (law, slowed): cells.load("robust_cutting", spindle_encoder={**length, **spindle}, controller=LAWS[law])
+        for law in LAWS
+        for slowed, spindle in ((False, {}), (True, _SPINDLE))
+    }
+    drives = drives_near(count)
+    made = [
+        _cell(bases, *names).varied({"seed": seed}) for *names, seed in product(conditions, LAWS, drives, range(seeds))
+    ]
+    shape = len(conditions), len(LAWS), len(drives), seeds
+    largest, rms, settled, effort = np.full((4, *shape), np.nan)
+    curves = np.full((*shape, revolutions), np.nan)
+    for place, judged in zip(np.ndindex(shape), cells.kept(made, Judge, track), strict=True):
+        if judged is None:
+            continue
+        found = judged.largest[:revolutions]
+        curves[place][: found.size] = found
+        largest[place], rms[place] = found[-_LAST:].max(), judged.rms
+        settled[place], effort[place] = judged.settled(parameters.tolerance_um), judged.effort
+    margin = np.array([[_margin(_cell(bases, conditions[0], law, drive)) for drive in drives] for law in LAWS])
+    last = np.where(np.isnan(largest[-1]), np.inf, largest[-1]).reshape(len(LAWS), -1)
+    return RobustResult(
+        conditions=conditions,
+        laws=list(LAWS),
+        seeds=seeds,
+        tolerance=parameters.tolerance_um,
+        largest=_worst(largest),
+        rms=_worst(rms),
+        settled=_worst(settled),
+        effort=_worst(effort),
+        margin=margin,
+        curves=[curves[-1, k].reshape(-1, revolutions)[worst] for k, worst in enumerate(last.argmax(axis=-1))],
+    )
+
+
+STUDY = Study(
+    "robust",
+    "which laws hold when speed, force and drive vary",
+    RobustParameters,
+    run,
+    size=(15.0, 4.6),
+)

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figs 2-4 of paper 003, with what the drive does between samples and behind a gap."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_papers.formulas import sampled_loop
+from lathe_papers.formulas.sampled_loop import Measures
+from lathe_papers.sampled_servo_numbers import DESIRED, numbers, stable
+from lathe_rc.control.sampled_link import ripple_free
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from lathe_papers.sampled_servo_numbers import SampledServoNumbers
+
+Array = npt.NDArray[np.float64]
+
+_SHOWN = 1.2  # time of the step responses [s]
+_COLOURS = ("#1f6f8b", "#e08e0b", "#c0392b", "#4a8f3c")
+
+
+def _line(found: Sequence[Measures | None]) -> Array:
+    """Overshoot [%] and settling [s] of several, NaN for None, shape (2, n)."""
+    return np.asarray(np.array([numbers(one) for one in found], dtype=np.float64).T)
+
+
+def draw(result: "SampledServoNumbers", figure: "Figure") -> None:
+    """Figs 2-4 with what is true between samples, and the backlash."""
+    (steps, gain, phase), (overshoot, settling, gap) = figure.subplots(2, 3)
+    _draw_steps(result, steps)
+    _draw_bode(result, gain, phase)
+    _draw_table(result, overshoot, settling)
+    _draw_gap(result, gap)
+    for axes in (steps, gain, phase, overshoot, settling, gap):
+        axes.grid(visible=True, alpha=0.3)
+        axes.legend(fontsize=7, ncols=2 if axes in (overshoot, settling) else 1)
+
+
+def _middle(result: "SampledServoNumbers") -> int:
+    """Place of the period that the figures of one period are for: 0.16 s, or the nearest."""
+    return int(np.argmin(np.abs(np.array(result.parameters.t) - 0.16)))
+
+
+def _draw_steps(result: "SampledServoNumbers", axes: "Axes") -> None:
+    axes.plot(*result.analog, ":", color="black", label="analog")
+    for (name, rows), colour in zip(result.all_links(), _COLOURS[1:], strict=True):
+        step = rows[_middle(result)].step
+        if step is not None:
+            axes.plot(step.time, step.motor, color=colour, label=f"link: {name}")
+            axes.plot(*step.at_samples, "o", ms=4, color=colour)
+    axes.set(xlim=(0.0, _SHOWN), xlabel="time [s]", ylabel="position / step")
+    period = result.parameters.t[_middle(result)]
+    axes.set_title(f"Fig. 2: step responses, T = {period:g} s; dots at the samples", fontsize=10)
+
+
+def _draw_bode(result: "SampledServoNumbers", gain: "Axes", phase: "Axes") -> None:
+    design = result.uncorrected[_middle(result)].design
+    frequency = design.frequency
+    drive = design.drive
+    curves = [("Lp, no link", sampled_loop.pseudo_frequency(drive).response(frequency), "black")]
+    for number, (function, colour) in enumerate(zip(DESIRED, _COLOURS, strict=False), start=1):
+        note = "" if stable(function) else " (unstable)"
+        curves.append((f"Lж{number}, T = 0.16 s{note}", function.response(frequency), colour))
+    ripple_free_loop = sampled_loop.open_loop(drive, ripple_free(drive))
+    curves.append(("ripple-free link", np.asarray(ripple_free_loop(1j * frequency)), _COLOURS[3]))
+    for label, response, colour in curves:
+        # Each begins at -90°, as its integrator does.
+        angle = np.degrees(np.unwrap(np.angle(1j * response))) - 90.0
+        gain.semilogx(frequency, 20.0 * np.log10(np.abs(response)), color=colour, label=label)
+        phase.semilogx(frequency, angle, color=colour, label=label)
+    gain.axhline(0.0, color="black", lw=0.6)
+    phase.axhline(-180.0, color="black", lw=0.6)
+    gain.set(xlabel="pseudo-frequency λ [rad/s]", ylabel="open loop [dB]")
+    gain.set_title(f"Fig. 3: open loop, T = {drive.period:g} s", fontsize=10)
+    phase.set(xlabel="pseudo-frequency λ [rad/s]", ylabel="phase [°]")
+    phase.set_title("its phase", fontsize=10)
+
+
+def _draw_table(result: "SampledServoNumbers", overshoot: "Axes", settling: "Axes") -> None:
+    for half, colour in zip(sorted({row.half_period for row in result.rows}), _COLOURS * 10, strict=False):
+        rows = [row for row in result.rows if row.half_period == half]
+        ratios = [row.ratio for row in rows]
+        for place, axes in ((0, overshoot), (1, settling)):
+            axes.plot(
+                ratios, _line([row.continuous for row in rows])[place], "-", color=colour, label=f"T/2 = {half:g} s"
+            )
+            axes.plot(ratios, _line([row.true for row in rows])[place], "--", color=colour)
+            axes.plot(ratios, [row.printed[place] if row.printed else np.nan for row in rows], "o", ms=4, color=colour)
+    for axes, name in ((overshoot, "overshoot [%]"), (settling, "settling [s]")):
+        axes.plot([], [], "o", ms=4, color="gray", label="printed")
+        axes.plot([], [], "-", color="gray", label="jλ read as p")
+        axes.plot([], [], "--", color="gray", label="drive with its link")
+        axes.set(xlabel="ρ = Te/(T/2)", ylabel=name)
+        axes.set_title(f"Fig. 4: {name.split(' ')[0]} of the desired function", fontsize=10)
+    # Room for the legend.
+    overshoot.set_ylim(-5.0, 130.0)
+    settling.set(yscale="log", ylim=(0.1, 60.0))
+
+
+def _draw_gap(result: "SampledServoNumbers", axes: "Axes") -> None:
+    for (name, label), colour in zip((("paper", "paper's"), ("ripple_free", "ripple-free")), _COLOURS[2:], strict=True):
+        row = result.links[name][_middle(result)]
+        for step, style, place in ((row.load, "-", "load"), (row.motor, "--", "motor")):
+            if step is not None:
+                axes.plot(step.time, step.load, style, color=colour, label=f"{label}, measured at the {place}")
+    axes.set(xlim=(0.0, _SHOWN), xlabel="time [s]", ylabel="load / step")
+    axes.axhline(1.0, color="black", lw=0.6)
+    axes.set_title(f"load behind a gap of {result.parameters.backlash:g}", fontsize=10)

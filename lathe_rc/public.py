@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Public names of a package: its stub lists them, for type checkers as well, and each is imported when it is used.
+
+So a package offers what is spread over its modules, and to import it costs nothing (PEP 562).
+"""
+
+import ast
+import importlib
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+
+@cache
+def homes(package: str) -> dict[str, tuple[str, str]]:
+    """Return module and name there of each public name of a package."""
+    stub = Path(str(sys.modules[package].__file__)).with_suffix(".pyi")
+    lines = ast.parse(stub.read_text(encoding="utf-8")).body
+    imports = [line for line in lines if isinstance(line, ast.ImportFrom)]
+    return {each.asname or each.name: (str(line.module), each.name) for line in imports for each in line.names}
+
+
+def attribute(package: str, name: str) -> Any:
+    """Return a public name of a package: its module-level ``__getattr__``.
+
+    Raises:
+        AttributeError: it has no such name.
+    """
+    if name == "__all__":
+        return sorted(homes(package))
+    if name not in homes(package):
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+    module, own = homes(package)[name]
+    if module == package:  # the name is a module of the package
+        return importlib.import_module(f"{package}.{own}")
+    return getattr(importlib.import_module(module), own)

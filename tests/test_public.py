@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The public face: few names, each with an example that runs, and the only ones that pages and templates use."""
+
+import ast
+import doctest
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+import lathe_rc
+from lathe_rc.cell.recording import Recording
+from lathe_rc.cell.scenario import Scenario
+
+ROOT = Path(__file__).parents[1]
+MOST = 30
+#: without an example of their own: constants, errors, and what the example of another name shows
+SHOWN_ELSEWHERE = {
+    *("DONE", "Input", "InputError", "LatheError", "LawParameters", "NodeParameters", "Now", "Output"),
+    *("PlantParameters", "Scenario", "messages", "study"),
+}
+EXAMPLES = {name: getattr(lathe_rc, name) for name in sorted({*lathe_rc.__all__} - SHOWN_ELSEWHERE)}
+EXAMPLES |= {"Scenario.varied": Scenario.varied, "Recording.frame": Recording.frame}
+PAGES = sorted([*ROOT.glob("docs/**/*.md"), *ROOT.glob("lathe_rc/templates/*/*.j2"), ROOT / "README.md"])
+
+
+def test_the_public_names_are_few_and_can_be_imported():
+    assert len(lathe_rc.__all__) <= MOST
+    assert set(lathe_rc.__all__) <= {*dir(lathe_rc)}
+    with pytest.raises(AttributeError, match="no attribute 'lode'"):
+        lathe_rc.lode  # noqa: B018 - it is not there
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_example_in_its_help_runs(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (example,) = doctest.DocTestFinder(recurse=False).find(EXAMPLES[name], name, globs={"__name__": __name__})
+    assert example.examples
+    failed, _ = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example)
+    assert failed == 0, capsys.readouterr().out
+
+
+def is_public(module: str, name: str) -> bool:
+    """Tell whether ``from module import name`` uses what the ``__all__`` of a package lists."""
+    package, _, last = module.rpartition(".")
+    if package and last in importlib.import_module(package).__all__:
+        return not name.startswith("_")  # of a public module
+    return name in getattr(importlib.import_module(module), "__all__", ())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: f"{page.parent.name}/{page.name}")
+def test_pages_and_templates_import_public_names_only(page):
+    text = page.read_text(encoding="utf-8")
+    code = re.findall(r"```py(?:thon)?[^\n]*\n(.*?)```", text, re.DOTALL) if page.suffix == ".md" else [text]
+    lines = re.findall(r"^from lathe_rc\b[^\n]*", "\n".join(code), re.MULTILINE)
+    for line in ast.walk(ast.parse(re.sub(r"\{%.*?%\}", "", "\n".join(lines)))):
+        if isinstance(line, ast.ImportFrom):
+            assert [alias.name for alias in line.names if not is_public(str(line.module), alias.name)] == []
