@@ -250,7 +250,6 @@ def watching(domain, folder, *options):
     """A bridge as a process of its own, which saves; killed at the end if it has not ended by itself."""
     environment = os.environ | {
         "ROS_DOMAIN_ID": str(domain),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_LOG_DIR": str(folder),
     }
     command = [sys.executable, "-m", "lathe_rc", "view", "--live", "--json", "-o", folder / "live.rrd", *options]

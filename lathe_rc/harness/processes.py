@@ -24,7 +24,6 @@ from lathe_rc.extensions import search_path
 from lathe_rc.harness.domain import free_domain
 from lathe_rc.harness.events import Event, how_it_ended, ignore
 from lathe_rc.namespace import absolute
-from lathe_rc.nodes import stale_shared_memory
 from lathe_rc.nodes.report import THROUGHPUT
 from lathe_rc.starting import Child, Start
 
@@ -36,7 +35,6 @@ _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
 _NO_SIGN_OF_LIFE = {"stall", "foreign_message", "stopped", "continued", "waits"}  # events of a cell that stands
 _LAST_WORDS = {"done", "error", "abandoned", "masterless"}  # events of a node that has nothing more to do
 _LOOK = 0.05  # [s] between looks at what a process has written
-_PATIENCE = 1.0  # [s] without any event until the harness looks for what processes wait for
 
 
 class Processes:
@@ -93,7 +91,6 @@ class Processes:
             self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-log-")))
             self._file = self._folder / "scenario.yaml"
             self._file.write_text(self._scenario.to_yaml(), encoding="utf-8")
-            stale_shared_memory.sweep()
             for group in self._groups:
                 self._start(group)
         except BaseException:
@@ -175,11 +172,8 @@ class Processes:
             wait = _FAREWELL if leaves else min(silence, self._settling) if self._lost else silence
             left = heard + wait - time.monotonic()
             try:
-                event = self._events.get(timeout=max(min(left, _PATIENCE), 0.0))
+                event = self._events.get(timeout=max(left, 0.0))
             except queue.Empty:
-                if left > _PATIENCE:
-                    stale_shared_memory.release()  # what a process that starts may wait for
-                    continue
                 if leaves and self._running:
                     self._end_the_silent()
                     continue

@@ -37,7 +37,6 @@ from lathe_rc.nodes import arguments, chain, dds, declare, overlooked
 from lathe_rc.nodes.encoder_node import EncoderNode
 from lathe_rc.nodes.events import Events
 from lathe_rc.nodes.exchange import Exchange
-from lathe_rc.nodes.lost_ports import LostPorts
 from lathe_rc.nodes.recorder_node import RecorderNode
 from lathe_rc.nodes.report import THROUGHPUT, Reporter
 from lathe_rc.nodes.shell import CellNode
@@ -127,7 +126,7 @@ def _work(nodes: Sequence[CellNode], stop: _Stop, until: float) -> None:
 
 
 def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
-    events, ports = Events(nodes), LostPorts(nodes[0].get_logger().warning)
+    events = Events(nodes)
     look = 0.0
     while not stop.signal:
         now = time.monotonic()
@@ -141,7 +140,6 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
                 look = now + _LONGEST_WAIT
                 for node in nodes:
                     overlooked.take(node)
-                ports.look(now)
                 if reporter.orphaned:
                     return
         due = _due(nodes, now)

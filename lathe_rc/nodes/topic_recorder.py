@@ -22,7 +22,6 @@ from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.topic_recorder import KIND, TopicRecorderParameters
 from lathe_rc.errors import InputError, LossyRunError
 from lathe_rc.nodes import alone, arguments, publisher_info
-from lathe_rc.nodes.lost_ports import LostPorts
 from lathe_rc.nodes.ports import message_class
 
 _CLOCK = "/clock"
@@ -209,13 +208,12 @@ class TopicRecorder:
             LatheError: the disk does not take it, or /clock is of no use.
             LossyRunError: messages are missing, or not where they belong.
         """
-        looked, ports = 0.0, LostPorts(self._node.get_logger().warning)
+        looked = 0.0
         try:
             while not self.stopped.is_set():
                 if time.monotonic() - looked > _LOOK:
                     self._discover()
                     looked = time.monotonic()
-                    ports.look(looked)
                 if not self._step() and self._parameters.once and self._left():
                     break
             while self._step():
