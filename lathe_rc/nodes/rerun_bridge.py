@@ -24,8 +24,9 @@ from rclpy.subscription import Subscription
 
 from lathe_rc.cell.rerun_bridge import KIND, RerunBridgeParameters
 from lathe_rc.errors import LatheError
-from lathe_rc.nodes import alone, arguments
+from lathe_rc.nodes import arguments
 from lathe_rc.nodes.ports import message_class
+from lathe_rc.nodes.standalone_node import standalone_node
 from lathe_rc.view.rerun_heard import Backlog
 from lathe_rc.view.rerun_live import Live, Shown
 from lathe_rc.view.rerun_output import Output, require
@@ -162,7 +163,10 @@ def run(values: Mapping[str, object], args: Sequence[str]) -> list[Shown]:
     """
     require()
     signals = SignalHandlerOptions.NO
-    with alone.member_of_none(KIND, RerunBridgeParameters, values, args, signals=signals) as (node, parameters):
+    with standalone_node.standalone_node(KIND, RerunBridgeParameters, values, args, signals=signals) as (
+        node,
+        parameters,
+    ):
         output = Output(parameters.output, file=Path(parameters.file), url=parameters.url, port=parameters.port)
         with output:
             bridge = RerunBridge(node, parameters, output)

@@ -21,7 +21,7 @@ from lathe_rc.bag.writing.writer import FLUSH_PERIOD, BagWriter
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.topic_recorder import KIND, TopicRecorderParameters
 from lathe_rc.errors import InputError, LossyRunError
-from lathe_rc.nodes import alone, arguments, publisher_info
+from lathe_rc.nodes import arguments, publisher_info, standalone_node
 from lathe_rc.nodes.ports import message_class
 
 _CLOCK = "/clock"
@@ -254,8 +254,8 @@ def _work(node: Node, parameters: TopicRecorderParameters) -> None:
 
 
 def run(values: Mapping[str, object], args: Sequence[str]) -> int:
-    """Record until it is stopped; see `alone.run`."""
-    return alone.run(KIND, TopicRecorderParameters, _work, values, args)
+    """Record until it is stopped; see `standalone_node.run`."""
+    return standalone_node.run(KIND, TopicRecorderParameters, _work, values, args)
 
 
 def main() -> NoReturn:

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The common part of all nodes: how they begin, watch one another, make progress, fail and end.
-
-Longer than 400 lines: whoever changes a step of a node's life has to see what the others do to the same state.
-"""
+"""The common part of all nodes: how they begin, watch one another, make progress, fail and end."""
 
 import math
 import os
