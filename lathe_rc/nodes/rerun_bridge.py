@@ -163,7 +163,7 @@ def run(values: Mapping[str, object], args: Sequence[str]) -> list[Shown]:
     """
     require()
     signals = SignalHandlerOptions.NO
-    with standalone_node.standalone_node(KIND, RerunBridgeParameters, values, args, signals=signals) as (
+    with standalone_node(KIND, RerunBridgeParameters, values, args, signals=signals) as (
         node,
         parameters,
     ):
