@@ -376,7 +376,6 @@ def test_a_node_alone_refuses_bad_parameters_in_one_line(node, arguments, expect
             environment=os.environ | {"ROS_LOG_DIR": str(tmp_path)},
             report=theirs,
             log=file.fileno(),
-            changed=lambda *_: None,
         )
         code = child.wait(60.0)
     said = log.read_text(encoding="utf-8")

@@ -163,10 +163,7 @@ def run(values: Mapping[str, object], args: Sequence[str]) -> list[Shown]:
     """
     require()
     signals = SignalHandlerOptions.NO
-    with standalone_node(KIND, RerunBridgeParameters, values, args, signals=signals) as (
-        node,
-        parameters,
-    ):
+    with standalone_node(KIND, RerunBridgeParameters, values, args, signals=signals) as (node, parameters):
         output = Output(parameters.output, file=Path(parameters.file), url=parameters.url, port=parameters.port)
         with output:
             bridge = RerunBridge(node, parameters, output)
