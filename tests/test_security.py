@@ -262,7 +262,6 @@ def running(folder, commands):
                     environment=environment,
                     report=theirs,
                     log=log.fileno(),
-                    changed=lambda *_: None,
                     command=[sys.executable, "-m", *command] if command[0].startswith("lathe_rc.") else [],
                 )
             started.append((child, folder / f"{number}.log", ours))
