@@ -93,8 +93,7 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
 
     bag = tmp_path_factory.mktemp("docs") / "bag"
     kinds = {"spindle_encoder": SpindleNode, "tool": StageNode, "recorder": RecorderNode}
-    with pytest.MonkeyPatch.context() as patch, free_domain() as domain:
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with free_domain() as domain:
         rclpy.init(args=["docs", "--ros-args", "-p", f"recorder:bag:={bag}"], domain_id=domain)
         made = {}
         try:

@@ -24,6 +24,7 @@ from lathe_rc.bag import reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import LatheError
+from lathe_rc.nodes import dds
 from lathe_rc.view.rerun_live import Backlog, Live, Order
 from lathe_rc.view.rerun_output import Output
 from lathe_rc.view.rerun_signals import drawn
@@ -203,7 +204,6 @@ def watching(domain, folder, *options):
     """A bridge as a process of its own, which saves; killed at the end if it has not ended by itself."""
     environment = os.environ | {
         "ROS_DOMAIN_ID": str(domain),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_LOG_DIR": str(folder),
     }
     command = [sys.executable, "-m", "lathe_rc", "view", "--live", "--json", "-o", folder / "live.rrd", *options]
@@ -271,7 +271,12 @@ def test_a_bridge_that_is_stuck_delays_no_member(offline, tmp_path):
         folder.mkdir()
     with contextlib.ExitStack() as stack:
         domain = stack.enter_context(harness.free_domain())
-        bridges = [stack.enter_context(watching(domain, folder)) for folder in folders]
+        # With buffers as large as those of the members, nothing would be lost in so short a run.
+        small = tmp_path / "small_buffers.xml"
+        small.write_text(Path(dds.__file__).with_name("fastdds.xml").read_text("utf-8").replace("4194304", "212992"))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv(dds.PROFILES, str(small))
+            bridges = [stack.enter_context(watching(domain, folder)) for folder in folders]
         with cell(tmp_path, domain, "spindle_encoder.speed_factor=0.5") as (processes, begin):
             for bridge in bridges:
                 listens(bridge)
