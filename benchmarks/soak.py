@@ -106,7 +106,7 @@ class At:
     Attributes:
         seen: events of each kind.
         noticed: times from an act until the time master named somebody dead or silent [s].
-        witnessed: times from an act until the harness saw a process end or stop [s].
+        witnessed: times from an act until the harness saw a process end [s].
     """
 
     def __init__(self, moments: Sequence[tuple[int, str]], act: Callable[[int], None]) -> None:
@@ -126,7 +126,7 @@ class At:
             while self._moments and event.get("samples", 0) >= self._moments[0][0]:
                 self._act(self._pids[self._moments.pop(0)[1]])
                 self._acted = self._hit = time.monotonic_ns()
-        if self._hit and event["event"] in ("exit", "stopped"):
+        if self._hit and event["event"] == "exit":
             self.witnessed.append((event["monotonic_ns"] - self._hit) * 1e-9)
             self._hit = 0
         if self._acted and event["event"] in ("dead", "stall"):

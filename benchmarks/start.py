@@ -118,18 +118,18 @@ def _told(harness: ModuleType) -> None:
 
 def main() -> None:
     """The command line, telling of what its runs go through; it imports what ``lathe`` does, and when it does."""
-    from lathe_rc import cli, starting
+    from lathe_rc import cli, process_launcher
 
-    ordinary = starting.ForkServer.preload
+    ordinary = process_launcher.ForkServer.preload
 
-    def preload(server: starting.ForkServer, nodes: Mapping[str, Any]) -> None:
+    def preload(server: process_launcher.ForkServer, nodes: Mapping[str, Any]) -> None:
         ordinary(server, nodes)
         if not nodes:
             _told(importlib.import_module("lathe_rc.harness"))
 
     if "offline" in sys.argv:
         _told(importlib.import_module("lathe_rc.harness"))
-    setattr(starting.ForkServer, "preload", preload)  # noqa: B010 - mypy would not have it assigned
+    setattr(process_launcher.ForkServer, "preload", preload)  # noqa: B010 - mypy would not have it assigned
     cli.main()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prints the table of structures.md for a form that changes along the part: the formula against a run."""
+"""Prints a table that learning.md cites, of a form that changes along the part: the formula against a run."""
 
 import numpy as np
 import numpy.typing as npt

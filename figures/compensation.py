@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draws img/compensation.png and prints the tables of compensation.md: what direct piezo compensation can do."""
+"""Draws img/compensation.png and prints the tables of learning.md: what direct piezo compensation can do."""
 
 from functools import partial
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prints the table of studies.md: counts that pass a ratio of small numbers, and the sample rate that is its cure."""
+"""Prints a table that studies.md cites: counts that pass a ratio of small numbers, and the sample rate as cure."""
 
 import re
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draws img/feed_drive.png of feed_drive.md."""
+"""Draws img/feed_drive.png of feed.md."""
 
 import numpy as np
 import numpy.typing as npt

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draws img/piezo.png of piezo.md and prints its tables."""
+"""Draws img/piezo.png of drives.md and prints its tables."""
 
 from typing import Any
 

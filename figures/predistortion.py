@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draws img/predistortion.png of predistortion.md and prints its tables."""
+"""Draws img/predistortion.png of force_position.md and prints its tables."""
 
 import numpy as np
 from matplotlib.figure import Figure

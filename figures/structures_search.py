@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Searches for the parameters of structures.md and prints how good the table of paper 001 can get."""
+"""Searches for the parameters of learning.md and prints how good the table of paper 001 can get."""
 
 import numpy as np
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prints the tables of structures.md: parameters, convergence and steady errors against those of paper 001."""
+"""Prints tables that learning.md cites: parameters, convergence and steady errors against those of paper 001."""
 
 from lathe_papers.formulas.structures import Channel, contraction, cycles, lead_errors, supremum
 from lathe_papers.formulas.tuning import FREQUENCIES, HIGHEST, LEAD_LAG, PLAIN, PRINTED, ROWS, START

@@ -2,9 +2,7 @@
 """Settings that all tests share."""
 
 import gc
-import os
 import signal
-from pathlib import Path
 
 import pytest
 import rclpy
@@ -26,7 +24,7 @@ settings.load_profile("steady")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Nodes that the tests make have the DDS settings of those of a cell: by default what one missed comes after 3 s.
-os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(dds.__file__).with_name("fastdds.xml")))
+dds.settle()
 
 
 @pytest.hookimpl(wrapper=True)
@@ -59,7 +57,6 @@ def domain(monkeypatch):
     """A ROS domain of its own, for this process and those that it starts."""
     with harness.free_domain() as number:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         yield number
 
 

@@ -22,7 +22,6 @@ from lathe_rc.nodes.spindle_node import SpindleNode  # noqa: E402
 @pytest.fixture
 def spindle(monkeypatch):
     """A spindle of a short run with one member, in a process with an exchange; not yet running."""
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     given = ["members:=['eager']", "window:=3", "speed_factor:=0.0", "revolutions:=0.3"]
     with free_domain() as domain:
         rclpy.init(args=["test", "--ros-args", *(part for text in given for part in ("-p", text))], domain_id=domain)

@@ -16,7 +16,7 @@ from cells import told_until_all_have_ended
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from lathe_rc import harness, messages, starting
+from lathe_rc import harness, messages, process_launcher
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
 from lathe_rc.bag.resimulation.resim import resimulate
@@ -161,7 +161,7 @@ def test_a_member_that_fails_by_an_error_ends_in_the_safe_state(mode, groups, tm
     assert safe["lost"] == ["/learning_controller"]
     (complete,) = [event["monotonic_ns"] for event in events if event["event"] == "complete"]
     left = [event["monotonic_ns"] for event in events if event["event"] == "exit"]
-    assert all(complete < moment for moment in left), "who leaves in mid-traffic may take a lock of DDS with it"
+    assert all(complete < moment for moment in left), "DDS sends nothing again for a process that has left"
     recording = reader.read_bag(bag)
     assert {signals.size for fields in recording.dense.values() for signals in fields.values()} == {safe["end"]}
     assert recording.of_type(messages.STATE)["position"][-1] == pytest.approx(0.3e-3, abs=1e-6)
@@ -181,9 +181,7 @@ def told_after_the_death_of(node, bag):
 def test_without_the_harness_every_process_of_a_cell_that_lost_a_member_says_so_by_its_exit_code(tmp_path):
     told = told_after_the_death_of("tool", tmp_path / "bag")
     codes = {event["node"]: event["code"] for event in told if event["event"] == "exit"}
-    # Who is killed may take a lock of DDS with it: whichever that blocks is killed and named.
-    held_up = {event["node"] for event in told if event["event"] == "stuck"}
-    assert {name for name, code in codes.items() if code == -signal.SIGKILL} == {"tool"} | held_up
+    assert {name for name, code in codes.items() if code == -signal.SIGKILL} == {"tool"}
     assert {code for code in codes.values() if code != -signal.SIGKILL} == {LatheError.exit_code}
     assert check(tmp_path / "bag").exit_code == 3, "what the tool published is held"
 
@@ -253,7 +251,6 @@ def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_i
     bag, told = tmp_path / "bag", []
     cell = harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=6.0"]), bag, keep=True)
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
-        # It stands for a process that DDS blocks.
         processes._children["held"] = subprocess.Popen(["/bin/sh", "-c", "trap '' USR1; exec sleep 1000"])
         thread = threading.Thread(target=processes._listen, args=("held", socket.socket(), processes._children["held"]))
         thread.start()
@@ -267,7 +264,7 @@ def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_i
 
 
 def test_who_does_not_end_after_the_safe_state_is_killed_and_named(monkeypatch, tmp_path):
-    """It has said that it is done, as all others that still run: nobody waits a minute for DDS to let it go."""
+    """It has said that it is done, as all others that still run: nothing is lost without it."""
     monkeypatch.setattr("lathe_rc.harness.processes._FAREWELL", 1.0)
     monkeypatch.setattr("lathe_rc.harness.processes._GRACE", 0.2)
     cell, told = (
@@ -379,12 +376,11 @@ def test_a_node_alone_refuses_bad_parameters_in_one_line(node, arguments, expect
     log = tmp_path / "said"
     ours, theirs = socket.socketpair()
     with ours, theirs, log.open("wb") as file:
-        child = starting.server().start(
+        child = process_launcher.server().start(
             [node, "--ros-args", *arguments],
             environment=os.environ | {"ROS_LOG_DIR": str(tmp_path)},
             report=theirs,
             log=file.fileno(),
-            changed=lambda *_: None,
         )
         code = child.wait(60.0)
     said = log.read_text(encoding="utf-8")

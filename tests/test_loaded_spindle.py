@@ -155,6 +155,7 @@ def _part_of_a_step(state, torque, before, after, since, step):
 @pytest.mark.parametrize("frequency", [5.0, 30.0, 200.0, 500.0, 1500.0])
 @pytest.mark.parametrize("belt", [None, BELT], ids=["rigid", "belt"])
 def test_speed_over_load_is_that_of_the_formula(belt, frequency):
+    """Speed over torque of a sine, within 1 %."""
     period = round(2 * np.pi / frequency / STEP)
     settle = -(-round(1.2 / STEP) // period)
     force = 10.0 * np.sin(2 * np.pi / period * np.arange((settle + 4) * period))

@@ -24,9 +24,7 @@ from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import sample_fields
-from lathe_rc.nodes import lost_ports
 from lathe_rc.nodes.spindle_node import SpindleNode
-from lathe_rc.nodes.stale_shared_memory import FOLDER
 
 CONFIG = Path(__file__).parents[1] / "config"
 BLOCK = 64
@@ -126,23 +124,6 @@ def test_a_killed_controller_goes_on_in_another_process_to_the_bit(tmp_path):
     window = cell.nodes[OWN].window
     assert [event["blocks"] % window for event in killer.all("resumed")] == [0, 0]  # states are kept exactly then
     assert not killer.all("safe")
-
-
-def test_who_listens_where_nobody_finds_it_is_found_again(tmp_path, monkeypatch):
-    """The file of a port is the name by which a restarted controller finds it; DDS has removed that of the recorder."""
-
-    class Thief(Killer):
-        def __call__(self, event):
-            if event["event"] == "progress" and self.at and event["samples"] >= self.at[0]:
-                monkeypatch.setattr(lost_ports, "_OWN", Path(f"/proc/{self.pids['recorder']}"))
-                for port in lost_ports._listened():
-                    (FOLDER / port).unlink()
-            super().__call__(event)
-
-    kept = [f"{OWN}.restart_file={tmp_path}/state", "spindle_encoder.revolutions=20.0"]
-    cell, thief = load(CONFIG / "piston.yaml", kept), Thief(OWN, [30_000])
-    assert harness.run(cell, mode="processes", bag=tmp_path / "bag", watch=thief).digest == harness.run(cell).digest
-    assert len(thief.all("resumed")) == 1
 
 
 def test_an_event_that_was_asked_for_is_kept_when_a_state_of_before_is_written(ghost, domain, tmp_path):

@@ -27,7 +27,6 @@ def folder(tmp_path_factory):
     """A folder for parameter files, in a process that ROS nodes elsewhere do not see."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", "97")
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         yield tmp_path_factory.mktemp("yaml")
 
 

@@ -21,7 +21,7 @@ from lathe_rc_msgs.msg import CellState
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import NodeNameNonExistentError
 
-from lathe_rc import cli, harness, security, starting
+from lathe_rc import cli, harness, process_launcher, security
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.replayer import KIND as REPLAYER
 from lathe_rc.cell.rerun_bridge import KIND as RERUN_BRIDGE
@@ -257,12 +257,11 @@ def running(folder, commands):
         for number, command in enumerate(commands):
             ours, theirs = map(stack.enter_context, socket.socketpair())
             with theirs, (folder / f"{number}.log").open("ab") as log:
-                child = starting.server().start(
+                child = process_launcher.server().start(
                     command,
                     environment=environment,
                     report=theirs,
                     log=log.fileno(),
-                    changed=lambda *_: None,
                     command=[sys.executable, "-m", *command] if command[0].startswith("lathe_rc.") else [],
                 )
             started.append((child, folder / f"{number}.log", ours))
@@ -370,7 +369,7 @@ def udp_ports(pid):
 
 def as_started_by_a_user(monkeypatch):
     """Settings of the nodes in this process hold for those that it starts, too."""
-    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
+    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTDDS_BUILTIN_TRANSPORTS", "FASTRTPS_DEFAULT_PROFILES_FILE"):
         monkeypatch.delenv(name, raising=False)
 
 

@@ -24,10 +24,11 @@ import ros_wheels
 import steps
 import system
 import workplace
+from lathe_rc.nodes import dds
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 # what ./lathe reads to decide whether anything has changed
-INPUTS = ["lathe", "tools", "requirements", "msg_defs", "setup.py", "setup.cfg", "package.xml"]
+INPUTS = ["lathe", "tools", "requirements", "msg_defs", "setup.py", "setup.cfg", "package.xml", "lathe_rc/nodes/dds.py"]
 LINES_SHOWN = 15
 
 
@@ -38,9 +39,9 @@ def copy(tmp_path):
 
 
 def copy_to(target: Path) -> Path:
-    target.mkdir(parents=True)
     for name in INPUTS:
         source = CHECKOUT / name
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
         (shutil.copytree if source.is_dir() else shutil.copy)(source, target / name)
     return target
 
@@ -486,15 +487,8 @@ def test_run_environment_adds_to_the_users_own():
         "PYTHONPATH": "/mine",
         "EDITOR": "vi",
         "GUARD": "1",
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "FASTRTPS_DEFAULT_PROFILES_FILE": str(environment.DDS),
+        **dds.settings({}),
     }
-    assert environment.DDS.is_file()
-
-
-def test_users_settings_of_dds_stay():
-    own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "FASTRTPS_DEFAULT_PROFILES_FILE": "/mine.xml"}
-    assert environment.run_environment(environment.changes({}), own) == own
 
 
 @pytest.mark.parametrize("shell", ["sh", "bash"])

@@ -101,7 +101,7 @@ def test_more_support_gives_way_less(head, tail, turn, share):
 
 
 def test_middle_of_the_example_is_as_soft_as_w3_of_the_paper():
-    """The shaft of docs/predistortion.md."""
+    """The shaft of docs/force_position.md."""
     compliance = Shaft(LENGTH, DIAMETER, **SPRINGS, carriage=5e7).compliance(LENGTH / 2)
     assert float(compliance) == pytest.approx(3.85e-7, rel=0.01)
 

@@ -11,7 +11,6 @@ from cells import SCENARIOS, run, scenario
 from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.cell.scenario import Scenario, load
-from lathe_rc.drawing import form
 from lathe_rc.errors import InputError
 
 LONGEST = 200  # characters of a line that a prompt shows
@@ -112,7 +111,7 @@ class TestPlot:
         assert len(form.get_lines()) == 2
 
     def test_of_a_bag_is_that_of_its_run(self, result):
-        assert form.png(reader.read_bag(result.bag).plot("test")) == form.png(result.plot())
+        assert reader.read_bag(result.bag).plot("test")._repr_png_() == result.plot()._repr_png_()
 
     def test_is_shown_by_a_notebook_without_pyplot(self, result):
         assert result.plot()._repr_png_().startswith(b"\x89PNG")
@@ -129,4 +128,4 @@ class TestPlot:
     def test_of_a_round_part_that_is_met_at_once(self):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            form.png(run(tool={"harmonic_order": [1], "harmonic_amplitude": [0.0], "harmonic_phase": [0.0]}).plot())
+            run(tool={"harmonic_order": [1], "harmonic_amplitude": [0.0], "harmonic_phase": [0.0]}).plot()._repr_png_()

@@ -4,7 +4,6 @@
 import json
 import math
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 
 import altair as alt
@@ -14,6 +13,7 @@ import pytest
 from click.testing import CliRunner
 from matplotlib.image import imread
 from numpy.testing import assert_allclose
+from shown_page import ShownPage
 
 from lathe_rc import cli, resources
 from lathe_rc.cell import scenario
@@ -32,42 +32,8 @@ EXTERNAL = re.compile(r"""(?:src|href|action)=["'](?!data:)|url\((?!data:)|@impo
 LARGEST = 3_000_000  # [B] of a page
 
 
-class Shown(HTMLParser):
-    """A page as it is read: tables by the heading above them, and its data."""
-
-    def __init__(self, path):
-        super().__init__()
-        self.source = path.read_text(encoding="utf-8")
-        self.tables, self.text, self._heading, self._inside = {}, "", "", []
-        self.feed(self.source)
-        self.text = " ".join(self.text.split())
-        told = re.search(r'<script type="application/json" id="figures">(.*?)</script>', self.source)
-        found = json.loads(told[1]) if told else {}
-        self.specs, self.data, self.chosen = (found.get(name, {}) for name in ("specs", "data", "chosen"))
-
-    def handle_starttag(self, tag, attributes):
-        self._inside = [*self._inside, tag] if tag in ("style", "script", "h2", "td", "noscript") else self._inside
-        if tag == "h2":
-            self._heading = ""
-        elif tag == "tr":
-            self.tables.setdefault(self._heading, []).append([])
-        elif tag == "td":
-            self.tables[self._heading][-1].append("")
-
-    def handle_endtag(self, tag):
-        self._inside = self._inside[:-1] if self._inside and self._inside[-1] == tag else self._inside
-
-    def handle_data(self, data):
-        if not {"style", "script", "noscript"} & set(self._inside):
-            self.text += data
-        if "h2" in self._inside:
-            self._heading += data
-        if "td" in self._inside:
-            self.tables[self._heading][-1][-1] += data
-
-    def rows(self, heading):
-        """Of the table under a heading, without its head."""
-        return [row for row in self.tables[heading] if row]
+def shown_page(folder):
+    return ShownPage((folder.path / "page.html").read_text(encoding="utf-8"))
 
 
 def swept(place, space, outcome, cell=PISTON):
@@ -97,7 +63,7 @@ def bowl(values):
 def grid(tmp_path_factory):
     space = Space(grid={LEAD: "1e-3:3e-3:9", Q: "1e-5:1e-3:7:log", LAW: ["constant_angle", "variable"]})
     folder = swept(tmp_path_factory.mktemp("grid") / "sweep", space, bowl)
-    return folder, page.write(folder), Shown(folder.path / "page.html")
+    return folder, page.write(folder), shown_page(folder)
 
 
 @pytest.fixture(autouse=True)
@@ -219,7 +185,7 @@ class TestPage:
 
     def test_counts_what_came_of_the_cells_with_their_reasons(self, grid):
         """Two leads of nine are refused; their reasons differ in a number alone, so they are one row."""
-        rows = grid[2].rows("What the cells came to")
+        rows = grid[2].rows("Outcomes")
         assert [row[:3] for row in rows] == [["done", "98", "77.8%"], ["refused", "28", "22.2%"]]
         assert rows[1][3] == "cell 98: learning_controller: grows 0.00275 times a cycle; allowed: below 1"
 
@@ -266,7 +232,7 @@ class TestPage:
         """A margin is to be large: the best cells have the largest, and the yield counts from above."""
         folder = swept(tmp_path / "sweep", Space(grid={LEAD: "1e-3:2e-3:11"}), bowl)
         page.write(folder, "margin")
-        shown = Shown(folder.path / "page.html")
+        shown = shown_page(folder)
         margins = np.array(folder.table(["margin"]).column("margin").to_pylist())
         assert shown.rows("Best cells")[0][0] == str(margins.argmax())
         assert "largest margin" in shown.text
@@ -277,7 +243,7 @@ class TestPage:
     def test_one_parameter_has_a_line_and_no_map(self, tmp_path):
         folder = swept(tmp_path / "sweep", Space(grid={LEAD: "1e-3:2e-3:11"}), bowl)
         page.write(folder)
-        shown = Shown(folder.path / "page.html")
+        shown = shown_page(folder)
         assert set(shown.specs) == {"lines", "sensitivity", "parallel-coordinates", "yield"}
         assert len(shown.data["one-0"]) == 11
         assert shown.rows("What matters")[0][1].startswith("1.000 (+")
@@ -293,7 +259,7 @@ class TestPage:
         assert axes["electrodynamic_actuator.autostart"].texts == ["false", "true"]
         assert_allclose(axes["spindle_encoder.deviation_amplitude"].distinct, [0.05, 0.1, 0.2])
         page.write(folder)
-        rows = {row[0]: row[1] for row in Shown(folder.path / "page.html").rows("What matters")}
+        rows = {row[0]: row[1] for row in shown_page(folder).rows("What matters")}
         assert rows[LAW] == "1.000"
         assert rows["electrodynamic_actuator.autostart"] == "0.000 (+0.00)"
 
@@ -303,7 +269,7 @@ class TestPage:
         space = Space(grid={"run_id": [hostile, "<b>$x"], Q: "1e-5,2e-5"})
         folder = swept(tmp_path / "sweep", space, lambda values: ("failed", hostile) if values[Q] < 1.5e-5 else 1e-6)
         page.write(folder)
-        shown = Shown(folder.path / "page.html")
+        shown = shown_page(folder)
         assert shown.source.count("<script") == shown.source.count("</script>") == 3
         assert "<b>$x" not in shown.source
         assert hostile in shown.text
@@ -320,7 +286,7 @@ class TestPage:
         (folder.path / "figures").mkdir()
         (folder.path / "figures" / "yield.png").touch()
         written = page.write(folder)
-        shown = Shown(written.page)
+        shown = shown_page(folder)
         assert "No cell has a tool.max_error: 5 refused." in shown.text
         assert (shown.specs, written.figures, list((folder.path / "figures").iterdir())) == ({}, [], [])
         assert "<script" not in shown.source
@@ -333,7 +299,7 @@ class TestPage:
         space = Space(sampled={LEAD: "normal:5%"}, sample="sobol:128", ties={Q: f"{LEAD} / 20"})
         folder = swept(tmp_path / "sweep", space, lambda values: abs(values[LEAD] - 1.4e-3) * 2e-3, cell)
         page.write(folder)
-        shown = Shown(folder.path / "page.html")
+        shown = shown_page(folder)
         errors = np.array(folder.table(["tool.max_error"]).column("tool.max_error").to_pylist()) * 1e6
         share = np.mean(errors <= 0.3)
         said = re.search(r"([\d.]+)% are within the tolerance of 0.3 µm, of .* ([\d.]+)% to ([\d.]+)%", shown.text)
@@ -357,7 +323,7 @@ class TestPage:
         )  # fmt: skip
         folder.write([table])
         written = page.write(folder)
-        shown = Shown(written.page)
+        shown = shown_page(folder)
         assert written.page.stat().st_size < LARGEST
         assert all(sum(row["n"] for row in shown.data[f"pair-0-{place}"]) == 100_000 for place in range(1, 4))
         assert "400 of 100000 cells with a result are in it: the best, and others by lot." in shown.text

@@ -344,47 +344,75 @@ class Taken(list):
     """A sink that keeps what it is given."""
 
     def chunk(self, first, samples, dense, sparse):
-        kept = {topic: {name: array.copy() for name, array in signals.items()} for topic, signals in dense.items()}
-        self.append((first, samples, kept, sparse))
+        self.append((first, samples, dense, sparse))
 
 
 TWO = {"/a": messages.COMMAND, "/b": messages.COMMAND}
 
 
-def blocks(pieces, topic, *spans):
-    for first, end in spans:
-        pieces.block(topic, first, {"position": np.arange(first, end, dtype=float)})
-
-
-def test_blocks_of_different_lengths_meet_in_pieces():
+def given(text, types=TWO, *, close=True):
+    """The pieces of 100 samples, and what they lost, of blocks such as "a:0-64 b:0-100"; "+" tells of both topics."""
     taken = Taken()
-    pieces = Pieces(TWO, 100, taken)
-    blocks(pieces, "a", (0, 64), (64, 128), (128, 230))
-    assert not taken
+    pieces = Pieces(types, 100, taken)
     pieces.message(Sparse("events", messages.EVENT, 150, {"action": "freeze"}))
-    blocks(pieces, "/b", (0, 7), (7, 230))
-    assert [(first, samples) for first, samples, _, _ in taken] == [(0, 100), (100, 100)]
-    pieces.close()
-    assert taken[2][:2] == (200, 30)
-    for first, samples, dense, sparse in taken:
-        assert list(dense) == ["/a", "/b"]
-        for topic in TWO:
-            assert_array_equal(dense[topic]["position"], np.arange(first, first + samples))
-        assert [m.index for found in sparse.values() for m in found] == ([150] if first == 100 else [])
-    assert pieces.lost == 0
+    for step in text.split():
+        if step == "+":
+            pieces.learn(TWO)
+        else:
+            topic, first, end = step.replace("-", ":").split(":")
+            pieces.block(topic, int(first), {"position": np.arange(int(first), int(end), dtype=float)})
+    if close:
+        pieces.close()
+    return taken, pieces
 
 
-def test_what_is_missing_stops_nobody():
+@pytest.mark.parametrize(
+    ("blocks", "expected", "lost"),
+    [
+        pytest.param("a:0-64 a:64-128 a:128-230 b:0-7 b:7-230", "0:100ab 100:100ab 200:30ab", 0, id="other lengths"),
+        pytest.param(
+            "a:0-50 a:60-1000 b:0-1000",
+            "100:100a 200:100a 300:100a 400:100a 500:100a 600:100ab 700:100ab 800:100ab 900:100ab",
+            6,
+            id="a gap, then six pieces ahead of the other topic",
+        ),
+        pytest.param(
+            "a:0-100 b:0-100 a:150-200 a:530-600 a:600-800 b:150-200 b:530-600 b:600-800",
+            "0:100ab 600:100ab 700:100ab",
+            5,
+            id="nothing came",
+        ),
+        pytest.param(
+            "a:0-80 a:100-250 b:0-80 b:100-250", "0:80ab 100:100ab 200:50ab", 1, id="an end that is missing everywhere"
+        ),
+    ],
+)
+def test_blocks_meet_in_pieces_and_what_is_missing_stops_nobody(blocks, expected, lost):
     """A topic that is silent, has a gap or comes too late is left out of those pieces alone."""
-    taken = Taken()
-    pieces = Pieces(TWO, 100, taken)
-    blocks(pieces, "/a", (0, 50), (60, 1000))
-    blocks(pieces, "/b", (0, 1000))
-    pieces.close()
-    late = [(first, ["/a"]) for first in range(100, 600, 100)]  # after its gap; six pieces ahead of /b
-    both = [(first, ["/a", "/b"]) for first in range(600, 1000, 100)]
-    assert [(first, sorted(dense)) for first, _, dense, _ in taken] == [*late, *both]
-    assert pieces.lost == 6
+    taken, pieces = given(blocks)
+    told = [f"{first}:{samples}{''.join(sorted(dense)).replace('/', '')}" for first, samples, dense, _ in taken]
+    assert told == expected.split()
+    assert pieces.lost == lost
+    for first, samples, dense, _ in taken:
+        for signals in dense.values():
+            assert_array_equal(signals["position"], np.arange(first, first + samples))
+    found = [
+        (m.index, first, first + samples) for first, samples, _, sparse in taken for m in sparse.get("/events", [])
+    ]
+    assert [index for index, *_ in found] == [150]
+    assert found[0][2] > 150
+
+
+@pytest.mark.parametrize(
+    ("blocks", "begins", "lost"),
+    [
+        pytest.param("a:0-300 + b:0-100 b:100-400 a:300-400", [0, 100, 200, 300], 3, id="shown without it"),
+        pytest.param("a:130-200 + a:200-400 b:210-500 a:400-500", [300, 400], 0, id="begins where all are whole"),
+    ],
+)
+def test_a_topic_that_nobody_knew_of(blocks, begins, lost):
+    taken, pieces = given(blocks, {"/a": messages.COMMAND}, close=False)
+    assert ([first for first, *_ in taken], pieces.first, pieces.lost) == (begins, begins[0], lost)
 
 
 def test_a_view_does_not_depend_on_the_blocks(turned, shown, tmp_path):

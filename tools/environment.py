@@ -2,6 +2,7 @@
 """The environment in which lathe_rc is built and run."""
 
 import os
+import runpy
 import shlex
 from collections.abc import Mapping
 from typing import TypedDict
@@ -10,9 +11,8 @@ import ros_wheels
 from ros import SourcedRos, site_packages, split, split_own
 from workplace import ROOT, VENV
 
-# Where Fast DDS is told how fast it is to ask for what it has missed.
-PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
-DDS = ROOT / "lathe_rc" / "nodes" / "fastdds.xml"
+# The settings of DDS that lathe's own nodes give themselves, for nodes in plain rclpy beside them.
+DDS = ROOT / "lathe_rc" / "nodes" / "dds.py"
 # What a shell sets for itself.
 SHELL_OWN = frozenset({"_", "OLDPWD", "PWD", "SHLVL"})
 
@@ -73,7 +73,7 @@ def apply(wanted: Changes, environ: Mapping[str, str]) -> dict[str, str]:
 
 def run_environment(wanted: Changes, environ: Mapping[str, str]) -> dict[str, str]:
     """Return the environment in which to run lathe_rc, and nodes in plain rclpy beside it."""
-    return apply(wanted, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", PROFILES: str(DDS), **environ})
+    return apply(wanted, {**environ, **runpy.run_path(str(DDS))["settings"](environ)})
 
 
 def shell_lines(wanted: Changes) -> str:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """./lathe docs --figures: draws the pictures of the pages anew and tells which are no longer what the code draws.
 
-The tables that the same command prints have to be on the page.
+The tables that the same command prints have to be on the page, or those that the page shows have to be printed.
 """
 
 import os
@@ -18,6 +18,7 @@ from workplace import ROOT
 
 PICTURES = ROOT / "docs" / "img"
 _TABLE = re.compile(r"(?:^.*[|┃│╇┼━].*\n?)+", re.MULTILINE)
+_LEFT_OUT = "...\n"  # a line of a page that stands for lines of an output
 LARGEST_SHARE = 5e-4  # of pixels that may differ: other versions of fonts and plots round otherwise
 LARGEST_STEP = 0.2  # of a colour, from 0 to 1, that is no difference yet
 
@@ -69,16 +70,16 @@ _SWEEP = (
 )
 TABLE = {
     "architecture.svg": _script("architecture", 1, "index"),
-    "compensation.png": _script("compensation", 5),
+    "compensation.png": _script("compensation", 5, "learning"),
     "cutting.png": _script("cutting", 20),
     "demo.png": Picture("demo", "../README.md", "bags/demo-1.png", 10),
     "demo_interrupted.png": Picture("demo interrupted", "robust.md", "bags/demo-1.png", 60),
-    "feed_drive.png": _script("feed_drive", 30),
+    "feed_drive.png": _script("feed_drive", 30, "feed"),
     "lay.png": _script("lay", 5, "metrology"),
     "machine.svg": _script("machine", 1, "index"),
     "metrology.png": _script("metrology", 5),
-    "piezo.png": _script("piezo", 30),
-    "predistortion.png": _script("predistortion", 5),
+    "piezo.png": _script("piezo", 30, "drives"),
+    "predistortion.png": _script("predistortion", 5, "force_position"),
     "report.png": _photograph("report_screenshot", "view.md", " chromium turned"),
     "report_dark.png": _photograph("report_screenshot", "view.md", " chromium turned"),
     "report_narrow.png": _photograph("report_screenshot", "view.md", " chromium turned"),
@@ -87,15 +88,15 @@ TABLE = {
     "study-angle-domain.png": _study("angle-domain", 30),
     "study-best-law.png": _study("best-law", 600),
     "study-coupling.png": _study("coupling", 60),
-    "study-decoupling.png": _study("decoupling", 30, "decoupling"),
+    "study-decoupling.png": _study("decoupling", 30, "force_position"),
     "study-drive-models.png": _study("drive-models", 10, columns=80),
     "study-drive-tolerance.png": _study("drive-tolerance", 60),
     "study-invariance.png": _study("invariance", 10),
     "study-multichannel.png": _study("multichannel", 10),
     "study-piston.png": _study("piston", 10),
     "study-robust.png": _study("robust", 600),
-    "study-sampled-servo.png": _study("sampled-servo", 30, "sampled_servo"),
-    "study-saturation.png": _study("saturation", 60, "saturation", " --set corners=true"),
+    "study-sampled-servo.png": _study("sampled-servo", 30, "feed"),
+    "study-saturation.png": _study("saturation", 60, "feed", " --set corners=true"),
     "study-sensor-map.png": _study("sensor-map", 600),
     "study-speed-deviation.png": _study("speed-deviation", 60),
     "sweep.png": Picture(_SWEEP, "sweeps.md", "sweep-piston/figures/heat-map.png", 60),
@@ -121,15 +122,35 @@ def check(name: str, folder: Path) -> tuple[list[str], Path]:
         last = (done.stderr.strip() or "it wrote no picture").splitlines()[-1]
         return [f"{name}: lathe {picture.command} failed: {last}"], drawn
     page = (ROOT / "docs" / picture.page).read_text(encoding="utf-8")
-    said = [f"{name}: {picture.page} does not have what it prints: {part.splitlines()[0].strip()} …"
-            for part in printed(done.stdout) if part not in page]  # fmt: skip
-    return [*differences(PICTURES / name, drawn), *said], drawn
+    return [*differences(PICTURES / name, drawn), *tables_astray(name, page, done.stdout)], drawn
 
 
-def printed(text: str) -> list[str]:
-    """Return the tables in what a command prints, which pages show; what lies between them is different each time."""
-    bare = "".join(f"{line.rstrip()}\n" for line in text.splitlines())
-    return [table.strip("\n") for table in _TABLE.findall(bare)]
+def tables_astray(name: str, page: str, output: str) -> list[str]:
+    """Return a line for each table that the page lacks, or shows and the command of a picture does not print.
+
+    A page shows all tables, unless its block of the command has lines `...`: then it shows some, or some of their rows.
+    """
+    picture = TABLE[name]
+    _, _, rest = page.partition(f"$ ./lathe {picture.command}\n")
+    block, _, _ = rest.partition("```")
+    if f"\n{_LEFT_OUT}" in f"\n{block}":
+        strange = [part for part in tables(block) if part not in _bare(output)]
+        return [f"{name}: {picture.page} shows, but it does not print: {_first(part)} …" for part in strange]
+    missing = [part for part in tables(output) if part not in page]
+    return [f"{name}: {picture.page} does not have what it prints: {_first(part)} …" for part in missing]
+
+
+def tables(text: str) -> list[str]:
+    """Return the tables in an output, which pages show; the lines between them are different each time."""
+    return [table.strip("\n") for table in _TABLE.findall(_bare(text))]
+
+
+def _bare(text: str) -> str:
+    return "".join(f"{line.rstrip()}\n" for line in text.splitlines())
+
+
+def _first(table: str) -> str:
+    return table.splitlines()[0].strip()
 
 
 def differences(old: Path, new: Path) -> list[str]:

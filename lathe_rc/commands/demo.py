@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from lathe_rc import starting
+from lathe_rc import process_launcher
 from lathe_rc.commands.demos import DEMOS
 
 
@@ -19,7 +19,7 @@ def demo(name: str, revolutions: float, folder: Path) -> None:
     NAME is piston (one channel, the default), two_channel (a piezo channel learns what the coarse one leaves) or
     interrupted (a keyway, force on the drive and a wandering speed, by the disturbance controller and by its peer).
     """
-    starting.server().preload({})  # it imports while this process does
+    process_launcher.server().preload({})  # it imports while this process does
     from lathe_rc.commands import running
 
     running.demo(DEMOS[name], revolutions, folder)

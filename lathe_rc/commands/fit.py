@@ -36,7 +36,7 @@ def fit() -> None:
 @click.option("--state", "state_topic", default="/fine/state", show_default=True, help="of a bag: topic")
 @_json
 def hysteresis(measured: Path, stroke: float, command_topic: str, state_topic: str, *, as_json: bool) -> None:
-    """Plays of Prandtl and Ishlinskii by least squares (docs/piezo.md).
+    """Plays of Prandtl and Ishlinskii by least squares (docs/drives.md).
 
     MEASURED is a CSV file with command_um,displacement_um, or a bag of a drive that ran with linearisation: none.
     """
@@ -110,7 +110,7 @@ def channel(
     lags: bool,
     as_json: bool,
 ) -> None:
-    """Reduced-order model, realisable inverse, and the fastest PID with the margins asked for (docs/decoupling.md).
+    """Reduced-order model, realisable inverse, and the fastest PID with the margins asked for (docs/force_position.md).
 
     MEASURED is a CSV file with time_s,response: the response to a step of 1 at time 0, in even steps. A model without
     an inverse or a PID is printed all the same, with the reason, and exit code 1.

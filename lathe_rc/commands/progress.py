@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The progress of a run, shown while it goes on."""
 
-import signal
 import time
 from collections.abc import Callable
 
@@ -100,10 +99,6 @@ TROUBLE: dict[str, Callable[[harness.Event], str]] = {
         + ("another process goes on in its place" if event["restarts"] else "the cell goes to its safe state")
     ),
     "exit": lambda event: harness.how_it_ended(event) if event["code"] < 0 else "",
-    "stopped": lambda event: (
-        f"{event['node']} has been stopped ({signal.Signals(event['signal']).name}): the cell "
-        + ("waits for it" if event["waits"] else "goes to its safe state, if it does not go on in time")
-    ),
     "not_reached": lambda event: f"{event['node']}: the run ends before {'; '.join(event['events'])}",
     "unchecked": lambda event: f"not checked: {event['message']}",
     "warning": lambda event: f"warning: {event['message']}",

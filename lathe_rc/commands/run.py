@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lathe_rc import allowed_code, starting
+from lathe_rc import allowed_code, process_launcher
 from lathe_rc.commands import options
 
 if TYPE_CHECKING:
     from lathe_rc.harness import Mode
-    from lathe_rc.starting import Start
+    from lathe_rc.process_launcher import Start
 
 
 @click.command()
@@ -52,7 +52,7 @@ def run(
     """Run a SCENARIO, a ROS 2 parameter file, to its end."""
     allowed_code.allow_own_code()
     if mode != "offline" and start != "spawn":
-        starting.server().preload({})  # it imports while this process does
+        process_launcher.server().preload({})  # it imports while this process does
     from lathe_rc.commands import running
 
     running.run(

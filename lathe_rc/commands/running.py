@@ -15,7 +15,7 @@ from lathe_rc.commands.demos import Demo
 from lathe_rc.commands.progress import Watch
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place
-from lathe_rc.starting import Start
+from lathe_rc.process_launcher import Start
 
 _NO_SNAPSHOTS = "no snapshots: no --bag was given"
 

@@ -45,17 +45,13 @@ class RunFigure(Figure):
     """A figure that a notebook shows, though nobody has imported pyplot there."""
 
     def _repr_png_(self) -> bytes:
-        return png(self)
+        """As a notebook shows it: small."""
+        image = io.BytesIO()
+        self.savefig(image, format="png", dpi=_IN_NOTEBOOK, metadata={"Software": None})
+        return image.getvalue()
 
 
-def png(figure: Figure) -> bytes:
-    """A figure as a notebook shows it: small."""
-    image = io.BytesIO()
-    figure.savefig(image, format="png", dpi=_IN_NOTEBOOK, metadata={"Software": None})
-    return image.getvalue()
-
-
-def draw(run: TurnedForm, title: str = "", beside: tuple[str, TurnedForm] | None = None) -> Figure:
+def draw(run: TurnedForm, title: str = "", beside: tuple[str, TurnedForm] | None = None) -> RunFigure:
     """Desired form, form error over angle in the first and the last revolution, and form error by revolution.
 
     Args:
@@ -130,7 +126,7 @@ def _beside(over_angle: Axes, curve: Axes, name: str, peer: TurnedForm) -> None:
     curve.legend(fontsize=8)
 
 
-def learning(errors: FormErrors, before: int = 0) -> Figure:
+def learning(errors: FormErrors, before: int = 0) -> RunFigure:
     """The form error by revolution alone, small; ``before``: revolutions before the first of them."""
     figure = RunFigure(figsize=(5.0, 2.4), layout="constrained")
     _by_revolution(figure.subplots(), errors, before)

@@ -14,7 +14,7 @@ def errors_picture(errors: FormErrors, before: int) -> str:
         return ""
     from lathe_rc.drawing import form
 
-    image = base64.b64encode(form.png(form.learning(errors, before))).decode()
+    image = base64.b64encode(form.learning(errors, before)._repr_png_()).decode()
     return f'<img alt="form error by revolution" src="data:image/png;base64,{image}" />'
 
 

@@ -8,10 +8,7 @@ Nodes report their events over a socket each (`lathe_rc.nodes.report`), so whoev
 never for time. Every child is ended, however a run goes; this package does not import rclpy.
 """
 
-from lathe_rc.harness.domain import free_domain
-from lathe_rc.harness.events import Event, how_it_ended
-from lathe_rc.harness.processes import Processes
-from lathe_rc.harness.recorded import with_recorder
+from lathe_rc.harness.processes import Event, Processes, free_domain, how_it_ended, with_recorder
 from lathe_rc.harness.result import Mode, Result
 from lathe_rc.harness.runner import run
 

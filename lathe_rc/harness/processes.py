@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The processes of a cell: how they start, what they report, and how they end."""
+"""The processes of a cell: their domain, start, events and end."""
 
 import contextlib
+import itertools
 import json
 import os
 import queue
@@ -13,30 +14,75 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType, TracebackType
+from typing import Any
 
-from lathe_rc import allowed_code, starting
+from lathe_rc import allowed_code, process_launcher
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.extensions import search_path
-from lathe_rc.harness.domain import free_domain
-from lathe_rc.harness.events import Event, how_it_ended, ignore
 from lathe_rc.namespace import absolute
-from lathe_rc.nodes import stale_shared_memory
 from lathe_rc.nodes.report import THROUGHPUT
-from lathe_rc.starting import Child, Start
+from lathe_rc.process_launcher import Child, Start
+
+Event = Mapping[str, Any]  #: of a cell, as its nodes and the harness report them
 
 _SILENCE_LIMIT = 120.0  # [s] without any event: the first start on a machine compiles kernels
 _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag closed
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
 _MOST_RESTARTS = 8  # of a process
 _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
-_NO_SIGN_OF_LIFE = {"stall", "foreign_message", "stopped", "continued", "waits"}  # events of a cell that stands
+_NO_SIGN_OF_LIFE = {"stall", "foreign_message", "waits"}  # events of a cell that stands
 _LAST_WORDS = {"done", "error", "abandoned", "masterless"}  # events of a node that has nothing more to do
 _LOOK = 0.05  # [s] between looks at what a process has written
-_PATIENCE = 1.0  # [s] without any event until the harness looks for what processes wait for
+_DOMAINS = 100  # domain_coordinator reserves 1 to 100
+# Each cell gets the next one, and each process begins elsewhere: in the domain of a cell that has just ended, a process
+# that was killed or orphaned may not have left yet.
+_numbers = itertools.count(os.getpid() * 37)
+
+
+def how_it_ended(event: Event) -> str:
+    """The description of a process that did not end by itself and in order, from its ``exit``."""
+    code = event["code"]
+    return f"{event['node']} " + (
+        f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+    )
+
+
+def ignore(event: Event) -> None:
+    """Watch nothing."""
+
+
+@contextlib.contextmanager
+def free_domain(number: int | None = None) -> Iterator[int]:
+    """A ROS domain that no other program on this machine uses; ``number`` if one is given."""
+    if number is not None:
+        yield number
+        return
+    from domain_coordinator import domain_id
+
+    with domain_id(lambda: next(_numbers) % _DOMAINS + 1) as free:
+        yield int(free)
+
+
+def with_recorder(scenario: Scenario, bag: Path, *, keep: bool, snapshots: Path | None = None) -> Scenario:
+    """The scenario as its processes run it: with a recorder on ``bag``, and a spindle that waits for all members.
+
+    With ``snapshots`` it makes those too, in that folder; what is not to be kept has none.
+    """
+    nodes = dict(scenario.nodes)
+    name, table = scenario.recorder
+    changes: dict[str, object] = {"bag": str(bag.resolve())}
+    if not keep:
+        changes |= {"compression": "none", "mode": "continuous"}
+    elif snapshots is not None:
+        changes |= {"mode": "both", "snapshots": str(snapshots.resolve())}
+    nodes[name] = table.model_copy(update=changes)
+    for master in scenario.masters:
+        others = [node for node in nodes if node != master]
+        nodes[master] = nodes[master].model_copy(update={"members": others})
+    return Scenario(scenario.name, nodes)
 
 
 class Processes:
@@ -93,7 +139,6 @@ class Processes:
             self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-log-")))
             self._file = self._folder / "scenario.yaml"
             self._file.write_text(self._scenario.to_yaml(), encoding="utf-8")
-            stale_shared_memory.sweep()
             for group in self._groups:
                 self._start(group)
         except BaseException:
@@ -121,12 +166,11 @@ class Processes:
         ]
         ours, theirs = socket.socketpair()
         with theirs, (self._folder / f"{group[0]}.log").open("ab") as log:
-            child = starting.server().start(
+            child = process_launcher.server().start(
                 arguments,
                 environment=environment,
                 report=theirs,
                 log=log.fileno(),
-                changed=partial(self._changed, name),
                 command=self._command(group[0], arguments),
             )
         self._children[name] = child
@@ -155,14 +199,6 @@ class Processes:
         """An event of the harness's own, as nodes report theirs."""
         self._events.put({"event": event, "node": name, "monotonic_ns": time.monotonic_ns(), **values})
 
-    def _changed(self, name: str, state: str, number: int) -> None:
-        """Turn into an event that a process has been stopped by a signal, or continued.
-
-        A process that is stopped with a lock of DDS in its hands blocks all that send to it, the time master among
-        them: then nobody else can say so.
-        """
-        self._say(state, name, signal=number, waits=self._waits)
-
     def events(self, silence: float) -> Iterator[Event]:
         """Events as they come.
 
@@ -175,11 +211,8 @@ class Processes:
             wait = _FAREWELL if leaves else min(silence, self._settling) if self._lost else silence
             left = heard + wait - time.monotonic()
             try:
-                event = self._events.get(timeout=max(min(left, _PATIENCE), 0.0))
+                event = self._events.get(timeout=max(left, 0.0))
             except queue.Empty:
-                if left > _PATIENCE:
-                    stale_shared_memory.release()  # what a process that starts may wait for
-                    continue
                 if leaves and self._running:
                     self._end_the_silent()
                     continue
@@ -232,12 +265,6 @@ class Processes:
         return waits and "block0" in self._newest and not self._complete and not masters & set(name.split("+"))
 
     @property
-    def _waits(self) -> bool:
-        """Whether the cell waits for a member that stands still, however long."""
-        masters = (self._scenario.nodes[name] for name in self._scenario.masters)
-        return all(getattr(master, "stall_reaction", "") == "wait" for master in masters)
-
-    @property
     def _running(self) -> list[str]:
         return [name for name in self._children if name not in self._ended]
 
@@ -252,10 +279,7 @@ class Processes:
         return bool(self._running) and all(node in self._left for name in self._running for node in name.split("+"))
 
     def _end_the_silent(self) -> None:
-        """End processes that the run does not need any more, and that do not end by themselves; names them.
-
-        DDS may block one: a neighbour that left took a lock of the shared memory with it.
-        """
+        """Kill and name the processes that do not end by themselves though the run does not need them any more."""
         for name in self._running:
             self._abandoned.add(name)
             self._say("stuck", name, place=self._place(name))

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lathe_rc import messages, starting
+from lathe_rc import messages, process_launcher
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.collect import Collector, check_room
 from lathe_rc.cell.durations import Lateness
@@ -20,13 +20,11 @@ from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.harness.events import Event, ignore
-from lathe_rc.harness.processes import Processes
-from lathe_rc.harness.recorded import with_recorder
+from lathe_rc.harness.processes import Event, Processes, ignore, with_recorder
 from lathe_rc.harness.result import Mode, Result
 from lathe_rc.messages import Signals
 from lathe_rc.namespace import checked
-from lathe_rc.starting import Start
+from lathe_rc.process_launcher import Start
 
 
 def run(
@@ -72,7 +70,7 @@ def run(
         lathe_rc.errors.InputError: piston_bag exists; a bag is never overwritten...
     """
     if mode != "offline" and start == "fork":
-        starting.server()  # it imports while the cell is checked
+        process_launcher.server()  # it imports while the cell is checked
     cell = Cell(scenario.nodes)
     cell.check()
     check_room(cell)
@@ -115,7 +113,7 @@ def _run(
 
     if start == "fork":
         nodes = {name: (scenario.kind(name), table.model_dump()) for name, table in scenario.nodes.items()}
-        starting.server().preload(nodes)
+        process_launcher.server().preload(nodes)
     with contextlib.ExitStack() as stack:
         table = scenario.recorder[1]
         folder = table.snapshots_of(bag) if bag is not None and table.mode != "continuous" else None

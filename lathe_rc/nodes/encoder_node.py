@@ -56,7 +56,7 @@ class EncoderNode(SpindleNode):
     stage: EncoderDevice
     _line: LineReader | None = None
     _listens = _lost = False
-    _overlooked = 0  # joint states that say nothing of the spindle
+    _unusable = 0  # joint states that say nothing of the spindle
     _other = ""  # the last of them
 
     def configure_part(self) -> None:
@@ -79,8 +79,8 @@ class EncoderNode(SpindleNode):
         """See `CellNode`."""
         counted = self.stage.counted
         told: dict[str, object] = {"newest reading [s]": round(counted.time, 6), "late readings": counted.late}
-        if self._overlooked:
-            told["joint states without the spindle"] = f"{self._overlooked}, the last {self._other}"
+        if self._unusable:
+            told["joint states without the spindle"] = f"{self._unusable}, the last {self._other}"
         return {**super().statistics(), **told} if self.stage.live else super().statistics()
 
     # ---- readings -----------------------------------------------------------------------------------
@@ -96,7 +96,7 @@ class EncoderNode(SpindleNode):
     def _on_joints(self, joints: Any) -> None:
         where, place = self.topic(self._device.topic), _place(joints, self._device.joint)
         if place is None:
-            self._overlooked += 1
+            self._unusable += 1
             self._other = f"of {', '.join(joints.name) or 'no joint'} with {len(joints.position)} positions"
             return
         stamp = joints.header.stamp
@@ -178,9 +178,9 @@ class EncoderNode(SpindleNode):
             topic, why = self.topic(self._device.topic), ""
             if self._line is None and not self._listens:
                 why = f"; nobody publishes {topic}"
-            elif self._overlooked:
+            elif self._unusable:
                 wanted = f"joint {self._device.joint!r}" if self._device.joint else "a first joint"
-                why = f"; {self._overlooked} messages on {topic} have no position of {wanted}, the last {self._other}"
+                why = f"; {self._unusable} messages on {topic} have no position of {wanted}, the last {self._other}"
             raise LatheError(
                 f"{self.get_name()}: no counts for {silent:.3g} s, after {self.stage.counted.time:.6g} s; allowed: up "
                 f"to max_silence = {self._device.max_silence:g} s{why}"

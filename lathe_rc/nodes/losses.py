@@ -9,8 +9,8 @@ from lathe_rc_msgs.msg import CellState, Member
 
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.errors import LatheError
+from lathe_rc.nodes.cell_node import GIVEN_UP, given_up, why_failed
 from lathe_rc.nodes.liveliness import SILENCE
-from lathe_rc.nodes.shell import GIVEN_UP, given_up, why_failed
 from lathe_rc.nodes.stage_node import StageNode
 
 _GONE = 0.2  # [s] for messages to be acknowledged, if who has died never will

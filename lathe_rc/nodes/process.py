@@ -33,14 +33,13 @@ from lathe_rc.cell.stages.encoder_device import EncoderDevice
 from lathe_rc.cell.stages.loaded_spindle import LoadedSpindleStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes import arguments, chain, dds, declare, overlooked
+from lathe_rc.nodes import arguments, chain, dds, declare
+from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.encoder_node import EncoderNode
-from lathe_rc.nodes.events import Events
 from lathe_rc.nodes.exchange import Exchange
-from lathe_rc.nodes.lost_ports import LostPorts
+from lathe_rc.nodes.executor import Events, drain_missed_messages
 from lathe_rc.nodes.recorder_node import RecorderNode
 from lathe_rc.nodes.report import THROUGHPUT, Reporter
-from lathe_rc.nodes.shell import CellNode
 from lathe_rc.nodes.spindle_node import SpindleNode
 from lathe_rc.nodes.stage_node import StageNode
 
@@ -127,7 +126,7 @@ def _work(nodes: Sequence[CellNode], stop: _Stop, until: float) -> None:
 
 
 def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
-    events, ports = Events(nodes), LostPorts(nodes[0].get_logger().warning)
+    events = Events(nodes)
     look = 0.0
     while not stop.signal:
         now = time.monotonic()
@@ -140,8 +139,7 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
             if now >= look:
                 look = now + _LONGEST_WAIT
                 for node in nodes:
-                    overlooked.take(node)
-                ports.look(now)
+                    drain_missed_messages(node)
                 if reporter.orphaned:
                     return
         due = _due(nodes, now)

@@ -26,10 +26,10 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import LatheError, LossyRunError
+from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import BlockQueue, latched_qos
 from lathe_rc.nodes.refused_messages import ForeignMessage
-from lathe_rc.nodes.shell import CellNode
 
 _HOST_TOPICS = {
     "/diagnostics": (DiagnosticArray, QoSProfile(depth=100)),

@@ -36,7 +36,7 @@ from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.names import instead
-from lathe_rc.nodes import alone, arguments, replayed_qos
+from lathe_rc.nodes import arguments, replayed_qos, standalone_node
 from lathe_rc.nodes.ports import latched_qos, message_class
 from lathe_rc.nodes.replayed_qos import DEPTH
 
@@ -374,8 +374,8 @@ def _work(node: Node, parameters: ReplayerParameters) -> None:
 
 
 def run(values: Mapping[str, object], args: Sequence[str]) -> int:
-    """Replay until the end, a failure, or Ctrl-C; see `alone.run`."""
-    return alone.run(KIND, ReplayerParameters, _work, values, args)
+    """Replay until the end, a failure, or Ctrl-C; see `standalone_node.run`."""
+    return standalone_node.run(KIND, ReplayerParameters, _work, values, args)
 
 
 def main() -> NoReturn:

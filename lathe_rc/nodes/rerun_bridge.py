@@ -24,11 +24,10 @@ from rclpy.subscription import Subscription
 
 from lathe_rc.cell.rerun_bridge import KIND, RerunBridgeParameters
 from lathe_rc.errors import LatheError
-from lathe_rc.nodes import alone, arguments
-from lathe_rc.nodes.lost_ports import LostPorts
+from lathe_rc.nodes import arguments
 from lathe_rc.nodes.ports import message_class
-from lathe_rc.view.rerun_heard import Backlog
-from lathe_rc.view.rerun_live import Live, Shown
+from lathe_rc.nodes.standalone_node import standalone_node
+from lathe_rc.view.rerun_live import Backlog, Live, Shown
 from lathe_rc.view.rerun_output import Output, require
 from lathe_rc.view.rerun_signals import drawn
 
@@ -79,14 +78,13 @@ class RerunBridge:
         shower = threading.Thread(target=self._show)
         shower.start()
         os.nice(_NICE)  # of this thread alone; those of DDS keep theirs, and so lose less
-        due, ports = 0.0, LostPorts(self._node.get_logger().warning)
+        due = 0.0
         try:
             while not (self._stop or self._output.ended or (self._parameters.once and self._live.shown)):
                 if not shower.is_alive():
                     break
                 if (now := time.monotonic()) >= due:
                     due = now + (_BUSY if self._look() else _PERIOD)
-                    ports.look(now)
                 self._hear()
                 time.sleep(_PERIOD)
             self._hear()
@@ -164,7 +162,7 @@ def run(values: Mapping[str, object], args: Sequence[str]) -> list[Shown]:
     """
     require()
     signals = SignalHandlerOptions.NO
-    with alone.member_of_none(KIND, RerunBridgeParameters, values, args, signals=signals) as (node, parameters):
+    with standalone_node(KIND, RerunBridgeParameters, values, args, signals=signals) as (node, parameters):
         output = Output(parameters.output, file=Path(parameters.file), url=parameters.url, port=parameters.port)
         with output:
             bridge = RerunBridge(node, parameters, output)

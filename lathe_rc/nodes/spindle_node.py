@@ -186,7 +186,7 @@ class SpindleNode(LossWatch):
             if self.blocks == self._blocks_in_run or not self._credit():
                 return
             if time.monotonic() - begun > _LOOK:
-                break  # DDS waits a while for a reader that has died: that shall be noticed
+                break  # a window may hold many blocks: meanwhile deaths shall be noticed
             if not (samples := self._possible()):
                 return
             if factor and not self._is_due(size * step / factor, -(-samples // size)):

@@ -16,9 +16,9 @@ from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Samples, Signals
+from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import BlockQueue, message_class, signal_qos
-from lathe_rc.nodes.shell import CellNode
 
 _TOGETHER = 2  # parts of the window: so much is computed in one go, and members still work side by side
 _OUTSIDE_PERIOD = 0.1  # [s] between looks at who reads what in other processes

@@ -21,8 +21,7 @@ from lathe_rc.bag.writing.writer import FLUSH_PERIOD, BagWriter
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.topic_recorder import KIND, TopicRecorderParameters
 from lathe_rc.errors import InputError, LossyRunError
-from lathe_rc.nodes import alone, arguments, publisher_info
-from lathe_rc.nodes.lost_ports import LostPorts
+from lathe_rc.nodes import arguments, publisher_info, standalone_node
 from lathe_rc.nodes.ports import message_class
 
 _CLOCK = "/clock"
@@ -209,13 +208,12 @@ class TopicRecorder:
             LatheError: the disk does not take it, or /clock is of no use.
             LossyRunError: messages are missing, or not where they belong.
         """
-        looked, ports = 0.0, LostPorts(self._node.get_logger().warning)
+        looked = 0.0
         try:
             while not self.stopped.is_set():
                 if time.monotonic() - looked > _LOOK:
                     self._discover()
                     looked = time.monotonic()
-                    ports.look(looked)
                 if not self._step() and self._parameters.once and self._left():
                     break
             while self._step():
@@ -256,8 +254,8 @@ def _work(node: Node, parameters: TopicRecorderParameters) -> None:
 
 
 def run(values: Mapping[str, object], args: Sequence[str]) -> int:
-    """Record until it is stopped; see `alone.run`."""
-    return alone.run(KIND, TopicRecorderParameters, _work, values, args)
+    """Record until it is stopped; see `standalone_node.run`."""
+    return standalone_node.run(KIND, TopicRecorderParameters, _work, values, args)
 
 
 def main() -> NoReturn:

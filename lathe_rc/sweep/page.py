@@ -8,14 +8,13 @@ import math
 import re
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import vl_convert
 
 from lathe_rc import __version__, files
 from lathe_rc.errors import LatheError, shown
@@ -25,8 +24,7 @@ from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.parallel import parallel
 from lathe_rc.sweep.seen import GOAL, Seen, text_of
-from lathe_rc.view.charts import Charts
-from lathe_rc.view.page_template import page_template
+from lathe_rc.view.charts import Charts, page_template
 
 PAGE, FIGURES = "page.html", "figures"
 
@@ -41,17 +39,6 @@ _MOST_REASONS = 12
 _SCALE = 2.0  # of the PNGs
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _NAMES = ("heat-map", "lines", "sensitivity", "parallel-coordinates", "yield")
-_LIGHT = {
-    "font": "sans-serif",
-    "background": "white",
-    "view": {"stroke": None},
-    "style": {
-        "edge": {"stroke": "#888"},
-        "halo": {"stroke": "white", "strokeWidth": 4, "fontSize": 11},
-        "guide-label": {"fontSize": 11},
-        "guide-title": {"fontSize": 11},
-    },
-}  #: looks of the PNGs; those of the page are in its script
 
 
 @dataclass(frozen=True)
@@ -65,18 +52,6 @@ class Written:
 
     page: Path
     figures: Sequence[Path]
-
-
-def _pngs(charts: Charts) -> dict[str, bytes]:
-    """The pictures by their names, each as it is shown first."""
-    found = {}
-    for name, specs in charts.specs.items():
-        spec = {**specs[charts.chosen[name]], "config": _LIGHT}
-        if name == "parallel-coordinates":
-            found[name] = vl_convert.vega_to_png(spec, scale=_SCALE)
-        else:
-            found[name] = vl_convert.vegalite_to_png({**spec, "datasets": charts.data}, scale=_SCALE)
-    return found
 
 
 def write(folder: Folder, goal: str = GOAL) -> Written:
@@ -94,7 +69,7 @@ def write(folder: Folder, goal: str = GOAL) -> Written:
     drawn = Charts()
     text = _text(seen, drawn)
     place, page = folder.path / FIGURES, folder.path / PAGE
-    pngs = {place / f"{name}.png": png for name, png in _pngs(drawn).items()}
+    pngs = {place / f"{name}.png": drawn.png(name, _SCALE) for name in drawn.specs}
     try:
         place.mkdir(exist_ok=True)
         for old in {place / f"{name}.png" for name in _NAMES} - pngs.keys():
@@ -137,50 +112,42 @@ def _nothing(seen: Seen) -> str:
         return "No cell is computed yet."
     if seen.goal.order.size:
         return ""
-    statuses = Counter(seen.table.column("status").to_pylist())
-    told = ", ".join(f"{count} {status}" for status, count in statuses.most_common())
+    told = ", ".join(f"{count} {status}" for status, count in seen.statuses.most_common())
     others = ", ".join(goal.name for goal in seen.goals)
     instead = f" What cells have is {others}: choose one with --goal." if others else ""
     return f"No cell has a {seen.goal.name}: {told}.{instead}"
 
 
-def _facts(seen: Seen, done: Yield) -> list[dict[str, str]]:
-    """The figures at the top."""
-    statuses = Counter(seen.table.column("status").to_pylist())
-    found = [{"name": "cells", "value": str(len(seen.cells)), "mood": ""}]
-    found += [
-        {"name": status, "value": str(statuses[status]), "mood": "" if status == row.DONE else "bad"}
-        for status in (row.DONE, row.REFUSED, row.DIVERGED, row.FAILED)
-        if statuses[status]
-    ]
-    unit = f" {seen.goal.unit}" if seen.goal.unit else ""
+def _facts(seen: Seen, done: Yield) -> Iterator[tuple[str, str, str]]:
+    """The figures at the top: name, value and mood."""
+    yield "cells", str(len(seen.cells)), ""
+    for status in (row.DONE, row.REFUSED, row.DIVERGED, row.FAILED):
+        if count := seen.statuses[status]:
+            yield status, str(count), "" if status == row.DONE else "bad"
     if done.goal.size:
         best, which = (done.goal[-1], "largest") if done.above else (done.goal[0], "smallest")
-        found.append({"name": f"{which} {seen.goal.name}", "value": f"{said(float(best))}{unit}", "mood": "good"})
+        yield f"{which} {seen.goal.name}", seen.goal.told(float(best)), "good"
         limit = done.point(0.95)
-        kept = "not reached" if limit is None else f"{said(limit)}{unit}"
-        found.append({"name": f"95 % of all cells {'from' if done.above else 'up to'}", "value": kept, "mood": ""})
+        kept = "not reached" if limit is None else seen.goal.told(limit)
+        yield f"95 % of all cells {'from' if done.above else 'up to'}", kept, ""
     if seen.tolerance is not None:
-        share = f"{done.share(seen.tolerance):.2%}"
-        found.append({"name": f"within {said(seen.tolerance)}{unit}", "value": share, "mood": ""})
-    return found
+        yield f"within {seen.goal.told(seen.tolerance)}", f"{done.share(seen.tolerance):.2%}", ""
 
 
 def _outcomes(seen: Seen) -> list[list[str]]:
     """Status, how many, and why, with the numbers left out by which reasons differ; the first cell's as example."""
     groups: dict[tuple[str, str], list[int]] = {}
-    statuses, reasons = seen.table.column("status").to_pylist(), seen.table.column("reason").to_pylist()
+    statuses, reasons = (seen.table.column(name).to_pylist() for name in ("status", "reason"))
     for place, (status, reason) in enumerate(zip(statuses, reasons, strict=True)):
         groups.setdefault((status, _NUMBER.sub("…", reason or "")), []).append(place)
     largest = sorted(groups.items(), key=lambda item: -len(item[1]))
-    found = []
-    for (status, pattern), places in largest[:_MOST_REASONS]:
-        told = f"cell {seen.cells[places[0]]}: {reasons[places[0]]}" if pattern else ""
-        found.append([status, str(len(places)), f"{len(places) / len(seen.cells):.1%}", told])
+    found = [
+        (status, len(places), f"cell {seen.cells[places[0]]}: {reasons[places[0]]}" if pattern else "")
+        for (status, pattern), places in largest[:_MOST_REASONS]
+    ]
     if rest := largest[_MOST_REASONS:]:
-        count = sum(len(places) for _, places in rest)
-        found.append(["others", str(count), f"{count / len(seen.cells):.1%}", f"{len(rest)} more reasons"])
-    return found
+        found.append(("others", sum(len(places) for _, places in rest), f"{len(rest)} more reasons"))
+    return [[status, str(count), f"{count / len(seen.cells):.1%}", told] for status, count, told in found]
 
 
 def _limits(seen: Seen) -> str:
@@ -191,50 +158,49 @@ def _limits(seen: Seen) -> str:
 
 def _sections(seen: Seen, done: Yield, drawn: Charts) -> dict[str, Any]:
     """The sections of the template for cells that have a goal, and the figures."""
-    grids = {goal.name: is_grid(seen.axes, goal.values) for goal in seen.goals}
-    effects = {goal.name: [_effect(axis, goal, grid=grids[goal.name]) for axis in seen.axes] for goal in seen.goals}
+    weighed = zip(seen.axes, _effects_on(seen.goal, seen.axes), strict=True)
+    axes = [axis for axis, _ in sorted(weighed, key=lambda each: _weight(*each))]
+    effects = {goal.name: _effects_on(goal, axes) for goal in seen.goals}
     mine = effects[seen.goal.name]
-    order = sorted(range(len(seen.axes)), key=lambda place: _weight(seen.axes[place], mine[place]))
-    axes = [seen.axes[place] for place in order]
     told = parallel_note = ""
     if axes:
         told = _choices(seen, axes, drawn)
-        names = [axis.name for axis in axes]
-        drawn.add("sensitivity", {"": figures.sensitivity(names, [mine[place] for place in order])})
+        drawn.add("sensitivity", {"": figures.sensitivity([axis.name for axis in axes], mine)})
         parallel_note = _parallel(seen, axes, drawn)
     drawn.add("yield", {"": figures.cumulative(done, seen.goal, seen.tolerance)})
-    shares = [mine[place].share for place in order if not seen.axes[place].tied]
-    rest = 1.0 - sum(share for share in shares if share is not None)
+    shares = [each.share for axis, each in zip(axes, mine, strict=True) if not axis.tied and each.share is not None]
+    goals = [goal for goal in seen.goals if any(found.share is not None for found in effects[goal.name])]
     return {
         "best": _best(seen),
         "choices": [axis.label for axis in axes[:_MOST_AXES]],
         "parameters": len(axes),
         "map_note": told,
         "parallel_note": parallel_note,
-        "effects": _effects(seen, effects, order),
-        "exact": grids[seen.goal.name],
-        "rest": f"{round(rest, 3) + 0.0:.3f}" if any(share is not None for share in shares) else "",
-        "yields": _yields(seen, done),
+        "effects": {
+            "columns": ["parameter", *(f"{goal.name} (log)" if goal.log else goal.name for goal in goals)],
+            "rows": [
+                [
+                    f"{axis.name} (tied)" if axis.tied else axis.name,
+                    *(_told(effects[goal.name][place]) for goal in goals),
+                ]
+                for place, axis in enumerate(axes)
+            ],
+        },
+        "exact": is_grid(seen.axes, seen.goal.values),
+        "rest": f"{round(1.0 - sum(shares), 3) + 0.0:.3f}" if shares else "",
+        "yields": list(_yields(seen, done)),
     }
 
 
-def _effect(axis: Axis, goal: Goal, *, grid: bool) -> Effect:
-    return effect(axis, np.log10(goal.values) if goal.log else goal.values, exact=grid)
+def _effects_on(goal: Goal, axes: Sequence[Axis]) -> list[Effect]:
+    exact = is_grid(axes, goal.values)
+    return [effect(axis, np.log10(goal.values) if goal.log else goal.values, exact=exact) for axis in axes]
 
 
 def _weight(axis: Axis, found: Effect) -> tuple[bool, float, float]:
     """By which parameters are put in order, the one that matters most first; those that follow from others last."""
     share = -math.inf if found.share is None else found.share
     return axis.tied, -share, -abs(found.rank or 0.0)
-
-
-def _effects(seen: Seen, effects: Mapping[str, Sequence[Effect]], order: Sequence[int]) -> dict[str, Any]:
-    """The table of what each goal depends on."""
-    goals = [goal for goal in seen.goals if any(found.share is not None for found in effects[goal.name])]
-    columns = ["parameter", *(f"{goal.name} (log)" if goal.log else goal.name for goal in goals)]
-    names = [f"{axis.name} (tied)" if axis.tied else axis.name for axis in seen.axes]
-    rows = [[names[place], *(_told(effects[goal.name][place]) for goal in goals)] for place in order]
-    return {"columns": columns, "rows": rows}
 
 
 def _told(found: Effect) -> str:
@@ -298,23 +264,18 @@ def _best(seen: Seen) -> dict[str, Any]:
     return {"columns": ["cell", *seen.folder.targets, *(goal.label for goal in goals)], "rows": rows}
 
 
-def _yields(seen: Seen, done: Yield) -> list[str]:
+def _yields(seen: Seen, done: Yield) -> Iterator[str]:
     """The sentences about the yield."""
-    unit = f" {seen.goal.unit}" if seen.goal.unit else ""
-    bound = "at least" if done.above else "at most"
     points = {share: done.point(share) for share in (0.95, 0.99)}
-    found = [
-        f"{share:.0%} of the cells have {bound} {said(limit)}{unit}."
-        for share, limit in points.items()
-        if limit is not None
-    ]
-    found += [f"Fewer than {share:.0%} come to a result." for share, limit in points.items() if limit is None][:1]
+    for share, limit in points.items():
+        if limit is not None:
+            yield f"{share:.0%} of the cells have {'at least' if done.above else 'at most'} {seen.goal.told(limit)}."
+    if missed := [share for share, limit in points.items() if limit is None]:
+        yield f"Fewer than {missed[0]:.0%} come to a result."
     if seen.tolerance is not None:
         low, high = done.interval(seen.tolerance)
         sure = f", of all that could be drawn {low:.2%} to {high:.2%} (95 % confidence)" if seen.is_sampled else ""
-        found.append(
-            f"{done.share(seen.tolerance):.2%} are within the tolerance of {said(seen.tolerance)}{unit}{sure}."
-        )
+        within = f"{done.share(seen.tolerance):.2%}"
+        yield f"{within} are within the tolerance of {seen.goal.told(seen.tolerance)}{sure}."
     if done.goal.size < done.cells:
-        found.append(f"{done.cells - done.goal.size} cells without a result count as beyond every limit.")
-    return found
+        yield f"{done.cells - done.goal.size} cells without a result count as beyond every limit."

@@ -14,10 +14,9 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
 from lathe_rc.sweep.effects import Axis, Samples
-from lathe_rc.sweep.figures import GOOD_TO_BAD, Goal, number, said
-from lathe_rc.view.charts import Rows, Spec
+from lathe_rc.sweep.figures import GOOD_TO_BAD, Goal, said
+from lathe_rc.view.charts import Column, Rows, Spec, number, rows
 
-_SCHEMA = "https://vega.github.io/schema/vega/v6.json"
 _GAP = 74  # [px] from axis to axis
 _SIDE = 26  # [px] beside the axes, for the labels at their ends
 _TOP, _BOTTOM = 62, 26  # [px] above the first axis and below the last
@@ -103,40 +102,38 @@ def _brush(place: int) -> Spec:
     }
 
 
+def _mark(kind: str, *, style: str = "", data: str = "", interactive: bool = False, **channels: object) -> Spec:
+    """A mark; of its channels, texts that begin with = are expressions, and mappings are as Vega has them."""
+    encoded = {
+        name: value
+        if isinstance(value, dict)
+        else {"signal": value[1:]}
+        if isinstance(value, str) and value.startswith("=")
+        else {"value": value}
+        for name, value in channels.items()
+    }
+    found: Spec = {"type": kind, "interactive": interactive, "encode": {"update": encoded}}
+    return found | ({"style": style} if style else {}) | ({"from": {"data": data}} if data else {})
+
+
 def _axis(place: int, axis: Axis, ticks: int) -> list[Spec]:
     """The marks of an axis."""
-    height, held = place * _GAP, f"brush_{place}"
-    quiet: Spec = {"interactive": False}
-    across = {"signal": "datum.u * width"}
-    line = {"x": {"value": 0}, "x2": {"signal": "width"}, "y": {"value": height}}
-    tick = {"x": across, "y": {"value": height - 4}, "y2": {"value": height + 4}}
-    text = {"x": across, "y": {"value": height + 17}, "align": {"value": "center"}, "text": {"field": "t"}}
-    text["limit"] = {"signal": f"(width + {2 * _SIDE}) / {max(ticks, 1)} - 4"}
-    name = {"x": {"value": 4 - _SIDE}, "y": {"value": height - 17}, "text": {"value": axis.label}}
-    band = {
-        "x": {"signal": f"{held} ? min({held}[0], {held}[1]) * width : 0"},
-        "x2": {"signal": f"{held} ? max({held}[0], {held}[1]) * width : 0"},
-        "y": {"value": height - _REACH},
-        "height": {"value": 2 * _REACH},
-        "fill": {"value": "#888888"},
-        "fillOpacity": {"value": 0.4},
-    }
-    hit = {
-        "x": {"value": -_SIDE},
-        "x2": {"signal": f"width + {_SIDE}"},
-        "y": {"value": height - _REACH},
-        "height": {"value": 2 * _REACH},
-        "fill": {"value": "transparent"},
-        "cursor": {"value": "ew-resize"},
-    }
-    data = {"from": {"data": f"ticks_{place}"}, **quiet}
+    height, held, data = place * _GAP, f"brush_{place}", f"ticks_{place}"
+    across = "=datum.u * width"
+    label: dict[str, Any] = {"x": across, "y": height + 17, "align": "center", "text": {"field": "t"}}
+    label["limit"] = f"=(width + {2 * _SIDE}) / {max(ticks, 1)} - 4"
+    name: dict[str, Any] = {"x": 4 - _SIDE, "y": height - 17, "text": {"value": axis.label}}
+    reach: dict[str, Any] = {"y": height - _REACH, "height": 2 * _REACH}
+    low, high = (f"={held} ? {end}({held}[0], {held}[1]) * width : 0" for end in ("min", "max"))
     return [
-        {"type": "rule", "style": "edge", **quiet, "encode": {"update": line}},
-        {"type": "rule", "style": "edge", **data, "encode": {"update": tick}},
-        *({"type": "text", "style": style, **data, "encode": {"update": text}} for style in ("halo", "guide-label")),
-        *({"type": "text", "style": style, **quiet, "encode": {"update": name}} for style in ("halo", "guide-title")),
-        {"type": "rect", **quiet, "encode": {"update": band}},
-        {"type": "rect", "encode": {"update": hit}},
+        _mark("rule", style="edge", x=0, x2="=width", y=height),
+        _mark("rule", style="edge", data=data, x=across, y=height - 4, y2=height + 4),
+        *(_mark("text", style=style, data=data, **label) for style in ("halo", "guide-label")),
+        *(_mark("text", style=style, **name) for style in ("halo", "guide-title")),
+        _mark("rect", x=low, x2=high, **reach, fill="#888888", fillOpacity=0.4),
+        _mark(
+            "rect", interactive=True, x=-_SIDE, x2=f"=width + {_SIDE}", **reach, fill="transparent", cursor="ew-resize"
+        ),
     ]
 
 
@@ -149,70 +146,54 @@ def parallel(axes: Sequence[Axis], goal: Goal, numbers: NDArray[np.int64]) -> Dr
         numbers: of the cells, shape (n,).
     """
     cells, known = chosen(axes, goal)
-    scaled = [_scaled(axis) for axis in axes]
-    rows: Rows = []
-    for cell in cells:
-        row: dict[str, Any] = {"c": int(numbers[cell]), "g": number(float(goal.values[cell])), "v": []}
-        for place, (axis, (values, low, high)) in enumerate(zip(axes, scaled, strict=True)):
-            row[f"u{place}"] = number((float(values[cell]) - low) / (high - low))
-            row["v"].append(axis.texts[int(axis.values[cell])] if axis.texts else said(float(axis.values[cell])))
-        rows.append(row)
-    ticks = [_ticks(axis, low, high) for axis, (_, low, high) in zip(axes, scaled, strict=True)]
+    count = len(cells)
+    columns: dict[str, Column] = {"c": numbers[cells], "g": goal.values[cells]}
+    ticks: list[Rows] = []
+    texts = []
+    for place, axis in enumerate(axes):
+        values, low, high = _scaled(axis)
+        columns[f"u{place}"] = (values[cells] - low) / (high - low)
+        texts.append([axis.texts[int(value)] if axis.texts else said(value) for value in axis.values[cells].tolist()])
+        places, labels = zip(*_ticks(axis, low, high), strict=True)
+        ticks.append(rows(u=np.array(places), t=list(labels)))
+    lines = [{**row, "v": list(text)} for row, text in zip(rows(**columns), zip(*texts, strict=True), strict=True)]
     inside = " && ".join(f"(!brush_{place} || inrange(datum.u{place}, brush_{place}))" for place in range(len(axes)))
     points = " + 'L' + ".join(f"datum.u{place} * width + ',{place * _GAP}'" for place in range(len(axes)))
-    opacity = number(min(0.8, max(0.3, 30.0 / max(len(rows), 1))))
+    opacity = number(min(0.8, max(0.3, 30.0 / max(count, 1))))
     told = ", ".join(f"{json.dumps(axis.label)}: datum.v[{place}]" for place, axis in enumerate(axes))
-    line = {
-        "path": {"signal": f"'M' + {points}"},
-        "stroke": {"scale": "colour", "field": "g"},
-        "strokeWidth": {"value": 1.3},
-        "strokeOpacity": {"signal": f"{inside} ? {opacity} : 0.03"},
-        "tooltip": {"signal": f"{{'cell': datum.c, {told}}}"},
-    }
-    of = f"of {len(rows)} lines inside the brushes"
-    count = {
-        "x": {"value": 4 - _SIDE},
-        "y": {"value": 20 - _TOP},
-        "text": {"signal": f"(length(data('inside')) ? data('inside')[0].count : 0) + ' {of}'"},
-    }
-    return Drawn(
-        {
-            "$schema": _SCHEMA,
-            "width": 640 - 2 * _SIDE,
-            "height": (len(axes) - 1) * _GAP,
-            "padding": {"left": _SIDE, "right": _SIDE, "top": _TOP, "bottom": _BOTTOM},
-            "autosize": "none",
-            "data": [
-                {"name": "cells", "values": rows},
-                {
-                    "name": "inside",
-                    "source": "cells",
-                    "transform": [{"type": "filter", "expr": inside}, {"type": "aggregate"}],
-                },
-                *(
-                    {"name": f"ticks_{place}", "values": [{"u": number(u), "t": text} for u, text in each]}
-                    for place, each in enumerate(ticks)
-                ),
-            ],
-            "signals": [_brush(place) for place in range(len(axes))],
-            "scales": [
-                {
-                    "name": "colour",
-                    **goal.scale,
-                    "domain": {"data": "cells", "field": "g"},
-                    "range": list(reversed(GOOD_TO_BAD) if goal.above else GOOD_TO_BAD),
-                }
-            ],
-            "marks": [
-                {"type": "path", "from": {"data": "cells"}, "encode": {"update": line}},
-                *(
-                    mark
-                    for place, (axis, each) in enumerate(zip(axes, ticks, strict=True))
-                    for mark in _axis(place, axis, len(each))
-                ),
-                {"type": "text", "style": "guide-label", "interactive": False, "encode": {"update": count}},
-            ],
-        },
-        len(rows),
-        known,
+    colours = list(reversed(GOOD_TO_BAD) if goal.above else GOOD_TO_BAD)
+    line = _mark(
+        "path",
+        data="cells",
+        interactive=True,
+        path=f"='M' + {points}",
+        stroke={"scale": "colour", "field": "g"},
+        strokeWidth=1.3,
+        strokeOpacity=f"={inside} ? {opacity} : 0.03",
+        tooltip=f"={{'cell': datum.c, {told}}}",
     )
+    kept = f"=(length(data('inside')) ? data('inside')[0].count : 0) + ' of {count} lines inside the brushes'"
+    spec = {
+        "$schema": "https://vega.github.io/schema/vega/v6.json",
+        "width": 640 - 2 * _SIDE,
+        "height": (len(axes) - 1) * _GAP,
+        "padding": {"left": _SIDE, "right": _SIDE, "top": _TOP, "bottom": _BOTTOM},
+        "autosize": "none",
+        "data": [
+            {"name": "cells", "values": lines},
+            {
+                "name": "inside",
+                "source": "cells",
+                "transform": [{"type": "filter", "expr": inside}, {"type": "aggregate"}],
+            },
+            *({"name": f"ticks_{place}", "values": each} for place, each in enumerate(ticks)),
+        ],
+        "signals": [_brush(place) for place in range(len(axes))],
+        "scales": [{"name": "colour", **goal.scale, "domain": {"data": "cells", "field": "g"}, "range": colours}],
+        "marks": [
+            line,
+            *(mark for place, axis in enumerate(axes) for mark in _axis(place, axis, len(ticks[place]))),
+            _mark("text", style="guide-label", x=4 - _SIDE, y=20 - _TOP, text=kept),
+        ],
+    }
+    return Drawn(spec, count, known)

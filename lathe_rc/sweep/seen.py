@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The data of a sweep's page: its parameters as axes, its goals, and the results of the cells."""
 
+from collections import Counter
 from functools import cached_property
 from typing import cast
 
@@ -111,6 +112,11 @@ class Seen:
             ends = ["", ""] if axis.texts else [said(float(axis.distinct[0])), said(float(axis.distinct[-1]))]
             found.append([axis.label, told, *ends, str(axis.distinct.size), own])
         return found
+
+    @cached_property
+    def statuses(self) -> Counter[str]:
+        """How many cells have each status."""
+        return Counter(self.table.column("status").to_pylist())
 
     @cached_property
     def seeds(self) -> int:

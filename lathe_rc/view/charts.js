@@ -1,19 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
 // Draws the figures of a page in its own colours, light or dark, and as wide as the page is.
 // A figure with a parameter "box" is enlarged by dragging across it; a double click or the button shows it whole.
-const { specs: SPECS, data: DATA, chosen: CHOSEN } = JSON.parse(document.getElementById("figures").textContent);
+const { specs: SPECS, data: DATA, chosen: CHOSEN, look: LOOK } = JSON.parse(document.getElementById("figures").textContent);
 const DARK = matchMedia("(prefers-color-scheme: dark)"), ENLARGED = {}, LEAST = 8, MARGIN = 5; // [px]
 function config(width) {
-  const style = getComputedStyle(document.documentElement), told = name => style.getPropertyValue(name).trim();
-  const [ink, soft, line, paper] = ["--ink", "--soft", "--line", "--paper"].map(told);
-  const guide = { labelColor: soft, titleColor: ink, gridColor: line, domainColor: soft, tickColor: soft, labelFontSize: 11, titleFontSize: 11 };
-  const columns = width < 560 ? 1 : 0; // of a legend; 0: as many as it has names
-  return {
-    background: null, font: "system-ui, sans-serif", view: { stroke: null }, axis: guide, legend: { ...guide, columns }, text: { color: ink },
-    title: { color: ink, fontSize: 12 }, rule: { color: soft },
-    range: { category: told("--marks").split(" "), diverging: { scheme: told("--below-zero-above").split(" ") } },
-    style: { "guide-label": { fill: soft, fontSize: 11 }, "guide-title": { fill: ink, fontSize: 11 }, edge: { stroke: soft }, halo: { stroke: paper, strokeWidth: 4, fontSize: 11 } },
-  };
+  const style = getComputedStyle(document.documentElement);
+  const found = JSON.parse(JSON.stringify(LOOK), (_, value) => {
+    if (typeof value != "string" || !value.startsWith("--")) return value;
+    const colours = style.getPropertyValue(value).trim().split(" ");
+    return colours.length > 1 ? colours : colours[0];
+  });
+  found.legend.columns = width < 560 ? 1 : 0; // 0: as many as it has names
+  return found;
 }
 async function draw(name) {
   const place = document.getElementById(name), spec = structuredClone(SPECS[name][CHOSEN[name]]);

@@ -1,31 +1,86 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of an HTML page, drawn where it is read: Vega-Lite, its library, and the script that draws.
+"""HTML pages with figures: Vega-Lite specifications, drawn by the page itself or here as pictures.
 
-The page carries all of it. It runs these two scripts alone, known by their hashes, and nothing that a bag or a sweep
-says in it.
+The page carries Vega's library and the script that draws. It runs these two scripts alone, known by their hashes, and
+nothing that a bag or a sweep says in it.
 """
 
 import base64
 import hashlib
-from collections.abc import Iterable, Mapping
+import json
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import vl_convert
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
+
+from lathe_rc.messages import Samples
 
 Spec = dict[str, Any]
 Rows = list[dict[str, Any]]
+Column = Samples | Sequence[float | str | None] | float | str | bool | None
 
-SCHEMA = "https://vega.github.io/schema/vega-lite/v6.json"
-FIT = {"type": "fit-x", "contains": "padding"}
+_HERE = Path(__file__).parent
+_PAPER = 900  # [px] width of a picture, about that of the page
+_GUIDE: Spec = {"labelColor": "--soft", "titleColor": "--ink", "gridColor": "--line", "domainColor": "--soft"}
+_GUIDE |= {"tickColor": "--soft", "labelFontSize": 11, "titleFontSize": 11}
+#: Looks of all figures; names that begin with -- are colours of the page, see page.css.
+LOOK: Spec = {
+    "background": None,
+    "font": "system-ui, sans-serif",
+    "view": {"stroke": None},
+    "axis": _GUIDE,
+    "legend": _GUIDE,
+    "text": {"color": "--ink"},
+    "title": {"color": "--ink", "fontSize": 12},
+    "rule": {"color": "--soft"},
+    "range": {"category": "--marks", "diverging": {"scheme": "--below-zero-above"}},
+    "style": {
+        "guide-label": {"fill": "--soft", "fontSize": 11},
+        "guide-title": {"fill": "--ink", "fontSize": 11},
+        "edge": {"stroke": "--soft"},
+        "halo": {"stroke": "--paper", "strokeWidth": 4, "fontSize": 11},
+    },
+}
 
 
 @cache
 def library() -> str:
     """Vega, Vega-Lite and vega-embed, as one script."""
     return str(vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;"))
+
+
+@cache
+def _light() -> Spec:
+    """`LOOK` in the colours of a light page."""
+    light = (_HERE / "page.css").read_text(encoding="utf-8").partition("@media")[0]
+    colours = {name: value.split() for name, value in re.findall(r"(--[\w-]+): ([^;]+);", light)}
+    text = re.sub(
+        r'"(--[\w-]+)"', lambda found: json.dumps(c if len(c := colours[found[1]]) > 1 else c[0]), json.dumps(LOOK)
+    )
+    return {**json.loads(text), "font": "sans-serif", "background": "white"}
+
+
+def page_template(path: Path, **filters: Callable[[str], str]) -> Template:
+    """The template in a file; others beside it can be included, and what pages have in common from here.
+
+    What a bag or a sweep says in it ends no element.
+    """
+    environment = Environment(
+        loader=FileSystemLoader([path.parent, _HERE]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(filters)
+    return environment.get_template(path.name)
 
 
 @dataclass(eq=False)
@@ -46,19 +101,104 @@ class Charts:
         """Add a figure, which goes into the element of this id."""
         self.specs[name], self.chosen[name] = dict(specs), first
 
+    def place(self, specs: Sequence[Spec]) -> list[str]:
+        """Add the parts of one more figure without a choice; returns the ids of their elements."""
+        count = len({name.split("-")[1] for name in self.specs})
+        places = [f"figure-{count}-{part}" for part in range(len(specs))]
+        for place, spec in zip(places, specs, strict=True):
+            self.add(place, {"": spec})
+        return places
+
+    def _static(self, name: str) -> Spec:
+        """The specification of a figure as it is shown first, on white paper."""
+        spec = {**self.specs[name][self.chosen[name]], "config": _light()}
+        return spec if is_vega(spec) else {**spec, "datasets": self.data}
+
+    def png(self, name: str, scale: float) -> bytes:
+        """A figure as a file of its own."""
+        spec = self._static(name)
+        convert = vl_convert.vega_to_png if is_vega(spec) else vl_convert.vegalite_to_png
+        return bytes(convert(spec, scale=scale))
+
+    def picture(self, name: str, beside: int) -> str:
+        """One of so many parts of a figure as a data URI: SVG, or JPEG where it has too many marks for that."""
+        spec = self._static(name)
+        own = spec.get("usermeta", {})
+        if "square" in own:  # as charts.js draws it
+            spec |= {"width": own["square"], "height": own["square"], "autosize": "pad"}
+        else:
+            spec["width"] = _PAPER // beside
+        if own.get("renderer") == "canvas":
+            kind, image = "jpeg", vl_convert.vegalite_to_jpeg(spec, scale=1.5, quality=90)
+        else:
+            ids: dict[str, str] = {}  # Vega counts them through all figures of a process
+            svg = re.sub(
+                r'(?<= id=")clip\d+|(?<=url\(#)clip\d+',
+                lambda found: ids.setdefault(found[0], f"clip{len(ids)}"),
+                vl_convert.vegalite_to_svg(spec),
+            )
+            kind, image = "svg+xml", svg.encode()
+        return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"
+
+    @property
+    def document(self) -> Spec:
+        """All that the script of the page needs."""
+        return {"specs": self.specs, "data": self.data, "chosen": self.chosen, "look": LOOK}
+
     @property
     def scripts(self) -> list[str]:
         """Those that draw the figures; none without figures."""
-        return [library(), Path(__file__).with_name("charts.js").read_text(encoding="utf-8")] if self.specs else []
+        return [library(), (_HERE / "charts.js").read_text(encoding="utf-8")] if self.specs else []
 
     @property
     def policy(self) -> str:
         """The page's Content-Security-Policy: it loads nothing, and runs these scripts alone."""
-        return (
-            f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src {_allowed(self.scripts)}"
-        )
+        hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in self.scripts]
+        allowed = " ".join(f"'sha256-{each}'" for each in hashes) or "'none'"
+        return f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src {allowed}"
 
 
-def _allowed(scripts: Iterable[str]) -> str:
-    hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
-    return " ".join(f"'sha256-{each}'" for each in hashes) or "'none'"
+# --- parts of specifications
+
+
+def is_vega(spec: Spec) -> bool:
+    """Whether it is a specification of Vega itself, without a grammar of graphics."""
+    return "/vega/" in spec["$schema"]
+
+
+def chart(height: int, **parts: Any) -> Spec:
+    """A specification as wide as the page; ``height`` in px."""
+    schema, fit = "https://vega.github.io/schema/vega-lite/v6.json", {"type": "fit-x", "contains": "padding"}
+    return {"$schema": schema, "width": 640, "height": height, "autosize": fit, **parts}
+
+
+def number(value: float, digits: int = 5) -> float | None:
+    """As it goes into a page: short, and None for what is none."""
+    return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+
+
+def rows(**columns: Column) -> Rows:
+    """A data set; numbers are shortened, and what is one value for all rows is repeated."""
+    lists = {name: column.tolist() if isinstance(column, np.ndarray) else column for name, column in columns.items()}
+    length = max(len(column) for column in lists.values() if isinstance(column, list))
+    filled = [column if isinstance(column, list) else [column] * length for column in lists.values()]
+    return [
+        {name: number(value) if isinstance(value, float) else value for name, value in zip(lists, row, strict=True)}
+        for row in zip(*filled, strict=True)
+    ]
+
+
+def quantity(field: str, title: str, **more: Any) -> Spec:
+    """An encoding by numbers."""
+    return {"field": field, "type": "quantitative", "title": title, **more}
+
+
+def tip(**fields: str) -> Rows:
+    """The text at the pointer: titles by fields of numbers."""
+    return [quantity(name, title, format=".4~g") for name, title in fields.items()]
+
+
+def axis_scale(*, log: bool = False, ends: Sequence[float] = ()) -> Spec:
+    """Scale of an axis or of colours, from the smallest to the largest value or between two ends."""
+    kind: Spec = {"type": "log", "nice": False} if log else {"type": "linear", "nice": False, "zero": False}
+    return kind | ({"domain": [number(end, 6) for end in ends]} if len(ends) else {})

@@ -1,288 +1,412 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a report, as SVG: light, printable, and all in one style."""
+"""The figures of a report, as specifications of Vega-Lite; on a screen they can be enlarged."""
 
-import base64
-import io
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import SymLogNorm
-from matplotlib.figure import Figure
-from matplotlib.projections.polar import PolarAxes
 
 from lathe_rc.analysis.metrology import Lay
 from lathe_rc.messages import Samples
+from lathe_rc.view.charts import Rows, Spec, axis_scale, chart, number, quantity, rows, tip
 from lathe_rc.view.report_form import Form, Revolution
 from lathe_rc.view.report_gather import Gathered
 from lathe_rc.view.report_host import Host
 from lathe_rc.view.report_series import Envelope
 
-FIRST, LAST, BEST = "#c0392b", "#1f6f8b", "#d08a1d"
-_GREY = "#999999"
-_COLOURS = (LAST, FIRST, BEST, "#5b7f3a")
-_CYCLE_COLOURS = (FIRST, BEST, "#5b7f3a", "#7d5a9b")
-_WIDTH = 9.2  # [in]
-_TICKS = 8  # font size
+_FIELDS = 40_000  # of all maps of a page
+_ACROSS = 256  # fields of a map in a revolution
+_LINEAR = 8.0  # of the symmetrical logarithm: so much of its colours are for what is left at the end
+_SQUARE = 460  # [px] the largest polar figure
+_INSIDE = 1.2  # radius of the desired form in a polar figure, by the largest deviation
+_POINTS = 720  # of a polar figure
+_OTHERS = 4  # controllers whose cycles are drawn
+_LAST, _FIRST, _BEST, _GREY, _COLOURS = 0, 1, 2, 5, 6  # places in the page's colours, and how many it has
 _LONGEST_LABEL = 60  # characters
-LONGEST_LENGTH = 1e3  #: that is drawn [m]
+_LONGEST_LENGTH = 1e3  # that is drawn [m]
 _MOST_VALUE = 1e12  # of other signals
-FLOOR = 1e-3  #: size of a form error that a figure takes for the least [µm]
+_FLOOR = 1e-3  # size of a form error that a figure takes for the least [µm]
 _ALMOST = 1e-9  # of their size, by which numbers differ that count as two
-STYLE: Any = {"svg.hashsalt": "lathe_rc", "axes.titlesize": 10, "axes.labelsize": 9, "legend.fontsize": 8}
-STYLE |= {"xtick.labelsize": _TICKS, "ytick.labelsize": _TICKS}
+
+#: Dragging marks what is to be enlarged.
+_BOX: Spec = {"name": "box", "select": {"type": "interval", "translate": False, "zoom": False, "clear": False}}
+_LEGEND: Spec = {"orient": "top", "title": None, "labelLimit": 260, "symbolOpacity": 1, "symbolStrokeWidth": 3}
+_LEGEND["columnPadding"] = 24  # where a reader's letters are wider than those that the picture was measured with
+_GRADIENT: Spec = {"orient": "top", "direction": "horizontal", "gradientLength": 260, "columns": 0, "titleLimit": 300}
 
 
-def plain(text: str) -> str:
-    """A text from a bag, for a label: short, and without what matplotlib takes for formulas."""
-    shown = text[:_LONGEST_LABEL].encode("ascii", "replace").decode()
-    return "".join(letter if letter.isprintable() else "?" for letter in shown).replace("$", r"\$")
+def _plain(text: str) -> str:
+    """A text from a bag, for a label."""
+    return "".join(letter if letter.isprintable() and letter.isascii() else "?" for letter in text[:_LONGEST_LABEL])
 
 
 def um(length: Samples) -> Samples:
     """Lengths [m] in µm; absurd ones are cut at 1 km, for figures of a bag that holds just anything."""
-    cut: Samples = np.clip(np.nan_to_num(length), -LONGEST_LENGTH, LONGEST_LENGTH) * 1e6
+    cut: Samples = np.clip(np.nan_to_num(length), -_LONGEST_LENGTH, _LONGEST_LENGTH) * 1e6
     return cut
 
 
-def limited(values: Samples) -> Samples:
+def _limited(values: Samples) -> Samples:
     """Other signals; absurd values are cut."""
     cut: Samples = np.clip(values, -_MOST_VALUE, _MOST_VALUE)
     return cut
 
 
-def colour_range(rows: Samples) -> tuple[float, float]:
+def _figure(height: int, *, usermeta: Mapping[str, Any] | None = None, **parts: Any) -> Spec:
+    return chart(height, usermeta={"box": True, **(usermeta or {})}, **parts)
+
+
+def _rectangles(height: int, x: Spec, y: Spec, y2: Spec, colour: Spec, tooltip: Rows, **parts: Any) -> Spec:
+    """Rectangles from u to u2 across, and from y to y2."""
+    encoding = {"x": x, "x2": {"field": "u2"}, "y": y, "y2": y2, "color": colour, "tooltip": tooltip}
+    if colour["type"] == "quantitative":  # no gaps between the fields of a map
+        encoding["stroke"] = {key: value for key, value in colour.items() if key != "legend"}
+    mark = {"type": "rect", "clip": True, "strokeWidth": 1.2}
+    return _figure(height, params=[_BOX], mark=mark, encoding=encoding, **parts)
+
+
+def _colours(places: Mapping[str, int], symbol: str = "stroke", *, legend: bool) -> Spec:
+    """Colours by label: those of the page, by their places."""
+    domain = [f"_{place}" for place in range(_COLOURS)]
+    for label, place in places.items():
+        domain[place] = label
+    named = {**_LEGEND, "symbolType": symbol, "values": list(places)} if legend else None
+    return {"field": "l", "type": "nominal", "scale": {"domain": domain}, "legend": named}
+
+
+# --- maps
+
+
+def colour_range(map_rows: Samples) -> tuple[float, float]:
     """Largest magnitude of a map [µm], and up to which its colours are linear: the largest of its quietest quarter.
 
     So the first cycles, the rest, and a fault can be seen.
     """
-    each = np.sort(np.abs(rows).max(axis=1))
-    largest = max(float(each[-1]), FLOOR)
+    each = np.sort(np.abs(map_rows).max(axis=1))
+    largest = max(float(each[-1]), _FLOOR)
     return largest, min(max(float(each[(len(each) - 1) // 4]), largest * 1e-4), largest)
+
+
+def _map(fields: Samples, across: Spec, up: Spec, colour: Spec) -> Spec:
+    """A field for each number; across and up say where they begin, how large they are, and how their axis looks."""
+    place = "(datum.k - 1)"
+    return _rectangles(
+        340,
+        quantity("u", "spindle angle [°]", scale=axis_scale(ends=(0, 360)), axis=across["axis"]),
+        quantity("v", up["title"], scale=up["scale"], axis={"grid": False}),
+        {"field": "v2"},
+        colour,
+        tip(u="spindle angle [°]", v=up["title"], data=colour["title"]),
+        data={"values": [number(value) for value in fields.ravel().tolist()]},
+        transform=[
+            {"window": [{"op": "row_number", "as": "k"}]},
+            {"calculate": f"{across['start']} + {place} % {fields.shape[1]} * {across['step']}", "as": "u"},
+            {"calculate": f"datum.u + {across['step']}", "as": "u2"},
+            {"calculate": f"{up['start']} + floor({place} / {fields.shape[1]}) * {up['step']}", "as": "v"},
+            {"calculate": f"min(datum.v + {up['step']}, {up['end']})", "as": "v2"},
+        ],
+        usermeta={"renderer": "canvas"},
+    )
+
+
+def _across(step: float, ticks: int) -> Spec:
+    return {"start": 0, "step": step, "axis": {"values": list(range(0, 361, ticks)), "grid": False}}
+
+
+def _thinner(fields: Samples, most: int) -> tuple[Samples, int]:
+    """Means of neighbours in each column, of so many rows that no more than ``most`` are left; and of how many."""
+    group = -(-len(fields) // most)
+    starts = np.arange(0, len(fields), group)
+    counts = np.minimum(starts + group, len(fields)) - starts
+    return np.add.reduceat(fields, starts) / counts[:, None], group
+
+
+def form_map(form: Form, maps: int) -> Spec:
+    """Radius deviation by revolution and angle; ``maps``: of the page."""
+    fields = um(form.map.rows())
+    largest, linear = colour_range(fields)
+    fields = fields.reshape(len(fields), _ACROSS, -1).mean(axis=-1)
+    fields, group = _thinner(fields, max(2, _FIELDS // _ACROSS // maps))
+    end = form.map.size + 0.5
+    up = {"title": "revolution", "start": 0.5, "step": group * form.map.group, "end": end}
+    up["scale"] = {**axis_scale(ends=(0.5, end)), "reverse": True}
+    ticks = [largest, linear] if largest > 3 * linear else [largest]
+    values = [*(-tick for tick in ticks), 0.0, *reversed(ticks)]
+    scale = {"type": "symlog", "constant": linear / _LINEAR, "domain": [-largest, largest], "range": "diverging"}
+    legend = {**_GRADIENT, "values": values, "format": ".3~g"}
+    colour = quantity("data", "radius deviation [µm]", scale=scale, legend=legend)
+    return _map(fields, _across(360 / _ACROSS, 45), up, colour)
+
+
+def along(surface: Lay) -> list[Spec]:
+    """The surface along the part over angle and height, and one trace of it."""
+    deviation = um(surface.surface)  # by angle and height
+    place = np.clip(surface.height, -_LONGEST_LENGTH, _LONGEST_LENGTH) * 1e3
+    low, high = float(place[0]), float(place[-1])
+    step = (high - low) / (place.size - 1) if place.size > 1 else 1.0
+    fields, group = _thinner(deviation.T, 128)
+    fields, wide = _thinner(fields.T, _ACROSS)
+    up = {"title": "height [mm]", "start": low - step / 2, "step": step * group, "end": high + step / 2}
+    up["scale"] = axis_scale(ends=sorted((low - step / 2, high + step / 2)))
+    colour = quantity("data", "radius deviation [µm]", scale={"scheme": "viridis"}, legend=_GRADIENT)
+    line = _figure(
+        240,
+        data={"values": rows(u=place, v=deviation[0])},
+        params=[_BOX],
+        mark={"type": "line", "clip": True, "strokeWidth": 1.4},
+        encoding={
+            "x": quantity("u", "height [mm]", scale=axis_scale()),
+            "y": quantity("v", "radius deviation at 0° [µm]", scale=axis_scale()),
+            "tooltip": tip(u="height [mm]", v="deviation [µm]"),
+        },
+    )
+    return [_map(fields.T, _across(360 / len(deviation) * wide, 90), up, colour), line]
+
+
+# --- revolutions
+
+
+def polar(form: Form) -> list[Spec]:
+    """Radius deviation of the first and the last revolution, each in its own scale."""
+    return [_polar(each, colour) for each, colour in ((form.first, _FIRST), (form.last, _LAST)) if each]
+
+
+def _polar(revolution: Revolution, colour: int) -> Spec:
+    profile = um(revolution.profile)
+    deviation = profile[:: max(1, profile.size // _POINTS)]
+    deviation = np.append(deviation, deviation[0])
+    size = max(float(np.abs(profile).max()), _FLOOR)
+    told = revolution.numbers
+
+    def at(radius: Samples | float, angle: Samples | float, **more: Any) -> Rows:
+        """Places, the desired form in the middle and the largest deviation 1 from it."""
+        return rows(u=radius * np.cos(angle), v=radius * np.sin(angle), **more)
+
+    angle, turn, eighths = (np.linspace(0.0, 2.0 * np.pi, points) for points in (deviation.size, 181, 9))
+    rings = {f"{side * size:.3g}": _INSIDE + side for side in (-1.0, 0.0, 1.0)}
+    ticks = [*list(rings)[:2], f"{size:.3g} µm"]
+    texts = at(np.array(list(rings.values())), 1.17, t=ticks)
+    texts += at(2.42, eighths[:8], t=[f"{degrees:.0f}°" for degrees in np.rad2deg(eighths[:8])])
+    form = at(_INSIDE + deviation / size, angle, l="form", k=np.arange(angle.size), a=np.rad2deg(angle), d=deviation)
+    circles = [
+        row
+        for name, radius in rings.items()
+        for row in at(np.full(turn.size, radius), turn, l=name, k=np.arange(turn.size))
+    ]
+    where = {"scale": axis_scale(ends=(-2.55, 2.55)), "axis": None}
+    dash = {"domain": list(rings), "range": [[1, 3], [4, 3], [1, 3]]}
+    line = {"type": "line", "clip": True}
+    return _figure(
+        _SQUARE,
+        title=f"revolution {told['revolution']}: {told['rms']:.3g} µm RMS",
+        encoding={"x": quantity("u", "", **where), "y": quantity("v", "", **where)},
+        layer=[
+            {
+                "params": [_BOX],
+                "data": {"values": circles},
+                "mark": {**line, "color": "#888", "strokeWidth": 1},
+                "encoding": {
+                    "order": {"field": "k"},
+                    "detail": {"field": "l"},
+                    "strokeDash": {"field": "l", "type": "nominal", "legend": None, "scale": dash},
+                },
+            },
+            {
+                "data": {"values": form},
+                "mark": {**line, "strokeWidth": 1.6},
+                "encoding": {
+                    "order": {"field": "k"},
+                    "color": _colours({"form": colour}, legend=False),
+                    "tooltip": tip(a="angle [°]", d="deviation [µm]"),
+                },
+            },
+            {
+                "data": {"values": texts},
+                "mark": {"type": "text", "clip": True, "fontSize": 10},
+                "encoding": {"text": {"field": "t"}},
+            },
+        ],
+        usermeta={"square": _SQUARE},
+    )
+
+
+def shown_revolutions(form: Form) -> list[tuple[str, Revolution]]:
+    """First, best and last revolution with what they are, each once."""
+    shown: dict[int, tuple[str, Revolution]] = {}
+    for name, revolution in (("first", form.first), ("best", form.best), ("last", form.last)):
+        if revolution:
+            number_ = revolution.numbers["revolution"]
+            shown[number_] = f"{shown[number_][0]}, {name}" if number_ in shown else name, revolution
+    return list(shown.values())
 
 
 def spectrum_range(form: Form) -> tuple[float, float]:
     """Range of amplitudes [µm] in which each shown revolution has three decades; (0, 0) without any amplitude."""
-    tops = [float(um(revolution.amplitude[1:]).max()) for _, _, revolution in shown_revolutions(form)]
+    tops = [float(um(revolution.amplitude[1:]).max()) for _, revolution in shown_revolutions(form)]
     tops = [top for top in tops if top > 0.0]
     return (min(min(tops) * 1e-3, max(tops) * 1e-6), max(tops) * 2.0) if tops else (0.0, 0.0)
 
 
-def _figure(height: float) -> Figure:
-    return Figure(figsize=(_WIDTH, height), layout="constrained")
-
-
-def _svg(figure: Figure) -> str:
-    """The figure as a data URI."""
-    image = io.BytesIO()
-    figure.savefig(image, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
-    return "data:image/svg+xml;base64," + base64.b64encode(image.getvalue()).decode()
-
-
-def _grid(axes: Axes) -> None:
-    axes.grid(visible=True, which="major", alpha=0.3)
-
-
-def _band(axes: Axes, place: Samples, low: Samples, high: Samples, colour: str, label: str | None = None) -> None:
-    """An envelope: a line where it is thin."""
-    axes.fill_between(place, low, high, color=colour, alpha=0.35, lw=0)
-    axes.plot(place, (low + high) / 2, color=colour, lw=1.0, label=label)
-
-
-def form_map(form: Form) -> str:
-    """Radius deviation by revolution and angle."""
-    rows = um(form.map.rows())
-    figure = _figure(3.6)
-    axes = figure.subplots()
-    largest, linear = colour_range(rows)
-    revolutions = np.minimum(np.arange(len(rows) + 1) * form.map.group, form.map.size) + 0.5
-    degrees = np.linspace(0, 360, rows.shape[1] + 1)
-    norm = SymLogNorm(linear, linscale=1.0, vmin=-largest, vmax=largest, base=10)
-    mesh = axes.pcolormesh(degrees, revolutions, rows, norm=norm, cmap="RdBu_r", rasterized=True)
-    axes.set(xlabel="spindle angle [°]", ylabel="revolution", xticks=range(0, 361, 45))
-    axes.invert_yaxis()
-    bar = figure.colorbar(mesh, ax=axes, pad=0.01)
-    ticks = np.array([linear, largest] if largest > 3 * linear else [largest])
-    bar.set_ticks([*-ticks[::-1], 0.0, *ticks], labels=[f"{tick:.3g}" for tick in (*-ticks[::-1], 0.0, *ticks)])
-    bar.ax.minorticks_off()
-    bar.set_label("radius deviation [µm]", fontsize=9)
-    return _svg(figure)
-
-
-def along(surface: Lay) -> str:
-    """The surface along the part over angle and height, and one trace of it."""
-    figure = _figure(3.2)
-    whole, trace = figure.subplots(1, 2, width_ratios=(3, 2))
-    closed = um(np.concatenate((surface.surface, surface.surface[:1])))
-    place = np.clip(surface.height, -LONGEST_LENGTH, LONGEST_LENGTH) * 1e3
-    degrees = np.linspace(0, 360, closed.shape[0])
-    mesh = whole.pcolormesh(degrees, place, closed.T, shading="gouraud", cmap="viridis", rasterized=True)
-    whole.set(xlabel="spindle angle [°]", ylabel="height [mm]", xticks=range(0, 361, 90))
-    figure.colorbar(mesh, ax=whole, pad=0.01).set_label("radius deviation [µm]", fontsize=9)
-    trace.plot(place, closed[0], color=LAST, lw=1.0)
-    trace.set(xlabel="height [mm]", ylabel="radius deviation at 0° [µm]")
-    _grid(trace)
-    return _svg(figure)
-
-
-def polar(form: Form) -> str:
-    """Radius deviation of the first and the last revolution, each in its own scale."""
-    assert form.first, "there is no revolution"
-    assert form.last, "there is no revolution"
-    figure = _figure(4.1)
-    for place, (revolution, colour) in enumerate(((form.first, FIRST), (form.last, LAST)), start=1):
-        axes = figure.add_subplot(1, 2, place, projection="polar")
-        assert isinstance(axes, PolarAxes)
-        deviation = um(np.append(revolution.profile, revolution.profile[0]))
-        angle = np.linspace(0, 2 * np.pi, deviation.size)
-        size = max(float(np.abs(deviation).max()), FLOOR)
-        axes.plot(angle, np.zeros_like(angle), color="#444444", lw=1.1, ls="--")
-        axes.plot(angle, deviation, color=colour, lw=1.3)
-        axes.set_rlim(-2.2 * size, 1.15 * size)
-        axes.set_rticks([-size, 0.0, size], [f"{-size:.3g}", "0", f"{size:.3g} µm"])
-        axes.set_rlabel_position(67)
-        number, rms = revolution.numbers["revolution"], revolution.numbers["rms"]
-        axes.set_title(f"revolution {number}: {rms:.3g} µm RMS", color=colour)
-    return _svg(figure)
-
-
-def shown_revolutions(form: Form) -> list[tuple[str, str, Revolution]]:
-    """Name, colour and revolution: first, best and last, each once."""
-    shown: dict[int, tuple[str, str, Revolution]] = {}
-    for name, colour, revolution in (
-        ("first", FIRST, form.first),
-        ("best", BEST, form.best),
-        ("last", LAST, form.last),
-    ):
-        if revolution:
-            number = revolution.numbers["revolution"]
-            names = f"{shown[number][0]}, {name}" if number in shown else name
-            shown[number] = names, colour, revolution
-    return list(shown.values())
-
-
-def spectrum(form: Form) -> str:
+def spectrum(form: Form) -> Spec:
     """Amplitude by undulations per revolution."""
-    figure = _figure(3.0)
-    axes = figure.subplots()
-    shown = shown_revolutions(form)
-    width = 0.8 / len(shown)
-    for k, (name, colour, revolution) in enumerate(shown):
-        amplitude = um(revolution.amplitude[1:])
-        order = np.arange(1, amplitude.size + 1)
-        label = f"{name} revolution ({revolution.numbers['revolution']})"
-        axes.bar(order + (k - (len(shown) - 1) / 2) * width, amplitude, width, color=colour, label=label)
-    axes.set(xlabel="undulations per revolution", ylabel="amplitude [µm]", xlim=(0.4, 50.6))
+    places = {"first": _FIRST, "best": _BEST, "last": _LAST}
+    shown = {f"{name} revolution ({each.numbers['revolution']})": each for name, each in shown_revolutions(form)}
     low, high = spectrum_range(form)
-    if high:
-        axes.set(yscale="log", ylim=(low, high))
-    _grid(axes)
-    axes.legend(loc="upper right")
-    return _svg(figure)
+    bars: Rows = []
+    width = 0.8 / len(shown)
+    for k, (label, revolution) in enumerate(shown.items()):
+        value = np.maximum(um(revolution.amplitude[1:]), low or _FLOOR)
+        order = np.arange(1, value.size + 1)
+        left = order - 0.4 + k * width
+        bars += rows(n=order, u=left, u2=left + width, v=value, l=label)
+    colours = {label: places[label.partition(" revolution")[0].split(", ")[-1]] for label in shown}
+    ends = (low, high) if high else ()
+    return _rectangles(
+        260,
+        quantity("u", "undulations per revolution", scale=axis_scale(ends=(0.4, 50.6)), axis={"grid": False}),
+        quantity("v", "amplitude [µm]", scale=axis_scale(log=bool(high), ends=ends)),
+        {"datum": number(low)},
+        _colours(colours, "square", legend=True),
+        tip(n="undulations per revolution", v="amplitude [µm]"),
+        data={"values": bars},
+    )
 
 
-def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> str:
+# --- curves
+
+
+_Drawn = Mapping[str, tuple[Envelope, int, bool]]  # by name: series, place of its colour, and whether it is dots
+_Scaled = Callable[[Samples], Samples]
+
+
+def _lines(
+    curves: _Drawn,
+    scaled: tuple[_Scaled, _Scaled],
+    titles: tuple[str, str],
+    *,
+    height: int,
+    log: bool,
+    limit: float = 0.0,
+) -> Spec:
+    """Lines by name, each with a band where it stands for several values; a limit as a dashed one.
+
+    Of what has no place on a logarithmic axis nothing is drawn.
+
+    Args:
+        curves: see there.
+        scaled: places and values, to the units of the axes.
+        titles: of the axes.
+        height: [px].
+        log: values are on a logarithmic axis.
+        limit: 0: none.
+    """
+    across, up = titles
+    data: Rows = []
+    for label, (series, _, dots) in curves.items():
+        place, low, high = (
+            scale(each) for scale, each in zip((scaled[0], scaled[1], scaled[1]), series.curve(), strict=True)
+        )
+        kept = (low > 0.0) | (not log)
+        data += rows(u=place[kept], a=low[kept], b=high[kept], l=label, dot=dots)
+    tooltip = tip(u=across, a="lowest", b="highest")
+    line = {"type": "line", "clip": True, "strokeWidth": 1.4, "point": {"size": 12} if len(data) <= 400 else False}
+    layer: Rows = [
+        {
+            "params": [_BOX],
+            "transform": [{"filter": "!datum.dot"}],
+            "mark": {"type": "area", "opacity": 0.35, "clip": True},
+            "encoding": {"y": quantity("a", up), "y2": {"field": "b"}},
+        },
+    ]
+    point = {"type": "point", "filled": True, "size": 16, "clip": True}
+    for drawn, mark in (("!datum.dot", line), *([("datum.dot", point)] if any(row["dot"] for row in data) else [])):
+        encoding = {"y": {"field": "m"}, "tooltip": tooltip}
+        layer.append({"transform": [{"filter": drawn}], "mark": mark, "encoding": encoding})
+    if limit > 0.0:
+        data_ = {"values": [{"v": number(limit), "t": f"tolerance {limit:.3g} µm"}]}
+        where = {"y": {"field": "v"}, "color": {"value": "#888"}}
+        rule = {"type": "rule", "strokeDash": [6, 4], "clip": True}
+        text = {"type": "text", "align": "right", "dy": -6, "clip": True, "fontSize": 11}
+        end = {"value": "width"}
+        layer += [
+            {"data": data_, "mark": rule, "encoding": {"x": {"value": 0}, "x2": end, **where}},
+            {"data": data_, "mark": text, "encoding": {"x": end, "text": {"field": "t"}, **where}},
+        ]
+    axis = {"format": ".4~g", "tickCount": 5}
+    places = {label: colour for label, (_, colour, _) in curves.items()}
+    return _figure(
+        height,
+        data={"values": data},
+        transform=[{"calculate": "sqrt(datum.a * datum.b)" if log else "(datum.a + datum.b) / 2", "as": "m"}],
+        encoding={
+            "x": quantity("u", across, scale=axis_scale(), axis={"grid": False, "format": "~r", "tickCount": 12}),
+            "y": {"type": "quantitative", "title": up, "scale": axis_scale(log=log), "axis": axis},
+            "color": _colours(places, legend=len(places) > 1),
+        },
+        layer=layer,
+    )
+
+
+def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> Spec:
     """Form error by revolution, and by name what the controllers say of each cycle [m]."""
-    figure = _figure(3.2)
-    axes = figure.subplots()
-    if form and form.rms.size:
-        for series, colour, label in (
-            (form.largest, _GREY, "form error, largest"),
-            (form.rms, LAST, "form error, RMS"),
-        ):
-            place, low, high = series.curve()
-            _band(axes, place + 1, um(low), um(high), colour, label)
-    for (name, series), colour in zip(cycles.items(), _CYCLE_COLOURS, strict=False):
-        place, low, high = series.curve()
-        axes.plot(place + 1, (um(low) + um(high)) / 2, ".", color=colour, ms=4, label=plain(name))
-    if form and form.tolerance:
-        limit = form.tolerance * 1e6
-        axes.axhline(limit, color=_GREY, lw=1.0, ls="--", label=f"tolerance {limit:.3g} µm")
-    axes.set(xlabel="revolution or cycle", ylabel="error [µm]", yscale="log")
-    _grid(axes)
-    axes.legend(loc="upper right")
-    return _svg(figure)
+    own = {"form error, RMS": (form.rms, _LAST), "form error, largest": (form.largest, _GREY)} if form else {}
+    drawn = {label: (series, colour, False) for label, (series, colour) in own.items() if series.size}
+    for colour, (name, series) in enumerate(list(cycles.items())[:_OTHERS], start=1):
+        drawn[_plain(name)] = series, colour, True
+    limit = form.tolerance * 1e6 if form else 0.0
+    titles = "revolution or cycle", "error [µm]"
+    return _lines(drawn, (lambda place: place + 1, um), titles, height=280, log=True, limit=limit)
 
 
-def against_time(told: Gathered, curves: Mapping[str, Envelope], unit: str, scale: float) -> str:
+def against_time(told: Gathered, signals: Mapping[str, Envelope], unit: str, scale: float) -> Spec:
     """Signals by simulated time, their extremes as a band.
 
     Args:
         told: for the time.
-        curves: by name.
+        signals: by name.
         unit: of the axis, with its quantity.
         scale: from the signals' unit to that one.
     """
-    figure = _figure(2.5)
-    axes = figure.subplots()
-    for (name, series), colour in zip(curves.items(), _COLOURS, strict=False):
-        place, low, high = series.curve()
-        low, high = limited(np.array([low, high])) * scale
-        _band(axes, told.at(place), low, high, colour, plain(name))
-    axes.set(xlabel="time since sample 0 [s]", ylabel=unit)
-    axes.set_xmargin(0.01)
-    _grid(axes)
-    if len(curves) > 1:
-        axes.legend(loc="upper right")
-    return _svg(figure)
+    drawn = {_plain(name): (series, colour, False) for colour, (name, series) in enumerate(signals.items())}
+    scaled = told.at, lambda values: _limited(values) * scale
+    return _lines(drawn, scaled, ("time since sample 0 [s]", unit), height=220, log=False)
 
 
-def _told_apart(numbers: Samples) -> tuple[float, float] | None:
-    """Range of a histogram; numbers that are all but the same get one that can be cut into bins."""
-    if not numbers.size:
-        return None
-    low, high = float(numbers.min()), float(numbers.max())
+# --- histograms
+
+
+def _histogram(name: str, counts: Samples, edges: Samples, axes: tuple[str, str], colour: int, *, log: bool) -> Spec:
+    """Counts of bins: shape (bins,), their edges (bins + 1,), and what the axes say."""
+    across, up = axes
+    scale = axis_scale(log=log, ends=(edges[0], edges[-1]))
+    return _rectangles(
+        220,
+        quantity("u", across, scale=scale, axis={"grid": False, "format": "~r"}),
+        quantity("v", up, scale={"zero": True}),
+        {"value": "height"},
+        _colours({name: colour}, legend=False),
+        tip(u="from", u2="to", v=up),
+        title=name,
+        data={"values": rows(u=edges[:-1], u2=edges[1:], v=counts.astype(int), l=name)},
+    )
+
+
+def timing(host: Host, step: float) -> list[Spec]:
+    """Histograms of pace, and of lateness and latency of blocks where there are any; ``step`` in s."""
+    pace = _limited(np.array(host.pace)) * step
+    low, high = (float(pace.min()), float(pace.max())) if pace.size else (0.0, 1.0)
     least = _ALMOST * max(abs(low), abs(high))
-    return (low, high) if high - low > least else (low - 0.5 - least, high + 0.5 + least)
-
-
-@dataclass(frozen=True)
-class Histogram:
-    """Counts of bins.
-
-    Attributes:
-        counts: shape (bins,).
-        edges: shape (bins + 1,).
-        across, up: what the axes say.
-        log: the bins are as wide as they are far from 0.
-    """
-
-    counts: Samples
-    edges: Samples
-    across: str
-    up: str
-    log: bool = False
-
-
-def histograms(host: Host, step: float) -> dict[str, Histogram]:
-    """Of pace, and of lateness and latency of blocks where there are any; ``step`` in s."""
-    numbers = limited(host.pace.values()) * step
-    bins = min(30, max(5, numbers.size // 3))
-    counts, edges = np.histogram(numbers, bins=bins, range=_told_apart(numbers))
-    found = {"pace": Histogram(counts, edges, "simulated by wall time [s/s]", "reports")}
-    for name, across, durations in (
-        ("lateness", "let go after it was due [ms]", host.lateness),
-        ("latency", "until completed by all [ms]", host.latency),
+    if high - low <= least:  # paces that are all but the same need a range that can be cut into bins
+        low, high = low - 0.5 - least, high + 0.5 + least
+    counts, edges = np.histogram(pace, bins=min(30, max(5, pace.size // 3)), range=(low, high))
+    found = [_histogram("pace", counts, edges, ("simulated by wall time [s/s]", "reports"), _GREY, log=False)]
+    for name, across, durations, colour in (
+        ("lateness", "let go after it was due [ms]", host.lateness, _BEST),
+        ("latency", "until completed by all [ms]", host.latency, _LAST),
     ):
-        if any(any(each.counts) for each in durations.values()):
-            counts = np.sum([each.counts for each in durations.values()], axis=0)
+        counts = np.sum([each.counts for each in durations.values()], axis=0)
+        if counts.any():
             used = np.flatnonzero(counts)
             edges = 2.0 ** np.arange(used[0] - 1, used[-1] + 1) * 1e-3
-            found[name] = Histogram(counts[used[0] : used[-1] + 1], edges, across, "blocks", log=True)
+            found.append(_histogram(name, counts[used[0] : used[-1] + 1], edges, (across, "blocks"), colour, log=True))
     return found
-
-
-def timing(host: Host, step: float) -> str:
-    """The figure of `histograms`."""
-    figure = _figure(2.8)
-    found = histograms(host, step)
-    colours = {"pace": _GREY, "lateness": BEST, "latency": LAST}
-    for axes, (name, each) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items(), strict=True):
-        axes.stairs(each.counts, each.edges, fill=True, color=colours[name], edgecolor="white", lw=0.5)
-        axes.set(xscale="log" if each.log else "linear", xlabel=each.across, ylabel=each.up, title=name)
-        if not each.log:
-            axes.yaxis.get_major_locator().set_params(integer=True)
-        _grid(axes)
-    return _svg(figure)

@@ -65,10 +65,12 @@ class Form:
         self._encoder, self.tool, self.tolerance = encoder, tool, tolerance
         self._nose_radius = nose_radius
         self._largest, self._before = array("d"), 0  # form error [m] of every revolution, and those before the first
-        self._angle, self._error, self._height = np.empty(0), np.empty(0), np.empty(0)
+        self._held = np.empty(
+            (3, 0)
+        )  # angle, form error and height, of 0 if nobody asks; from a margin before the next
         self._along = deque[tuple[Samples, Samples]](maxlen=_ALONG)  # profiles and heights
         self.surface: Lay | str | None = None
-        self._done = 0  # revolutions measured; the arrays go back to a margin before the next
+        self._done = 0  # revolutions measured
         self.first: Revolution | None = None
         self.last: Revolution | None = None
         self.best: Revolution | None = None
@@ -79,17 +81,15 @@ class Form:
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
-        if not self.refused:
-            if first and not self._angle.size and not self._done:
-                # A snapshot begins in the midst of a revolution.
-                self._done = self._before = int(np.ceil(dense[self._encoder]["angle_true"][0] / _TURN))
-            angle, tool = dense[self._encoder]["angle_true"], dense[self.tool]
-            kept = that_count(angle, tool["error"])
-            self._angle = np.concatenate([self._angle, angle[kept]])
-            self._error = np.concatenate([self._error, tool["error"][kept]])
-            if self._nose_radius:
-                self._height = np.concatenate([self._height, tool["height"][kept]])
-            self._measure(_MARGIN)
+        if self.refused:
+            return
+        angle, tool = dense[self._encoder]["angle_true"], dense[self.tool]
+        if first and not self._held.size and not self._done:  # a snapshot begins in the midst of a revolution
+            self._done = self._before = int(np.ceil(angle[0] / _TURN))
+        height = tool["height"] if self._nose_radius else np.zeros(samples)
+        new = np.stack([angle, tool["error"], height])[:, that_count(angle, tool["error"])]
+        self._held = np.concatenate([self._held, new], axis=1)
+        self._measure(_MARGIN)
 
     @property
     def verdict(self) -> Verdict | None:
@@ -117,13 +117,10 @@ class Form:
 
     def _measure(self, margin: int) -> None:
         """Measure the complete revolutions that end ``margin`` samples or more before the newest, or one not finite."""
-        finite = np.isfinite(self._angle) & np.isfinite(self._error)
-        if self._height.size:
-            finite &= np.isfinite(self._height)
-        broken = np.flatnonzero(~finite)
-        if broken.size:
-            margin, end = 0, int(broken[0])
-            self._angle, self._error, self._height = self._angle[:end], self._error[:end], self._height[:end]
+        finite = np.isfinite(self._held).all(axis=0)
+        broken = not finite.all()
+        if broken:
+            margin, self._held = 0, self._held[:, : np.argmin(finite)]
         try:
             self._check()
             with np.errstate(over="ignore", invalid="ignore"):  # of absurd samples; they show in the numbers
@@ -131,12 +128,12 @@ class Form:
                     pass
         except InputError as error:
             self._refuse(str(error))
-        if broken.size and not self.refused:
+        if broken and not self.refused:
             self._refuse("samples that are not finite")
 
     def _refuse(self, reason: str) -> None:
         self.refused = f"{reason} (after revolution {self._done})"
-        self._angle = self._error = self._height = np.empty(0)
+        self._held = np.empty((3, 0))
 
     def _check(self) -> None:
         """Refuse what would take memory or give no form.
@@ -144,38 +141,38 @@ class Form:
         Raises:
             InputError: says why.
         """
-        step = np.diff(self._angle)
+        angle = self._held[0]
+        step = np.diff(angle)
         if step.size and not (step.min() >= 0.0 and step.max() < _TURN / 3):
             raise InputError("the angle falls, or rises by more than a third of a turn in a sample")
-        if self._done == 0 and self._angle.size and not 0.0 <= self._angle[0] < _TURN:
-            raise InputError(f"the angle begins at {self._angle[0]:g} rad; allowed: in the first turn")
-        if self._angle.size > _LONGEST:
+        if self._done == 0 and angle.size and not 0.0 <= angle[0] < _TURN:
+            raise InputError(f"the angle begins at {angle[0]:g} rad; allowed: in the first turn")
+        if angle.size > _LONGEST:
             raise InputError(f"a revolution longer than {_LONGEST} samples")
 
     def _next(self, margin: int) -> bool:
         """Measure some revolutions; whether there were any."""
-        angle = self._angle - self._done * _TURN
+        _, error, height = self._held
+        angle = self._held[0] - self._done * _TURN
         edges = np.searchsorted(angle, _TURN * np.arange(_AT_ONCE + 1))
         whole = int(np.count_nonzero(edges[1:] + margin < angle.size)) if margin else _AT_ONCE
         if not whole:
             return False
         stop = int(edges[whole]) + _MARGIN
-        found = measure(angle[:stop], self._error[:stop], roundness_cutoff=CUTOFF, roughness_cutoff=CUTOFF)
+        found = measure(angle[:stop], error[:stop], roundness_cutoff=CUTOFF, roughness_cutoff=CUTOFF)
         whole = min(whole, found.form.rms.size)
         if not whole:
             return False
         self._take(found, whole)
         if self._nose_radius:
-            heights = evenly(angle[:stop], self._height[:stop])
+            heights = evenly(angle[:stop], height[:stop])
             self._along.extend(zip(found.profile[:whole], heights[:whole], strict=True))
         self._done += whole
-        keep = max(0, int(np.searchsorted(angle, whole * _TURN)) - _MARGIN)
-        self._angle, self._error, self._height = self._angle[keep:], self._error[keep:], self._height[keep:]
+        self._held = self._held[:, max(0, int(np.searchsorted(angle, whole * _TURN)) - _MARGIN) :]
         return True
 
     def _take(self, found: Measurement, whole: int) -> None:
-        for row in found.profile[:whole].reshape(whole, ACROSS, POINTS // ACROSS).mean(axis=-1):
-            self.map.add(row)
+        self.map.add(found.profile[:whole].reshape(whole, ACROSS, POINTS // ACROSS).mean(axis=-1))
         self.newest.extend(found.profile[max(0, whole - LAST) : whole].copy())
         rms = found.form.rms[:whole]
         self.rms.add(rms)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a report, gathered in one pass over the bag, in memory that grows by 8 bytes a revolution."""
+"""The figures of a report, gathered in one pass over the bag.
+
+Memory grows by 8 bytes a revolution and a report of the time master.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,7 +12,6 @@ import numpy as np
 
 from lathe_rc import event_log, messages
 from lathe_rc.bag import provenance
-from lathe_rc.bag.provenance import nose_radius
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import Feeder
 from lathe_rc.bag.snapshot import first_sample, span_of
@@ -27,11 +29,9 @@ from lathe_rc.view.report_series import Envelope
 _MOST_OF_A_TYPE = 4  # topics that have figures
 _MOST_EVENTS = 100
 _PIECE = 65536  # samples
-_CURVES = {
-    messages.ENCODER: ("speed_true",),
-    messages.CUT: ("force", "wear"),
-}  # fields that are drawn against time
-_CYCLES = {messages.LEARNING: "rms_error", messages.PERIODIC: "max_error"}  # fields that are drawn against cycles
+#: Fields that are drawn against time, and those against cycles, by message type.
+_CURVES = ((messages.ENCODER, "speed_true"), (messages.CUT, "force"), (messages.CUT, "wear"))
+_CYCLES = ((messages.LEARNING, "rms_error"), (messages.PERIODIC, "max_error"))
 
 
 @dataclass
@@ -90,13 +90,8 @@ class Curves:
 
     def __init__(self, types: Mapping[str, str]) -> None:
         self._types = types
-        self.signals = {
-            (topic, name): Envelope()
-            for kind, names in _CURVES.items()
-            for topic in of_type(types, kind)
-            for name in names
-        }
-        self.cycles = {(topic, name): Envelope() for kind, name in _CYCLES.items() for topic in of_type(types, kind)}
+        self.signals = {(topic, name): Envelope() for kind, name in _CURVES for topic in of_type(types, kind)}
+        self.cycles = {(topic, name): Envelope() for kind, name in _CYCLES for topic in of_type(types, kind)}
         self.events: list[LogEntry] = []
         self.event_count = 0
         self.kinds: dict[tuple[str, str], Alike] = {}
@@ -108,24 +103,18 @@ class Curves:
         for (topic, name), envelope in self.cycles.items():
             envelope.add(np.array([message.values[name] for message in sparse.get(topic, [])], dtype=float))
         for topic, found in sparse.items():
-            if self._types[topic] in LOGGED:
-                self.event_count += len(found)
-                room = max(0, _MOST_EVENTS - len(self.events))
-                said = [LogEntry(event.index, topic, event_log.text(event)) for event in found]
-                self.events += said[:room]
-                for event, entry in zip(found, said, strict=True):
-                    self._count(entry, alarm=bool(event.values.get("state")))
-
-    def _count(self, entry: LogEntry, *, alarm: bool) -> None:
-        """Count an event of its kind."""
-        topic, text = entry.topic, entry.text
-        # Of an alarm: monitor and subject, which come before what was found.
-        key = topic, " ".join(text.split()[:2]) if alarm else text.partition(":")[0]
-        if key not in self.kinds and len(self.kinds) < _MOST_EVENTS:
-            self.kinds[key] = Alike(topic, text, alarm, entry.sample)
-        if key in self.kinds:
-            self.kinds[key].last = entry.sample
-            self.kinds[key].count += 1
+            for event in found if self._types[topic] in LOGGED else ():
+                self.event_count += 1
+                text, alarm = event_log.text(event), bool(event.values.get("state"))
+                if len(self.events) < _MOST_EVENTS:
+                    self.events.append(LogEntry(event.index, topic, text))
+                # Of an alarm: monitor and subject, which come before what was found.
+                key = topic, " ".join(text.split()[:2]) if alarm else text.partition(":")[0]
+                if key not in self.kinds and len(self.kinds) < _MOST_EVENTS:
+                    self.kinds[key] = Alike(topic, text, alarm, event.index)
+                if alike := self.kinds.get(key):
+                    alike.last = event.index
+                    alike.count += 1
 
 
 def of_type(types: Mapping[str, str], kind: str) -> list[str]:
@@ -192,19 +181,6 @@ class Gathered:
         return place * (self.step_ns * 1e-9)
 
 
-def _values_of(about: Mapping[str, str]) -> tuple[Mapping[str, Mapping[str, Value]], str]:
-    """Values by node of the scenario, and why they cannot be had."""
-    try:
-        return provenance.values_of(about), ""
-    except InputError as error:
-        return {}, str(error)
-
-
-def _of(tool: str, allowed: Mapping[str, float]) -> float:
-    """The tolerance of a tool by its fully qualified topic [m]; 0: none."""
-    return next((value for topic, value in allowed.items() if tool.endswith(f"/{topic}")), 0.0)
-
-
 def gather(path: Path) -> Gathered:
     """Read a bag once.
 
@@ -213,17 +189,23 @@ def gather(path: Path) -> Gathered:
     """
     with Source(path) as source:
         types = {topic: found.type for topic, found in source.topics.items()}
-        encoders = of_type(types, messages.ENCODER)
-        nodes, unjudged = _values_of(source.about)
-        allowed = provenance.tolerances(nodes)
-        nose = nose_radius(source.about)
-        tools = of_type(types, messages.TOOL) if encoders else []
-        forms = [Form(encoders[0], tool, _of(tool, allowed), nose) for tool in tools]
-        curves = Curves(types)
-        told = Gathered(source.about, {topic: Tally(kind) for topic, kind in sorted(types.items())}, forms, curves)
-        told.nodes, told.unjudged = nodes, unjudged
+        nodes, unjudged = {}, ""
+        try:
+            nodes = provenance.values_of(source.about)
+        except InputError as error:
+            unjudged = str(error)
+        allowed, nose = provenance.tolerances(nodes), provenance.nose_radius(source.about)
+        forms = [
+            Form(
+                encoder, tool, next((limit for name, limit in allowed.items() if tool.endswith(f"/{name}")), 0.0), nose
+            )
+            for encoder in of_type(types, messages.ENCODER)[:1]
+            for tool in of_type(types, messages.TOOL)
+        ]
+        tallies = {topic: Tally(kind) for topic, kind in sorted(types.items())}
+        told = Gathered(source.about, tallies, forms, Curves(types), nodes=nodes, unjudged=unjudged)
         first = first_sample(source.about)
-        feeder = Feeder(types, [*forms, curves], _PIECE, first)
+        feeder = Feeder(types, [*forms, told.curves], _PIECE, first)
         try:
             _read(source, feeder, told)
         except LatheError as error:
@@ -235,7 +217,7 @@ def gather(path: Path) -> Gathered:
 
 
 def _read(source: Source, feeder: Feeder, told: Gathered) -> None:
-    """Hand every message to those whom it concerns."""
+    """Count every message, and hand it to the feeder or to the host's figures."""
     newest: dict[str, bytes] = {}
     for topic, log_ns, data in source.messages():
         tally = told.topics[topic]

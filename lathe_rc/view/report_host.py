@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recorded host topics: the state of the nodes, and how late the cell was."""
 
+import math
+from array import array
 from dataclasses import dataclass, field
 from typing import Any
 
 from lathe_rc import messages
 from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
-from lathe_rc.view.report_series import Thinned
 
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 TYPES = frozenset({DIAGNOSTICS, messages.CELL_STATE})
@@ -36,15 +37,6 @@ class Node:
     values: dict[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class _Mark:
-    """Where the time master was at a wall time [s]."""
-
-    wall: float
-    blocks: float
-    samples: float
-
-
 class Host:
     """Takes the messages of host topics.
 
@@ -63,10 +55,10 @@ class Host:
         self.states: list[str] = []
         self.errors: list[str] = []
         self.unreadable = self.left_out = 0
-        self.pace = Thinned()
+        self.pace = array("d")
         self.lateness: dict[str, Durations] = {}
         self.latency: dict[str, Durations] = {}
-        self._marks: dict[str, _Mark] = {}
+        self._marks: dict[str, tuple[float, float, float]] = {}  # wall time [s], blocks and samples of the last report
 
     def add(self, msgtype: str, data: bytes) -> None:
         """Take a message of one of `TYPES`."""
@@ -93,10 +85,9 @@ class Host:
         named = _STATES[message.state] if message.state < len(_STATES) else f"state {message.state}"
         text = f"{named} from sample {message.first_index}" + (f": {message.message}" if message.message else "")
         self._line(self.states, text)
-        if message.state == _SAFE:
-            self._line(self.errors, f"safe state from sample {message.first_index} on: {message.message}")
-        if message.state == _FAILED:
-            self._line(self.errors, f"the cell failed at sample {message.first_index}: {message.message}")
+        failures = {_SAFE: "safe state from sample {} on: {}", _FAILED: "the cell failed at sample {}: {}"}
+        if failure := failures.get(message.state):
+            self._line(self.errors, failure.format(message.first_index, message.message))
 
     def _status(self, wall: float, status: Any) -> None:
         if status.name not in self.nodes and len(self.nodes) >= _MOST_NODES:
@@ -117,16 +108,17 @@ class Host:
         if "schedule slipped [s]" not in values:
             return  # of another node
         try:
-            mark = _Mark(wall, *(float(values[key]) for key in ("blocks", "samples")))
+            blocks, samples = (float(values[key]) for key in ("blocks", "samples"))
             durations = [Durations.parse(values.get(key, "")) for key in (LATENESS, LATENCY)]
         except (KeyError, ValueError):
             return
         self.lateness[name], self.latency[name] = durations
-        before = self._marks.get(name)
-        self._marks[name] = mark
-        if before is None or not before.blocks or mark.wall <= before.wall or mark.blocks <= before.blocks:
-            return  # it was not running all that time
-        self.pace.add((mark.samples - before.samples) / (mark.wall - before.wall))
+        began, done, turned = self._marks.get(name, (wall, 0.0, 0.0))
+        self._marks[name] = wall, blocks, samples
+        if done and wall > began and blocks > done:  # it was running all that time
+            pace = (samples - turned) / (wall - began)
+            if math.isfinite(pace):
+                self.pace.append(pace)
 
     @property
     def lost_blocks(self) -> dict[str, int]:

@@ -63,7 +63,15 @@ def judged(told: Gathered, losses: Sequence[str], made_of: Budget | None) -> Tol
     happened = list(_happened(told))
     growth = form.growth if form else None
     wrong = [Finding(text, BAD) for text in [*happened, *losses]]
-    limits = [*(_causes(made_of) if made_of else ()), *_limited(told)]
+    limits = []
+    if made_of:
+        largest = max((*made_of.causes, made_of.rest), key=lambda part: part.share)
+        text = f"The largest cause, by the budget below: {largest.name}, {largest.percent()} % of the power."
+        limits.append(Finding(text))
+    for alike in told.curves.kinds.values():
+        if alike.text.startswith(LIMITED):
+            node = alike.topic.strip("/").removesuffix("/events")
+            limits.append(Finding(f"{node} came to the limits of its command, {_at(told, alike)}.", WARN))
     if form and not happened and not growth:  # else the form error is what those have made of it
         limits += _form(told, form)
     verdict = _verdict(told, form)
@@ -108,19 +116,6 @@ def _happened(told: Gathered) -> Iterator[str]:
         yield f"{len(kinds) - _MOST} further kinds of faults and alarms, see the events"
 
 
-def _causes(made_of: Budget) -> Iterator[Finding]:
-    largest = max((*made_of.causes, made_of.rest), key=lambda part: part.share)
-    yield Finding(f"The largest cause, by the budget below: {largest.name}, {largest.percent()} % of the power.")
-
-
-def _limited(told: Gathered) -> Iterator[Finding]:
-    """Nodes that came to a limit."""
-    for alike in told.curves.kinds.values():
-        if alike.text.startswith(LIMITED):
-            node = alike.topic.strip("/").removesuffix("/events")
-            yield Finding(f"{node} came to the limits of its command, {_at(told, alike)}.", WARN)
-
-
 def _form(told: Gathered, form: Form) -> Iterator[Finding]:
     """How the form error ends, and of what kind it is."""
     profiles = um(np.array(form.newest))
@@ -133,11 +128,14 @@ def _form(told: Gathered, form: Form) -> Iterator[Finding]:
     yield from _trend(rms, form)
     count = len(profiles)
     mean = profiles.mean(axis=0)
-    changing = float(np.mean((profiles - mean) ** 2)) * count / (count - 1)
-    share = min(changing / power, 1.0)
+    share = min(float(np.mean((profiles - mean) ** 2)) * count / (count - 1) / power, 1.0)
+    amplitude = np.abs(np.fft.rfft(mean)) * 2.0 / mean.size
+    order = int(np.argmax(amplitude[1:])) + 1
+    left = ": what learning and its Q filter leave" if told.has(messages.LEARNING) else ""
+    causes = [*changing(told.nodes), *(["cut"] if told.has(messages.CUT) else []), *_speed(told)]
     parts = [
-        (1.0 - share, f"repeats from revolution to revolution{_waves(mean)}{_left(told)}"),
-        (share, f"changes from revolution to revolution{_changing(told)}"),
+        (1.0 - share, f"repeats from revolution to revolution, most at {order} UPR ({amplitude[order]:.3g} µm){left}"),
+        (share, f"changes from revolution to revolution{': ' if causes else ''}{', '.join(causes)}"),
     ]
     for part, text in sorted(parts, reverse=True):
         if part >= _SOME:
@@ -160,34 +158,12 @@ def _trend(rms: messages.Samples, form: Form) -> Iterator[Finding]:
         yield Finding(f"The form error grows by {each - 1.0:.1%} a revolution in the last {len(rms)}.", WARN)
 
 
-def _waves(mean: messages.Samples) -> str:
-    """The largest undulation of what repeats."""
-    amplitude = np.abs(np.fft.rfft(mean)) * 2.0 / mean.size
-    order = int(np.argmax(amplitude[1:])) + 1
-    return f", most at {order} UPR ({amplitude[order]:.3g} µm)"
-
-
-def _left(told: Gathered) -> str:
-    """The origin of a form error that repeats, if the cell learns."""
-    return ": what learning and its Q filter leave" if told.has(messages.LEARNING) else ""
-
-
-def _changing(told: Gathered) -> str:
-    """The causes of a form error that changes, of those that this run contains."""
-    names = [*changing(told.nodes), *(["cut"] if told.has(messages.CUT) else []), *filter(None, [_speed(told)])]
-    return f": {', '.join(names)}" if names else ""
-
-
-def _speed(told: Gathered) -> str:
-    """By how much the spindle speed varies; empty if it does not."""
+def _speed(told: Gathered) -> Iterator[str]:
+    """By how much the spindle speed varies, if it does."""
     for (_, name), series in told.curves.signals.items():
         low, high = series.extremes
         if name == "speed_true" and low > 0.0 and math.isfinite(high):
             deviation = (high - low) / (high + low)
-            return f"speed (which varies by ±{deviation:.1%})" if deviation >= _VARIES else ""
-    return ""
-
-
-def hint(told: Gathered, made_of: Budget | None) -> bool:
-    """Whether a budget could tell more."""
-    return made_of is None and any(form.newest for form in told.forms[:1])
+            if deviation >= _VARIES:
+                yield f"speed (which varies by ±{deviation:.1%})"
+            return

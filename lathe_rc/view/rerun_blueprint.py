@@ -8,31 +8,26 @@ import rerun.blueprint as rrb
 from lathe_rc import messages
 from lathe_rc.event_log import LOGGED
 from lathe_rc.view import rerun_part as parts
-from lathe_rc.view.rerun_signals import CYCLES, DRIVE, ERROR, PLOTS, POSITION, curve_path, curves
-from lathe_rc.view.rerun_states import ROOT
+from lathe_rc.view.rerun_signals import CYCLES, DRIVE, ERROR, PLOTS, POSITION, STATES, curve_path, curves
 
 _LATEST_S, _LATEST_REVOLUTIONS = 0.3, 5  # before the time cursor, in plots of fast signals
 _FAST = {ERROR, POSITION, DRIVE}
 _COLOURS = ("blue", "orange", "green")  # as words, of the first curves of a plot
 
 
-def _so_far() -> list[rrb.VisibleTimeRange]:
-    """Everything up to the time cursor: rings that have been turned stay."""
+def _until_cursor(time: rrb.TimeRangeBoundary, revolution: rrb.TimeRangeBoundary) -> list[rrb.VisibleTimeRange]:
+    """What is seen at the time cursor, from these on."""
     end = rrb.TimeRangeBoundary.cursor_relative(seq=0)
-    return [
-        rrb.VisibleTimeRange(timeline, start=rrb.TimeRangeBoundary.infinite(), end=end)
-        for timeline in ("time", "revolution")
-    ]
-
-
-def _latest() -> list[rrb.VisibleTimeRange]:
-    """The range shortly before the time cursor: the plot takes its scale from that."""
-    starts = {
-        "time": rrb.TimeRangeBoundary.cursor_relative(seconds=-_LATEST_S),
-        "revolution": rrb.TimeRangeBoundary.cursor_relative(seq=-_LATEST_REVOLUTIONS),
-    }
-    end = rrb.TimeRangeBoundary.cursor_relative(seq=0)
+    starts = {"time": time, "revolution": revolution}
     return [rrb.VisibleTimeRange(timeline, start=start, end=end) for timeline, start in starts.items()]
+
+
+_EVER = rrb.TimeRangeBoundary.infinite()
+_SO_FAR = _until_cursor(_EVER, _EVER)  # rings that have been turned stay
+_LATEST = _until_cursor(  # a plot takes its scale from that
+    rrb.TimeRangeBoundary.cursor_relative(seconds=-_LATEST_S),
+    rrb.TimeRangeBoundary.cursor_relative(seq=-_LATEST_REVOLUTIONS),
+)
 
 
 def _plots(types: Mapping[str, str]) -> dict[str, rrb.TimeSeriesView]:
@@ -59,7 +54,7 @@ def _plots(types: Mapping[str, str]) -> dict[str, rrb.TimeSeriesView]:
             contents=paths[plot],
             name=named(plot, unit),
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=len(paths[plot]) > len(_COLOURS)),
-            time_ranges=_latest() if plot in _FAST else None,
+            time_ranges=_LATEST if plot in _FAST else None,
         )
         for plot, unit in PLOTS.items()
         if plot in paths
@@ -79,7 +74,7 @@ def _part() -> rrb.Vertical:
             ),
             line_grid=False,
             background=rrb.Background(color=(24, 27, 33)),
-            time_ranges=_so_far(),
+            time_ranges=_SO_FAR,
         ),
         rrb.TensorView(
             origin="/form_error/map",
@@ -129,7 +124,7 @@ def blueprint(types: Mapping[str, str], *, live: bool = False, silent: Collectio
     if tabs:
         rows.append(rrb.Tabs(*tabs, active_tab=0))
     if messages.SAFETY_STATUS in kinds or said & {*LOGGED}:
-        rows.append(rrb.StateTimelineView(origin=f"/{ROOT}", name="states of the supervisor, faults, limits met"))
+        rows.append(rrb.StateTimelineView(origin=f"/{STATES}", name="states of the supervisor, faults, limits met"))
     above = [rrb.Horizontal(*top, column_shares=[3, 2][: len(top)])] if top else []
     right = rrb.Vertical(*rows)
     below = rrb.Horizontal(left, right, column_shares=[4, 5]) if left else right

@@ -1,24 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs as they are heard, shown while they go on; knows nothing of ROS.
+"""Running cells, shown from their messages; knows nothing of ROS.
 
 The view delays no member. Messages that come faster than it can show are left out, counted and reported; a run that
 begins anew, under whatever name, is a recording of its own.
 """
 
 import math
-from collections.abc import Callable, Mapping
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from lathe_rc import messages
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder
-from lathe_rc.errors import LatheError, shown
+from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
-from lathe_rc.view.rerun_blueprint import blueprint
-from lathe_rc.view.rerun_heard import Order
 from lathe_rc.view.rerun_pieces import Pieces
 from lathe_rc.view.rerun_scene import Scene
 from lathe_rc.view.rerun_signals import wanted
@@ -26,11 +26,88 @@ from lathe_rc.view.rerun_signals import wanted
 if TYPE_CHECKING:
     import rerun as rr
 
+Message = tuple[str, str, bytes]  # fully qualified topic, message type, encoded message
+Open = Callable[[str], tuple["rr.RecordingStream", Path | None]]  # a recording by name, and the file that it goes to
+
 PIECE = 0.1  #: length of a piece, about [s] of simulated time
-_FLUSH = 30.0  # [s] for a viewer to take the rest of a recording
 
 
-@dataclass(frozen=True)
+class Backlog:
+    """Messages that have not been shown yet. When it is full, all of them are left out: later pieces are whole again.
+
+    To leave out every second message instead would leave no piece without a gap.
+
+    Args:
+        limit: its size [B].
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._size = 0
+        self._messages: deque[Message | None] = deque()
+        self._news = threading.Condition()
+        self._closed = False
+
+    def put(self, *added: Message | None) -> None:
+        """Add messages; None: nobody sends any more."""
+        with self._news:
+            for message in added:
+                size = len(message[2]) if message else 0
+                if self._size + size > self._limit:
+                    self._messages.clear()
+                    self._size = 0
+                self._size += size
+                self._messages.append(message)
+            self._news.notify()
+
+    def close(self) -> None:
+        """Let the reader end when it has taken all messages."""
+        with self._news:
+            self._closed = True
+            self._news.notify()
+
+    def __iter__(self) -> Iterator[Message | None]:
+        """Take messages as they come, until it is closed and empty."""
+        while True:
+            with self._news:
+                self._news.wait_for(lambda: self._messages or self._closed)
+                if not self._messages:
+                    return
+                message = self._messages.popleft()
+                self._size -= len(message[2]) if message else 0
+            yield message
+
+
+class Order:
+    """Tells runs apart in what comes from many topics, each in its own order, none in step with the others.
+
+    A run has a name, but equal scenarios have equal names: it also begins anew when a topic goes back. What a topic
+    still brings of the run before goes on from where that topic was.
+    """
+
+    def __init__(self) -> None:
+        self._run: str | None = None
+        self._before: str | None = None
+        self._ends: dict[str, int] = {}  # sample after the newest of each topic, in this run
+        self._old: dict[str, int] = {}  # and in the one before
+
+    def place(self, topic: str, run: str, first: int, end: int) -> Literal["same", "new", "old"]:
+        """Where samples of a topic belong: to the run that goes on, to a new one, or to the one before."""
+        newest = max(self._ends.values(), default=0)
+        if run == self._run and first >= self._ends.get(topic, 0):
+            again = run == self._before and topic not in self._ends
+            if again and newest < first and first >= self._old.get(topic, first + 1):
+                return "old"
+            self._ends[topic] = end
+            return "same"
+        if run == self._before != self._run and first >= self._old.get(topic, 0):
+            return "old"
+        self._run, self._before = run, self._run
+        self._ends, self._old = {topic: end}, self._ends
+        return "new"
+
+
+@dataclass
 class Shown:
     """The view of a run.
 
@@ -46,11 +123,11 @@ class Shown:
 
     run_id: str
     file: Path | None
-    first: int
-    end: int
-    revolutions: int
-    left_out: int
-    complete: bool
+    first: int = 0
+    end: int = 0
+    revolutions: int = 0
+    left_out: int = 0
+    complete: bool = False
 
 
 class _Run:
@@ -59,35 +136,27 @@ class _Run:
     Args:
         block: the first that was heard.
         types: message type by topic, of those that are known to be there.
-        recording: where it goes.
-        file: that the recording is saved to.
+        open_recording: makes its recording.
         rate: points of a curve in a second, at most.
         say: tells people.
     """
 
     def __init__(
-        self,
-        block: Block,
-        types: Mapping[str, str],
-        recording: "rr.RecordingStream",
-        file: Path | None,
-        rate: float,
-        say: Callable[[str], None],
+        self, block: Block, types: Mapping[str, str], open_recording: Open, rate: float, say: Callable[[str], None]
     ) -> None:
         if not block.step_ns:
             raise LatheError(f"{block.source} sends a step of 0 ns")
+        self._recording, file = open_recording(block.run_id or "run")
+        self._step_ns = block.step_ns
+        self._name, self._say = f"run {block.run_id or '(no id)'}", say
+        self._scene = Scene(self._recording, types, block.step_ns, rate=rate, live=True)
+        self._size = math.ceil(PIECE * 1e9 / block.step_ns / self._scene.window) * self._scene.window
+        self._pieces = Pieces(types, self._size, self)
+        self._shown = Shown(block.run_id, file, end=block.first_index)
+        self._begun = False
         self._types = dict(types)
-        self._recording, self._file, self._say = recording, file, say
-        self._name, self._step_ns = block.run_id or "(no id)", block.step_ns
-        self._scene = Scene(recording, types, block.step_ns, rate=rate)
-        size = math.ceil(PIECE * 1e9 / block.step_ns / self._scene.window) * self._scene.window
-        self._pieces = Pieces(types, size, self)
-        self._piece_s = size * block.step_ns * 1e-9
-        self._told = 0  # pieces that are known to be left out
-        self._end, self._begun = block.first_index, False
-        self._run_id = block.run_id
-        self._ended: dict[str, bool] = {topic: False for topic, kind in types.items() if wanted(kind)}
-        recording.send_blueprint(blueprint(types, live=True))
+        self._ended = {topic: False for topic, kind in types.items() if wanted(kind)}
+        self.message = self._pieces.message
 
     def block(self, topic: str, msgtype: str, block: Block) -> bool:
         """Take a block; tells whether the run is over with it."""
@@ -97,63 +166,45 @@ class _Run:
             self._types[topic] = msgtype
             self._scene.learn(self._types)
             self._pieces.learn(self._types)
-            self._recording.send_blueprint(blueprint(self._types, live=True))
         self._pieces.block(topic, block.first_index, block.signals)
-        self._end = max(self._end, block.first_index + block.samples)
+        self._shown.end = max(self._shown.end, block.first_index + block.samples)
         self._ended[topic] = block.last
         return block.last and all(self._ended.values())
-
-    def message(self, message: Sparse) -> None:
-        """Take a message at a chosen sample."""
-        self._pieces.message(message)
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
         if not self._begun:
             self._begun = True
             late = f" from {self._pieces.first * self._step_ns * 1e-9:.2f} s on" if self._pieces.first else ""
-            self._say(f"run {self._name} is shown{late}")
+            self._say(f"{self._name} is shown{late}")
         self._tell(first)
         self._scene.chunk(first, samples, dense, sparse)
 
     def _tell(self, index: int) -> None:
         """Say what has been left out before a sample since this was last said."""
-        missing = self._pieces.lost - self._told
-        if missing:
-            self._told += missing
-            at = index * self._step_ns * 1e-9
-            text = f"left out, wholly or in part: {missing} pieces of {self._piece_s:.3g} s, by {at:.2f} s"
+        if missing := self._pieces.lost - self._shown.left_out:
+            self._shown.left_out = self._pieces.lost
+            piece, at = (samples * self._step_ns * 1e-9 for samples in (self._size, index))
+            text = f"left out, wholly or in part: {missing} pieces of {piece:.3g} s, by {at:.2f} s"
             self._scene.note(index, text)
-            self._say(f"run {self._name}: {text}")
+            self._say(f"{self._name}: {text}")
 
     def close(self) -> Shown:
         """Show what is left, and end the recording."""
+        shown = self._shown
         self._pieces.close()
-        self._tell(self._end)
-        complete = all(self._ended.values())
-        if not complete:
-            self._scene.note(self._end, "the end of the run was not heard")
-        self._scene.close()
-        seen = Shown(
-            self._run_id,
-            self._file,
-            self._pieces.first,
-            self._end,
-            self._scene.revolutions,
-            self._pieces.lost,
-            complete,
-        )
-        self._say(
-            f"run {self._name}: {seen.revolutions} revolutions shown, {seen.left_out} pieces left out"
-            + ("" if complete else "; its end was not heard")
-        )
+        self._tell(shown.end)
+        shown.first, shown.complete = self._pieces.first, all(self._ended.values())
+        if not shown.complete:
+            self._scene.note(shown.end, "the end of the run was not heard")
         try:
-            self._recording.flush(timeout_sec=_FLUSH)
-        except (RuntimeError, ValueError) as error:
-            raise LatheError(f"the view cannot be written ({shown(error)})") from None
+            self._scene.close()
         finally:
             self._recording.disconnect()
-        return seen
+        shown.revolutions = self._scene.revolutions
+        unheard = "" if shown.complete else "; its end was not heard"
+        self._say(f"{self._name}: {shown.revolutions} revolutions shown, {shown.left_out} pieces left out{unheard}")
+        return shown
 
 
 class Live:
@@ -169,13 +220,7 @@ class Live:
         shown: the runs that are over.
     """
 
-    def __init__(
-        self,
-        open_recording: Callable[[str], tuple["rr.RecordingStream", Path | None]],
-        *,
-        rate: float,
-        say: Callable[[str], None],
-    ) -> None:
+    def __init__(self, open_recording: Open, *, rate: float, say: Callable[[str], None]) -> None:
         self._open, self._rate, self._say = open_recording, rate, say
         self.present: Mapping[str, str] = {}
         self.shown: list[Shown] = []
@@ -193,36 +238,27 @@ class Live:
         """
         try:
             if msgtype in messages.block_types():
-                self._block(topic, msgtype, data)
+                if topic not in self._decoders:
+                    self._decoders[topic] = Decoder(msgtype, sorted(wanted(msgtype)))
+                block = self._decoders[topic].decode(data)
+                if self._belongs(topic, block.run_id, block.first_index, block.first_index + block.samples):
+                    self._block(topic, msgtype, block)
             else:
-                self._message(topic, msgtype, data)
+                message = messages.decode(msgtype, data)
+                index = int(message.sample_index)
+                if self._belongs(topic, message.run_id, index, index):
+                    take = self._run.message if self._run else self._early.append
+                    take(Sparse(topic, msgtype, index, messages.values_of(msgtype, data)))
         except ValueError as error:
             raise LatheError(f"{topic}: {error}") from None
 
-    def _block(self, topic: str, msgtype: str, data: bytes) -> None:
-        decoder = self._decoders.get(topic)
-        if decoder is None:
-            decoder = self._decoders[topic] = Decoder(msgtype, sorted(wanted(msgtype)))
-        block = decoder.decode(data)
-        if not self._belongs(topic, block.run_id, block.first_index, block.first_index + block.samples):
-            return
+    def _block(self, topic: str, msgtype: str, block: Block) -> None:
         if self._run is None:
-            recording, file = self._open(block.run_id or "run")
-            self._run = _Run(block, {**self.present, topic: msgtype}, recording, file, self._rate, self._say)
+            self._run = _Run(block, {**self.present, topic: msgtype}, self._open, self._rate, self._say)
             for message in self._early:
                 self._run.message(message)
         if self._run.block(topic, msgtype, block):
             self.end()
-
-    def _message(self, topic: str, msgtype: str, data: bytes) -> None:
-        message = messages.decode(msgtype, data)
-        index = int(message.sample_index)
-        if self._belongs(topic, message.run_id, index, index):
-            sparse = Sparse(topic, msgtype, index, messages.values_of(msgtype, data))
-            if self._run:
-                self._run.message(sparse)
-            else:
-                self._early.append(sparse)
 
     def _belongs(self, topic: str, run_id: str, first: int, end: int) -> bool:
         """Whether samples belong to the run that is shown; one that begins with them is from now on."""

@@ -15,6 +15,8 @@ import numpy.typing as npt
 from lathe_rc.view.rerun_revolutions import ANGLES, Revolution
 
 Array = npt.NDArray[np.float64]
+#: A ring of vertices, its normals and colours, each shape (vertices, 3 or 4).
+Edge = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.uint8]]
 
 COLOURS: Final = "turbo"  #: Rerun has it under the same name
 LOG_RANGE = (-1.5, 2.5)  #: of the colours: log10 of |form error| in µm
@@ -92,17 +94,8 @@ class Scale:
         return f"radius deviation ×{self.deviation / 1e3:.0f}, {along}"
 
 
-@dataclass(frozen=True)
-class Edge:
-    """A ring of vertices, its normals and colours, each shape (vertices, 3 or 4)."""
-
-    vertices: npt.NDArray[np.float32]
-    normals: npt.NDArray[np.float32]
-    colours: npt.NDArray[np.uint8]
-
-
 def edge(revolution: Revolution, scale: Scale) -> Edge:
-    """The part in a revolution."""
+    """The part in a revolution; two of them are a strip, see `TRIANGLES`."""
     angle = 2.0 * np.pi * (np.arange(_VERTICES) * _STEP + 0.5 * _STEP) / ANGLES
     radius = scale.x(revolution.radius.reshape(_VERTICES, _STEP).mean(axis=1))
     z = float(scale.z(np.array(revolution.number - 0.5), np.array(revolution.height)))
@@ -112,16 +105,7 @@ def edge(revolution: Revolution, scale: Scale) -> Edge:
     normals = np.stack([radius * cosine + slope * sine, radius * sine - slope * cosine, np.zeros(_VERTICES)], axis=1)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     magnitude = np.abs(revolution.error).reshape(_VERTICES, _STEP).max(axis=1)
-    return Edge(vertices.astype(np.float32), normals.astype(np.float32), colours(magnitude))
-
-
-def strip(before: Edge, after: Edge) -> Edge:
-    """The surface between two rings; see `TRIANGLES`."""
-    return Edge(
-        np.concatenate([before.vertices, after.vertices]),
-        np.concatenate([before.normals, after.normals]),
-        np.concatenate([before.colours, after.colours]),
-    )
+    return vertices.astype(np.float32), normals.astype(np.float32), colours(magnitude)
 
 
 def _triangles() -> npt.NDArray[np.uint32]:

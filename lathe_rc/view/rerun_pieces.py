@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Blocks of many topics, as they come, made into pieces of one length that all topics share.
 
-For a bag this fixes where the pieces begin, so that a picture does not depend on how the bag was cut. Live, it joins
-what several publishers send, and goes on where something is missing: a viewer has no claim on every block.
+Pieces begin at fixed samples, so that a picture does not depend on how a run was cut. They join what several
+publishers send, and go on where something is missing: a viewer has no claim on every block.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping
 
-from lathe_rc import messages
+import numpy as np
+
 from lathe_rc.cell.engine import Sink
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.messages import Samples, Signals, full
@@ -15,25 +17,20 @@ from lathe_rc.view.rerun_signals import wanted
 
 _AHEAD = 4  # pieces that wait for the topics that are late
 
+_Cuts = list[tuple[int, Signals]]  # first sample and signals of the blocks of a topic in a piece, as they came
 
-class _Part:
-    """The part of a piece that has come of one topic."""
 
-    def __init__(self, msgtype: str, size: int) -> None:
-        fields = wanted(msgtype)
-        self.signals: Signals = {
-            name: array for name, array in messages.allocate(msgtype, size).items() if name in fields
-        }
-        self.end = 0  # samples that are there without a gap
-        self.broken = False
+def _length(signals: Mapping[str, Samples]) -> int:
+    return next(iter(signals.values())).size
 
-    def add(self, start: int, signals: Mapping[str, Samples], source: slice) -> None:
-        """Copy samples to ``start``; unless they follow those that are there, the part stays incomplete."""
-        self.broken |= start != self.end
-        count = source.stop - source.start
-        for name, array in self.signals.items():
-            array[start : start + count] = signals[name][source]
-        self.end = start + count
+
+def _joined(first: int, cuts: _Cuts) -> Signals | None:
+    """The signals from a sample on; None if there is a gap."""
+    for begin, signals in cuts:
+        if begin != first:
+            return None
+        first += _length(signals)
+    return {name: np.concatenate([signals[name] for _, signals in cuts]) for name in cuts[0][1]}
 
 
 class Pieces:
@@ -50,9 +47,9 @@ class Pieces:
     """
 
     def __init__(self, types: Mapping[str, str], size: int, sink: Sink) -> None:
-        self._types: dict[str, str] = {}
+        self._fields: dict[str, set[str]] = {}  # that are drawn, by topic
         self._size, self._sink = size, sink
-        self._waiting: dict[int, dict[str, _Part]] = {}
+        self._waiting: defaultdict[int, defaultdict[str, _Cuts]] = defaultdict(lambda: defaultdict(list))
         self._ends: dict[str, int] = {}  # sample after the newest of each topic
         self._sparse: list[Sparse] = []
         self._next = 0
@@ -63,18 +60,10 @@ class Pieces:
 
     def learn(self, types: Mapping[str, str]) -> None:
         """Wait for these topics as well from now on."""
-        new = {full(topic): kind for topic, kind in types.items() if wanted(kind)}
+        new = {full(topic): fields for topic, kind in types.items() if (fields := wanted(kind))}
         if self._begun:
-            self._late |= new.keys() - self._types.keys()
-        self._types |= new
-
-    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
-        del samples
-        for found in sparse.values():
-            self._sparse += found
-        for topic, signals in dense.items():
-            self.block(topic, first, signals)
+            self._late |= new.keys() - self._fields.keys()
+        self._fields |= new
 
     def block(self, topic: str, first: int, signals: Mapping[str, Samples]) -> None:
         """Take consecutive samples of one topic; those that come too late are passed over.
@@ -84,27 +73,27 @@ class Pieces:
             first: index of the first sample.
             signals: by field, shape (samples,).
         """
-        topic = full(topic)
-        msgtype = self._types.get(topic)
-        if msgtype is None:
+        topic, size = full(topic), self._size
+        if topic not in self._fields:
             return
-        if topic not in self._ends and not self._begun:
-            self._join(first)
+        if topic not in self._ends and not self._begun:  # begin no earlier than with the piece after its first sample
+            self._next = max(self._next, -(-first // size))
+            self.first = self._next * size
+            for piece in [piece for piece in self._waiting if piece < self._next]:
+                del self._waiting[piece]
         if topic in self._late:
             self._late.remove(topic)
-            self.lost += max(0, self._next - first // self._size)
-        samples, taken = next(iter(signals.values())).size, 0
-        while taken < samples:
-            piece, start = divmod(first + taken, self._size)
-            count = min(self._size - start, samples - taken)
-            if piece >= self._next:
-                parts = self._waiting.setdefault(piece, {})
-                if topic not in parts:
-                    parts[topic] = _Part(msgtype, self._size)
-                parts[topic].add(start, signals, slice(taken, taken + count))
-            taken += count
-        self._ends[topic] = first + samples
-        self._hand_on()
+            self.lost += max(0, self._next - first // size)
+        end = first + _length(signals)
+        for piece in range(max(first // size, self._next), -(-end // size)):
+            begin = max(first, piece * size)
+            span = slice(begin - first, min(end, (piece + 1) * size) - first)
+            self._waiting[piece][topic].append((begin, {name: signals[name][span] for name in self._fields[topic]}))
+        self._ends[topic] = end
+        # Hand on what nothing more can come for, and what has waited long enough.
+        complete = min(self._ends.get(each, 0) for each in self._fields) // size
+        while self._waiting and ((oldest := min(self._waiting)) < complete or len(self._waiting) > _AHEAD):
+            self._give(oldest)
 
     def message(self, message: Sparse) -> None:
         """Take a message at a chosen sample."""
@@ -115,42 +104,26 @@ class Pieces:
         while self._waiting:
             self._give(min(self._waiting), closing=True)
         if self._sparse:
-            self._sink.chunk(self._next * self._size, 0, {}, self._messages(None))
-
-    def _join(self, first: int) -> None:
-        """Begin no earlier than with the piece after a sample."""
-        self._next = max(self._next, -(-first // self._size))
-        self.first = self._next * self._size
-        self._waiting = {piece: parts for piece, parts in self._waiting.items() if piece >= self._next}
-
-    def _hand_on(self) -> None:
-        """Hand on what nothing more can come for, and what has waited long enough."""
-        complete = min(self._ends.get(topic, 0) for topic in self._types) // self._size
-        while self._waiting and ((oldest := min(self._waiting)) < complete or len(self._waiting) > _AHEAD):
-            self._give(oldest)
+            self._sink.chunk(
+                self._next * self._size, 0, {}, self._messages(max(each.index for each in self._sparse) + 1)
+            )
 
     def _give(self, piece: int, *, closing: bool = False) -> None:
-        whole = {topic: part for topic, part in self._waiting.pop(piece).items() if not part.broken}
-        samples = max((part.end for part in whole.values()), default=0)
-        dense = {
-            topic: {name: array[:samples] for name, array in part.signals.items()}
-            for topic, part in whole.items()
-            if part.end == samples
-        }
+        begin = piece * self._size
+        joined = {topic: _joined(begin, cuts) for topic, cuts in self._waiting.pop(piece).items()}
+        samples = max((_length(signals) for signals in joined.values() if signals), default=0)
+        dense = {topic: signals for topic, signals in joined.items() if signals and _length(signals) == samples}
         cut = samples < self._size and not (closing and not self._waiting)  # only the last may be short
-        self.lost += piece - self._next + (cut or len(dense) < len(self._types))
+        self.lost += piece - self._next + (cut or len(dense) < len(self._fields))
         self._next, self._begun = piece + 1, True
         if samples:
-            self._sink.chunk(piece * self._size, samples, dense, self._messages(piece * self._size + samples))
+            self._sink.chunk(begin, samples, dense, self._messages(begin + samples))
 
-    def _messages(self, end: int | None) -> dict[str, list[Sparse]]:
-        """Those up to a sample, by topic; None: all."""
+    def _messages(self, end: int) -> dict[str, list[Sparse]]:
+        """Those up to a sample, by topic."""
         taken: dict[str, list[Sparse]] = {}
-        left = []
         for message in self._sparse:
-            if end is None or message.index < end:
+            if message.index < end:
                 taken.setdefault(full(message.topic), []).append(message)
-            else:
-                left.append(message)
-        self._sparse = left
+        self._sparse = [message for message in self._sparse if message.index >= end]
         return taken

@@ -3,6 +3,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,7 @@ Array = npt.NDArray[np.float64]
 ANGLES = 360  #: parts of a revolution
 HIGHEST = 50  #: of the harmonics [UPR]
 _FEWEST = 4.0  # samples a revolution; no spindle turns faster between two of them
+_LONGEST = 2**22  # samples of one revolution
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,24 @@ class Revolution:
         return np.asarray(amplitude / np.sinc(np.arange(HIGHEST + 1) / ANGLES))
 
 
+def _measured(samples: Array, step: Array, end: int) -> Iterator[Revolution]:
+    """The revolution of samples, each of which stands for a step [revolution]; none if the spindle stood still."""
+    turns, error, reference, height = samples
+    if not step.any():
+        return
+    number = int(turns[0])
+    place = np.minimum(((turns - number) * ANGLES).astype(np.intp), ANGLES - 1)
+    weight = np.bincount(place, minlength=ANGLES)
+    there, angles = weight > 0, np.arange(ANGLES)
+    mean_error, mean_reference = (
+        np.interp(angles, angles[there], np.bincount(place, values, ANGLES)[there] / weight[there], period=ANGLES)
+        for values in (error, reference)
+    )
+    rms = float(np.sqrt(np.dot(error * error, step) / step.sum()))
+    radius = mean_reference - mean_error
+    yield Revolution(number + 1, end, mean_error, radius, float(height.mean()), rms, float(np.abs(error).max()))
+
+
 class Revolutions:
     """Collects samples and gives the revolutions that are complete.
 
@@ -53,19 +73,12 @@ class Revolutions:
     """
 
     def __init__(self) -> None:
-        self._started = False
-        self._held: dict[str, Array] = {}  # the last sample: the angle that it stands for ends with the next one
+        # Angle [revolution], error, reference and height of the revolution under way, shape (4, n); the angle that a
+        # sample stands for ends with the next one.
+        self._held = np.empty((4, 0))
         self._next = 0  # index of the sample after it
-        self._step = 0.0  # from the sample before it [revolution]
-        self._clear(0)
-
-    def _clear(self, revolution: int) -> None:
-        self._revolution = revolution  # the one under way, from 0
-        self._entire = False  # whether its first samples were there
-        self._weight = np.zeros(ANGLES)
-        self._sums = {name: np.zeros(ANGLES) for name in ("error", "reference")}
-        self._height = self._square = self._angle = self._largest = 0.0
-        self._count = 0
+        self._step = 0.0  # to the last sample [revolution]
+        self._entire: bool | None = None  # whether the first samples of the revolution are there; None: not known yet
 
     def add(self, first: int, angle: Array, error: Array, reference: Array, height: Array) -> Iterator[Revolution]:
         """Take consecutive samples; where some are missing before them, the revolution under way is dropped.
@@ -80,28 +93,11 @@ class Revolutions:
         Raises:
             LatheError: the angle goes back, or faster than any spindle.
         """
-        turns = angle / (2.0 * np.pi)
-        new = {"turns": turns, "error": error, "reference": reference, "height": height}
-        if not self._held or first != self._next:
-            self._started = False
-            self._held = {name: values[:0] for name, values in new.items()}
-        held = {name: np.concatenate([self._held[name], values]) for name, values in new.items()}
-        self._held = {name: values[-1:] for name, values in held.items()}
-        start, self._next = first - held["turns"].size + turns.size, first + turns.size
-        yield from self._take(start, held, np.diff(held["turns"]))
-
-    def finish(self) -> Iterator[Revolution]:
-        """The last revolution, if less than two samples of it are missing."""
-        if self._step > 0.0:
-            yield from self._take(self._next - 1, self._held, np.array([self._step]))
-            if self._held["turns"][0] + 2.0 * self._step >= self._revolution + 1:
-                yield from self._complete(self._next)
-
-    def _take(self, start: int, samples: dict[str, Array], step: Array) -> Iterator[Revolution]:
-        """Take samples; ``step`` is how far each goes [revolution], one fewer than samples except at the end."""
-        turns = samples["turns"][: step.size]
-        if not step.size:
-            return
+        if first != self._next:
+            self._held, self._entire = np.empty((4, 0)), None
+        start, self._next = first - self._held.shape[1], first + angle.size
+        held = np.concatenate([self._held, np.stack([angle / (2.0 * np.pi), error, reference, height])], axis=1)
+        turns, step = held[0], np.diff(held[0])
         possible = (step >= 0.0) & (step <= 1.0 / _FEWEST)
         if not possible.all():
             bad = int(np.argmin(possible))
@@ -109,48 +105,20 @@ class Revolutions:
                 f"the true spindle angle goes by {step[bad]:.4g} revolutions after sample {start + bad}; allowed: from "
                 f"0 to {1.0 / _FEWEST:g}"
             )
-        self._step = float(step[-1])
-        whole = np.floor(turns)
-        if not self._started:
-            self._clear(int(whole[0]))
-            self._entire = turns[0] - whole[0] <= 1.5 * step[0]
-            self._started = True
-        edges = np.flatnonzero(np.diff(whole)) + 1
-        for a, b in zip([0, *edges], [*edges, turns.size], strict=True):
-            if whole[a] > self._revolution:
-                yield from self._complete(start + int(a))
-                self._clear(int(whole[a]))
-                self._entire = True
-            self._part(turns[a:b] - whole[a], {name: values[a:b] for name, values in samples.items()}, step[a:b])
-
-    def _part(self, turn: Array, samples: dict[str, Array], step: Array) -> None:
-        """Add samples of one revolution to its sums."""
-        place = np.minimum((turn * ANGLES).astype(np.intp), ANGLES - 1)
-        self._weight += np.bincount(place, minlength=ANGLES)
-        for name in self._sums:
-            self._sums[name] += np.bincount(place, samples[name], ANGLES)
-        error = samples["error"]
-        self._square += float(np.dot(error * error, step))
-        self._angle += float(step.sum())
-        self._largest = max(self._largest, float(np.abs(error).max()))
-        self._height += float(samples["height"].sum())
-        self._count += turn.size
-
-    def _complete(self, end: int) -> Iterator[Revolution]:
-        if not self._entire or self._angle == 0.0:
+        self._held = held
+        if not step.size:
             return
-        there = self._weight > 0
-        place = np.arange(ANGLES)
-        error, reference = (
-            np.interp(place, place[there], total[there] / self._weight[there], period=ANGLES)
-            for total in self._sums.values()
-        )
-        yield Revolution(
-            self._revolution + 1,
-            end,
-            error,
-            reference - error,
-            self._height / self._count,
-            float(np.sqrt(self._square / self._angle)),
-            self._largest,
-        )
+        self._step = float(step[-1])
+        if self._entire is None:
+            self._entire = bool(turns[0] % 1.0 <= 1.5 * step[0])
+        begins = [0] * self._entire + (np.flatnonzero(np.diff(np.floor(turns))) + 1).tolist()
+        for a, b in pairwise(begins):
+            yield from _measured(held[:, a:b], step[a:b], start + b)
+        self._entire = bool(begins) and turns.size - begins[-1] <= _LONGEST
+        self._held = held[:, begins[-1] if self._entire else -1 :]
+
+    def finish(self) -> Iterator[Revolution]:
+        """The last revolution, if less than two samples of it are missing."""
+        turns = self._held[0]
+        if self._entire and self._step > 0.0 and turns[-1] + 2.0 * self._step >= np.floor(turns[-1]) + 1.0:
+            yield from _measured(self._held, np.append(np.diff(turns), self._step), self._next)

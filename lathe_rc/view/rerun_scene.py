@@ -6,25 +6,28 @@ Timelines are ``time``, simulated time from sample 0, and ``revolution``, from 1
 
 import contextlib
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
 from lathe_rc import event_log, messages
+from lathe_rc.cell.rerun_bridge import RATE
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.event_log import LOGGED
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view import rerun_part as parts
-from lathe_rc.view import rerun_states
+from lathe_rc.view.rerun_blueprint import blueprint
 from lathe_rc.view.rerun_revolutions import ANGLES, HIGHEST, Revolution, Revolutions
-from lathe_rc.view.rerun_signals import CYCLES, curve_path, curves, envelope
+from lathe_rc.view.rerun_signals import CYCLES, STATE_COLOURS, band, curve_path, curves, envelope, supervisor
 
 _POSES = 250.0  # of part and tool in a second
 _ROWS = 512  # of the map
 _BARS = np.arange(1, HIGHEST + 1) - 0.5  # left edges: Rerun draws bars to the right of their place
+_FLUSH, _EVER = 30.0, 1e9  # [s] for a viewer to take the rest of a live recording, and for a file
 _GROWTH = 8  # the map is sent again when it has this part more rows
 # Colours of Okabe and Ito, which most colour-blind people can distinguish.
 _PALETTE = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (240, 228, 66), (213, 94, 0))
@@ -42,6 +45,8 @@ class Scene:
         step_ns: sampling step [ns].
         outlook: on the whole run.
         rate: points of a curve in a second, at most.
+        live: the picture follows what comes in.
+        silent: topics on which nothing was said.
 
     Attributes:
         window: samples that two points of a curve stand for.
@@ -56,9 +61,12 @@ class Scene:
         step_ns: int,
         *,
         outlook: parts.Outlook | None = None,
-        rate: float = 2000.0,
+        rate: float = RATE,
+        live: bool = False,
+        silent: Collection[str] = (),
     ) -> None:
         self._recording, self._step_ns = recording, step_ns
+        self._live, self._silent = live, {full(topic) for topic in silent}
         self._types: dict[str, str] = {}
         self._nominal: set[str] = set()  # supervisors whose first state is shown
         self._outlook = outlook or parts.Outlook()
@@ -84,6 +92,7 @@ class Scene:
         self._curves = curves(self._types)
         by_type = {kind: topic for topic, kind in reversed(self._types.items())}  # the first of each
         self._encoder, self._tool = by_type.get(messages.ENCODER), by_type.get(messages.TOOL)
+        self._recording.send_blueprint(blueprint(self._types, live=self._live, silent=self._silent))
         self._describe()
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
@@ -107,7 +116,7 @@ class Scene:
             self._part(first, angle, named[self._tool])
 
     def close(self) -> None:
-        """Log what is left; the recording stays open.
+        """Log what is left and wait until it is written; the recording stays open.
 
         Raises:
             LatheError: it cannot be written.
@@ -115,10 +124,12 @@ class Scene:
         self._form(list(self._revolutions.finish()))
         if self._newest and self._sent != len(self._rows):
             self._send_map(self._newest)
+        with _written():
+            self._recording.flush(timeout_sec=_FLUSH if self._live else _EVER)
 
     def note(self, index: int, text: str) -> None:
         """Write a line at a sample among the events."""
-        self._send("events", self._when(np.array([index]), None), rr.TextLog.columns(text=[text], level=["WARN"]))
+        self._send("events", rr.TextLog.columns(text=[text], level=["WARN"]), np.array([index]))
 
     # --- what never changes
 
@@ -134,25 +145,16 @@ class Scene:
                 plots.setdefault(curve.plot, []).append(path)
         for paths in plots.values():
             for path, colour in zip(paths, itertools.cycle(_PALETTE), strict=False):
-                self._static(
-                    path, rr.SeriesLines(names=names[path], colors=colour, widths=1.5, aggregation_policy="minmax")
-                )
+                line = rr.SeriesLines(names=names[path], colors=colour, widths=1.5, aggregation_policy="minmax")
+                self._static(path, line)
         if self._encoder and self._tool:
             self._static("machine", rr.ViewCoordinates.RIGHT_HAND_X_UP)
             self._static("machine/part/surface", rr.Mesh3D.from_fields(triangle_indices=parts.TRIANGLES))
-            chuck = rr.Cylinders3D(
-                lengths=[16.0],
-                radii=[1.15 * parts.RADIUS],
-                centers=[[0.0, 0.0, -9.0]],
-                colors=(120, 126, 138),
-                fill_mode="solid",
-            )
-            self._static("machine/part/chuck", chuck)
+            chuck: dict[str, Any] = {"lengths": [16.0], "radii": [1.15 * parts.RADIUS], "centers": [[0.0, 0.0, -9.0]]}
+            self._static("machine/part/chuck", rr.Cylinders3D(**chuck, colors=(120, 126, 138), fill_mode="solid"))
             vertices, triangles = parts.TOOL
-            self._static(
-                "machine/tool/insert",
-                rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, albedo_factor=(230, 190, 60)),
-            )
+            insert = rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, albedo_factor=(230, 190, 60))
+            self._static("machine/tool/insert", insert)
             self._send_legend()
 
     def _send_legend(self) -> None:
@@ -161,16 +163,10 @@ class Scene:
         decade = np.isclose(dots, np.round(dots))
         z = np.linspace(0.0, parts.LENGTH, dots.size)
         positions = np.stack([np.full(dots.size, -1.35 * parts.RADIUS), np.zeros(dots.size), z], axis=1)
-        self._static(
-            "machine/scale",
-            rr.Points3D(
-                positions,
-                colors=parts.colours(10.0**dots * 1e-6),
-                radii=np.where(decade, 2.6, 1.7),
-                labels=[f"{10**dot:g} µm" if whole else "" for dot, whole in zip(dots.tolist(), decade, strict=True)],
-                show_labels=True,
-            ),
-        )
+        labels = [f"{10**dot:g} µm" if whole else "" for dot, whole in zip(dots.tolist(), decade, strict=True)]
+        radii, colours = np.where(decade, 2.6, 1.7), parts.colours(10.0**dots * 1e-6)
+        scale = rr.Points3D(positions, colors=colours, radii=radii, labels=labels, show_labels=True)
+        self._static("machine/scale", scale)
 
     def _static(self, path: str, what: rr.AsComponents) -> None:
         with _written():
@@ -183,18 +179,16 @@ class Scene:
         for topic, kind in self._types.items():
             if kind == messages.SAFETY_STATUS and topic not in self._nominal:
                 self._nominal.add(topic)
-                path, states = rerun_states.supervisor(topic), rerun_states.COLOURS
-                colours = np.array(list(states.values()), dtype=np.uint32)
-                self._static(path, rr.StateConfiguration(values=list(states), colors=colours))
-                when = self._when(np.array([first]), None)
-                self._send(path, when, rr.StateChange.columns(state=[next(iter(states))]))
+                colours = np.array(list(STATE_COLOURS.values()), dtype=np.uint32)
+                self._static(supervisor(topic), rr.StateConfiguration(values=list(STATE_COLOURS), colors=colours))
+                self._change(supervisor(topic), next(iter(STATE_COLOURS)), first)
 
     def _curve(self, path: str, first: int, values: Samples, turns: Samples | None) -> None:
         """Points of a curve."""
         at = envelope(values, self.window)
         self.points += at.size
         number = None if turns is None else np.floor(turns[at]) + 1
-        self._send(path, self._when(first + at, number), rr.Scalars.columns(scalars=values[at]))
+        self._send(path, rr.Scalars.columns(scalars=values[at]), first + at, number)
 
     def _tell(self, topic: str, found: list[Sparse]) -> None:
         """The controllers' reports of their cycles, and events."""
@@ -203,15 +197,13 @@ class Scene:
             cycle = CYCLES[kind]
             values = parts.log_um(np.array([message.values[cycle.error] for message in found], dtype=np.float64))
             number = np.array([message.values[cycle.counter] for message in found])
-            self._send(f"learning{topic}", self._when(index, number), rr.Scalars.columns(scalars=values))
+            self._send(f"learning{topic}", rr.Scalars.columns(scalars=values), index, number)
         elif kind in LOGGED:
             for message in found:
-                if change := rerun_states.band(message):
-                    path, state = change
-                    when = self._when(np.array([message.index]), None)
-                    self._send(path, when, rr.StateChange.columns(state=[state]))
+                if change := band(message):
+                    self._change(*change, message.index)
             texts = [f"{topic.strip('/')}: {event_log.text(message)}" for message in found]
-            self._send("events", self._when(index, None), rr.TextLog.columns(text=texts))
+            self._send("events", rr.TextLog.columns(text=texts), index)
 
     def _part(self, first: int, angle: Samples, tool: Signals) -> None:
         """The part, the tool and the form error."""
@@ -223,51 +215,41 @@ class Scene:
         at = np.arange(-first % self._pose, angle.size, self._pose)
         if at.size:
             turns = angle[at] / (2.0 * np.pi)
-            when = self._when(first + at, np.floor(turns) + 1)
-            self._send("machine/part", when, rr.Transform3D.columns(quaternion=parts.rotations(angle[at])))
+            when = first + at, np.floor(turns) + 1
+            self._send("machine/part", rr.Transform3D.columns(quaternion=parts.rotations(angle[at])), *when)
             place = np.zeros((at.size, 3))
             place[:, 0] = self._scale.x((reference - error)[at])
             place[:, 2] = self._scale.z(turns, height[at])
-            self._send("machine/tool", when, rr.Transform3D.columns(translation=place))
+            self._send("machine/tool", rr.Transform3D.columns(translation=place), *when)
         self._form(list(self._revolutions.add(first, angle, error, reference, height)))
 
     # --- revolutions
 
     def _form(self, complete: list[Revolution]) -> None:
         """Rings, rows, spectra and the learning curve of revolutions that are complete."""
-        rings: list[tuple[Revolution, parts.Edge]] = []
+        if not complete:
+            return
+        self._newest = complete[-1]
+        self.revolutions += len(complete)
+        for name in ("rms", "largest"):
+            values = parts.log_um(np.array([getattr(revolution, name) for revolution in complete]))
+            self._send(f"learning/form_error/{name}", rr.Scalars.columns(scalars=values), *_when(complete))
+        rings: list[Revolution] = []
+        strips: list[parts.Edge] = []
         for revolution in complete:
-            self._newest = revolution
-            self.revolutions += 1
-            self._send(
-                "form_error/spectrum",
-                self._at([revolution]),
-                rr.BarChart.columns(values=revolution.harmonics()[1:] * 1e6, abscissa=_BARS),
-            )
+            bars = rr.BarChart.columns(values=revolution.harmonics()[1:] * 1e6, abscissa=_BARS)
+            self._send("form_error/spectrum", bars, *_when([revolution]))
             if (revolution.number - 1) % self._every == 0:
-                rings.append((revolution, self._ring(revolution)))
+                assert self._scale is not None
+                after = parts.edge(revolution, self._scale)
+                strips += [self._edge or after, after]
+                self._edge = after
+                rings.append(revolution)
                 self._row(revolution)
-        if complete:
-            for name in ("rms", "largest"):
-                values = parts.log_um(np.array([getattr(revolution, name) for revolution in complete]))
-                self._send(f"learning/form_error/{name}", self._at(complete), rr.Scalars.columns(scalars=values))
         if rings:
-            strips = [strip for _, strip in rings]
-            columns = rr.Mesh3D.columns(
-                vertex_positions=np.concatenate([strip.vertices for strip in strips]),
-                vertex_normals=np.concatenate([strip.normals for strip in strips]),
-                vertex_colors=np.concatenate([strip.colours for strip in strips]),
-            )
-            when = self._at([revolution for revolution, _ in rings])
-            self._send("machine/part/surface", when, columns.partition([parts.STRIP] * len(rings)))
-
-    def _ring(self, revolution: Revolution) -> parts.Edge:
-        """The surface from the ring before to this one."""
-        assert self._scale is not None
-        after = parts.edge(revolution, self._scale)
-        strip = parts.strip(self._edge or after, after)
-        self._edge = after
-        return strip
+            vertices, normals, colours = map(np.concatenate, zip(*strips, strict=True))
+            columns = rr.Mesh3D.columns(vertex_positions=vertices, vertex_normals=normals, vertex_colors=colours)
+            self._send("machine/part/surface", columns.partition([parts.STRIP] * len(rings)), *_when(rings))
 
     def _row(self, revolution: Revolution) -> None:
         """Add a row to the map; when it is full, every second one goes."""
@@ -285,28 +267,32 @@ class Scene:
         names = ["revolution" if self._every == 1 else f"revolution / {self._every}", f"angle / {360 // ANGLES}°"]
         tensor = rr.encodings.TensorData(array=np.stack(self._rows), dim_names=names)
         columns = rr.Tensor.columns(data=tensor, value_range=[parts.LOG_RANGE])
-        self._send("form_error/map", self._at([revolution]), columns)
+        self._send("form_error/map", columns, *_when([revolution]))
 
     # --- sending
 
-    def _at(self, revolutions: list[Revolution]) -> list[rr.TimeColumn]:
-        return self._when(np.array([r.end for r in revolutions]), np.array([r.number for r in revolutions]))
+    def _change(self, path: str, state: str, index: int) -> None:
+        self._send(path, rr.StateChange.columns(state=[state]), np.array([index]))
 
-    def _when(self, index: Samples, revolution: Samples | None) -> list[rr.TimeColumn]:
-        """Both timelines of samples, or only time where the spindle angle is not known."""
-        columns = [rr.TimeColumn("time", duration=(index * self._step_ns).astype("timedelta64[ns]"))]
+    def _send(
+        self, path: str, columns: rr.ComponentColumnList, index: Samples, revolution: Samples | None = None
+    ) -> None:
+        """Log at samples on both timelines, or on time alone where the spindle angle is not known."""
+        when = [rr.TimeColumn("time", duration=(index * self._step_ns).astype("timedelta64[ns]"))]
         if revolution is not None:
-            columns.append(rr.TimeColumn("revolution", sequence=revolution.astype(np.int64)))
-        return columns
-
-    def _send(self, path: str, when: list[rr.TimeColumn], columns: rr.ComponentColumnList) -> None:
+            when.append(rr.TimeColumn("revolution", sequence=revolution.astype(np.int64)))
         with _written():
             self._recording.send_columns(path, when, columns, strict=True)
+
+
+def _when(revolutions: list[Revolution]) -> tuple[Samples, Samples]:
+    """Samples after revolutions, and their numbers."""
+    return np.array([each.end for each in revolutions]), np.array([each.number for each in revolutions])
 
 
 @contextlib.contextmanager
 def _written() -> Iterator[None]:
     try:
         yield
-    except RuntimeError as error:
+    except (RuntimeError, ValueError) as error:
         raise LatheError(f"the view cannot be written ({shown(error)}); is the disk full?") from None

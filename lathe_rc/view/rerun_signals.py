@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which fields of a recording are drawn as curves, in what unit, and how long ones are thinned out."""
+"""What of a recording is drawn: fields as curves, thinned out where they are long, and states as bands over time."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,8 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc import messages
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED
 from lathe_rc.event_log import LOGGED
 from lathe_rc.messages import Samples, full
+from lathe_rc.safety.state_machine import State
 
 
 @dataclass(frozen=True)
@@ -109,22 +112,39 @@ def envelope(values: Samples, window: int) -> npt.NDArray[np.intp]:
     Returns:
         Indices, shape (up to 2·⌈n/window⌉,).
     """
-    if window <= 2:
+    if window <= 2 or not values.size:
         return np.arange(values.size)
-    whole = values.size // window * window
-    pieces = [_extremes(values[:whole].reshape(-1, window), 0)]
-    if whole < values.size:
-        pieces.append(_extremes(values[None, whole:], whole))
-    return np.concatenate(pieces)
+    rows = np.pad(values, (0, -values.size % window), mode="edge").reshape(-1, window)
+    ends = np.sort([rows.argmin(axis=1), rows.argmax(axis=1)], axis=0)
+    keep = np.stack([np.ones(len(rows), dtype=bool), ends[0] != ends[1]], axis=1)
+    return np.asarray((ends + np.arange(len(rows)) * window).T[keep])
 
 
-def _extremes(rows: Samples, start: int) -> npt.NDArray[np.intp]:
-    """Places of the extremes of each row, counted through all rows from ``start``."""
-    if not rows.size:
-        return np.empty(0, dtype=np.intp)
-    low, high = rows.argmin(axis=1), rows.argmax(axis=1)
-    both = np.sort(np.stack([low, high], axis=1), axis=1)
-    both += start + np.arange(rows.shape[0])[:, None] * rows.shape[1]
-    keep = np.ones(both.shape, dtype=bool)
-    keep[:, 1] = low != high
-    return np.asarray(both[keep])
+# --- bands
+
+STATES = "states"  #: where the bands are in the view
+#: Colours of the supervisor's states.
+STATE_COLOURS = {"nominal": 0x2E7D4FFF, "degraded": 0xB8860BFF, "retracting": 0xD2622AFF, "safe": 0xB3262EFF}
+_FAULT, _REPAIR = "fault ", "repair "  # how the events of faults begin
+
+
+def supervisor(topic: str) -> str:
+    """Where the band of a supervisor is, by the topic of its status."""
+    return f"{STATES}/cell{full(topic).removesuffix('/status')}"
+
+
+def band(message: Sparse) -> tuple[str, str] | None:
+    """Which band changes with a message, and to what; an empty text ends a band. None: no band does."""
+    topic = full(message.topic)
+    if message.type == messages.SAFETY_STATUS:
+        state = message.values["state"]
+        return supervisor(topic), State(state).name.lower() if state in set(State) else "?"
+    action, node = str(message.values["action"]), f"{STATES}{topic.removesuffix('/events')}"
+    if action.startswith(_FAULT):
+        return f"{node}/fault", action.removeprefix(_FAULT)
+    if action.startswith(_REPAIR):
+        return f"{node}/fault", ""
+    kind = action.partition(":")[0]
+    if kind in (LIMITED, FREE):
+        return f"{node}/limits", LIMITED if kind == LIMITED else ""
+    return None

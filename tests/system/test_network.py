@@ -92,8 +92,6 @@ class Wire:
 @pytest.fixture
 def wire(request, monkeypatch):
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
-    # The namespaces share /dev/shm, as machines do not.
-    monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
     with Wire(f"lathe{os.getpid() % 10000}", *getattr(request, "param", (0.0, 0.0))) as made:
         yield made
 

@@ -184,14 +184,14 @@ def test_paper_and_a_browser_without_scripts_have_the_pictures(page, tmp_path):
 def test_every_figure_of_the_report_renders(page, tmp_path):
     """The images in a page of our own, with a script that the report forbids itself."""
     images = re.findall(r'<img src="data:[^"]+"', page.read_text(encoding="utf-8"))
-    assert len(images) == 7  # map, polar, spectrum, convergence, speed, force, wear
+    assert len(images) == 8  # map, two polar ones, spectrum, convergence, speed, force, wear
     script = "onload=\"document.title=[...document.images].map(i=>i.naturalWidth+'x'+i.naturalHeight).join()\""
     gallery = tmp_path / "gallery.html"
     gallery.write_text(f"<body {script}>{'>'.join(images)}></body>", encoding="utf-8")
     title = re.search(r"<title>(.*)</title>", Visit(gallery, tmp_path).document)
     sizes = [tuple(map(int, size.split("x"))) for size in title[1].split(",")]
-    assert len(sizes) == 7
-    assert all(width > 500 and height > 150 for width, height in sizes)
+    assert len(sizes) == 8
+    assert all(width > 400 and height > 150 for width, height in sizes)
 
 
 def test_a_page_of_many_figures_is_not_blank(page, tmp_path):

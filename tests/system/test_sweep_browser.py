@@ -10,7 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from test_report_browser import Visit, by_hand
-from test_sweep_page import LAW, LEAD, Q, Shown, bowl, swept
+from test_sweep_page import LAW, LEAD, Q, bowl, shown_page, swept
 
 from lathe_rc.sweep import page
 from lathe_rc.sweep.space import Space
@@ -52,13 +52,14 @@ addEventListener("load", async () => {
 def test_figures_are_drawn_chosen_and_brushed(tmp_path):
     """Of seven leads with a result each has 14 cells; the brush lies over the second of them."""
     space = Space(grid={LEAD: "1e-3:3e-3:9", Q: "1e-5:1e-3:7:log", LAW: ["constant_angle", "variable"]})
-    written = page.write(swept(tmp_path / "sweep", space, bowl))
-    text = written.page.read_text(encoding="utf-8")
-    visit = Visit(by_hand(text, _HAND, tmp_path), tmp_path, "--window-size=900,900")
+    folder = swept(tmp_path / "sweep", space, bowl)
+    page.write(folder)
+    shown = shown_page(folder)
+    visit = Visit(by_hand(shown.source, _HAND, tmp_path), tmp_path, "--window-size=900,900")
     assert visit.console == []
     assert visit.requests == []
     told = re.search(r"<title>(.*)</title>", visit.document)[1]
-    for name in Shown(written.page).specs:
+    for name in shown.specs:
         assert int(re.search(rf"\| {name} (\d+)", told)[1]) > 500, told
     assert "same: Choose two different parameters. | chosen: 1-0 true" in told
     assert "all: 98 | brushed: 14" in told

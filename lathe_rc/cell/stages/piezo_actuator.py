@@ -63,7 +63,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
         1.0, "error of its identification: factor on the weights of the plays, or on A; 0.85 is 15 % low"
     )
     identified_weights: list[float] = parameter(
-        [], "weights of the plays that an identification found (docs/piezo.md); empty: those of the drive"
+        [], "weights of the plays that an identification found (docs/drives.md); empty: those of the drive"
     )
     identified_thresholds: list[Annotated[float, Gt(0)]] = parameter(
         [], "thresholds that belong to identified_weights; empty: those of the drive"

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The common part of all nodes: how they begin, watch one another, make progress, fail and end.
-
-Longer than 400 lines: whoever changes a step of a node's life has to see what the others do to the same state.
-"""
+"""The common part of all nodes: how they begin, watch one another, make progress, fail and end."""
 
 import math
 import os
@@ -25,7 +22,7 @@ from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes import declare, stale_shared_memory
+from lathe_rc.nodes import declare
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.listening import Listening
 from lathe_rc.nodes.liveliness import SILENCE, Watch, liveliness
@@ -248,8 +245,8 @@ class CellNode(Listening):
     def end(self, acknowledged: list[Publisher]) -> None:
         """The node's part is over. In a cell it stays until all have ended; else until others have its last messages.
 
-        A process that leaves while messages are under way may take a lock of the transport with it, and those who
-        send to the same reader wait for ever. So one that has given up stays as well, while the others go on.
+        DDS sends a lost message again only as long as its process lives. A node that has given up stays as well, while
+        the others go on: its announcement says why, also to members that look later.
         """
         self.over = True
         if self.master is None or self.master.name == self.full_name:
@@ -360,7 +357,6 @@ class CellNode(Listening):
         """Say now and then what it waits for: nobody else knows."""
         self._tell_due = now + next(self._tell_after)
         if missing := self.missing():
-            stale_shared_memory.release()  # what those may wait for
             self.get_logger().warning(f"waits for {'; '.join(missing)}")
             self.reporter("waits", self.get_name(), missing=missing)
 

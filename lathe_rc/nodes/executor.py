@@ -2,11 +2,15 @@
 """How the nodes of a process wait for messages, requests and events, and hand them to their callbacks."""
 
 from collections.abc import Sequence
+from typing import Any
 
 from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
 
-from lathe_rc.nodes.shell import CellNode
+from lathe_rc.nodes.cell_node import CellNode
+
+_MOST = 64  # of one topic or service at a time: a flood keeps nobody from its neighbours
 
 
 class Events:
@@ -41,3 +45,27 @@ class Events:
                 while node.discarded:
                     node.discarded.pop()()
             self._executor = self._made()
+
+
+def drain_missed_messages(node: Node) -> None:
+    """Hand over the messages and requests that wait at a node unannounced; to be called from time to time.
+
+    When EventsExecutor takes up a subscription or a service, rmw_fastrtps first counts the messages that have come and
+    then sets the callback that announces others (since its pull request 657). A message in between is never announced,
+    and from then on each announcement takes the message before: the newest one waits for the next. A cell whose last
+    message before the start is missed stands still for ever.
+    """
+    for subscription in [*node.subscriptions]:
+        with subscription.handle:
+            for _ in range(_MOST):
+                if (found := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is None:
+                    break
+                subscription.callback(found[0])
+    for service in [*node.services]:
+        kind: Any = service.srv_type  # rclpy does not say that it has requests and responses
+        with service.handle:
+            for _ in range(_MOST):
+                request, header = service.handle.service_take_request(kind.Request)
+                if header is None:
+                    break
+                service.send_response(service.callback(request, kind.Response()), header)

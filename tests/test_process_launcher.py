@@ -2,7 +2,6 @@
 """Processes that a fork server starts: what they are given, what is heard of them, what becomes of them without it."""
 
 import os
-import queue
 import select
 import signal
 import socket
@@ -13,7 +12,7 @@ from pathlib import Path
 import pytest
 from cells import scenario
 
-from lathe_rc import harness, starting
+from lathe_rc import harness, process_launcher
 from lathe_rc.errors import LatheError
 
 PATIENCE = 30.0  # [s]
@@ -30,7 +29,6 @@ class Shell:
     """
 
     def __init__(self, server, log, script, **environment):
-        self.changes = queue.SimpleQueue()
         self.line, theirs = socket.socketpair()
         self.line.settimeout(PATIENCE)
         with log.open("ab") as file, theirs:
@@ -39,14 +37,13 @@ class Shell:
                 environment=os.environ | environment,
                 report=theirs,
                 log=file.fileno(),
-                changed=lambda *change: self.changes.put(change),
                 command=["/bin/sh", "-c", script],
             )
 
 
 @pytest.fixture
 def server():
-    made = starting.ForkServer()
+    made = process_launcher.ForkServer()
     yield made
     made.close()
 
@@ -63,36 +60,24 @@ def test_a_process_has_the_folder_environment_log_and_line_of_who_asked(server, 
 
 @pytest.mark.parametrize(("script", "code"), [("exit 3", 3), ("kill -SEGV $$", -signal.SIGSEGV)])
 def test_how_a_process_ended_is_known(server, tmp_path, script, code):
-    """The harness learns from the operating system how a process has ended."""
     child = Shell(server, tmp_path / "log", script).child
     assert child.wait(PATIENCE) == code
     assert child.poll() == code
     child.kill()  # which has ended: no other process that has its number now
 
 
-def test_who_is_stopped_and_continued_is_known(server, tmp_path):
-    """The harness learns from the operating system that a process is stopped or continued."""
-    shell = Shell(server, tmp_path / "log", "echo; exec sleep 1000")
-    assert shell.child.poll() is None
-    with pytest.raises(subprocess.TimeoutExpired):
-        shell.child.wait(0.0)
-    for number, change in ((signal.SIGSTOP, "stopped"), (signal.SIGCONT, "continued")):
-        shell.child.send_signal(number)
-        assert shell.changes.get(timeout=PATIENCE) == (change, number)
-    shell.child.kill()
-    assert shell.child.wait(PATIENCE) == -signal.SIGKILL
-
-
 def test_without_the_server_its_processes_are_killed_and_another_server_starts_others(tmp_path, monkeypatch):
-    starting._server_of.cache_clear()
-    first = starting.server()
+    process_launcher._server_of.cache_clear()
+    first = process_launcher.server()
     child = Shell(first, tmp_path / "log", "exec sleep 1000").child
+    with pytest.raises(subprocess.TimeoutExpired):
+        child.wait(0.0)
     first._process.kill()
     assert child.wait(PATIENCE) == -signal.SIGKILL
     for _ in range(2):
         with pytest.raises(LatheError, match="the process that starts the nodes has ended"):
             Shell(first, tmp_path / "log", "true")
-    second = starting.server()
+    second = process_launcher.server()
     assert second is not first
     assert Shell(second, tmp_path / "log", "true").child.wait(PATIENCE) == 0
 
@@ -100,8 +85,8 @@ def test_without_the_server_its_processes_are_killed_and_another_server_starts_o
 def test_the_server_ends_with_the_process_that_started_it():
     code = """if True:
         import os, signal
-        from lathe_rc import starting
-        print(starting.server()._process.pid, flush=True)
+        from lathe_rc import process_launcher
+        print(process_launcher.server()._process.pid, flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
     """
     told = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=False).stdout
@@ -119,10 +104,10 @@ def test_separate_interpreters_give_the_bits_of_forked_processes():
 
 STUCK = """
 import os, socket, sys, time
-from lathe_rc import starting
+from lathe_rc import process_launcher
 ours, theirs = socket.socketpair()
-child = starting.server().start(
-    [], environment=dict(os.environ), report=theirs, log=2, changed=print,
+child = process_launcher.server().start(
+    [], environment=dict(os.environ), report=theirs, log=2,
     command=["/bin/sh", "-c", "trap '' TERM HUP; exec sleep 1000"],
 )
 print(child.pid, flush=True)
@@ -131,7 +116,7 @@ time.sleep(1000.0)
 
 
 def test_a_process_that_does_not_end_by_itself_is_killed_when_nobody_is_left_to_do_it():
-    """Its harness has been killed, and it hears nothing: as one that waits for a lock of DDS."""
+    """Its harness has been killed, and it takes no signal that it can ignore."""
     with subprocess.Popen([sys.executable, "-c", STUCK], stdout=subprocess.PIPE) as harness_process:
         descriptor = os.pidfd_open(int(harness_process.stdout.readline()))
         harness_process.kill()

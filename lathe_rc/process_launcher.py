@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starting processes by way of a fork server, see `lathe_rc.nodes.fork_server`; this module imports no ROS."""
+"""Starting processes by way of a fork server, see `lathe_rc.nodes.fork_server`; this module imports no ROS.
+
+`multiprocessing` has a fork server, too, but imports the user's main module anew in each process: a script without
+``if __name__ == "__main__"`` would run itself again, and so would a notebook. Nor can it load kernels on request.
+"""
 
 import atexit
 import contextlib
@@ -11,7 +15,8 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+import weakref
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -20,7 +25,6 @@ from lathe_rc import allowed_code, extras
 from lathe_rc.errors import LatheError
 
 Start = Literal["fork", "spawn"]  #: of a process: as a copy of one that has imported everything, or from nothing
-Change = Callable[[str, int], None]
 
 _MOST = 2**16  # [B] of an answer
 
@@ -30,19 +34,18 @@ class Child:
 
     Args:
         pid: its number.
-        descriptor: its pidfd.
-        changed: called with ``stopped`` or ``continued`` and the number of the signal, from a thread.
+        descriptor: its pidfd, which never names another process, even when the number is used again.
 
     Attributes:
         returncode: as that of `subprocess.Popen`.
     """
 
-    def __init__(self, pid: int, descriptor: int, changed: Change) -> None:
+    def __init__(self, pid: int, descriptor: int) -> None:
         self.pid = pid
         self.returncode: int | None = None
-        self._descriptor, self._changed = descriptor, changed
+        self._descriptor = descriptor
+        weakref.finalize(self, os.close, descriptor)
         self._ended = threading.Event()
-        self._lock = threading.Lock()
 
     def poll(self) -> int | None:
         """Its exit code once it has ended."""
@@ -61,22 +64,16 @@ class Child:
 
     def send_signal(self, number: int) -> None:
         """Send a signal, unless it has ended."""
-        with self._lock, contextlib.suppress(ProcessLookupError):
-            if self.returncode is None:
-                signal.pidfd_send_signal(self._descriptor, number)
+        with contextlib.suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self._descriptor, number)
 
     def kill(self) -> None:
         """Send SIGKILL."""
         self.send_signal(signal.SIGKILL)
 
-    def note(self, state: str, code: int) -> None:
-        """Take what the server says of it."""
-        if state != "ended":
-            self._changed(state, code)
-            return
-        with self._lock:
-            self.returncode = code
-            os.close(self._descriptor)
+    def end(self, code: int) -> None:
+        """Take the exit code that the server reports."""
+        self.returncode = code
         self._ended.set()
 
 
@@ -104,7 +101,6 @@ class ForkServer:
         self._children: dict[int, Child] = {}
         self._started: queue.SimpleQueue[Child | None] = queue.SimpleQueue()
         self._asking = threading.Lock()
-        self._changed: Change
         self.lost = False
         threading.Thread(target=self._listen, daemon=True).start()
         atexit.register(self.close)
@@ -125,7 +121,6 @@ class ForkServer:
         environment: Mapping[str, str],
         report: socket.socket,
         log: int,
-        changed: Change,
         command: Sequence[str] = (),
     ) -> Child:
         """Start a process in a session of its own, in this process's folder.
@@ -135,7 +130,6 @@ class ForkServer:
             environment: all of it.
             report: where its `lathe_rc.nodes.report.Reporter` writes; the caller may close it then.
             log: descriptor of a file for what it prints.
-            changed: see `Child`.
             command: what it is to be instead.
 
         Raises:
@@ -149,7 +143,6 @@ class ForkServer:
             "command": list(command),
         }
         with self._asking:
-            self._changed = changed
             with contextlib.suppress(BrokenPipeError):
                 socket.send_fds(self._line, [json.dumps(request).encode()], [report.fileno(), log])
             child = self._started.get()
@@ -159,25 +152,19 @@ class ForkServer:
         return child
 
     def _listen(self) -> None:
-        """Hand on what the server says; without it nobody would know how its processes end, so they do."""
+        """Take the server's answers; without it no exit code would be known, so its processes end with it."""
         with contextlib.suppress(OSError):
-            while True:
-                told, descriptors, _, _ = socket.recv_fds(self._line, _MOST, 1)
-                if not told:
-                    break
-                change = json.loads(told)
-                pid, state = change["pid"], change["state"]
-                if state == "started":
-                    self._children[pid] = Child(pid, descriptors[0], self._changed)
-                    self._started.put(self._children[pid])
+            while (answer := socket.recv_fds(self._line, _MOST, 1))[0]:
+                pid, code = json.loads(answer[0])
+                if code is None:
+                    child = self._children[pid] = Child(pid, answer[1][0])
+                    self._started.put(child)
                 else:
-                    self._children[pid].note(state, change["code"])
-                if state == "ended":
-                    del self._children[pid]
+                    self._children.pop(pid).end(code)
         self.lost = True
         for child in self._children.values():
             child.kill()
-            child.note("ended", -signal.SIGKILL)
+            child.end(-signal.SIGKILL)
         self._started.put(None)
 
     def close(self) -> None:
@@ -195,8 +182,6 @@ def _server_of(_pid: int) -> ForkServer:
 
 def server() -> ForkServer:
     """The fork server of this process, started when it is first needed."""
-    found = _server_of(os.getpid())
-    if found.lost:
+    if _server_of(os.getpid()).lost:
         _server_of.cache_clear()
-        found = _server_of(os.getpid())
-    return found
+    return _server_of(os.getpid())

@@ -19,7 +19,7 @@ T = TypeVar("T", bound=Table)
 
 
 @contextlib.contextmanager
-def member_of_none(
+def standalone_node(
     kind: str,
     table: type[T],
     values: Mapping[str, object],
@@ -79,7 +79,7 @@ def run(
     """
     try:
         # What the replayed system told on /rosout must not be mixed with what this node tells.
-        with member_of_none(kind, table, values, args, rosout=False) as (node, parameters):
+        with standalone_node(kind, table, values, args, rosout=False) as (node, parameters):
             work(node, parameters)
     except LatheError as error:
         print(f"lathe: {error}", file=sys.stderr)
