@@ -70,6 +70,7 @@ setup(
             "py.typed",
             "__init__.pyi",
             "*/__init__.pyi",
+            "commands/completion.*",
             "nodes/*.xml",
             "msg_defs/msg/*.msg",
             "msg_defs/srv/*.srv",

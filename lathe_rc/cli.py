@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line, ``lathe``: it knows its commands by name and imports the one that is called.
+"""The command line, ``lathe``: it knows its commands by name and imports the one that is called or completed.
 
-To list or complete the commands takes no more than their names and summaries, so both answer at once.
+To list the commands takes no more than their names and summaries, so that is answered at once.
 """
 
 import io
@@ -24,28 +24,21 @@ class _Command(click.Command):
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
     ) -> click.Context:
-        """See `click.Command`."""
-        name = str(self.name)
-        if extra.get("resilient_parsing"):
-            from lathe_rc import completing
-
-            command = completing.stand_in(name)
-        else:
-            command = imported(name)
-        return command.make_context(info_name, args, parent, **extra)
+        """Make the context of the imported command."""
+        return imported(str(self.name)).make_context(info_name, args, parent, **extra)
 
 
 class Group(click.Group):
-    """Turns the project's errors into one line and an exit code."""
+    """The commands, and errors of the project as one line and an exit code."""
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """See `click.Command`; ./lathe of a checkout names its own commands in the environment."""
+        """Complete also the commands of a checkout's launcher, which names them in the environment."""
         also = os.environ.get("_LATHE_ALSO", "").split()
         own = [CompletionItem(name) for name in also if name.startswith(incomplete) and not incomplete.startswith("-")]
         return [*super().shell_complete(ctx, incomplete), *own]
 
     def invoke(self, ctx: click.Context) -> Any:
-        """See `click.Command`."""
+        """Run a command; errors of the project are one line and an exit code."""
         # SIGTERM ends a command as Ctrl-C does: children are ended and bags closed on the way out.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         for stream in (sys.stdout, sys.stderr):

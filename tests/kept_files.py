@@ -10,14 +10,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
-from lathe_rc import completing, jit
+from lathe_rc import jit
 from lathe_rc.cell import program, scenario, state_file
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.control import memory_file
 from lathe_rc.errors import LatheError
 from lathe_rc.signals import kept_table
 from lathe_rc.sweep import row, study, tune
-from lathe_rc.sweep.folder import Folder
+from lathe_rc.sweep.folder import Folder, Request
 from lathe_rc.sweep.space import Space
 from lathe_rc.sweep.study import Study
 from lathe_rc.sweep.sweep import ignore
@@ -62,10 +62,7 @@ def computed(_crew: object, order: Any, jobs: Any, _count: int) -> Any:
 
 def tuned(path: Path, trials: int = 8) -> Folder:
     """A tuning whose rows are made up; `computed` has to stand in for the workers."""
-    told = {
-        "targets": [LEAD], "free": {LEAD: "1e-3:2e-3"}, "goals": ["tool.rms_error"], "subjects": [],
-        "percentile": 100.0, "over": Space().to_json(), "sampler": "tpe", "seed": 0, "batch": 4, "formulas": False,
-    }  # fmt: skip
+    told = Request([LEAD], {LEAD: "1e-3:2e-3"}, ["tool.rms_error"], [], 100.0, Space(), "tpe", 0, 4, formulas=False)
     start = load().varied({LEAD: 1.8e-3})
     folder = Folder.begin(path, start, None, [], told)
     state = Study(folder)
@@ -134,12 +131,6 @@ def _table(_folder: Path) -> Kept:
     return Kept(path, read)
 
 
-def _completion(_folder: Path) -> Kept:
-    completing.known()
-    (path,) = Path(completing.platformdirs.user_cache_path("lathe_rc")).glob("completion-*.json")
-    return Kept(path, completing.known)
-
-
 def _compiled(suffix: str) -> Callable[[Path], Kept]:
     def made(_folder: Path) -> Kept:
         def read() -> object:
@@ -162,7 +153,6 @@ KINDS: dict[str, Callable[[Path], Kept]] = {
     "memory of a controller": _memory,
     "state of a node": _state,
     "table of a form": _table,
-    "completion": _completion,
     "index of compiled code": _compiled(".nbi"),
     "compiled code": _compiled(".nbc"),
 }
@@ -205,11 +195,9 @@ def flip(kept: Kept, bits: int, said: Callable[[], str]) -> int:
 
 
 def made(kind: str, monkeypatch: Any, folder: Path) -> Kept:
-    """A file of a kind, in a cache of its own if it is part of one; tunings have no workers, and few words complete."""
+    """A file of a kind, in a cache of its own if it is part of one; tunings have no workers."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
     monkeypatch.setattr(study, "rows", computed)
-    words = {"commands": {"run": {"params": ["--set"]}}, "nodes": {"tool": ["form"]}}
-    monkeypatch.setattr(completing, "look", lambda: words)
     if kind in CACHED:
         monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder))
     return KINDS[kind](folder)

@@ -21,7 +21,7 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.sweep import page, row
 from lathe_rc.sweep.effects import Axis, Yield, bins, effect, is_grid
 from lathe_rc.sweep.folder import Folder
-from lathe_rc.sweep.seen import Seen
+from lathe_rc.sweep.page_data import PageData
 from lathe_rc.sweep.space import Space
 from lathe_rc.view import charts
 
@@ -254,7 +254,7 @@ class TestPage:
         )
         space = Space(grid={**space.grid, "electrodynamic_actuator.autostart": [True, False]})
         folder = swept(tmp_path / "sweep", space, lambda values: 1e-6 * (1 + (values[LAW] == "constant_angle")))
-        axes = {axis.name: axis for axis in Seen(folder).axes}
+        axes = {axis.name: axis for axis in PageData(folder).axes}
         assert axes[LAW].texts == ["variable", "constant_angle"]
         assert axes["electrodynamic_actuator.autostart"].texts == ["false", "true"]
         assert_allclose(axes["spindle_encoder.deviation_amplitude"].distinct, [0.05, 0.1, 0.2])

@@ -18,16 +18,16 @@ from lathe_rc import cli, harness, resources
 from lathe_rc.analysis.pid_tuning import evaluate
 from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.commands import sweep as command
+from lathe_rc.commands import progress
 from lathe_rc.control.decoupler import PAPER
 from lathe_rc.control.pid import PidGains
 from lathe_rc.errors import InputError
 from lathe_rc.sweep import formulas, history, row, sweep, tune
-from lathe_rc.sweep.aims import aims
-from lathe_rc.sweep.free import Free, frees
+from lathe_rc.sweep.objectives import objectives
+from lathe_rc.sweep.search_space import Dimension, search_space
 from lathe_rc.sweep.space import Space
 from lathe_rc.sweep.study import Study
-from lathe_rc.sweep.tuned import Tuning
+from lathe_rc.sweep.tuning import Tuning
 
 LEAD, Q = "learning_controller.lead_time", "learning_controller.q_time"
 FREE = {LEAD: "0.8e-3:2e-3", Q: "40e-6:300e-6:log"}
@@ -50,6 +50,20 @@ def client():
     options = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
     with distributed.Client(**options, set_as_default=False) as made:
         yield made
+
+
+WITH = {"subjects": ["margin>=0.1"], "batch": 4}
+
+
+@pytest.fixture(scope="module")
+def search(piston, client, tmp_path_factory):
+    """Searches the piston's lead and Q in a folder of this module by its name, or in a given one."""
+    place = tmp_path_factory.mktemp("tune")
+
+    def go(folder, trials, goals=("tool.rms_error",), *, free=FREE, **more):
+        return lathe_rc.tune(piston, free, list(goals), place / folder, trials=trials, client=client, **more)
+
+    return go
 
 
 def told(tuning):
@@ -80,11 +94,11 @@ class TestAsking:
     )
     def test_what_cannot_be_searched_is_refused_in_one_line(self, piston, free, said):
         with pytest.raises(InputError, match=said) as refused:
-            frees(piston, free)
+            search_space(piston, free)
         assert "\n" not in str(refused.value)
 
     def test_a_range_in_percent_is_of_the_start(self, piston):
-        found = frees(piston, {LEAD: "50%:200%"})[LEAD].distribution
+        found = search_space(piston, {LEAD: "50%:200%"})[LEAD].distribution
         assert (found.low, found.high) == pytest.approx((0.45e-3, 1.8e-3))
 
     @pytest.mark.parametrize(
@@ -101,12 +115,12 @@ class TestAsking:
     )
     def test_what_cannot_be_wanted_is_refused_in_one_line(self, piston, goals, subjects, said):
         with pytest.raises(InputError, match=said):
-            aims(piston, goals, subjects)
+            objectives(piston, goals, subjects)
 
     @pytest.mark.parametrize(("goal", "why"), [("tool.max_error", "there is no tool"), ("-margin", "nobody learns")])
     def test_a_column_that_a_cell_never_has_is_refused(self, goal, why):
         with pytest.raises(InputError, match=f"{why} in interrupted_cut"):
-            aims(load("interrupted_cut", 3), [goal])
+            objectives(load("interrupted_cut", 3), [goal])
 
     def test_the_command_refuses_in_one_line(self, tmp_path):
         asked = ["tune", "piston", "--free", f"{LEAD}=1e-3:2e-3", "--goal", "margin", "--out", str(tmp_path / "x")]
@@ -138,16 +152,15 @@ class TestScore:
     def test_the_worst_or_a_percentile_of_the_cells_counts(self, piston):
         cells = self.cells(*(1e-6 * k for k in range(1, 101)))
         for percentile, cost in ((100.0, 100e-6), (95.0, 95e-6), (50.0, 50e-6)):
-            score = aims(piston, ["tool.max_error"], percentile=percentile).score(cells)
+            score = objectives(piston, ["tool.max_error"], percentile=percentile).score(cells)
             assert score.costs == pytest.approx((cost,))
-
-    def test_a_goal_with_a_minus_is_to_be_large_and_its_smallest_counts(self, piston):
+        # With a minus a goal is to be large, and its smallest counts.
         cells = self.cells(1e-6, margin=0.3) + self.cells(1e-6, margin=0.1)
-        score = aims(piston, ["-margin"]).score(cells)
+        score = objectives(piston, ["-margin"]).score(cells)
         assert (score.costs, score.margin) == ((-0.1,), 0.1)
 
     def test_refused_and_diverged_cells_are_infeasible_the_more_the_farther_they_are(self, piston):
-        wanted = aims(piston, ["tool.max_error"], ["margin>=0.2"])
+        wanted = objectives(piston, ["tool.max_error"], ["margin>=0.2"])
         near, far = (
             wanted.score([{"status": row.REFUSED, "tool.max_error": None, "margin": margin}, *self.cells(1e-6)])
             for margin in (-0.01, -0.5)
@@ -156,27 +169,20 @@ class TestScore:
         assert not near.feasible
         assert all(a < b for a, b in zip(near.violations, far.violations, strict=True))
         assert wanted.score(self.cells(1e-6)).feasible
+        no_value = [{**cell, "tool.in_tolerance_from": None} for cell in self.cells(1e-6)]
+        assert not objectives(piston, ["tool.in_tolerance_from"]).score(no_value).feasible
 
     def test_a_percentile_leaves_out_so_many_that_are_refused(self, piston):
         refused = [{"status": row.REFUSED, "tool.max_error": None, "margin": -1.0}]
-        wanted = aims(piston, ["tool.max_error"], ["margin>=0.2"], percentile=95.0)
+        wanted = objectives(piston, ["tool.max_error"], ["margin>=0.2"], percentile=95.0)
         assert wanted.score(self.cells(*[1e-6] * 95) + refused * 5).feasible
         assert not wanted.score(self.cells(*[1e-6] * 94) + refused * 6).feasible
 
-    def test_a_cell_without_a_value_of_its_goal_is_infeasible(self, piston):
-        score = aims(piston, ["tool.in_tolerance_from"]).score(
-            [{**cell, "tool.in_tolerance_from": None} for cell in self.cells(1e-6)]
-        )
-        assert not score.feasible
-
 
 @pytest.fixture(scope="module")
-def tuned(piston, client, tmp_path_factory):
+def tuned(search):
     """A search that nothing interrupted."""
-    folder = tmp_path_factory.mktemp("tune") / "whole"
-    return lathe_rc.tune(
-        piston, FREE, ["tool.rms_error"], folder, subjects=["margin>=0.1"], trials=20, batch=4, client=client
-    )
+    return search("whole", 20, **WITH)
 
 
 class TestSearch:
@@ -188,6 +194,7 @@ class TestSearch:
         assert start.values == {LEAD: 0.9e-3, Q: 200e-6}
         feasible = [trial.score.costs[0] for trial in tuned.trials if trial.score.feasible]
         assert best.score.costs[0] == min(feasible)
+        assert scenario.load(tuned.folder.path / "best.yaml").identity == tuned.scenario(best).identity
 
     def test_each_trial_is_a_row_that_runs_again_to_its_digest(self, tuned):
         table = tuned.sweep.table()
@@ -199,31 +206,17 @@ class TestSearch:
         again = harness.run(tuned.sweep.scenario(best))
         assert row.digest(again.recording, []) == tuned.sweep.row(best)["digest"]
 
-    def test_best_yaml_is_the_best_cell(self, tuned):
-        written = scenario.load(tuned.folder.path / "best.yaml")
-        assert written.identity == tuned.scenario(tuned.best).identity
-
-    def test_the_same_call_computes_nothing_and_gives_the_same(self, tuned, piston, client):
+    def test_the_same_call_computes_nothing_and_gives_the_same(self, tuned, search):
         events = []
-        again = lathe_rc.tune(
-            piston,
-            FREE,
-            ["tool.rms_error"],
-            tuned.folder.path,
-            subjects=["margin>=0.1"],
-            trials=20,
-            batch=4,
-            client=client,
-            watch=lambda event: events.append(event["event"]),
-        )
+        again = search("whole", 20, **WITH, watch=lambda event: events.append(event["event"]))
         assert events == ["began"]
         assert same(again, tuned)
         assert same(tune.load(tuned.folder.path), tuned)
 
-    def test_stopped_anywhere_and_begun_again_it_is_the_same_search(self, tuned, piston, client, tmp_path, monkeypatch):
+    def test_stopped_anywhere_and_begun_again_it_is_the_same_search(self, tuned, search, monkeypatch):
         """It is stopped after some rows, and in the middle of asking; what was computed is kept."""
         seen = []
-        suggest = Free.suggest
+        suggest = Dimension.suggest
 
         def stop(free, trial, target):
             seen.append("asked")
@@ -231,59 +224,29 @@ class TestSearch:
                 raise KeyboardInterrupt
             suggest(free, trial, target)
 
-        monkeypatch.setattr(Free, "suggest", stop)
+        monkeypatch.setattr(Dimension, "suggest", stop)
 
         def watch(event):
             seen.append(event["event"])
             if event["event"] == "rows" and seen.count("rows") in {2, 7, 12}:
                 raise KeyboardInterrupt
 
-        def go():
-            return lathe_rc.tune(
-                piston,
-                FREE,
-                ["tool.rms_error"],
-                tmp_path / "stopped",
-                subjects=["margin>=0.1"],
-                trials=20,
-                batch=4,
-                client=client,
-                watch=watch,
-            )
-
         for _ in range(6):
             with pytest.raises(KeyboardInterrupt):
-                go()
-        assert same(go(), tuned)
+                search("stopped", 20, **WITH, watch=watch)
+        found = search("stopped", 20, **WITH)
+        assert same(found, tuned)
         rows = tuned.sweep.table().drop_columns(["seconds"])
-        assert tune.load(tmp_path / "stopped").sweep.table().drop_columns(["seconds"]).equals(rows)
+        assert found.sweep.table().drop_columns(["seconds"]).equals(rows)
 
-    def test_more_trials_go_on_from_those_that_are_there(self, tuned, piston, client, tmp_path):
-        for trials in (4, 8):
-            found = lathe_rc.tune(
-                piston,
-                FREE,
-                ["tool.rms_error"],
-                tmp_path / "more",
-                subjects=["margin>=0.1"],
-                trials=trials,
-                batch=4,
-                client=client,
-            )
-            assert told(found) == told(tuned)[:trials]
-
-    def test_trials_of_another_program_are_waited_for_and_taken_over_once_it_is_gone(
-        self, tuned, piston, client, tmp_path
-    ):
+    def test_trials_of_another_program_are_waited_for_and_taken_over_once_it_is_gone(self, search, client):
         """Both programs end with the same trials and the same best."""
 
         def go(trials, watch=sweep.ignore):
-            return lathe_rc.tune(
-                piston, FREE, ["margin"], tmp_path / "x", trials=trials, batch=4, client=client, watch=watch
-            )
+            return search("two programs", trials, ["margin"], batch=4, watch=watch)
 
-        go(4)
-        state = Study(tune.Folder(tmp_path / "x"))
+        folder = go(4).folder
+        state = Study(tune.Folder(folder.path))
 
         def compute(event):
             if event["event"] == "waiting":
@@ -295,12 +258,12 @@ class TestSearch:
             beside = go(12, compute)
             assert [trial.number for trial in beside.trials] == list(range(12))
             assert same(beside, state.tuning())
-            written = scenario.load(tmp_path / "x" / "best.yaml")
+            written = scenario.load(folder.path / "best.yaml")
             assert written.identity == beside.scenario(beside.best).identity
             assert len(state.ask(other, 16)) == 4
         assert [trial.number for trial in go(16).trials] == list(range(16))
 
-    def test_the_best_is_written_while_no_other_program_can(self, piston, client, tmp_path, monkeypatch):
+    def test_the_best_is_written_while_no_other_program_can(self, search, monkeypatch):
         """Or one that knows fewer trials would write it over a better one."""
         write, written = Tuning.write, []
 
@@ -311,86 +274,71 @@ class TestSearch:
             write(tuning, trial, path)
 
         monkeypatch.setattr(Tuning, "write", locked)
-        lathe_rc.tune(piston, FREE, ["tool.rms_error"], tmp_path / "x", trials=2, client=client)
+        search("locked", 2)
         assert written
 
-    @pytest.mark.parametrize(
-        ("lines", "line"),
-        [
-            (b"{broken\n", 1),
-            (b"null\n", 1),
-            (b"[]\n", 1),
-            (b"{}\n", 1),
-            (b'{"op_code":99,"worker_id":"x"}\n', 1),
-            (b'{"op_code":4,"worker_id":"x"}\n', 1),
-            (b"\xff\n", 1),
-        ],
-    )
-    def test_a_journal_of_something_else_is_one_line(self, tuned, tmp_path, lines, line):
-        for name in ("sweep.json", "scenario.yaml"):
-            (tmp_path / name).write_bytes((tuned.folder.path / name).read_bytes())
-        (tmp_path / "trials.log").write_bytes(lines)
-        with pytest.raises(InputError, match=rf"trials\.log, line {line}: no journal of Optuna, or damaged") as refused:
-            tune.load(tmp_path)
-        assert "\n" not in str(refused.value)
-
-    def test_a_line_that_a_process_was_stopped_in_is_left_out_and_said(self, tuned, tmp_path, capsys):
+    @pytest.fixture
+    def journal(self, tuned, tmp_path):
+        """The journal of a copy without rows."""
         for name in ("sweep.json", "scenario.yaml", "trials.log"):
             (tmp_path / name).write_bytes((tuned.folder.path / name).read_bytes())
-        journal = tmp_path / "trials.log"
+        return tmp_path / "trials.log"
+
+    @pytest.mark.parametrize(
+        "line", [b"{broken", b"null", b"[]", b"{}", b'{"op_code":99,"worker_id":"x"}', b'{"op_code":4}', b"\xff"]
+    )
+    def test_a_journal_of_something_else_is_one_line(self, journal, line):
+        journal.write_bytes(line + b"\n")
+        with pytest.raises(InputError, match=r"trials\.log, line 1: no journal of Optuna, or damaged") as refused:
+            tune.load(journal.parent)
+        assert "\n" not in str(refused.value)
+
+    def test_a_line_that_a_process_was_stopped_in_is_left_out_and_said(self, tuned, journal, capsys):
         lines = journal.read_bytes().splitlines(keepends=True)
         last = max(number for number, line in enumerate(lines) if b'"op_code":6' in line)
         journal.write_bytes(b"".join(lines[:last]) + lines[last][:-30])
-        assert told(tune.load(tmp_path)) == told(tuned)[:-1]
+        assert told(tune.load(journal.parent)) == told(tuned)[:-1]
         assert f"{journal}: the last line is not whole" in capsys.readouterr().err
 
-    def test_a_trial_of_another_program_is_refused(self, tuned, tmp_path):
-        for name in ("sweep.json", "scenario.yaml", "trials.log"):
-            (tmp_path / name).write_bytes((tuned.folder.path / name).read_bytes())
-        storage = JournalStorage(JournalFileBackend(str(tmp_path / "trials.log")))
+    def test_a_trial_of_another_program_is_refused(self, journal):
+        storage = JournalStorage(JournalFileBackend(str(journal)))
         study = optuna.load_study(study_name="tuning", storage=storage)
         study.add_trial(optuna.create_trial(value=0.0))
         with pytest.raises(InputError, match=r"trials\.log: trial 20 is another program's"):
-            tune.load(tmp_path)
+            tune.load(journal.parent)
 
-    def test_a_folder_holds_one_tuning_and_no_sweep(self, tuned, piston, client):
-        path = tuned.folder.path
+    def test_a_folder_holds_one_tuning_and_no_sweep(self, tuned, piston, search, client):
         with pytest.raises(InputError, match="holds a tuning; allowed: a new folder"):
-            lathe_rc.run_sweep(piston, Space(grid={LEAD: [1e-3]}), path, client=client)
+            lathe_rc.run_sweep(piston, Space(grid={LEAD: [1e-3]}), tuned.folder.path, client=client)
         with pytest.raises(InputError, match=r'holds a tuning with goals \["tool.rms_error"\], not \["margin"\]'):
-            lathe_rc.tune(piston, FREE, ["margin"], path, client=client)
+            search("whole", 20, ["margin"])
 
-    def test_choices_and_whole_numbers_are_searched(self, piston, client, tmp_path):
+    def test_choices_and_whole_numbers_are_searched(self, search):
         free = {
             "learning_controller.lead_law": "constant_angle,variable",
             "learning_controller.points_per_revolution": "1024,2048",
             "learning_controller.soft_start": [0.0, 1.0],
             "learning_controller.feedback_delay": "2000:3200",
         }
-        found = lathe_rc.tune(piston, free, ["tool.rms_error"], tmp_path / "x", trials=8, client=client)
+        found = search("choices", 8, free=free)
         values = found.trials[-1].values
         assert [type(values[target]) for target in free] == [str, int, float, int]
         assert found.start.score.feasible
         assert len({repr(trial.values) for trial in found.trials}) > 4
 
-    @pytest.mark.parametrize("sampler", ["cmaes", "nsga2"])
-    def test_other_samplers_go_on_where_they_were_stopped(self, piston, client, tmp_path, sampler):
-        def go(folder, trials):
-            return lathe_rc.tune(
-                piston, FREE, ["tool.rms_error"], tmp_path / folder, sampler=sampler, trials=trials, client=client
-            )
-
-        whole = go("whole", 24)
-        go("parts", 8)
-        assert same(go("parts", 24), whole)
+    @pytest.mark.parametrize("sampler", ["tpe", "cmaes", "nsga2"])
+    def test_other_samplers_go_on_where_they_were_stopped(self, search, sampler):
+        whole = search(sampler, 24, sampler=sampler)
+        search(f"{sampler} in parts", 8, sampler=sampler)
+        assert same(search(f"{sampler} in parts", 24, sampler=sampler), whole)
         assert whole.best.score.costs < whole.start.score.costs
 
-    def test_two_goals_give_a_front_and_a_file_of_each(self, piston, client, tmp_path):
-        found = lathe_rc.tune(piston, FREE, ["tool.rms_error", "-margin"], tmp_path / "x", trials=24, client=client)
+    def test_two_goals_give_a_front_and_a_file_of_each(self, search):
+        found = search("front", 24, ["tool.rms_error", "-margin"])
         front = found.front
         assert len(front) > 1
         for trial in front:
-            written = scenario.load(tmp_path / "x" / "front" / f"trial-{trial.number}.yaml")
+            written = scenario.load(found.folder.path / "front" / f"trial-{trial.number}.yaml")
             assert written.identity == found.scenario(trial).identity
         costs = np.array([trial.score.costs for trial in front])
         assert (np.diff(costs[:, 0]) > 0).all()
@@ -399,9 +347,9 @@ class TestSearch:
         assert not any(a <= c and b <= d and (a, b) != (c, d) for c, d in costs for a, b in feasible)
         assert found.best in front
 
-    def test_the_goal_over_plants_is_that_of_the_worst(self, piston, client, tmp_path):
+    def test_the_goal_over_plants_is_that_of_the_worst(self, search):
         over = Space(sampled={"electrodynamic_actuator.natural_frequency": "uniform:90%:110%"}, sample="sobol:4")
-        found = lathe_rc.tune(piston, FREE, ["tool.rms_error"], tmp_path / "x", over=over, trials=3, client=client)
+        found = search("plants", 3, over=over)
         errors = found.sweep.table().column("tool.rms_error").to_pylist()
         assert len(errors) == 12
         for trial in found.trials:
@@ -442,6 +390,7 @@ class TestFormulas:
         drive = piston.nodes["electrodynamic_actuator"]
         lag = 2.0 * drive.damping / drive.natural_frequency + drive.delay
         assert formulas.settings(piston, [LEAD, Q])[LEAD].value == pytest.approx(lag, rel=1e-3)
+        assert formulas.settings(piston, ["tool.feed", "learning_controller.soft_start"]) == {}
 
     def test_with_a_given_q_the_lead_has_the_largest_margin(self, piston):
         lead = formulas.settings(piston, [LEAD])[LEAD].value
@@ -460,9 +409,6 @@ class TestFormulas:
         assert loop.stable
         assert math.degrees(loop.phase_margin) == pytest.approx(60.0, abs=3.0)
         assert loop.gain_margin > 2.0
-
-    def test_there_is_none_for_what_they_do_not_know(self, piston):
-        assert formulas.settings(piston, ["tool.feed", "learning_controller.soft_start"]) == {}
 
 
 def test_the_robust_setting_of_the_page_is_twice_as_good_on_the_worst_plant_as_the_nominal_one():
@@ -488,39 +434,48 @@ def test_the_robust_setting_of_the_page_is_twice_as_good_on_the_worst_plant_as_t
     assert worst(robust) < 0.5 * worst(nominal)
 
 
-def test_the_command_shows_and_writes_what_it_found(tmp_path, monkeypatch, client):
+@pytest.fixture
+def command(tmp_path, monkeypatch, client):
+    """Runs ``lathe tune piston`` in this process."""
     monkeypatch.setattr(sweep, "client_of", lambda *_: sweep.nullcontext(client))
+
+    def run(*words):
+        asked = ["tune", "piston", "--free", f"{LEAD}=0.8e-3:2e-3", "--goal", "tool.max_error"]
+        return CliRunner().invoke(cli.main, [*asked, "--out", str(tmp_path / "x"), *words])
+
+    return run
+
+
+def test_the_command_shows_and_writes_what_it_found(tmp_path, command):
     folder = tmp_path / "x"
-    asked = ["tune", "piston", "--revolutions", "3", "--set", f"{LEAD}=0.9e-3", "--free", f"{LEAD}=0.8e-3:2e-3"]
-    asked += ["--goal", "tool.max_error", "--over", "electrodynamic_actuator.damping=uniform:95%:105%"]
-    asked += ["--over", "seed=0,1", "--sample", "sobol:2", "--percentile", "50", "--trials", "3", "--out", str(folder)]
-    shown = CliRunner().invoke(cli.main, asked)
+    asked = ["--revolutions", "3", "--set", f"{LEAD}=0.9e-3", "--over", "seed=0,1", "--sample", "sobol:2"]
+    asked += ["--over", "electrodynamic_actuator.damping=uniform:95%:105%", "--percentile", "50", "--trials", "3"]
+    shown = command(*asked)
     assert shown.exit_code == 0, shown.output
     assert "by formula, learning_controller.lead_time: T0 with the least sup|Q - γZ|" in shown.stdout
     assert f"best:    lathe run {folder / 'best.yaml'}" in shown.stdout
     assert (folder / "history.png").read_bytes().startswith(b"\x89PNG")
-    page = (folder / "history.html").read_text(encoding="utf-8")
-    assert "https://cdn" not in page
-    told = json.loads(CliRunner().invoke(cli.main, [*asked, "--json"]).stdout)
+    assert "https://cdn" not in (folder / "history.html").read_text(encoding="utf-8")
+    told = json.loads(command(*asked, "--json").stdout)
     assert (told["trials"], told["cells"], told["best"]["feasible"]) == (3, 4, True)
     assert told["best"]["goals"]["tool.max_error"] <= told["start"]["goals"]["tool.max_error"]
 
 
-def test_where_nothing_runs_the_command_says_why(tmp_path, monkeypatch, client):
-    monkeypatch.setattr(sweep, "client_of", lambda *_: sweep.nullcontext(client))
+def test_where_nothing_runs_the_command_says_why(command, monkeypatch):
     monkeypatch.setattr(history, "write", lambda found: found.folder.path / "history.png")
-    asked = ["tune", "piston", "--set", "spindle_encoder.revolutions=0.0", "--free", f"{LEAD}=1e-3:2e-3"]
-    shown = CliRunner().invoke(
-        cli.main, [*asked, "--goal", "tool.max_error", "--trials", "2", "--out", str(tmp_path / "x")]
-    )
+    shown = command("--set", "spindle_encoder.revolutions=0.0", "--trials", "2")
     assert "nothing meets all subjects; allowed: wider ranges" in shown.stdout
     assert "2 cells did not run to their end, as this one: spindle_encoder" in shown.stdout
 
 
-def test_ctrl_c_says_what_is_kept(tmp_path, monkeypatch, client):
-    monkeypatch.setattr(sweep, "client_of", lambda *_: sweep.nullcontext(client))
-    monkeypatch.setattr(command.Watch, "describe", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-    asked = ["tune", "piston", "--revolutions", "3", "--free", f"{LEAD}=0.8e-3:2e-3", "--goal", "tool.max_error"]
-    stopped = CliRunner().invoke(cli.main, [*asked, "--trials", "20", "--batch", "2", "--out", str(tmp_path / "x")])
+def test_ctrl_c_says_what_is_kept(tmp_path, command, monkeypatch):
+    def stop(watch, event):
+        take(watch, event)
+        if event["event"] == "told":
+            raise KeyboardInterrupt
+
+    take = progress.SweepWatch.__call__
+    monkeypatch.setattr(progress.SweepWatch, "__call__", stop)
+    stopped = command("--revolutions", "3", "--trials", "20", "--batch", "2")
     assert stopped.exit_code == 130
     assert f"lathe: stopped; 2 of 20 trials are in {tmp_path / 'x'}: the same command goes on" in stopped.stderr

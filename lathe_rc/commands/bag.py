@@ -10,8 +10,6 @@ from typing import Any
 
 import click
 from rich.console import Console
-from rich.table import Table as RichTable
-from rich.text import Text
 
 from lathe_rc import messages, part
 from lathe_rc.bag import provenance
@@ -20,9 +18,9 @@ from lathe_rc.bag.reading import stream
 from lathe_rc.bag.reading.source import Source, name_of
 from lathe_rc.bag.reading.tachogram import make as make_tachogram
 from lathe_rc.bag.repairing.recover import recover as recover_bag
+from lathe_rc.commands import options, tables
 
-_JSON = click.option("--json", "as_json", is_flag=True, help="print one JSON object")
-_BAG = click.argument("path", metavar="BAG", type=click.Path(path_type=Path))
+_BAG = click.argument("path", metavar="BAG", type=options.PATH)
 _LOSSY = 3  # exit code where something is missing
 _SIMULATED = 10**17  # [ns] that simulated time does not reach: three years; other clocks have passed it in 1973
 
@@ -44,7 +42,7 @@ def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
 @bag.command()
 @_BAG
 @click.option("--metrics/--no-metrics", default=True, help="form error of the part; reads the whole bag")
-@_JSON
+@options.as_json
 @click.pass_context
 def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> None:
     """Topics, rates, span, scenario and the form error of the part.
@@ -78,20 +76,18 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> Non
     if as_json:
         click.echo(json.dumps(told))
         ctx.exit(_LOSSY if source.damage else 0)
-    console = Console(highlight=False, soft_wrap=True)
-    table = RichTable(show_edge=False, header_style="bold")
-    for column, justify in (("topic", "left"), ("type", "left"), ("messages", "right"), ("rate [Hz]", "right")):
-        table.add_column(column, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    console = tables.console()
+    table = tables.table("topic", "type", "messages", "rate [Hz]", left=2, no_wrap=True)
     for topic, said in topics.items():
         rate = f"{said['rate_hz']:.4g}" if said["rate_hz"] else ""
-        table.add_row(Text(topic), Text(said["type"].rpartition("/")[2]), str(said["messages"]), rate)
+        table.add_row(topic, said["type"].rpartition("/")[2], str(said["messages"]), rate)
     console.print(table)
     for each in source.unread:
-        console.print(Text(f"not read: {each}"))
+        console.print(f"not read: {each}")
     for what in (*told["contradictions"], *told["damage"]):
         click.echo(what, err=True)
     for what in told["foreign"]:
-        console.print(Text(what))
+        console.print(what)
     console.print(f"span: {span:.6g} s from {told['start'] or format(told['start_s'], '.6g') + ' s'} on")
     if told["error_um"]:
         first, last = told["error_um"]["first"], told["error_um"]["last"]
@@ -108,15 +104,15 @@ def _print_about(console: Console, about: Mapping[str, str]) -> None:
     for key, text in about.items():
         if key == provenance.SCENARIO:
             console.print("scenario:")
-            console.print(Text("  " + text.strip().replace("\n", "\n  ")))
+            console.print("  " + text.strip().replace("\n", "\n  "))
         elif key == provenance.ORIGINS:
             for origin in provenance.origins({key: text}):
                 of = f" of {origin.package}" if origin.package else ""
-                console.print(Text(f"{', '.join(origin.used)}: {origin.name}{of}, source {origin.source}"))
+                console.print(f"{', '.join(origin.used)}: {origin.name}{of}, source {origin.source}")
         elif key.startswith(provenance.FILE):
-            console.print(Text(f"{key.removeprefix(provenance.FILE)}: a file, {len(text)} characters in base64"))
+            console.print(f"{key.removeprefix(provenance.FILE)}: a file, {len(text)} characters in base64")
         else:
-            console.print(Text(f"{key.removeprefix('lathe_rc.')}: {text}"))
+            console.print(f"{key.removeprefix('lathe_rc.')}: {text}")
 
 
 def _date(log_ns: int) -> str | None:
@@ -128,7 +124,7 @@ def _date(log_ns: int) -> str | None:
 
 @bag.command()
 @_BAG
-@_JSON
+@options.as_json
 @click.pass_context
 def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
     """Verify sequence, gaps, numbers, checksums and recorded digests.
@@ -162,8 +158,8 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
 
 @bag.command()
 @_BAG
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="folder of the new bag; default: BAG_recovered")
-@_JSON
+@click.option("-o", "--output", type=options.PATH, help="folder of the new bag; default: BAG_recovered")
+@options.as_json
 @click.pass_context
 def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: bool) -> None:
     """Copy what is whole of a broken bag to a new one; exit code 0: no message is missing, 3: some are."""
@@ -190,16 +186,16 @@ def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: boo
 
 @bag.command()
 @_BAG
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="CSV file; default: BAG-tachogram.csv, here")
+@click.option("-o", "--output", type=options.PATH, help="CSV file; default: BAG-tachogram.csv, here")
 @click.option(
     "--tolerance",
-    type=click.FloatRange(min=0, min_open=True),
+    type=options.POSITIVE,
     default=0.1,
     show_default=True,
     help="greatest distance of the file's lines from a recorded speed [rpm]",
 )
 @click.option("--topic", default="", help="of the encoder; default: the only one")
-@_JSON
+@options.as_json
 def tachogram(path: Path, output: Path | None, tolerance: float, topic: str, *, as_json: bool) -> None:
     """Write the recorded spindle speed as a CSV file for tachogram_file, with as few rows as the tolerance allows."""
     target = output or Path(f"{name_of(path).removesuffix('.mcap')}-tachogram.csv")

@@ -9,18 +9,19 @@ from lathe_rc.commands import options
 
 
 @click.command()
-@click.argument("scenario")
-@click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of the runs")
+@options.scenario
+@click.option("--revolutions", type=options.POSITIVE, help="length of the runs")
 @options.overrides
 @options.allow_code
-@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+@options.as_json
 def budget(scenario: str, revolutions: float | None, overrides: tuple[str, ...], *, as_json: bool) -> None:
     """Tell what causes make of the form error of a SCENARIO: it runs offline with one after the other switched off."""
-    from lathe_rc.commands import budgeting, outcome
+    from lathe_rc.commands import outcome
     from lathe_rc.commands import scenario as scenarios
+    from lathe_rc.commands.progress import watched_budget
 
     loaded = scenarios.load(scenario, overrides, revolutions=revolutions)
-    found = budgeting.shown(loaded)
+    found = watched_budget(loaded)
     if as_json:
         click.echo(json.dumps({"scenario": loaded.name, **found.summary()}))
         return

@@ -2,17 +2,65 @@
 """The command ``lathe demo``: a cell of ROS 2 processes, recorded, with a picture of the result."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import click
 
 from lathe_rc import process_launcher
-from lathe_rc.commands.demos import DEMOS
+from lathe_rc.commands import options
+
+
+class Demo(NamedTuple):
+    """A cell that is shown.
+
+    Attributes:
+        scenario: of its file.
+        announcement: before it runs.
+        title: of the figure.
+        overrides: of the scenario, as for ``--set``.
+        peer: overrides that put another law in the place of the scenario's, which runs offline and is drawn as well.
+        peer_name: of that law.
+    """
+
+    scenario: str
+    announcement: str
+    title: str
+    overrides: tuple[str, ...] = ()
+    peer: tuple[str, ...] = ()
+    peer_name: str = ""
+
+
+DEMOS = {
+    "piston": Demo(
+        "piston",
+        "An oval-barrel piston at 1000 rpm with a 10 % harmonic speed deviation: five ROS 2 processes, one bag.",
+        "Oval-barrel piston, 1000 rpm, 10 % speed deviation",
+    ),
+    "two_channel": Demo(
+        "two_channel",
+        "An oval-barrel piston, coarse and piezo channel both self-learning: seven ROS 2 processes, one bag.",
+        "Oval-barrel piston, 1000 rpm, self-learning coarse and piezo channel",
+    ),
+    "interrupted": Demo(
+        "robust_cutting",
+        "An oval-barrel piston with a keyway, cut while the speed wanders by 10 %; the force bends the drive. Six "
+        "ROS 2 processes, one bag; then the compound law of PMC8878366 on the same cell, offline.",
+        "Oval-barrel piston with a keyway, 1000 rpm ±10 %, force on the drive",
+        (
+            "profile.profile=piston",
+            "loaded_drive.cut_gap_start=[2.6]",
+            "loaded_drive.cut_gap_width=[0.35]",
+        ),
+        ("controller.stage=compound_controller",),
+        "compound law (PMC8878366)",
+    ),
+}
 
 
 @click.command()
 @click.argument("name", type=click.Choice(list(DEMOS)), default="piston")
 @click.option("--revolutions", type=click.FloatRange(min=1), default=60.0, show_default=True)
-@click.option("--folder", type=click.Path(path_type=Path), default=Path("bags"), show_default=True, help="for results")
+@click.option("--folder", type=options.PATH, default=Path("bags"), show_default=True, help="for results")
 def demo(name: str, revolutions: float, folder: Path) -> None:
     """Turn an oval-barrel piston: processes over DDS, learning, everything recorded.
 

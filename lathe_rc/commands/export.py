@@ -5,18 +5,19 @@ from pathlib import Path
 
 import click
 
+from lathe_rc.commands import options
 from lathe_rc.errors import InputError
 
 
 @click.command()
-@click.argument("bag", type=click.Path(path_type=Path))
+@options.bag
 @click.option("--csv", "kinds", flag_value="csv", multiple=True, help="a CSV file for each topic")
 @click.option("--parquet", "kinds", flag_value="parquet", multiple=True, help="a Parquet file for each topic")
 @click.option("--npz", "kinds", flag_value="npz", multiple=True, help="one NumPy archive")
 @click.option(
     "-o",
     "--output",
-    type=click.Path(path_type=Path),
+    type=options.PATH,
     help="folder, for --npz file, to make; must not exist; default: BAG-csv, BAG-parquet or BAG.npz, here",
 )
 @click.option("--topics", multiple=True, metavar="LIST", help="like /tool,/encoder; repeatable; default: all signals")

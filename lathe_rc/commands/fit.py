@@ -2,26 +2,19 @@
 """The command group ``lathe fit``: models from measurements, with the parameters to set."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
-from rich.console import Console
 
-from lathe_rc.analysis import hysteresis_fit, pid_tuning, reduced_order
-from lathe_rc.bag import reader
-from lathe_rc.commands import picture
+from lathe_rc.analysis import hysteresis_fit, reduced_order
+from lathe_rc.commands import options, picture
+from lathe_rc.commands.tables import console
 from lathe_rc.control.decoupler import LAG
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.transfer import TransferFunction
-
-_POSITIVE = click.FloatRange(min=0, min_open=True)
-
-
-def _json(command: Callable[..., Any]) -> Callable[..., Any]:
-    return click.option("--json", "as_json", is_flag=True, help="print one JSON object")(command)
 
 
 @click.group()
@@ -30,17 +23,19 @@ def fit() -> None:
 
 
 @fit.command()
-@click.argument("measured", type=click.Path(path_type=Path))
-@click.option("--stroke", type=_POSITIVE, default=15e-6, show_default=True, help="half-stroke of the drive [m]")
+@click.argument("measured", type=options.PATH)
+@click.option("--stroke", type=options.POSITIVE, default=15e-6, show_default=True, help="half-stroke of the drive [m]")
 @click.option("--command", "command_topic", default="/fine/command", show_default=True, help="of a bag: topic")
 @click.option("--state", "state_topic", default="/fine/state", show_default=True, help="of a bag: topic")
-@_json
+@options.as_json
 def hysteresis(measured: Path, stroke: float, command_topic: str, state_topic: str, *, as_json: bool) -> None:
     """Plays of Prandtl and Ishlinskii by least squares (docs/drives.md).
 
     MEASURED is a CSV file with command_um,displacement_um, or a bag of a drive that ran with linearisation: none.
     """
     if measured.is_dir():
+        from lathe_rc.bag import reader
+
         loop = hysteresis_fit.from_signals(reader.read_bag(measured).dense, command_topic, state_topic)
     else:
         loop = hysteresis_fit.read_csv(measured)
@@ -55,12 +50,12 @@ def hysteresis(measured: Path, stroke: float, command_topic: str, state_topic: s
     if as_json:
         click.echo(json.dumps(told))
         return
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(f"left by the fit: {100 * found.residual:.3g} % RMS; parameters of piezo_actuator:")
+    out = console()
+    out.print(f"left by the fit: {100 * found.residual:.3g} % RMS; parameters of piezo_actuator:")
     for name in ("identified_proportional", "identified_thresholds", "identified_weights"):
         values = np.atleast_1d(told[name])
         text = ", ".join(f"{value:.6g}" for value in values)
-        console.print(f"{name}: {text if np.ndim(told[name]) == 0 else f'[{text}]'}", markup=False)
+        out.print(f"{name}: {text if np.ndim(told[name]) == 0 else f'[{text}]'}")
 
 
 def _coefficients(transfer: TransferFunction) -> dict[str, list[float]]:
@@ -85,7 +80,7 @@ def _draw(path: Path, model: reduced_order.Fit, inverse: reduced_order.Fit | Non
 
 
 @fit.command()
-@click.argument("measured", type=click.Path(path_type=Path))
+@click.argument("measured", type=options.PATH)
 @click.option("--zeros", type=click.IntRange(0, 8), default=0, show_default=True, help="degree of the numerator")
 @click.option("--poles", type=click.IntRange(1, 8), default=2, show_default=True, help="beside an integrator")
 @click.option("--integrator", is_flag=True, help="the channel integrates")
@@ -93,9 +88,9 @@ def _draw(path: Path, model: reduced_order.Fit, inverse: reduced_order.Fit | Non
 @click.option("--phase-margin", type=click.FloatRange(1, 89), default=60.0, show_default=True, help="of the PID [°]")
 @click.option("--gain-margin", type=click.FloatRange(min=1), default=3.0, show_default=True, help="of the PID [1]")
 @click.option("--delay", type=click.FloatRange(min=0), default=1e-3, show_default=True, help="in the loop [s]")
-@click.option("--lag", type=_POSITIVE, default=LAG, show_default=True, help="least lag of the inverse [s]")
-@click.option("--figure", type=click.Path(path_type=Path), default=Path("fit-channel.png"), show_default=True)
-@_json
+@click.option("--lag", type=options.POSITIVE, default=LAG, show_default=True, help="least lag of the inverse [s]")
+@click.option("--figure", type=options.PATH, default=Path("fit-channel.png"), show_default=True)
+@options.as_json
 def channel(
     measured: Path,
     zeros: int,
@@ -145,6 +140,8 @@ def _tuned(model: TransferFunction, phase_margin: float, gain_margin: float, del
     Raises:
         InputError: there is none.
     """
+    from lathe_rc.analysis import pid_tuning  # SciPy's optimisers take a second
+
     corners = np.abs(model.poles)
     corners = corners[corners > 0.0]
     band = (float(corners.min()) / 10.0, float(corners.max()) * 10.0)
@@ -170,19 +167,19 @@ def _tuned(model: TransferFunction, phase_margin: float, gain_margin: float, del
 
 def _show(told: Mapping[str, Any], delay: float) -> None:
     """Print all that has been found."""
-    console = Console(highlight=False, soft_wrap=True)
+    out = console()
 
     for name in ("model", "inverse"):
         if found := told.get(name):
             top, bottom = (", ".join(f"{value:.5g}" for value in found[part]) for part in ("numerator", "denominator"))
-            console.print(f"{name:8} [{top}] / [{bottom}], RMS {found['rms']:.3g}", markup=False)
+            out.print(f"{name:8} [{top}] / [{bottom}], RMS {found['rms']:.3g}")
     if "pid" in told:
         loop = told["loop"]
-        console.print("pid      " + ", ".join(f"{name} {value:.5g}" for name, value in told["pid"].items()))
+        out.print("pid      " + ", ".join(f"{name} {value:.5g}" for name, value in told["pid"].items()))
         margin = "any" if loop["gain_margin"] is None else f"{loop['gain_margin']:.3g}"
-        console.print(
+        out.print(
             f"loop     rise {loop['rise_s']:.3g} s, settling {loop['settling_s']:.3g} s, "
             f"overshoot {loop['overshoot_pct']:.3g} %, margins {margin} and {loop['phase_margin_deg']:.3g}° "
             f"with a delay of {delay * 1e3:g} ms"
         )
-    console.print(f"figure:  {told['figure']}")
+    out.print(f"figure:  {told['figure']}")

@@ -8,24 +8,22 @@ from pathlib import Path
 import click
 import numpy as np
 from rich.console import Console
-from rich.table import Table as RichTable
+from rich.table import Table
 
 from lathe_rc import part
 from lathe_rc.analysis.metrology import Lay, Measurement
 from lathe_rc.bag import provenance, reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.recording import Recording
+from lathe_rc.commands import options, tables
 from lathe_rc.errors import InputError
 
-_SHOWN = 10  # revolutions, unless others are asked for
 _COLUMNS = ("rev", "RMS", "max", "P-V", "RONt", "eccentric", "largest UPR", "Ra")
 
 
-def table(found: Measurement, revolutions: list[int]) -> RichTable:
+def table(found: Measurement, revolutions: list[int]) -> Table:
     """One line a revolution, in µm."""
-    lines = RichTable(title="form error and roundness [µm]", title_justify="left", show_edge=False, header_style="bold")
-    for column in _COLUMNS:
-        lines.add_column(column, justify="right")
+    lines = tables.table(*_COLUMNS, title="form error and roundness [µm]")
     for revolution in revolutions:
         told = part.numbers(found, revolution)
         upr = told["largest_upr"]
@@ -42,7 +40,7 @@ def table(found: Measurement, revolutions: list[int]) -> RichTable:
 def _chosen(text: str, whole: int) -> list[int]:
     """Revolutions, counted from 0, that a text such as 1,4,10-12 names; without one, some spread over all."""
     if not text:
-        return sorted(set(np.unique(np.geomspace(1, whole, _SHOWN).round().astype(int) - 1).tolist()))
+        return tables.spread(whole)
     chosen: list[int] = []
     for piece in text.split(","):
         span = re.fullmatch(r"(\d+)(?:-(\d+))?", piece.strip(), re.ASCII)
@@ -71,24 +69,24 @@ def _surface(bag: Path, recording: Recording, found: Measurement, nose_mm: float
 
 
 @click.command()
-@click.argument("bag", type=click.Path(path_type=Path))
+@options.bag
 @click.option("--revolutions", default="", metavar="LIST", help="like 1,4,10-12; default: some from all of the run")
 @click.option(
     "--cutoff",
-    type=click.FloatRange(min=0, min_open=True),
+    type=options.POSITIVE,
     default=50.0,
     show_default=True,
     help="of the filters for roundness and roughness [undulations per revolution]",
 )
 @click.option(
     "--nose-radius",
-    type=click.FloatRange(min=0, min_open=True),
+    type=options.POSITIVE,
     metavar="MM",
     help="radius of the tool's nose in the plane of the feed [mm]: tells the roughness along the part too; default: "
     "what the scenario in the bag says",
 )
-@click.option("--profile", type=click.Path(path_type=Path), help="CSV file to write these revolutions' profiles to")
-@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+@click.option("--profile", type=options.PATH, help="CSV file to write these revolutions' profiles to")
+@options.as_json
 def measure(
     bag: Path, revolutions: str, cutoff: float, nose_radius: float | None, profile: Path | None, *, as_json: bool
 ) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import click
 
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.commands import options
+from lathe_rc.commands import completers, options
 from lathe_rc.errors import InputError
 from lathe_rc.loading import load
 from lathe_rc.nodes.arguments import help_or_refusal
@@ -27,7 +27,7 @@ class _PassingThrough(click.Command):
 
 
 @click.command(cls=_PassingThrough, context_settings=_PASS_THROUGH)
-@click.argument("name", metavar="NAME[:STAGE]")
+@click.argument("name", metavar="NAME[:STAGE]", shell_complete=completers.kinds)
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
 @options.allow_code
 def node(name: str, arguments: tuple[str, ...]) -> None:
@@ -41,7 +41,7 @@ def node(name: str, arguments: tuple[str, ...]) -> None:
 
 
 @click.command(cls=_PassingThrough, context_settings=_PASS_THROUGH)
-@click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
+@click.argument("arguments", nargs=-1, type=click.UNPROCESSED, shell_complete=completers.kinds)
 @options.allow_code
 def container(arguments: tuple[str, ...]) -> None:
     """Run several nodes in one process: NODE[:STAGE]... [--ros-args ...]."""

@@ -1,11 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several commands have; to import them takes no more than click."""
+"""Arguments and options that several commands have; to import them takes no more than Click."""
 
 from collections.abc import Iterable
+from pathlib import Path
 
 import click
 
 from lathe_rc import allowed_code
+from lathe_rc.commands import completers
+
+POSITIVE = click.FloatRange(min=0, min_open=True)
+PATH = click.Path(path_type=Path)
+
+scenario = click.argument("scenario", shell_complete=completers.scenarios)
+bag = click.argument("bag", type=PATH)
+as_json = click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 
 allow_code = click.option(
     allowed_code.OPTION,
@@ -13,7 +22,7 @@ allow_code = click.option(
     metavar="PACKAGE",
     is_eager=True,
     expose_value=False,
-    callback=lambda _ctx, _option, packages: _allow(packages),
+    callback=lambda ctx, _option, packages: None if ctx.resilient_parsing else _allow(packages),
     help="import classes that scenario, bag or members name from this package, also of the current folder; repeatable",
 )
 
@@ -24,7 +33,12 @@ def _allow(packages: Iterable[str]) -> None:
 
 
 overrides = click.option(
-    "--set", "overrides", multiple=True, metavar="NODE.PARAM=VALUE", help="also PARAM=VALUE if shared"
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="NODE.PARAM=VALUE",
+    shell_complete=completers.targets,
+    help="also PARAM=VALUE if shared",
 )
 
 groups = click.option(
@@ -32,6 +46,7 @@ groups = click.option(
     "groups",
     multiple=True,
     metavar="NODE+NODE",
+    shell_complete=completers.nodes,
     help="nodes that share a process, instead of those that the scenario names; repeatable; none: one each",
 )
 
@@ -41,7 +56,29 @@ start = click.option(
     help="processes are forked from one that has imported everything, or interpreters of their own; default: fork",
 )
 
-length = click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of each run")
+length = click.option("--revolutions", type=POSITIVE, help="length of each run")
+
+# --- of the sweep and the tuning
+
+tie = click.option(
+    "--tie",
+    multiple=True,
+    metavar="NODE.PARAM=FORMULA",
+    shell_complete=completers.targets,
+    help="such as fine_controller.q_time*1.1",
+)
+
+seeds = click.option(
+    "--seeds", type=click.IntRange(1), default=1, show_default=True, help="each cell with so many seeds"
+)
+
+measures = click.option(
+    "--measure",
+    "measures",
+    multiple=True,
+    metavar="TOPIC.FIELD:STATISTIC",
+    help="more columns: max, rms, mean, peak_to_valley",
+)
 
 scheduler = click.option("--scheduler", metavar="ADDRESS", help="of Dask; default: workers on this machine")
 

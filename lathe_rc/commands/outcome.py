@@ -6,36 +6,33 @@ from itertools import groupby
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table as RichTable
+from rich.table import Table
 from rich.text import Text
 
 from lathe_rc import harness, part
 from lathe_rc.analysis.budget import Budget, Part
 from lathe_rc.analysis.metrology import Lay
 from lathe_rc.cell.durations import Lateness
-from lathe_rc.commands import plot
+from lathe_rc.commands import plot, tables
 
 _MOST_EVENTS = 12  # printed of a run
 _ALIKE = 4  # of them that follow one another: those in between are left out
 
 
-def table(result: harness.Result) -> RichTable:
+def table(result: harness.Result) -> Table:
     """The part in its first and last revolution."""
-    table = RichTable(show_edge=False, header_style="bold", title_justify="left")
     columns = {"rms": "RMS [µm]", "max": "maximum [µm]", "peak_to_valley": "peak to valley [µm]", "ront": "RONt [µm]"}
-    for column in ("", *columns.values()):
-        table.add_column(column, justify="right" if column else "left")
+    found = tables.table("", *columns.values(), left=1)
     for label, revolution in (("first revolution", 0), ("last revolution", -1)):
         told = part.numbers(result.part, revolution)
-        table.add_row(label, *(f"{told[name]:#.4g}" for name in columns))
-    return table
+        found.add_row(label, *(f"{told[name]:#.4g}" for name in columns))
+    return found
 
 
-def _events(result: harness.Result) -> RichTable:
+def _events(result: harness.Result) -> Table:
     """The event log, as far as there is room; of equal ones that follow one another the first and the last."""
-    table = RichTable(show_edge=False, header_style="bold")
-    for column in ("time [s]", "topic", "what happened"):
-        table.add_column(Text(column), justify="left" if table.columns else "right", overflow="fold")
+    table = tables.table("time [s]", "topic", "what happened", left=3, overflow="fold")
+    table.columns[0].justify = "right"
     step, rows = result.scenario.shared.step, list[tuple[str, str, str]]()
     for _, run in groupby(result.event_log, lambda found: (found.topic, found.text.partition(":")[0])):
         alike = [(f"{found.sample * step:.6g}", found.topic, found.text) for found in run]
@@ -77,21 +74,14 @@ def _lateness(told: Lateness) -> list[str]:
     ]
 
 
-def budget_table(found: Budget) -> RichTable:
-    """Cause by cause."""
-    table = RichTable(show_edge=False, header_style="bold", title_justify="left")
-    for column in ("cause", "share of the power [%]", "RMS [µm]", "maximum [µm]"):
-        table.add_column(column, justify="right" if table.columns else "left")
+def show_budget(found: Budget) -> None:
+    """Print a budget, cause by cause."""
+    lines = tables.table("cause", "share of the power [%]", "RMS [µm]", "maximum [µm]", left=1)
     whole = Part(f"form error, {found.revolutions} revolutions", 1.0, found.rms, found.largest)
     for each in (*found.rows, whole):
-        table.add_row(each.name, each.percent(), f"{each.rms * 1e6:.3g}", f"{each.largest * 1e6:.3g}")
-    return table
-
-
-def show_budget(found: Budget) -> None:
-    """Print a budget."""
+        lines.add_row(each.name, each.percent(), f"{each.rms * 1e6:.3g}", f"{each.largest * 1e6:.3g}")
     console = Console()
-    console.print(budget_table(found))
+    console.print(lines)
     for name, why in found.left_out.items():
         console.print(f"not switched off: {name}: {why}", highlight=False)
 

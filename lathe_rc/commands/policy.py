@@ -13,13 +13,13 @@ from lathe_rc.files import replacing
 
 
 @click.command()
-@click.argument("scenario")
+@options.scenario
 @options.groups
 @click.option("--namespace", default="/", show_default=True, help="of the cell")
 @click.option("--with", "beside", multiple=True, type=click.Choice(security.BESIDE), help="let in as well; repeatable")
 @options.overrides
 @options.allow_code
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="file to write; default: the standard output")
+@click.option("-o", "--output", type=options.PATH, help="file to write; default: the standard output")
 def policy(
     scenario: str,
     groups: tuple[str, ...],

@@ -3,27 +3,28 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
+from lathe_rc.commands import options
+
 
 @click.command()
-@click.argument("bag", type=click.Path(path_type=Path))
+@options.bag
 @click.option("--topics", multiple=True, metavar="TOPIC", help="repeatable; default: all but those of ROS itself")
-@click.option("--all", "everything", is_flag=True, help="hidden topics, /rosout and /parameter_events as well")
+@click.option("--all", is_flag=True, help="hidden topics, /rosout and /parameter_events as well")
 @click.option("--sim-time", is_flag=True, help="log times from /clock; default: the wall time of publication")
 @click.option("--once", is_flag=True, help="end when all publishers are gone")
 @click.option("--hold", type=click.FloatRange(min=0, min_open=True, max=60), help="[s] that messages wait for others")
-def record(
-    bag: Path, topics: tuple[str, ...], hold: float | None, *, everything: bool, sim_time: bool, once: bool
-) -> None:
+def record(bag: Path, topics: tuple[str, ...], hold: float | None, **values: Any) -> None:
     """Record any topics into a new BAG, in the order of their publication; Ctrl-C ends it.
 
     Exit code 3: messages are missing.
     """
     from lathe_rc.nodes import topic_recorder
 
-    values = {"bag": str(bag), "topics": list(topics), "all": everything, "sim_time": sim_time, "once": once}
+    values |= {"bag": str(bag), "topics": list(topics)}
     if hold is not None:
         values["hold"] = hold
     sys.exit(topic_recorder.run(values, ["--ros-args"]))

@@ -3,6 +3,7 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -10,7 +11,7 @@ from lathe_rc.commands import options
 
 
 @click.command()
-@click.argument("bag", type=click.Path(path_type=Path))
+@options.bag
 @click.option("--rate", type=click.FloatRange(min=0), default=1.0, show_default=True, help="0: as fast as it goes")
 @click.option("--loop", is_flag=True, help="begin again at the end")
 @click.option("--start", type=click.FloatRange(min=0), default=0.0, help="[s] from the bag's first message on")
@@ -19,20 +20,8 @@ from lathe_rc.commands import options
 @click.option("--wait", type=click.IntRange(min=0), default=0, metavar="N", help="begin when each topic has N readers")
 @click.option("--as-cell", is_flag=True, help="as the nodes that made it; begins when a recorder node is ready")
 @options.allow_code
-def replay(
-    bag: Path, rate: float, start: float, end: float, topics: tuple[str, ...], wait: int, *, loop: bool, as_cell: bool
-) -> None:
+def replay(bag: Path, topics: tuple[str, ...], **values: Any) -> None:
     """Send the messages of a BAG again, with /clock; services ~/pause, ~/resume and ~/toggle_paused."""
     from lathe_rc.nodes import replayer
 
-    values = {
-        "bag": str(bag),
-        "rate": rate,
-        "loop": loop,
-        "start": start,
-        "end": end,
-        "topics": list(topics),
-        "wait": wait,
-        "as_cell": as_cell,
-    }
-    sys.exit(replayer.run(values, ["--ros-args"]))
+    sys.exit(replayer.run({"bag": str(bag), "topics": list(topics), **values}, ["--ros-args"]))

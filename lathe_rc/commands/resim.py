@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 from rich.console import Console
-from rich.table import Table as RichTable
+from rich.table import Table
 
 from lathe_rc.analysis import drive_fit
 from lathe_rc.bag import provenance
@@ -19,35 +18,30 @@ from lathe_rc.bag.resimulation import identify
 from lathe_rc.bag.resimulation.bag_spindle import asked_for
 from lathe_rc.bag.resimulation.identify import Identified
 from lathe_rc.bag.resimulation.resim import Resimulation, resimulate
-from lathe_rc.commands import options
+from lathe_rc.commands import completers, options, tables
 from lathe_rc.errors import InputError
 
-_SHOWN = 10  # revolutions
 _DIFFERENT = 1  # exit code if an unchanged run does not come out as recorded
 _UNITS = {"natural_frequency": ("rad/s", 1.0), "damping": ("1", 1.0), "delay": ("ms", 1e3)}  # and factor for it
 
 
-def _table(found: Resimulation) -> RichTable:
+def _table(found: Resimulation) -> Table:
     """Recorded and re-simulated form error side by side."""
-    table = RichTable(title="form error, RMS [µm]", title_justify="left", show_edge=False, header_style="bold")
     positions = found.between_rms.size > 0
-    for column in ("revolution", "recorded", "re-simulated", "ratio", *(["positions differ by"] if positions else [])):
-        table.add_column(column, justify="right")
+    columns = ("revolution", "recorded", "re-simulated", "ratio", *(["positions differ by"] if positions else []))
+    table = tables.table(*columns, title="form error, RMS [µm]")
     whole = min(found.rms.size, found.recorded_rms.size)
-    for k in sorted(set(np.unique(np.geomspace(1, whole, _SHOWN).round().astype(int) - 1).tolist())):
+    for k in tables.spread(whole):
         old, new = found.recorded_rms[k] * 1e6, found.rms[k] * 1e6
         between = [f"{found.between_rms[k] * 1e6:#.4g}"] if positions else []
         table.add_row(str(k + 1), f"{old:#.4g}", f"{new:#.4g}", f"{new / old:.3g}" if old else "", *between)
     return table
 
 
-def _drive_table(drive: Identified) -> RichTable:
+def _drive_table(drive: Identified) -> Table:
     """Identified parameters beside those of the scenario."""
-    title = f"{drive.node} from {drive.command} and {drive.position[0]}"
-    table = RichTable(title=title, title_justify="left", show_edge=False, header_style="bold")
-    scenario = ["scenario"] if drive.before else []
-    for column in ("parameter", "unit", "identified", "standard error", *scenario):
-        table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
+    columns = ("parameter", "unit", "identified", "standard error", *(["scenario"] if drive.before else []))
+    table = tables.table(*columns, title=f"{drive.node} from {drive.command} and {drive.position[0]}", left=2)
     for name in drive_fit.PARAMETERS:
         unit, factor = _UNITS[name]
         values = [f"{drive.fit.values[name] * factor:.6g}", f"{drive.fit.errors[name] * factor:.2g}"]
@@ -112,19 +106,26 @@ def _has_scenario(bag: Path) -> bool:
 
 
 @click.command()
-@click.argument("bag", type=click.Path(path_type=Path))
-@click.option("--set", "overrides", multiple=True, metavar="NODE.PARAM=VALUE", help="repeatable; not of the spindle")
-@click.option("--controller", type=click.Path(path_type=Path), help="parameter file whose nodes replace the bag's")
-@click.option("--scenario", type=click.Path(path_type=Path), help="parameter file in place of the bag's scenario")
+@options.bag
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="NODE.PARAM=VALUE",
+    shell_complete=completers.targets,
+    help="repeatable; not of the spindle",
+)
+@click.option("--controller", type=options.PATH, help="parameter file whose nodes replace the bag's")
+@click.option("--scenario", type=options.PATH, help="parameter file in place of the bag's scenario")
 @click.option(
     "--topic", multiple=True, metavar="NAME=/TOPIC", help="what the bag calls a topic of the cell; repeatable"
 )
 @click.option("--identify", "identified", is_flag=True, help="electrodynamic drives as the bag shows them")
-@click.option("--write-parameters", type=click.Path(path_type=Path), help="file for the scenario, or the drive, found")
-@click.option("--write-form", type=click.Path(path_type=Path), help="CSV file for the tool's position by angle")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="folder of a bag for the result; must not exist")
+@click.option("--write-parameters", type=options.PATH, help="file for the scenario, or the drive, found")
+@click.option("--write-form", type=options.PATH, help="CSV file for the tool's position by angle")
+@click.option("-o", "--output", type=options.PATH, help="folder of a bag for the result; must not exist")
 @options.allow_code
-@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+@options.as_json
 @click.pass_context
 def resim(
     ctx: click.Context,
@@ -145,7 +146,7 @@ def resim(
     A BAG that holds no scenario needs --scenario; its drive can be identified without (docs/bags.md).
     """
     topics = _topics(topic)
-    console = Console(highlight=False, soft_wrap=True)
+    console = tables.console()
     if write_form:
         _form(bag, topics, write_form, console, quiet=as_json)
     if identified and scenario is None and not _has_scenario(bag):
@@ -158,7 +159,7 @@ def resim(
             click.echo(json.dumps({"bag": str(bag), "drives": [_told(drive) for drive in drives], "asked_for": rest}))
             return
         _show_drives(console, drives, write_parameters)
-        console.print(rest, markup=False)
+        console.print(rest)
         return
     found = resimulate(
         bag,
@@ -205,9 +206,9 @@ def _show_drives(console: Console, drives: Sequence[Identified], parameters: Pat
     for drive in drives:
         console.print(_drive_table(drive))
         for line in _drive_lines(drive):
-            console.print(line, markup=False)
+            console.print(line)
     if parameters:
-        console.print(f"parameters: {parameters}", markup=False)
+        console.print(f"parameters: {parameters}")
 
 
 def _show(console: Console, found: Resimulation, output: Path | None) -> None:
@@ -215,7 +216,7 @@ def _show(console: Console, found: Resimulation, output: Path | None) -> None:
         console.print(_table(found))
     if found.positions:
         told = " + ".join(f"{topic} {name}" for topic, name in found.positions)
-        console.print(f"recorded: {told}, against the scenario's form", markup=False)
+        console.print(f"recorded: {told}, against the scenario's form")
     elif not found.recorded:
         console.print("the recording is not complete: nothing to compare the whole with")
     if found.recorded and not found.different:
@@ -239,5 +240,4 @@ def _form(bag: Path, topics: Mapping[str, str], path: Path, console: Console, *,
         console.print(
             f"form: {path}, the tool's position in revolutions {first} to {last}, which differ from it by "
             f"{found.scatter * 1e6:.4g} µm RMS",
-            markup=False,
         )

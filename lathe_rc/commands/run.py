@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command ``lathe run``: a scenario to its end."""
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,14 +14,14 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("scenario")
+@options.scenario
 @click.option("--mode", type=click.Choice(["offline", "composed", "processes"]), default="offline", show_default=True)
 @options.groups
-@click.option("--revolutions", type=click.FloatRange(min=0, min_open=True), help="length of the run")
+@click.option("--revolutions", type=options.POSITIVE, help="length of the run")
 @click.option("--speed-factor", type=click.FloatRange(min=0), help="pace against real time; 0: as fast as possible")
-@click.option("--bag", type=click.Path(path_type=Path), help="folder to record to; must not exist")
-@click.option("--profile", type=click.Path(path_type=Path), help="CSV file to write the last revolution's profile to")
-@click.option("--figure", type=click.Path(path_type=Path), help="PNG to draw the form and its error to")
+@click.option("--bag", type=options.PATH, help="folder to record to; must not exist")
+@click.option("--profile", type=options.PATH, help="CSV file to write the last revolution's profile to")
+@click.option("--figure", type=options.PATH, help="PNG to draw the form and its error to")
 @options.overrides
 @click.option("--domain", type=click.IntRange(0, 232), help="ROS domain, for others to listen; default: a free one")
 @click.option("--namespace", help="of the nodes, for two cells in one domain; default: /")
@@ -30,45 +29,12 @@ if TYPE_CHECKING:
 @click.option("--require-tolerance", is_flag=True, help="exit with 1 unless the run ends within the tool's tolerance")
 @click.option("--budget", is_flag=True, help="tell what the form error is made of as well, by some ten further runs")
 @options.allow_code
-@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
-def run(
-    scenario: str,
-    mode: "Mode",
-    groups: tuple[str, ...],
-    revolutions: float | None,
-    speed_factor: float | None,
-    bag: Path | None,
-    profile: Path | None,
-    figure: Path | None,
-    overrides: tuple[str, ...],
-    domain: int | None,
-    namespace: str | None,
-    start: "Start | None",
-    *,
-    require_tolerance: bool,
-    budget: bool,
-    as_json: bool,
-) -> None:
+@options.as_json
+def run(mode: "Mode", start: "Start | None", **asked: Any) -> None:
     """Run a SCENARIO, a ROS 2 parameter file, to its end."""
     allowed_code.allow_own_code()
     if mode != "offline" and start != "spawn":
         process_launcher.server().preload({})  # it imports while this process does
     from lathe_rc.commands import running
 
-    running.run(
-        scenario,
-        mode,
-        groups,
-        revolutions,
-        speed_factor,
-        bag,
-        profile,
-        figure,
-        overrides,
-        domain,
-        namespace,
-        start,
-        require_tolerance=require_tolerance,
-        budget=budget,
-        as_json=as_json,
-    )
+    running.run(mode=mode, start=start, **asked)

@@ -3,16 +3,17 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
 
 from lathe_rc import harness, part
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.commands import budgeting, outcome, picture, plot
+from lathe_rc.commands import outcome, picture, plot
 from lathe_rc.commands import scenario as scenarios
-from lathe_rc.commands.demos import Demo
-from lathe_rc.commands.progress import Watch
+from lathe_rc.commands.demo import Demo
+from lathe_rc.commands.progress import Watch, watched_budget
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place
 from lathe_rc.process_launcher import Start
@@ -20,25 +21,15 @@ from lathe_rc.process_launcher import Start
 _NO_SNAPSHOTS = "no snapshots: no --bag was given"
 
 
-def _shown(
-    scenario: Scenario,
-    *,
-    mode: harness.Mode,
-    bag: Path | None,
-    groups: list[list[str]] | None = None,
-    domain: int | None = None,
-    namespace: str = "/",
-    start: Start = "fork",
-) -> harness.Result:
-    """Run a scenario and show its progress; the arguments are those of `lathe_rc.harness.run`."""
+def _watched(scenario: Scenario, **how: Any) -> harness.Result:
+    """Run a scenario and show its progress; the keywords are those of `lathe_rc.harness.run`."""
     with Watch(Console(stderr=True)) as watch:
-        return harness.run(
-            scenario, mode=mode, groups=groups, bag=bag, watch=watch, domain=domain, namespace=namespace, start=start
-        )
+        return harness.run(scenario, watch=watch, **how)
 
 
 def run(
     scenario: str,
+    *,
     mode: harness.Mode,
     groups: tuple[str, ...],
     revolutions: float | None,
@@ -50,12 +41,16 @@ def run(
     domain: int | None,
     namespace: str | None,
     start: Start | None,
-    *,
     require_tolerance: bool,
     budget: bool,
     as_json: bool,
 ) -> None:
-    """See `lathe_rc.commands.run`."""
+    """Run a scenario; the arguments are the options of `lathe_rc.commands.run`.
+
+    Raises:
+        InputError: options that do not go together, or a scenario that cannot run.
+        LatheError: the run failed, or is not within the tolerance that is required.
+    """
     loaded = scenarios.load(scenario, overrides, revolutions=revolutions, speed_factor=speed_factor)
     split = scenarios.split(loaded, groups)
     if groups and mode != "processes":
@@ -73,7 +68,7 @@ def run(
         picture.check_place(figure)
     if profile:
         check_place("--profile", profile)
-    result = _shown(
+    result = _watched(
         loaded,
         mode=mode,
         groups=split,
@@ -86,7 +81,7 @@ def run(
         part.write_profile(profile, result.recording, result.part, [result.errors.rms.size - 1])
     if figure:
         picture.save(result.plot(), figure)
-    found = budgeting.shown(loaded) if budget else None
+    found = watched_budget(loaded) if budget else None
     if as_json:
         click.echo(json.dumps(result.summary() | ({"budget": found.summary()} if found else {})))
     else:
@@ -111,7 +106,7 @@ def demo(shown: Demo, revolutions: float, folder: Path) -> None:
     console = Console()
     console.print(shown.announcement, highlight=False)
     folder.mkdir(parents=True, exist_ok=True)
-    result = _shown(scenario, mode="processes", bag=place)
+    result = _watched(scenario, mode="processes", bag=place)
     beside = None
     if shown.peer:
         peer = harness.run(scenarios.load(shown.scenario, [*shown.overrides, *shown.peer, length]))

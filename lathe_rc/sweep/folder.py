@@ -10,8 +10,9 @@ Each of these files has a checksum, which is compared when it is read; those of 
 
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -37,8 +38,8 @@ _MOST = 2**30  # longest file of rows [B]
 
 
 @dataclass(frozen=True)
-class _Tuning:
-    """The request of a tuning; see `lathe_rc.sweep.tune`."""
+class Request:
+    """The request of a tuning, see `lathe_rc.sweep.tune`; ``targets`` are columns."""
 
     targets: list[str]
     free: dict[str, str | list[Value]]
@@ -59,9 +60,9 @@ class _Contents:
     format: int
     name: str
     identity: str
-    measures: list[tuple[str, str, str]]
+    measures: list[Measure]
     spaces: list[Space]
-    tuning: _Tuning | None = None
+    tuning: Request | None = None
 
 
 class Folder:
@@ -75,7 +76,7 @@ class Folder:
         scenario: the cell that is varied.
         measures: what is measured of each, beside the rest.
         spaces: that were asked for, in order.
-        tuning: what is tuned, see `lathe_rc.sweep.tune`; its ``targets`` are columns. None: it is no tuning.
+        tuning: what is tuned; None: it is no tuning.
 
     Raises:
         InputError: it holds no sweep.
@@ -83,7 +84,7 @@ class Folder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        if not _is_there(path / "sweep.json"):
+        if not os.path.lexists(path / "sweep.json"):
             raise InputError(f"{path} holds no sweep; allowed: a folder that lathe sweep has written")
         told = _contents(path / "sweep.json")
         if told.format != _FORMAT:
@@ -94,9 +95,7 @@ class Folder:
             raise InputError(
                 f"{path}: its scenario has changed, or a file that it names; allowed: as it was, or a new folder"
             )
-        self.measures = [Measure(*each) for each in told.measures]
-        self.spaces = told.spaces
-        self.tuning: Mapping[str, Any] | None = asdict(told.tuning) if told.tuning else None
+        self.measures, self.spaces, self.tuning = told.measures, told.spaces, told.tuning
 
     @staticmethod
     def begin(
@@ -104,7 +103,7 @@ class Folder:
         scenario: Scenario,
         space: Space | None,
         measures: Sequence[Measure],
-        tuning: Mapping[str, Any] | None = None,
+        tuning: Request | None = None,
     ) -> "Folder":
         """The sweep of a folder, which is made if it is not there, with one more space; or its tuning.
 
@@ -112,25 +111,19 @@ class Folder:
             InputError: it holds something else.
             LatheError: it cannot be written.
         """
-        with _reading(path):
-            if _is_other(path) and not (path / _WRITING).exists():  # else another process has begun it just now
-                raise InputError(f"{path} holds something else than a sweep; allowed: a new folder, or that of a sweep")
+        if not (path / _WRITING).exists():  # else another process has begun it just now
+            _refuse_others(path)
         with writing(path):
             path.mkdir(parents=True, exist_ok=True)
-        with _locked(path / _WRITING):
-            return Folder._begin(path, scenario, space, measures, tuning)
+        with locked(path / _WRITING):
+            _refuse_others(path)
+            return Folder._with(path, scenario, space, measures, tuning)
 
     @staticmethod
-    def _begin(
-        path: Path,
-        scenario: Scenario,
-        space: Space | None,
-        measures: Sequence[Measure],
-        tuning: Mapping[str, Any] | None,
+    def _with(
+        path: Path, scenario: Scenario, space: Space | None, measures: Sequence[Measure], tuning: Request | None
     ) -> "Folder":
-        if _is_other(path):
-            raise InputError(f"{path} holds something else than a sweep; allowed: a new folder, or that of a sweep")
-        new = not _is_there(path / "sweep.json")
+        new = not os.path.lexists(path / "sweep.json")
         spaces = []
         if not new:
             there = Folder(path)
@@ -144,26 +137,17 @@ class Folder:
                 raise InputError(f"{path} holds {_difference(there.tuning, tuning)}; allowed: a new folder")
         if space is not None and (space := Space(**space.to_json())) not in spaces:
             spaces.append(space)
-        told = {
-            "format": _FORMAT,
-            "name": scenario.name,
-            "identity": scenario.identity,
-            "measures": [list(each) for each in measures],
-            "spaces": [each.to_json() for each in spaces],
-            **({} if tuning is None else {"tuning": tuning}),
-            "checksum": files.ROOM.decode(),
-        }
+        told = asdict(_Contents(_FORMAT, scenario.name, scenario.identity, list(measures), spaces, tuning))
         with writing(path):
             (path / "rows").mkdir(parents=True, exist_ok=True)
             if new:
                 with files.replacing(path / "scenario.yaml") as stream:
                     stream.write(files.sealed(scenario.to_yaml(given=True).encode() + b"# " + files.ROOM + b"\n"))
             with files.replacing(path / "sweep.json") as stream:
-                stream.write(files.sealed(json.dumps(told, indent=1).encode()))
+                stream.write(files.sealed(json.dumps(told | {"checksum": files.ROOM.decode()}, indent=1).encode()))
         return Folder(path)
 
-    @contextmanager
-    def locked(self, *, wait: bool = False) -> Iterator[None]:
+    def locked(self, *, wait: bool = False) -> AbstractContextManager[None]:
         """Keep others from computing into the folder.
 
         Args:
@@ -172,13 +156,12 @@ class Folder:
         Raises:
             InputError: somebody does already.
         """
-        with _locked(self.path / "lock", wait=wait):
-            yield
+        return locked(self.path / "lock", wait=wait)
 
     @property
     def targets(self) -> list[str]:
         """The parameters that differ between the cells."""
-        tuned: Sequence[str] = self.tuning["targets"] if self.tuning else ()
+        tuned = self.tuning.targets if self.tuning else ()
         named = [*tuned, *(target for space in self.spaces for target in space.targets())]
         return [target for target in dict.fromkeys(named) if target != "seed"]
 
@@ -201,20 +184,20 @@ class Folder:
         for target in self.targets:
             # A cell that was computed before a target was varied has the scenario's own value.
             if target in found.column_names and found.column(target).null_count:
-                base = pa.scalar(self.scenario.value(target), found.schema.field(target).type)
-                filled = [base.as_py() if value is None else value for value in found.column(target).to_pylist()]
-                place = found.column_names.index(target)
-                found = found.set_column(place, found.schema.field(target), pa.array(filled, base.type))
+                field = found.schema.field(target)
+                filled = pyarrow.compute.coalesce(
+                    found.column(target), pa.scalar(self.scenario.value(target), field.type)
+                )
+                found = found.set_column(found.column_names.index(target), field, filled)
         found = found.sort_by("cell")
         return found if columns is None else found.select(list(columns))
 
     def _read(self, columns: Sequence[str] | None) -> pa.Table:
         place, whole = self.path / "rows", self.schema.empty_table()
+        whole = whole if columns is None else whole.select(list(columns))
         with _reading(place):
-            paths = sorted(path for path in place.iterdir() if path.suffix == ".parquet") if _is_there(place) else []
-        return pa.concat_tables(
-            [whole if columns is None else whole.select(list(columns)), *(self._rows(path, columns) for path in paths)]
-        )
+            paths = sorted(path for path in place.iterdir() if path.suffix == ".parquet") if place.exists() else []
+        return pa.concat_tables([whole, *(self._rows(path, columns) for path in paths)])
 
     def _rows(self, path: Path, columns: Sequence[str] | None) -> pa.Table:
         """The rows in a file."""
@@ -258,7 +241,7 @@ class Folder:
             LatheError: it cannot be written; what was written before is there still.
         """
         place = self.path / "rows"
-        with _locked(self.path / _WRITING), writing(self.path):  # a tuning is computed by several
+        with locked(self.path / _WRITING), writing(self.path):  # a tuning is computed by several
             taken = [int(path.stem) for path in place.glob("*.parquet") if path.stem.isdigit()]
             with files.replacing(place / f"{max(taken, default=-1) + 1:06d}.parquet") as stream:
                 stream.write(_parquet(pa.concat_tables(rows)))
@@ -299,63 +282,42 @@ def _read(path: Path) -> bytes:
     return content
 
 
-def _is_other(path: Path) -> bool:
-    """Whether there is something else than the folder of a sweep."""
+def _refuse_others(path: Path) -> None:
+    """Refuse what is there and no folder of a sweep."""
+    if not os.path.lexists(path):
+        return
     with _reading(path):
-        if not _is_there(path):
-            return False
         names = {each.name for each in path.iterdir()} if path.is_dir() else {""}
-        return "sweep.json" not in names and not names <= {"lock", _WRITING}
+    if "sweep.json" not in names and not names <= {"lock", _WRITING}:
+        raise InputError(f"{path} holds something else than a sweep; allowed: a new folder, or that of a sweep")
 
 
 @contextmanager
-def _locked(path: Path, *, wait: bool = True) -> Iterator[None]:
+def locked(path: Path, *, wait: bool = True) -> Iterator[None]:
     """Hold a lock.
 
     Raises:
         InputError: there can be none; without ``wait``: another process holds it.
     """
     lock = filelock.FileLock(path)
-    try:
-        lock.acquire(blocking=wait)
-    except filelock.Timeout:
-        raise InputError(f"{path.parent}: another sweep computes into it; allowed: one at a time") from None
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or shown(error)}") from None
+    with _reading(path):
+        try:
+            lock.acquire(blocking=wait)
+        except filelock.Timeout:
+            raise InputError(f"{path.parent}: another sweep computes into it; allowed: one at a time") from None
     try:
         yield
     finally:
         lock.release()
 
 
-def _is_there(path: Path) -> bool:
-    with _reading(path):
-        try:
-            path.lstat()
-        except (FileNotFoundError, NotADirectoryError):
-            return False
-        return True
-
-
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Say in one line why something cannot be read.
-
-    Raises:
-        InputError: it cannot.
-    """
+    """Say in one line why something cannot be read."""
     try:
         yield
     except OSError as error:
         raise InputError(f"{error.filename or path}: {error.strerror or shown(error)}") from None
-
-
-def _difference(there: Mapping[str, Any] | None, asked: Mapping[str, Any] | None) -> str:
-    """The difference between the content of a folder and the request, in words."""
-    if there is None or asked is None:
-        return "a sweep" if there is None else "a tuning"
-    name = next(name for name in there if there[name] != asked[name])
-    return f"a tuning with {name} {shown(json.dumps(there[name]))}, not {shown(json.dumps(asked[name]))}"
 
 
 @contextmanager
@@ -368,7 +330,16 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        told = error.strerror or shown(error)
         raise LatheError(
-            f"{path}: {told}; what was written before is kept: once there is room, the same command goes on from it"
+            f"{path}: {error.strerror or shown(error)}; what was written before is kept: once there is room, the same "
+            "command goes on from it"
         ) from None
+
+
+def _difference(there: Request | None, asked: Request | None) -> str:
+    """The difference between the content of a folder and the request, in words."""
+    if there is None or asked is None:
+        return "a sweep" if there is None else "a tuning"
+    one, other = asdict(there), asdict(asked)
+    name = next(name for name in one if one[name] != other[name])
+    return f"a tuning with {name} {shown(json.dumps(one[name]))}, not {shown(json.dumps(other[name]))}"

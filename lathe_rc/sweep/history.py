@@ -8,73 +8,56 @@ from typing import Any, cast
 import altair as alt
 
 from lathe_rc.sweep.folder import writing
-from lathe_rc.sweep.tuned import Trial, Tuning
+from lathe_rc.sweep.tuning import Tuning, unit
 
 _WIDTH, _HEIGHT = 560, 300
-_FEASIBLE, _OTHER, _BEST, _START = "#1f6f8b", "#c8cdd0", "#c0392b", "#e08e0b"
+_START, _FEASIBLE, _OTHER, _BEST = "#e08e0b", "#1f6f8b", "#c8cdd0", "#c0392b"
+_KINDS = ("start", "meets all subjects", "does not")
 
 
-def unit(column: str) -> tuple[float, str]:
-    """In what a column is shown: how many of the unit are 1, and its name."""
-    return (1e6, "µm") if column.endswith("_error") else (1.0, "")
-
-
-def _title(tuning: Tuning, place: int) -> str:
-    goal = tuning.aims.goals[place]
-    name = unit(goal.column)[1]
-    over = ""
-    if tuning.over.count(tuning.folder.scenario) > 1:
-        percentile = tuning.aims.percentile
-        over = ", worst" if percentile == 100.0 else f", {percentile:g}th percentile"
-    return f"{goal.column}{over}{f' [{name}]' if name else ''}"
-
-
-def _shown(tuning: Tuning, trial: Trial, place: int) -> float | None:
-    goal, cost = tuning.aims.goals[place], trial.score.costs[place]
-    return goal.sign * cost * unit(goal.column)[0] if math.isfinite(cost) else None
+def _title(tuning: Tuning, column: str) -> str:
+    percentile, name = tuning.objectives.percentile, unit(column)[1]
+    over = "" if tuning.cells == 1 else ", worst" if percentile == 100.0 else f", {percentile:g}th percentile"
+    return f"{column}{over}{f' [{name}]' if name else ''}"
 
 
 def chart(tuning: Tuning) -> alt.LayerChart:
     """By trial: the goal, and the best so far; of several goals, the second over the first."""
+    columns = [goal.column for goal in tuning.objectives.goals]
+    front = {trial.number for trial in tuning.front}
+    improvements = {trial.number for trial in tuning.improvements}
     rows: list[dict[str, Any]] = []
     best: float | None = None
-    least = math.inf
-    front = {trial.number for trial in tuning.front}
-    several = len(tuning.aims.goals) > 1
     for trial in tuning.trials:
-        values = [_shown(tuning, trial, place) for place in range(len(tuning.aims.goals))]
-        if trial.score.feasible and trial.score.costs[0] < least:
-            best, least = values[0], trial.score.costs[0]
-        kind = "start" if trial.number == 0 else "meets all subjects" if trial.score.feasible else "does not"
-        told = {"trial": trial.number, "kind": kind, "first": values[0], "second": values[-1], "best": best}
+        goals = [value * unit(column)[0] for column, value in tuning.goals(trial).items()]
+        first, second = (value if math.isfinite(value) else None for value in (goals[0], goals[-1]))
+        best = first if trial.number in improvements else best
+        kind = _KINDS[0] if trial.number == 0 else _KINDS[1] if trial.score.feasible else _KINDS[2]
+        told = {"trial": trial.number, "kind": kind, "first": first, "second": second, "best": best}
         rows.append(told | {"front": trial.number in front})
-    kinds = ["start", "meets all subjects", "does not"]
     colour = alt.Color(
-        "kind:N", title=None, scale=alt.Scale(domain=kinds, range=[_START, _FEASIBLE, _OTHER]),
+        "kind:N",
+        title=None,
+        scale=alt.Scale(domain=_KINDS, range=[_START, _FEASIBLE, _OTHER]),
         legend=alt.Legend(orient="top"),
-    )  # fmt: skip
+    )
     base = alt.Chart(alt.InlineData(values=rows))
-    if several:
-        first, second = (
-            alt.X("first:Q", title=_title(tuning, 0), scale=_scale(rows, "first")),
-            alt.Y("second:Q", title=_title(tuning, 1), scale=_scale(rows, "second")),
-        )
-        line = base.transform_filter("datum.front").mark_line(color=_BEST).encode(first, second)
-        dots = base.mark_circle(size=40).encode(first, second, colour, tooltip=["trial:Q", "first:Q", "second:Q"])
+    scale = _scale(rows, "first")
+    if len(columns) > 1:
+        across = alt.X("first:Q", title=_title(tuning, columns[0]), scale=scale)
+        up = alt.Y("second:Q", title=_title(tuning, columns[-1]), scale=_scale(rows, "second"))
+        line = base.transform_filter("datum.front").mark_line(color=_BEST).encode(across, up)
+        tip = "second:Q"
     else:
-        scale = _scale(rows, "first")
-        trials = alt.X("trial:Q", title="trial")
-        line = base.mark_line(color=_BEST, interpolate="step-after").encode(
-            trials, alt.Y("best:Q", scale=scale, title=_title(tuning, 0))
-        )
-        dots = base.mark_circle(size=40).encode(
-            trials, alt.Y("first:Q", scale=scale), colour, tooltip=["trial:Q", "first:Q", "kind:N"]
-        )
+        across = alt.X("trial:Q", title="trial")
+        up = alt.Y("first:Q", title=_title(tuning, columns[0]), scale=scale)
+        line = base.mark_line(color=_BEST, interpolate="step-after").encode(across, alt.Y("best:Q", scale=scale))
+        tip = "kind:N"
+    dots = base.mark_circle(size=40).encode(across, up, colour, tooltip=["trial:Q", "first:Q", tip])
     text = f"Tuning of {tuning.folder.scenario.name}: {len(tuning.trials)} trials"
     without = sum(not all(map(math.isfinite, trial.score.costs)) for trial in tuning.trials)
-    title = alt.TitleParams(
-        text, subtitle=f"{without} of them refused or diverged: not in the figure" if without else []
-    )
+    subtitle = f"{without} of them refused or diverged: not in the figure" if without else []
+    title = alt.TitleParams(text, subtitle=subtitle)
     return cast("alt.LayerChart", alt.layer(dots, line).properties(width=_WIDTH, height=_HEIGHT, title=title))
 
 

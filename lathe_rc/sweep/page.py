@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A sweep as one HTML page that needs nothing else, and its figures as PNGs beside it; see `write`.
 
-`seen` says what is looked at, `effects` computes, `figures` and `parallel` draw.
+`page_data` says what is looked at, `effects` computes, `figures` and `parallel` draw.
 """
 
 import math
@@ -22,8 +22,8 @@ from lathe_rc.sweep import figures, row
 from lathe_rc.sweep.effects import LEAST, Axis, Bins, Effect, Yield, bins, effect, is_grid
 from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
+from lathe_rc.sweep.page_data import GOAL, PageData, text_of
 from lathe_rc.sweep.parallel import parallel
-from lathe_rc.sweep.seen import GOAL, Seen, text_of
 from lathe_rc.view.charts import Charts, page_template
 
 PAGE, FIGURES = "page.html", "figures"
@@ -65,7 +65,7 @@ def write(folder: Folder, goal: str = GOAL) -> Written:
         InputError: no such goal.
         LatheError: the disk does not take it.
     """
-    seen = Seen(folder, goal)
+    seen = PageData(folder, goal)
     drawn = Charts()
     text = _text(seen, drawn)
     place, page = folder.path / FIGURES, folder.path / PAGE
@@ -84,7 +84,7 @@ def write(folder: Folder, goal: str = GOAL) -> Written:
     return Written(page, list(pngs))
 
 
-def _text(seen: Seen, drawn: Charts) -> str:
+def _text(seen: PageData, drawn: Charts) -> str:
     done = Yield(np.sort(seen.goal.values[seen.goal.order]), len(seen.cells), seen.goal.above)
     sections: dict[str, Any] = {"nothing": _nothing(seen)}
     if not sections["nothing"]:
@@ -106,7 +106,7 @@ def _text(seen: Seen, drawn: Charts) -> str:
     )
 
 
-def _nothing(seen: Seen) -> str:
+def _nothing(seen: PageData) -> str:
     """Why nothing can be drawn; empty: something can."""
     if not len(seen.cells):
         return "No cell is computed yet."
@@ -118,7 +118,7 @@ def _nothing(seen: Seen) -> str:
     return f"No cell has a {seen.goal.name}: {told}.{instead}"
 
 
-def _facts(seen: Seen, done: Yield) -> Iterator[tuple[str, str, str]]:
+def _facts(seen: PageData, done: Yield) -> Iterator[tuple[str, str, str]]:
     """The figures at the top: name, value and mood."""
     yield "cells", str(len(seen.cells)), ""
     for status in (row.DONE, row.REFUSED, row.DIVERGED, row.FAILED):
@@ -134,7 +134,7 @@ def _facts(seen: Seen, done: Yield) -> Iterator[tuple[str, str, str]]:
         yield f"within {seen.goal.told(seen.tolerance)}", f"{done.share(seen.tolerance):.2%}", ""
 
 
-def _outcomes(seen: Seen) -> list[list[str]]:
+def _outcomes(seen: PageData) -> list[list[str]]:
     """Status, how many, and why, with the numbers left out by which reasons differ; the first cell's as example."""
     groups: dict[tuple[str, str], list[int]] = {}
     statuses, reasons = (seen.table.column(name).to_pylist() for name in ("status", "reason"))
@@ -150,13 +150,13 @@ def _outcomes(seen: Seen) -> list[list[str]]:
     return [[status, str(count), f"{count / len(seen.cells):.1%}", told] for status, count, told in found]
 
 
-def _limits(seen: Seen) -> str:
+def _limits(seen: PageData) -> str:
     """Which nodes came to a limit in how many cells."""
     counts = Counter(name for text in seen.table.column("limits").to_pylist() if text for name in text.split(", "))
     return ", ".join(f"{name} in {count} cells" for name, count in counts.most_common())
 
 
-def _sections(seen: Seen, done: Yield, drawn: Charts) -> dict[str, Any]:
+def _sections(seen: PageData, done: Yield, drawn: Charts) -> dict[str, Any]:
     """The sections of the template for cells that have a goal, and the figures."""
     weighed = zip(seen.axes, _effects_on(seen.goal, seen.axes), strict=True)
     axes = [axis for axis, _ in sorted(weighed, key=lambda each: _weight(*each))]
@@ -208,7 +208,7 @@ def _told(found: Effect) -> str:
     return f"{share} ({rank})" if rank else share or "–"
 
 
-def _choices(seen: Seen, axes: Sequence[Axis], drawn: Charts) -> str:
+def _choices(seen: PageData, axes: Sequence[Axis], drawn: Charts) -> str:
     """Maps and lines of the parameters that matter most; says what of the cells is in them."""
     some = list(axes[:_MOST_AXES])
     free = [axis for axis in axes if not axis.tied]
@@ -234,7 +234,7 @@ def _choices(seen: Seen, axes: Sequence[Axis], drawn: Charts) -> str:
     return f"{told} Values{whose} are put into {most} bins of equal width." if binned else told
 
 
-def _parallel(seen: Seen, axes: Sequence[Axis], drawn: Charts) -> str:
+def _parallel(seen: PageData, axes: Sequence[Axis], drawn: Charts) -> str:
     """Parallel coordinates; says which cells are in them."""
     some = list(axes[:_MOST_LINES])
     margin = next((goal for goal in seen.goals if goal.name == "margin" and goal is not seen.goal), None)
@@ -249,7 +249,7 @@ def _parallel(seen: Seen, axes: Sequence[Axis], drawn: Charts) -> str:
     return f"{found.lines} of {found.cells} cells with a result are in it: the best, and others by lot."
 
 
-def _best(seen: Seen) -> dict[str, Any]:
+def _best(seen: PageData) -> dict[str, Any]:
     """The table of the best cells."""
     places = seen.goal.order[:_BEST].tolist()
     others = [goal for goal in seen.goals if goal is not seen.goal and goal.name in ("tool.rms_error", "margin")]
@@ -264,7 +264,7 @@ def _best(seen: Seen) -> dict[str, Any]:
     return {"columns": ["cell", *seen.folder.targets, *(goal.label for goal in goals)], "rows": rows}
 
 
-def _yields(seen: Seen, done: Yield) -> Iterator[str]:
+def _yields(seen: PageData, done: Yield) -> Iterator[str]:
     """The sentences about the yield."""
     points = {share: done.point(share) for share in (0.95, 0.99)}
     for share, limit in points.items():

@@ -18,9 +18,13 @@
 | seed, version, digest | of the random parts; of lathe_rc; see `digest` |
 """
 
+import contextlib
 import math
+import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +32,7 @@ import pyarrow as pa
 import xxhash
 from numpy.typing import NDArray
 
-from lathe_rc import messages
+from lathe_rc import __version__, messages
 from lathe_rc.analysis.form_errors import FormErrors, RunningErrors
 from lathe_rc.analysis.tolerance import judge
 from lathe_rc.cell.batch import Bench, Errors
@@ -43,7 +47,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError, LatheError
 from lathe_rc.messages import Signals
 from lathe_rc.names import instead
-from lathe_rc.sweep.revision import revision
+from lathe_rc.sweep import NUMBERS
 
 DONE, REFUSED, DIVERGED, FAILED = "done", "refused", "diverged", "failed"
 LIMITS = (LIMITED, OUT_OF_REACH)  # how events of a limit begin
@@ -59,15 +63,7 @@ STATISTICS: Mapping[str, Callable[[Samples], float]] = {
 
 _ARROW = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
 HEAD = {"cell": pa.int64(), "key": pa.string(), "status": pa.string(), "reason": pa.string()}  #: columns of each row
-_FOUND = {
-    "tool.max_error": pa.float64(),
-    "tool.rms_error": pa.float64(),
-    "tool.first_max_error": pa.float64(),
-    "tool.first_rms_error": pa.float64(),
-    "tool.in_tolerance_from": pa.int64(),
-    "margin": pa.float64(),
-    "limits": pa.string(),
-}
+_FOUND = dict.fromkeys(NUMBERS, pa.float64()) | {"tool.in_tolerance_from": pa.int64(), "limits": pa.string()}
 _TAIL = {
     "tool.max_errors": pa.list_(pa.float64()),
     "tool.rms_errors": pa.list_(pa.float64()),
@@ -78,7 +74,6 @@ _TAIL = {
     "version": pa.string(),
     "digest": pa.string(),
 }
-NUMBERS = [name for name, kind in _FOUND.items() if kind != pa.string()]  #: what goals and pages can be made of
 
 
 class Measure(NamedTuple):
@@ -132,10 +127,9 @@ class _Keeper(Errors):
         super().__init__(cell, samples)
         self._events = [topic for topic, source in cell.sparse.items() if source.type == messages.EVENT]
         self.heard = [*self.heard, *self._events, *(f"{asked.topic}.{asked.field}" for asked in measures)]
-        self.limited: set[str] = set()
-        self.tolerance = next(
-            (stage.parameters.tolerance for stage in cell.stages.values() if isinstance(stage, Tool)), 0.0
-        )
+        self._limited: set[str] = set()
+        tools = [stage for stage in cell.stages.values() if isinstance(stage, Tool)]
+        self._tolerance = tools[0].parameters.tolerance if tools else 0.0
         self._measures = [(each, np.empty(samples)) for each in measures]
         self._turns = RunningErrors()  # a cell without a tool has no form error, but revolutions all the same
         self._hash = xxhash.xxh3_128()
@@ -145,7 +139,7 @@ class _Keeper(Errors):
         super().chunk(first, samples, dense, sparse)
         for topic, said in sparse.items():
             if topic in self._events and any(message.values["action"].startswith(LIMITS) for message in said):
-                self.limited.add(topic.removesuffix("/events"))
+                self._limited.add(topic.removesuffix("/events"))
         if self._tool:
             self._hash.update(_bytes(dense[self._tool]["error"]))
         elif self._measures and self._encoder:
@@ -154,16 +148,23 @@ class _Keeper(Errors):
         for asked, kept in self._measures:
             kept[first : first + samples] = dense[asked.topic][asked.field]
 
-    def measured(self, errors: FormErrors) -> dict[str, float]:
-        """By column; over the whole run, if there is no complete revolution."""
+    def row(self, errors: FormErrors) -> dict[str, Any]:
+        """The columns of a cell that ran to its end."""
         starts = (errors if self._tool else self._turns.found()).starts
-        last = slice(*starts[-2:]) if starts.size > 1 else slice(None)
-        return {asked.name: STATISTICS[asked.statistic](kept[last]) for asked, kept in self._measures}
-
-    @property
-    def digest(self) -> str | None:
-        """See `digest`."""
-        return _told(self._hash) if self._tool else _digest([kept for _, kept in self._measures])
+        last = slice(*starts[-2:]) if starts.size > 1 else slice(None)  # all, without a complete revolution
+        found: dict[str, Any] = {
+            "limits": ", ".join(sorted(self._limited)),
+            "revolutions": errors.rms.size,
+            "digest": _told(self._hash) if self._tool else _digest([kept for _, kept in self._measures]),
+            **{asked.name: STATISTICS[asked.statistic](kept[last]) for asked, kept in self._measures},
+        }
+        if errors.rms.size:
+            for name, values in (("max", errors.largest), ("rms", errors.rms)):
+                found |= {f"tool.first_{name}_error": values[0], f"tool.{name}_error": values[-1]}
+                found[f"tool.{name}_errors"] = values
+        if self._tolerance:
+            found["tool.in_tolerance_from"] = judge(errors.largest, self._tolerance).since or None
+        return found
 
 
 def digest(recording: Recording, measures: Sequence[Measure]) -> str | None:
@@ -221,8 +222,7 @@ def compute(
         cell.check(cures=False)
         keeper = _Keeper(cell, cell.samples, measures)
         started = True
-        errors = bench.run(cell, keeper)
-        row |= _found(cell, keeper, errors)
+        row |= keeper.row(bench.run(cell, keeper)) | {"samples": cell.samples}
     except LatheError as error:
         refused = isinstance(error, InputError) and not started
         row["status"] = REFUSED if refused else DIVERGED if isinstance(error, DivergedError) else FAILED
@@ -233,23 +233,16 @@ def compute(
     return row
 
 
-def _found(cell: Cell, keeper: _Keeper, errors: FormErrors) -> dict[str, Any]:
-    found: dict[str, Any] = {
-        "limits": ", ".join(sorted(keeper.limited)),
-        "samples": cell.samples,
-        "revolutions": errors.rms.size,
-        "digest": keeper.digest,
-        **keeper.measured(errors),
-    }
-    if errors.rms.size:
-        found |= {
-            "tool.max_errors": errors.largest,
-            "tool.rms_errors": errors.rms,
-            "tool.first_max_error": errors.largest[0],
-            "tool.first_rms_error": errors.rms[0],
-            "tool.max_error": errors.largest[-1],
-            "tool.rms_error": errors.rms[-1],
-        }
-    if keeper.tolerance:
-        found["tool.in_tolerance_from"] = judge(errors.largest, keeper.tolerance).since or None
-    return found
+@cache
+def revision() -> str:
+    """Return version and, in a checkout, commit of lathe_rc.
+
+    Such as ``0.1.0`` or ``0.1.0+93c5a79``; ``-dirty`` follows where files differ from the commit.
+    """
+    folder = Path(__file__).parents[2]
+    if (folder / ".git").exists():
+        with contextlib.suppress(OSError, subprocess.CalledProcessError):
+            asked = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--exclude=*"]
+            told = subprocess.run(asked, capture_output=True, check=True, text=True).stdout.strip()
+            return f"{__version__}+{told}"
+    return __version__

@@ -33,7 +33,7 @@ from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Row, Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, shown
-from lathe_rc.sweep.ties import Formulas, ordered
+from lathe_rc.sweep.derived_parameters import Formulas, ordered
 
 SAMPLERS = ("sobol", "halton", "latin", "random")
 _MOST_POINTS = 2**24

@@ -12,7 +12,7 @@ import sys
 import uuid
 import warnings
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -23,59 +23,45 @@ import numpy as np
 import optuna
 import pyarrow as pa
 from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+from optuna.storages.journal import BaseJournalBackend
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from lathe_rc.cell.parameters import Value
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.files import open_file
-from lathe_rc.sweep import formulas
-from lathe_rc.sweep.aims import Score, aims
-from lathe_rc.sweep.folder import Folder, writing
-from lathe_rc.sweep.formulas import Found
-from lathe_rc.sweep.free import frees
-from lathe_rc.sweep.space import Space
+from lathe_rc.sweep import BATCH, formulas
+from lathe_rc.sweep.folder import Folder, locked, writing
+from lathe_rc.sweep.objectives import Score, objectives
+from lathe_rc.sweep.search_space import search_space
 from lathe_rc.sweep.sweep import Key, Watch, keep, order_of
-from lathe_rc.sweep.tuned import Trial, Tuning
+from lathe_rc.sweep.tuning import Trial, Tuning
 from lathe_rc.sweep.workers import Job, rows
 
-BATCH = 8  #: trials that are asked for at once
 _STUDY = "tuning"
 _POPULATION = 3 * BATCH  # of NSGA-II
-_UNKNOWN = 1e9  # what the samplers are told in place of a cost that there is not: beyond all that there are
+_UNKNOWN = 1e9  # in place of an infinite cost, which the samplers do not take: beyond all that there are
 _CHECKSUM = "checksum"  # of a line of the journal, in itself
 _BY, _SCORE = "by", "score"  # attributes of a trial: its worker, its result
 
 
-class _Lock(JournalFileOpenLock):
-    """Of the journal. The system releases it when who holds it dies; Optuna's own would have to be waited for."""
+class _Journal(BaseJournalBackend):
+    """Optuna's journal with a checksum in each line; lines of older versions have none.
+
+    Optuna's own file takes a damaged last line for one that is being written, and passes over it. Only a process that
+    holds the lock of the folder writes.
+    """
 
     def __init__(self, path: Path) -> None:
-        self._lock = filelock.FileLock(path)
-
-    def acquire(self) -> bool:
-        """See `JournalFileOpenLock`."""
-        self._lock.acquire()
-        return True
-
-    def release(self) -> None:
-        """See `JournalFileOpenLock`."""
-        self._lock.release()
-
-
-class _Journal(JournalFileBackend):
-    """Optuna's journal. Each line has a checksum; lines of older versions have none."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(str(path), _Lock(path.with_suffix(".lock")))
+        self._path, self._starts = path, [0]
         self.line = 0  #: number of the line that was read last
+        path.touch()
         if self._cut():
             print(f"lathe: {path}: the last line is not whole: left out, and done again", file=sys.stderr)
 
     def _cut(self) -> bool:
         """Remove a line that a process was stopped in, or a full disk; by it the next line would be lost as well."""
-        with open(self._file_path, "rb+", opener=open_file) as file:
+        with open(self._path, "rb+", opener=open_file) as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(size - 1, 0))
             if file.read() in (b"", b"\n"):
@@ -85,42 +71,41 @@ class _Journal(JournalFileBackend):
         return True
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
-        """See `JournalFileBackend`."""
+        """Write lines, to the disk."""
         self._cut()
-        super().append_logs([log | {_CHECKSUM: _checksum(log)} for log in logs])
+        lines = (json.dumps(log | {_CHECKSUM: _checksum(log)}, separators=(",", ":")) + "\n" for log in logs)
+        with open(self._path, "ab", opener=open_file) as file:
+            file.write("".join(lines).encode())
+            file.flush()
+            os.fsync(file.fileno())
 
     def read_logs(self, log_number_from: int) -> Generator[dict[str, Any]]:
-        """See `JournalFileBackend`.
+        """Read lines.
 
         Raises:
             InputError: a line is damaged.
         """
-        starts = self._log_number_offset
-        with open(self._file_path, "rb", opener=open_file) as file:
-            file.seek(starts[log_number_from])
-            for number, line in enumerate(file, log_number_from):
+        with open(self._path, "rb", opener=open_file) as file:
+            file.seek(self._starts[log_number_from])
+            for self.line, line in enumerate(file, log_number_from + 1):
                 if not line.endswith(b"\n"):  # it is being written
                     return
-                starts[number + 1] = starts[number] + len(line)
-                self.line = number + 1
-                yield self._log(line)
-
-    def _log(self, line: bytes) -> dict[str, Any]:
-        try:
-            log = json.loads(line)
-        except ValueError as error:
-            raise self.refusal(error) from None
-        if not isinstance(log, dict):
-            raise self.refusal("no log")
-        checksum = _checksum(log)
-        if log.pop(_CHECKSUM, checksum) != checksum:
-            raise self.refusal("its checksum is that of another content")
-        return log
+                self._starts[self.line :] = [self._starts[self.line - 1] + len(line)]
+                try:
+                    log = json.loads(line)
+                except ValueError as error:
+                    raise self.refusal(error) from None
+                if not isinstance(log, dict):
+                    raise self.refusal("no log")
+                checksum = _checksum(log)
+                if log.pop(_CHECKSUM, checksum) != checksum:
+                    raise self.refusal("its checksum is that of another content")
+                yield log
 
     def refusal(self, reason: object) -> InputError:
         """The error for the line that was read last."""
         return InputError(
-            f"{self._file_path}, line {self.line}: no journal of Optuna, or damaged ({shown(reason)}); "
+            f"{self._path}, line {self.line}: no journal of Optuna, or damaged ({shown(reason)}); "
             "allowed: as it was written, or a new folder"
         )
 
@@ -161,85 +146,67 @@ class Study:
 
     def __init__(self, folder: Folder) -> None:
         assert folder.tuning is not None, "a tuning"
-        self._folder, told = folder, folder.tuning
-        scenario = folder.scenario
-        measures = [each.name for each in folder.measures]
-        self._aims = aims(scenario, told["goals"], told["subjects"], measures=measures, percentile=told["percentile"])
-        self._free = frees(scenario, told["free"])
-        self._over = Space(**told["over"])
-        self.count = self._over.count(scenario)
-        self._told = told
-        self._formulas = self._by_formula() if told["formulas"] else {}
+        self._folder, self._asked, scenario = folder, folder.tuning, folder.scenario
+        self._objectives = objectives(
+            scenario,
+            self._asked.goals,
+            self._asked.subjects,
+            measures=[each.name for each in folder.measures],
+            percentile=self._asked.percentile,
+        )
+        self._space = search_space(scenario, self._asked.free)
+        self.count = self._asked.over.count(scenario)
+        self._start = {target: scenario.value(target) for target in self._space}
+        margins = [each.bound for each in self._objectives.constraints if each.column == "margin" and each.below]
+        self._formulas = formulas.settings(scenario, list(self._space), *margins[:1]) if self._asked.formulas else {}
         self._key = Key(folder)
         self._known: dict[str, dict[str, Any]] = {}
-        self._take(folder.table(["key", *self._aims.columns]))
+        self._take(folder.table(["key", *self._objectives.columns]))
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         with writing(folder.path), folder.locked(wait=True):
-            self._storage, self._study = _opened(folder.path / "trials.log", len(self._aims.goals))
+            self._storage, self._study = _opened(folder.path / "trials.log", len(self._objectives.goals))
             if not self._study.get_trials(deepcopy=False):
-                self._enqueue()
-
-    def _by_formula(self) -> dict[str, Found]:
-        asked = [each.bound for each in self._aims.subjects if each.column == "margin" and each.below]
-        return formulas.settings(self._folder.scenario, list(self._free), *asked[:1])
-
-    def _enqueue(self) -> None:
-        """The start, and what the formulas give."""
-        start = {target: self._folder.scenario.value(target) for target in self._free}
-        given = {**start, **{target: found.value for target, found in self._formulas.items()}}
-        for values in [start, given] if given != start else [start]:
-            if all(free.holds(values[target]) for target, free in self._free.items()):
-                self._study.enqueue_trial({target: free.told(values[target]) for target, free in self._free.items()})
+                given = self._start | {target: found.value for target, found in self._formulas.items()}
+                for values in [self._start, given] if given != self._start else [given]:
+                    if all(dimension.contains(values[target]) for target, dimension in self._space.items()):
+                        self._study.enqueue_trial(
+                            {name: each.encoded(values[name]) for name, each in self._space.items()}
+                        )
 
     @contextmanager
     def present(self) -> Iterator[str]:
-        """Be known to be computing; yields one's name."""
-        place = self._folder.path / "running"
-        me = uuid.uuid4().hex
+        """Hold a lock of one's own, by which others see that this process computes; yields its name."""
+        place, me = self._folder.path / "running", uuid.uuid4().hex
         with writing(self._folder.path):
             place.mkdir(exist_ok=True)
-            lock = filelock.FileLock(place / me)
-            lock.acquire()
-        try:
-            yield me
-        finally:
-            lock.release()
-            (place / me).unlink(missing_ok=True)
+        with locked(place / me):
+            try:
+                yield me
+            finally:
+                (place / me).unlink(missing_ok=True)
 
-    def _gone(self, trial: FrozenTrial, me: str) -> bool:
-        """Whether nobody computes a trial."""
-        by = trial.user_attrs.get(_BY)
-        path = self._folder.path / "running" / str(by)
-        if by is None or not path.exists():
-            return True
-        if by == me:
-            return False
-        lock = filelock.FileLock(path)
-        try:
-            lock.acquire(blocking=False)
-        except filelock.Timeout:
-            return False
-        lock.release()
-        path.unlink(missing_ok=True)
-        return True
+    def _is_left(self, trial: FrozenTrial, me: str) -> bool:
+        """Whether the process that computed a trial has ended."""
+        by = str(trial.user_attrs.get(_BY))
+        path = self._folder.path / "running" / by
+        with suppress(filelock.Timeout):
+            if by != me:
+                with filelock.FileLock(path, timeout=0):
+                    path.unlink(missing_ok=True)
+                    return True
+        return False
 
-    def finished(self) -> int:
-        """How many trials are computed."""
-        return len(self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
-
-    def others_compute(self, most: int) -> bool:
-        """Whether other processes compute trials of the first ``most``, if this one has just `ask` ed for none."""
-        return any(
-            trial.number < most for trial in self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
-        )
+    def count_trials(self, state: TrialState, most: int = sys.maxsize) -> int:
+        """How many of the first ``most`` trials are in a state: computed, or being so, perhaps by other processes."""
+        return sum(trial.number < most for trial in self._study.get_trials(deepcopy=False, states=(state,)))
 
     def ask(self, me: str, most: int) -> list[FrozenTrial]:
         """The next batch: trials that somebody has left, filled up with new ones to ``most`` in all."""
         with writing(self._folder.path), self._folder.locked(wait=True), _quiet():
             there = self._study.get_trials(deepcopy=False)
             asked = [trial for trial in there if trial.state != TrialState.WAITING]
-            left = [trial.number for trial in asked if trial.state == TrialState.RUNNING and self._gone(trial, me)]
-            number, batch = len(asked), int(self._told["batch"])
+            left = [trial.number for trial in asked if trial.state == TrialState.RUNNING and self._is_left(trial, me)]
+            number, batch = len(asked), self._asked.batch
             missing = batch - number % batch if number % batch or not left else 0
             for _ in range(max(0, min(missing, most - number))):
                 self._study.sampler = self._sampler(number)
@@ -250,8 +217,8 @@ class Study:
                 self._study.sampler = self._sampler(each)
                 trial = self._trial(each)
                 trial.set_user_attr(_BY, me)
-                for target, free in self._free.items():  # who was stopped in the middle may have left some out
-                    free.suggest(trial, target)
+                for target, dimension in self._space.items():  # a process that was stopped may have left some out
+                    dimension.suggest(trial, target)
             return [trial for trial in self._study.get_trials() if trial.number in left]
 
     def _trial(self, number: int) -> optuna.Trial:
@@ -260,11 +227,10 @@ class Study:
 
     def _sampler(self, number: int) -> optuna.samplers.BaseSampler:
         """Of a trial."""
-        seed = int(np.random.SeedSequence([self._told["seed"], number]).generate_state(1)[0])
-        if self._told["sampler"] == "cmaes":
-            start = {target: self._folder.scenario.value(target) for target in self._free}
-            return optuna.samplers.CmaEsSampler(x0=start, seed=seed)
-        if self._told["sampler"] == "nsga2":
+        seed = int(np.random.SeedSequence([self._asked.seed, number]).generate_state(1)[0])
+        if self._asked.sampler == "cmaes":
+            return optuna.samplers.CmaEsSampler(x0=self._start, seed=seed)
+        if self._asked.sampler == "nsga2":
             return optuna.samplers.NSGAIISampler(population_size=_POPULATION, seed=seed)
         return optuna.samplers.TPESampler(multivariate=True, seed=seed)
 
@@ -272,31 +238,26 @@ class Study:
         """Compute the cells of a batch, and tell what came of it."""
         jobs = {trial.number: self._jobs(trial) for trial in asked}
         missing = {job.key: job for each in jobs.values() for job in each if job.key not in self._known}
-        keep(
-            self._folder,
-            rows(crew, order_of(self._folder), missing.values(), len(missing)),
-            watch,
-            self._take,
-        )
+        keep(self._folder, rows(crew, order_of(self._folder), missing.values(), len(missing)), watch, self._take)
         with writing(self._folder.path), self._folder.locked(wait=True), _quiet():
             for number, each in jobs.items():
-                self._tell(number, self._aims.score(self._known[job.key] for job in each))
+                self._tell(number, self._objectives.score(self._known[job.key] for job in each))
             tuning = self.tuning()
             if best := tuning.best:  # while no other process writes one of fewer trials
                 tuning.write(best, self._folder.path / "best.yaml")
         watch({"event": "told", "tuning": tuning})
 
     def _take(self, table: pa.Table) -> None:
-        for found in table.select(["key", *self._aims.columns]).to_pylist():
+        for found in table.select(["key", *self._objectives.columns]).to_pylist():
             self._known[found.pop("key")] = found
 
     def _values(self, trial: FrozenTrial) -> dict[str, Value]:
-        return {target: free.value(trial.params[target]) for target, free in self._free.items()}
+        return {target: dimension.value(trial.params[target]) for target, dimension in self._space.items()}
 
     def _jobs(self, trial: FrozenTrial) -> list[Job]:
         values = self._values(trial)
-        given = [{**values, **each} for each in self._over.given or ({},)]
-        cells = replace(self._over, given=given).cells(self._folder.scenario)
+        given = [{**values, **each} for each in self._asked.over.given or ({},)]
+        cells = replace(self._asked.over, given=given).cells(self._folder.scenario)
         first = trial.number * self.count
         return [Job(first + place, self._key.of(each), each) for place, each in enumerate(cells)]
 
@@ -306,7 +267,7 @@ class Study:
         for place, violation in enumerate(score.violations):
             trial.set_constraint(str(place), violation)
         known = [min(cost, _UNKNOWN) for cost in score.costs]
-        if self._told["sampler"] == "cmaes" and not score.feasible:  # it knows no constraints: the nearer the better
+        if self._asked.sampler == "cmaes" and not score.feasible:  # it knows no constraints: the nearer the better
             known = [_UNKNOWN * (1.0 + sum(max(violation, 0.0) for violation in score.violations))]
         self._study.sampler = self._sampler(number)
         self._study.tell(number, known)
@@ -315,14 +276,14 @@ class Study:
         """The tuning so far."""
         found = []
         for trial in self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
-            if _SCORE not in trial.user_attrs or not trial.params.keys() >= self._free.keys():
+            if _SCORE not in trial.user_attrs or not trial.params.keys() >= self._space.keys():
                 raise InputError(
                     f"{self._folder.path / 'trials.log'}: trial {trial.number} is another program's; allowed: as "
                     "lathe tune has written it, or a new folder"
                 )
             costs, violations, margin = cast("tuple[list[float], list[float], float]", trial.user_attrs[_SCORE])
             found.append(Trial(trial.number, self._values(trial), Score(tuple(costs), tuple(violations), margin)))
-        return Tuning(self._folder, self._aims, self._over, found, self._formulas)
+        return Tuning(self._folder, self._objectives, self._asked.over, found, self._formulas)
 
 
 @contextmanager

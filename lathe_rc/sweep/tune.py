@@ -8,7 +8,6 @@ DIR/front/           of several goals, the cells of all trials that no other is 
 DIR, the rest        see `lathe_rc.sweep.folder`: cell n of trial m is the row m * (cells of a trial) + n
 """
 
-import json
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -16,21 +15,22 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import distributed
+from optuna.trial import TrialState
 
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError
 from lathe_rc.names import instead
-from lathe_rc.sweep.aims import Aims, aims
-from lathe_rc.sweep.folder import Folder, writing
-from lathe_rc.sweep.free import Free, frees
+from lathe_rc.sweep import BATCH, SAMPLERS
+from lathe_rc.sweep.folder import Folder, Request, writing
+from lathe_rc.sweep.objectives import Objectives, objectives
+from lathe_rc.sweep.search_space import Dimension, search_space
 from lathe_rc.sweep.space import Space
-from lathe_rc.sweep.study import BATCH, Study
+from lathe_rc.sweep.study import Study
 from lathe_rc.sweep.sweep import Watch, crew_for, ignore
-from lathe_rc.sweep.tuned import Tuning
+from lathe_rc.sweep.tuning import Tuning
 
 _PAUSE = 0.2  # [s] before looking again whether other processes have computed their trials
-SAMPLERS = ("tpe", "cmaes", "nsga2")
 
 
 def tune(
@@ -58,7 +58,7 @@ def tune(
     Args:
         scenario: the cell; its own parameters are the start, trial 0. It needs a number of revolutions.
         free: what is searched, by ``NODE.PARAM``: ``LOW:HIGH``, ``LOW:HIGH:log``, or values: ``A,B,C`` or a list.
-        goals: columns of a row, see `lathe_rc.sweep.aims`; several are traded off.
+        goals: columns of a row, see `lathe_rc.sweep.objectives`; several are traded off.
         folder: of the results. Several programs, on this machine or others, may compute into it at the same time.
         subjects: what has to be met.
         over: plants and spindles; what counts is the worst of them, or a percentile. None: the scenario's own.
@@ -90,8 +90,8 @@ def tune(
         <Tuning of piston in lead: 8 trials, tool.rms_error = ... in trial ...>
     """
     over = Space(**(over or Space()).to_json())
-    wanted = aims(scenario, goals, subjects, measures=measures, percentile=percentile)
-    found = frees(scenario, free)
+    wanted = objectives(scenario, goals, subjects, measures=measures, percentile=percentile)
+    found = search_space(scenario, free)
     if twice := [target for target in found if target in over.targets()]:
         raise InputError(f"{twice[0]}: free, and what the goal is over as well; allowed: one of both")
     over.check(scenario)
@@ -99,27 +99,27 @@ def tune(
     for name, number in (("trials", trials), ("batch", batch)):
         if number < 1:
             raise InputError(f"{name} = {number}; allowed: from 1")
-    told = {
-        "targets": list(dict.fromkeys([*found, *over.targets()])),
-        "free": {target: told if isinstance(told, str) else list(told) for target, told in free.items()},
-        "goals": list(goals),
-        "subjects": list(subjects),
-        "percentile": percentile,
-        "over": over.to_json(),
-        "sampler": sampler,
-        "seed": seed,
-        "batch": batch,
-        "formulas": ask_formulas,
-    }
-    kept = Folder.begin(Path(folder), scenario, None, wanted.measures, json.loads(json.dumps(told)))
+    request = Request(
+        targets=list(dict.fromkeys([*found, *over.targets()])),
+        free={target: told if isinstance(told, str) else list(told) for target, told in free.items()},
+        goals=list(goals),
+        subjects=list(subjects),
+        percentile=percentile,
+        over=over,
+        sampler=sampler,
+        seed=seed,
+        batch=batch,
+        formulas=ask_formulas,
+    )
+    kept = Folder.begin(Path(folder), scenario, None, wanted.measures, request)
     state = Study(kept)
     with state.present() as me:
         asked = state.ask(me, trials)
-        there = state.finished()
+        there = state.count_trials(TrialState.COMPLETE)
         watch({"event": "began", "cells": trials * state.count, "computed": there * state.count, "trials": there})
         with ExitStack() as stack:
             crew = None
-            while asked or state.others_compute(trials):
+            while asked or state.count_trials(TrialState.RUNNING, trials):
                 if asked:
                     crew = crew or stack.enter_context(crew_for(scenario, client, scheduler, workers, watch))
                     state.compute(crew, asked, watch)
@@ -130,21 +130,16 @@ def tune(
     with kept.locked(wait=True):
         tuning = state.tuning()
         if len(goals) > 1:
-            _write_front(tuning)
+            with writing(kept.path):
+                (kept.path / "front").mkdir(exist_ok=True)
+                for path in (kept.path / "front").glob("*.yaml"):
+                    path.unlink(missing_ok=True)
+            for trial in tuning.front:
+                tuning.write(trial, kept.path / "front" / f"trial-{trial.number}.yaml")
     return tuning
 
 
-def _write_front(tuning: Tuning) -> None:
-    place = tuning.folder.path / "front"
-    with writing(tuning.folder.path):
-        place.mkdir(exist_ok=True)
-        for path in place.glob("*.yaml"):
-            path.unlink(missing_ok=True)
-    for trial in tuning.front:
-        tuning.write(trial, place / f"trial-{trial.number}.yaml")
-
-
-def _check_sampler(name: str, wanted: Aims, found: Mapping[str, Free]) -> None:
+def _check_sampler(name: str, wanted: Objectives, found: Mapping[str, Dimension]) -> None:
     if name not in SAMPLERS:
         raise InputError(f"sampler {name!r}; {instead(name, SAMPLERS)}")
     if name == "cmaes":

@@ -146,7 +146,9 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[distribute
             yield client
         return
     # Ctrl-C is for this process, which ends its workers.
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if _in_main_thread() else None
+    before = None
+    if threading.current_thread() is threading.main_thread():
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         os.environ["PYTHONSAFEPATH"] = "1"  # of the workers: the current folder is not on their path
         with dask.config.set(_SETTINGS):
@@ -162,10 +164,6 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[distribute
             signal.signal(signal.SIGINT, before)
     with cluster, distributed.Client(cluster, set_as_default=False) as client:
         yield client
-
-
-def _in_main_thread() -> bool:
-    return threading.current_thread() is threading.main_thread()
 
 
 def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: int) -> Generator[pa.Table]:

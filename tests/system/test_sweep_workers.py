@@ -71,11 +71,8 @@ def test_a_worker_dies_and_another_one_comes(piston, tmp_path):
     space = Space(grid={LEAD: f"1.4e-3:1.5e-3:{CELLS}"})
     with contextlib.ExitStack() as programs:
         start = programs.enter_context
-        scheduler, _ = start(
-            program(
-                "distributed.cli.dask_scheduler", "--host=127.0.0.1", "--port=0", "--no-dashboard", until=r"tcp://\S+"
-            )
-        )
+        words = ("distributed.cli.dask_scheduler", "--host=127.0.0.1", "--port=0", "--no-dashboard")
+        scheduler, _ = start(program(*words, until=r"tcp://\S+"))
         (_, first), _ = (start(worker(scheduler)) for _ in range(2))
         done = 0
 
@@ -92,11 +89,9 @@ def test_a_worker_dies_and_another_one_comes(piston, tmp_path):
     rows = found.table().to_pylist()
     assert [each["cell"] for each in rows] == list(range(CELLS))
     for each, values in zip(rows, space.cells(piston), strict=True):
-        own = row.compute(piston, values, [LEAD], [])
-        assert {name: each[name] for name in own if name != "seconds"} == {
-            name: value.tolist() if hasattr(value, "tolist") else value
-            for name, value in own.items()
-            if name != "seconds"
+        own = row.compute(piston, values, [LEAD], []) | {"seconds": each["seconds"]}
+        assert {name: each[name] for name in own} == {
+            name: value.tolist() if hasattr(value, "tolist") else value for name, value in own.items()
         }
 
 
@@ -126,14 +121,7 @@ def test_ctrl_c_keeps_what_is_computed_and_nothing_is_computed_twice(tmp_path):
 
 @pytest.mark.parametrize("small_disk", ["100k"], indirect=True)
 def test_a_full_disk_is_said_in_a_line_and_what_is_written_is_kept(small_disk):
-    words = [
-        "--vary",
-        f"{LEAD}=1.4e-3:1.5e-3:{MANY}",
-        "--out",
-        str(small_disk / "rows"),
-        "--measure",
-        "tool.error:rms",
-    ]
+    words = ["--vary", f"{LEAD}=1.4e-3:1.5e-3:{MANY}", "--out", str(small_disk / "rows"), "--measure", "tool.error:rms"]
     with lathe_sweep(*words) as full:
         _, said = full.communicate()
     assert full.returncode == 1

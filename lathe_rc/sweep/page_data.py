@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError, shown
 from lathe_rc.names import instead
-from lathe_rc.sweep import row
+from lathe_rc.sweep import NUMBERS
 from lathe_rc.sweep.effects import Axis
 from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
@@ -23,7 +23,7 @@ _UNITS = {"tool.in_tolerance_from": "revolutions"}
 _MOST_TEXTS = 24  # that have a colour each
 
 
-class Seen:
+class PageData:
     """The rows of a sweep, as they are looked at.
 
     Args:
@@ -43,7 +43,7 @@ class Seen:
     """
 
     def __init__(self, folder: Folder, goal: str = GOAL) -> None:
-        known = [*row.NUMBERS, *(each.name for each in folder.measures)]
+        known = [*NUMBERS, *(each.name for each in folder.measures)]
         if goal not in known:
             raise InputError(
                 f"--goal {shown(goal)!r}: no such number in a row of {folder.path}; {instead(goal, known)}"

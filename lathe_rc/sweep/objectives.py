@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Aims of a tuning: goals, subjects, and the share of the cells that has to meet them.
+"""Objectives of a tuning: goals, constraints, and the share of the cells that has to meet them.
 
 A goal is a column of a row (`lathe_rc.sweep.row`): as small as it can be, with a minus before it as large as it can be.
-A subject is a limit of a column. What counts of several cells, plants and spindles, is the worst of them or a
-percentile; a cell that was refused, that diverged or failed is as bad as none.
+A constraint is a limit of a column. Of several cells, plants and spindles, the worst or a percentile counts; a cell
+that was refused, that diverged or failed is as bad as none.
 """
 
 import math
@@ -20,10 +20,10 @@ from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, shown
 from lathe_rc.names import instead
-from lathe_rc.sweep import row
+from lathe_rc.sweep import NUMBERS, row
 from lathe_rc.sweep.row import Measure
 
-_SUBJECT = re.compile(r"(?P<column>.+?)\s*(?P<sense>>=|<=)\s*(?P<bound>\S+)")
+_CONSTRAINT = re.compile(r"(?P<column>.+?)\s*(?P<sense>>=|<=)\s*(?P<bound>\S+)")
 
 
 class Goal(NamedTuple):
@@ -38,7 +38,7 @@ class Goal(NamedTuple):
         return -1.0 if self.largest else 1.0
 
 
-class Subject(NamedTuple):
+class Constraint(NamedTuple):
     """A limit of a column, from below or from above."""
 
     column: str
@@ -56,7 +56,7 @@ class Score(NamedTuple):
 
     Attributes:
         costs: of the goals, less is better; infinite where a cell that counts has no value.
-        violations: of "it runs to its end" and of the subjects; up to 0 if it is met.
+        violations: of "it runs to its end" and of the constraints; up to 0 if it is met.
         margin: see `lathe_rc.sweep.row`, of the cell that counts; NaN: no cell learns.
     """
 
@@ -71,25 +71,25 @@ class Score(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Aims:
-    """The aims of a tuning.
+class Objectives:
+    """The objectives of a tuning.
 
     Attributes:
         goals: one, or two and more to be traded off.
-        subjects: that have to be met.
+        constraints: that have to be met.
         percentile: that counts of the cells; 100: the worst.
-        measures: columns of goals and subjects beside those of all rows.
+        measures: columns of goals and constraints beside those of all rows.
     """
 
     goals: Sequence[Goal]
-    subjects: Sequence[Subject]
+    constraints: Sequence[Constraint]
     percentile: float
     measures: Sequence[Measure]
 
     @property
     def columns(self) -> list[str]:
         """Columns that a score is made of."""
-        named = [goal.column for goal in self.goals] + [subject.column for subject in self.subjects]
+        named = [goal.column for goal in self.goals] + [limit.column for limit in self.constraints]
         return list(dict.fromkeys(["status", "margin", *named]))
 
     def score(self, rows: Iterable[Mapping[str, Any]]) -> Score:
@@ -101,7 +101,7 @@ class Aims:
         cells = list(rows)
         costs = [self._counts(_cost(cell, goal) for cell in cells) for goal in self.goals]
         violations = [self._counts(_stops(cell, self.goals) for cell in cells)]
-        violations += [self._counts(_violation(cell, subject) for cell in cells) for subject in self.subjects]
+        violations += [self._counts(_violation(cell, limit) for cell in cells) for limit in self.constraints]
         margins = [-cell["margin"] for cell in cells if cell["margin"] is not None]
         margin = -self._counts(margins) if margins else math.nan
         return Score(tuple(costs), tuple(violations), margin)
@@ -128,72 +128,63 @@ def _stops(cell: Mapping[str, Any], goals: Sequence[Goal]) -> float:
     return -margin if _known(margin) and margin < 0.0 else 1.0
 
 
-def _violation(cell: Mapping[str, Any], subject: Subject) -> float:
-    """A refused cell may have a margin all the same; what it does not tell is for `_stops` to say."""
-    value = cell[subject.column]
+def _violation(cell: Mapping[str, Any], limit: Constraint) -> float:
+    """A refused cell may have a margin all the same; a value that it lacks is for `_stops` to judge."""
+    value = cell[limit.column]
     if _known(value):
-        return subject.violation(value)
+        return limit.violation(value)
     return 0.0 if cell["status"] != row.DONE else 1.0
 
 
-def aims(
+def objectives(
     scenario: Scenario,
     goals: Sequence[str],
-    subjects: Sequence[str] = (),
+    constraints: Sequence[str] = (),
     *,
     measures: Sequence[str] = (),
     percentile: float = 100.0,
-) -> Aims:
-    """The aims in texts.
+) -> Objectives:
+    """The objectives in texts.
 
     Args:
         scenario: that is tuned.
         goals: ``COLUMN`` or ``-COLUMN``; a column may be ``TOPIC.FIELD:STATISTIC``.
-        subjects: ``COLUMN>=NUMBER`` or ``COLUMN<=NUMBER``.
+        constraints: ``COLUMN>=NUMBER`` or ``COLUMN<=NUMBER``.
         measures: further columns.
-        percentile: see `Aims`.
+        percentile: see `Objectives`.
 
     Raises:
         InputError: no goal, no such column, or no limit.
     """
     if not goals:
-        raise InputError(f"no goal; allowed: --goal COLUMN, of {', '.join(row.NUMBERS)} or TOPIC.FIELD:STATISTIC")
+        raise InputError(f"no goal; allowed: --goal COLUMN, of {', '.join(NUMBERS)} or TOPIC.FIELD:STATISTIC")
     if not 0.0 < percentile <= 100.0:
         raise InputError(f"percentile {percentile:g}; allowed: above 0 up to 100, which is the worst")
     wanted = [Goal(text.strip().removeprefix("-"), text.strip().startswith("-")) for text in goals]
-    limits = [_subject(text) for text in subjects]
+    limits = [_constraint(text) for text in constraints]
     measured = dict.fromkeys(row.measure(text, scenario) for text in measures)
     cell = Cell(scenario.nodes)
-    missing = {
-        **({} if any(isinstance(stage, Learner) for stage in cell.stages.values()) else {"margin": "nobody learns"}),
-        **(
-            {}
-            if any(source.type == messages.TOOL for source in cell.dense.values())
-            else {name: "there is no tool" for name in row.NUMBERS if name.startswith("tool.")}
-        ),
-    }
+    learns = any(isinstance(stage, Learner) for stage in cell.stages.values())
+    has_tool = any(source.type == messages.TOOL for source in cell.dense.values())
     for what, column in [("goal", goal.column) for goal in wanted] + [("subject", limit.column) for limit in limits]:
         if ":" in column:
             measured[row.measure(column, scenario)] = None
-        elif column not in row.NUMBERS:
-            raise InputError(f"{what} {shown(column)!r}: no such column; {_instead(column)}")
-        elif column in missing:
+        elif column not in NUMBERS:
+            told = instead(column, NUMBERS)
+            told = told if told.startswith("allowed") else f"{told} (or TOPIC.FIELD:STATISTIC)"
+            raise InputError(f"{what} {shown(column)!r}: no such column; {told}")
+        elif not (learns if column == "margin" else has_tool):
             raise InputError(
-                f"{what} {column}: {missing[column]} in {scenario.name}; allowed: TOPIC.FIELD:STATISTIC, such as "
-                f"{next(iter(cell.dense))}.FIELD:rms"
+                f"{what} {column}: {'nobody learns' if column == 'margin' else 'there is no tool'} in {scenario.name}; "
+                f"allowed: TOPIC.FIELD:STATISTIC, such as {next(iter(cell.dense))}.FIELD:rms"
             )
     if len({goal.column for goal in wanted}) < len(wanted):
         raise InputError("a goal is given twice; allowed: each once")
-    return Aims(wanted, limits, percentile, list(measured))
+    return Objectives(wanted, limits, percentile, list(measured))
 
 
-def _instead(column: str) -> str:
-    told = instead(column, row.NUMBERS)
-    return told if told.startswith("allowed") else f"{told} (or TOPIC.FIELD:STATISTIC)"
-
-
-def _subject(text: str) -> Subject:
-    found = _SUBJECT.fullmatch(text.strip())
+def _constraint(text: str) -> Constraint:
+    found = _CONSTRAINT.fullmatch(text.strip())
     allowed = "allowed: COLUMN>=NUMBER or COLUMN<=NUMBER, such as margin>=0.2"
     if not found:
         raise InputError(f"subject {shown(text)!r}; {allowed}")
@@ -203,4 +194,4 @@ def _subject(text: str) -> Subject:
         bound = math.nan
     if not math.isfinite(bound):
         raise InputError(f"subject {shown(text)!r}: {shown(found['bound'])!r} is no number; {allowed}")
-    return Subject(found["column"], found["sense"] == ">=", bound)
+    return Constraint(found["column"], found["sense"] == ">=", bound)

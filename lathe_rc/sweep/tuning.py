@@ -13,9 +13,9 @@ from lathe_rc import files
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError
-from lathe_rc.sweep.aims import Aims, Score
 from lathe_rc.sweep.folder import Folder, writing
 from lathe_rc.sweep.formulas import Found
+from lathe_rc.sweep.objectives import Objectives, Score
 from lathe_rc.sweep.space import Space
 from lathe_rc.sweep.sweep import Sweep
 
@@ -34,20 +34,25 @@ class Trial(NamedTuple):
     score: Score
 
 
+def unit(column: str) -> tuple[float, str]:
+    """The unit in which a column is shown: how many of it are 1, and its name."""
+    return (1e6, "µm") if column.endswith("_error") else (1.0, "")
+
+
 @dataclass(frozen=True, repr=False)
 class Tuning:
     """The result of a tuning.
 
     Attributes:
         folder: where it is.
-        aims: what was wanted.
+        objectives: what was wanted.
         over: the plants and spindles of each trial.
         trials: that are computed, in order.
         formulas: what formulas give, by free parameter, where there is one.
     """
 
     folder: Folder
-    aims: Aims
+    objectives: Objectives
     over: Space
     trials: Sequence[Trial]
     formulas: Mapping[str, Found] = field(default_factory=dict)
@@ -56,8 +61,7 @@ class Tuning:
         """The scenario and its best trial."""
         told = "nothing feasible"
         if best := self.best:
-            costs = zip(self.aims.goals, best.score.costs, strict=True)
-            told = ", ".join(f"{goal.column} = {goal.sign * cost:.4g}" for goal, cost in costs)
+            told = ", ".join(f"{column} = {value:.4g}" for column, value in self.goals(best).items())
             told = f"{told} in trial {best.number}"
         return f"<Tuning of {self.folder.scenario.name} in {self.folder.path}: {len(self.trials)} trials, {told}>"
 
@@ -65,6 +69,16 @@ class Tuning:
     def sweep(self) -> Sweep:
         """All cells of all trials."""
         return Sweep(self.folder)
+
+    @property
+    def cells(self) -> int:
+        """How many cells a trial has."""
+        return self.over.count(self.folder.scenario)
+
+    @property
+    def feasible(self) -> list[Trial]:
+        """The trials that meet all constraints."""
+        return [trial for trial in self.trials if trial.score.feasible]
 
     @property
     def start(self) -> Trial | None:
@@ -83,19 +97,21 @@ class Tuning:
         return next((trial for trial in self.trials if given and trial.values == own(trial)), None)
 
     @property
+    def improvements(self) -> list[Trial]:
+        """The trials that were better in the first goal than all before."""
+        found: list[Trial] = []
+        for trial in self.feasible:
+            if not found or trial.score.costs[0] < found[-1].score.costs[0]:
+                found.append(trial)
+        return found
+
+    @property
     def front(self) -> list[Trial]:
         """The trials that no other is better than in all goals, by the first goal; of one goal, the best."""
         found: list[Trial] = []
-        least = math.inf
-        feasible = [trial for trial in self.trials if trial.score.feasible]
-        for trial in sorted(feasible, key=lambda trial: (trial.score.costs, trial.number)):
-            if len(self.aims.goals) == 1:
-                return [trial]
-            if len(self.aims.goals) == 2:
-                if trial.score.costs[1] < least:
-                    found.append(trial)
-                    least = trial.score.costs[1]
-            elif not any(_dominates(other.score, trial.score) for other in feasible):
+        # In this order only a trial that is there already can be as good in all goals.
+        for trial in sorted(self.feasible, key=lambda trial: (trial.score.costs, trial.number)):
+            if not any(np.less_equal(other.score.costs, trial.score.costs).all() for other in found):
                 found.append(trial)
         return found
 
@@ -109,6 +125,19 @@ class Tuning:
         span = np.ptp(costs, axis=0)
         distance = np.linalg.norm((costs - costs.min(axis=0)) / np.where(span > 0.0, span, 1.0), axis=1)
         return front[int(np.argmin(distance))]
+
+    def goals(self, trial: Trial) -> dict[str, float]:
+        """The goals of a trial, by column [SI units]; infinite where there is none."""
+        pairs = zip(self.objectives.goals, trial.score.costs, strict=True)
+        return {goal.column: goal.sign * cost for goal, cost in pairs}
+
+    def goals_shown(self, trial: Trial) -> dict[str, str]:
+        """The goals of a trial as texts with units, by column."""
+        found = {}
+        for column, value in self.goals(trial).items():
+            factor, name = unit(column)
+            found[column] = f"{value * factor:.4g} {name}".rstrip() if math.isfinite(value) else "none"
+        return found
 
     def scenario(self, trial: Trial) -> Scenario:
         """The cell with a trial's parameters, on its own plant and spindle."""
@@ -135,8 +164,3 @@ class Tuning:
         text = f"# Trial {trial.number} of the tuning {self.folder.path} of {self.folder.scenario.name}.\n"
         with writing(path.parent), files.replacing(path) as stream:
             stream.write((text + self.scenario(trial).to_yaml(given=True)).encode())
-
-
-def _dominates(one: Score, other: Score) -> bool:
-    pairs = list(zip(one.costs, other.costs, strict=True))
-    return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)

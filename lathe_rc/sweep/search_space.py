@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Free parameters of a tuning: ranges and lists, as Optuna knows them."""
+"""The search space of a tuning: ranges and lists of parameters, as Optuna knows them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
@@ -13,20 +13,31 @@ from lathe_rc.errors import InputError, shown
 from lathe_rc.sweep.space import axis, canonical, number
 
 
-class Free(NamedTuple):
-    """A free parameter.
+class Dimension(NamedTuple):
+    """A parameter that is searched.
 
     Attributes:
-        distribution: where Optuna draws it from.
-        choices: the values of a list, by what Optuna knows them as; None: a range.
+        distribution: of Optuna.
+        choices: the values of a list, by the texts that Optuna knows them as; None: a range.
     """
 
     distribution: CategoricalDistribution | FloatDistribution | IntDistribution
     choices: Mapping[str, Value] | None
 
-    def value(self, told: Any) -> Value:
-        """Of what Optuna has drawn."""
-        return cast("Value", told) if self.choices is None else self.choices[told]
+    @property
+    def ends(self) -> list[Value]:
+        """The ends of the range, or all values of the list."""
+        if isinstance(self.distribution, CategoricalDistribution):
+            return list((self.choices or {}).values())
+        return [self.distribution.low, self.distribution.high]
+
+    def value(self, encoded: Any) -> Value:
+        """The value that Optuna has drawn."""
+        return cast("Value", encoded) if self.choices is None else self.choices[encoded]
+
+    def encoded(self, value: Value) -> Any:
+        """The form of a value in Optuna."""
+        return value if self.choices is None else _text(value)
 
     def suggest(self, trial: Trial, target: str) -> None:
         """Let a trial have a value, if it has none yet."""
@@ -38,23 +49,19 @@ class Free(NamedTuple):
         else:
             trial.suggest_float(target, found.low, found.high, log=found.log)
 
-    def told(self, value: Value) -> Any:
-        """The form of a value in Optuna."""
-        return value if self.choices is None else _known(value)
-
-    def holds(self, value: Value) -> bool:
+    def contains(self, value: Value) -> bool:
         """Whether a value is in the range or list."""
         if self.choices is not None:
-            return _known(value) in self.choices
-        found = cast("FloatDistribution | IntDistribution", self.distribution)
-        return found.low <= cast("float", value) <= found.high
+            return _text(value) in self.choices
+        low, high = cast("list[float]", self.ends)
+        return low <= cast("float", value) <= high
 
 
-def _known(value: Value) -> str:
+def _text(value: Value) -> str:
     return canonical({"": value})
 
 
-def frees(scenario: Scenario, free: Mapping[str, str | Sequence[Value]]) -> dict[str, Free]:
+def search_space(scenario: Scenario, free: Mapping[str, str | Sequence[Value]]) -> dict[str, Dimension]:
     """The free parameters of a scenario, by target.
 
     Args:
@@ -68,11 +75,11 @@ def frees(scenario: Scenario, free: Mapping[str, str | Sequence[Value]]) -> dict
         raise InputError("nothing is free; allowed: --free NODE.PARAM=LOW:HIGH, =LOW:HIGH:log or =A,B,C, once or more")
     found = {}
     for target, told in free.items():
-        found[target] = _free(scenario, target, told)
-        for value in _ends(found[target]):
+        found[target] = _dimension(scenario, target, told)
+        for value in found[target].ends:
             scenario.varied({target: value})
         start = scenario.value(target)
-        if not found[target].holds(start):
+        if not found[target].contains(start):
             text = told if isinstance(told, str) else ", ".join(map(str, told))
             raise InputError(
                 f"{target} = {shown(start)} is where the search starts, outside of {shown(text)}; allowed: a range or "
@@ -81,26 +88,19 @@ def frees(scenario: Scenario, free: Mapping[str, str | Sequence[Value]]) -> dict
     return found
 
 
-def _ends(free: Free) -> list[Value]:
-    if free.choices is not None:
-        return list(free.choices.values())
-    found = cast("FloatDistribution | IntDistribution", free.distribution)
-    return [found.low, found.high]
-
-
-def _free(scenario: Scenario, target: str, told: str | Sequence[Value]) -> Free:
+def _dimension(scenario: Scenario, target: str, told: str | Sequence[Value]) -> Dimension:
     row = scenario.parameter(target)
     parts = told.split(":") if isinstance(told, str) else []
     if len(parts) < 2 or row.is_list or row.type not in (int, float):
         values = axis(scenario, target, told)
         if row.type is float and not row.is_list:
             values = [float(cast("float", value)) for value in values]
-        choices = {_known(value): value for value in values}
+        choices = {_text(value): value for value in values}
         if len(choices) < 2:
             raise InputError(
                 f"{target}={shown(told)}: one value is no choice; allowed: LOW:HIGH, or two and more values"
             )
-        return Free(CategoricalDistribution(list(choices)), choices)
+        return Dimension(CategoricalDistribution(list(choices)), choices)
     log = parts[2:] == ["log"]
     if len(parts) != 2 + log:
         raise InputError(f"{target}={shown(told)}; allowed: LOW:HIGH, LOW:HIGH:log, or values between commas")
@@ -110,7 +110,7 @@ def _free(scenario: Scenario, target: str, told: str | Sequence[Value]) -> Free:
     if log and not low > 0.0:
         raise InputError(f"{target}={shown(told)}; allowed on a log range: ends above 0")
     if row.type is float:
-        return Free(FloatDistribution(low, high, log=log), None)
+        return Dimension(FloatDistribution(low, high, log=log), None)
     if low != round(low) or high != round(high):
         raise InputError(f"{target}={shown(told)}; allowed: whole numbers")
-    return Free(IntDistribution(round(low), round(high), log=log), None)
+    return Dimension(IntDistribution(round(low), round(high), log=log), None)
