@@ -18,8 +18,7 @@ from rich.console import Group
 from lathe_papers.formulas.loaded import compliance
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.plants.cutting import CuttingProcess
-from lathe_rc.plants.cutting_force import SpecificForce
-from lathe_rc.plants.deflection import RIGID
+from lathe_rc.plants.cutting_force import RIGID, SpecificForce
 from lathe_rc.plants.spindle import LoadedSpindle, SpeedLoop
 from lathe_rc.plants.tool_drive import ToolDrive
 from lathe_rc.plants.workpiece import Part

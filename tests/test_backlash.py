@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.plants.backlash import follow
+from lathe_rc.plants.feed import follow
 
 
 def path(motor, half, start=0.0):

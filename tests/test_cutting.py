@@ -10,9 +10,7 @@ from numpy.testing import assert_allclose
 
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.plants.cutting import CuttingProcess
-from lathe_rc.plants.cutting_force import STEEL, SpecificForce
-from lathe_rc.plants.deflection import PAPER, REALISTIC, RIGID, Elasticity
-from lathe_rc.plants.flank import Flank, Wear
+from lathe_rc.plants.cutting_force import PAPER, REALISTIC, RIGID, STEEL, Elasticity, Flank, SpecificForce, Wear
 from lathe_rc.plants.workpiece import HardSpot, Part
 from lathe_rc.signals import speed as speeds
 from lathe_rc.signals.allowance import PAPER_RMS, Allowance, mean_reverting

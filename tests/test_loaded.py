@@ -16,8 +16,7 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.plants.coil import Coil
 from lathe_rc.plants.cutting import CuttingProcess
-from lathe_rc.plants.cutting_force import SpecificForce
-from lathe_rc.plants.deflection import RIGID
+from lathe_rc.plants.cutting_force import RIGID, SpecificForce
 from lathe_rc.plants.piezo import Stack
 from lathe_rc.plants.tool_drive import Piezo, ToolDrive
 from lathe_rc.plants.workpiece import Part

@@ -13,8 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from lathe_papers.formulas.hyperstability import NOMINAL, plant, popov_bound
 from lathe_papers.formulas.periodic_loop import PeriodicLoop, disturbance, steady_derivatives
-from lathe_rc.control.periodic import PeriodicController, samples_in
-from lathe_rc.control.periodic_gains import PRESETS
+from lathe_rc.control.periodic import PRESETS, PeriodicController, samples_in
 from lathe_rc.errors import InputError
 from lathe_rc.transfer import LinearSystem
 

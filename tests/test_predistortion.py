@@ -12,8 +12,7 @@ from lathe_rc.analysis.shaft import Shaft
 from lathe_rc.control.predistortion import Predistortion, cancelling, contraction, proportional, turned
 from lathe_rc.errors import InputError
 from lathe_rc.plants.cutting import CuttingProcess
-from lathe_rc.plants.cutting_force import STEEL
-from lathe_rc.plants.deflection import Elasticity
+from lathe_rc.plants.cutting_force import STEEL, Elasticity
 from lathe_rc.plants.workpiece import Part
 
 STIFFNESS = 233.3e3  # [N/m]

@@ -12,9 +12,7 @@ from numpy.testing import assert_allclose
 from lathe_papers.formulas.regeneration import Regeneration, lobes
 from lathe_rc.errors import InputError
 from lathe_rc.plants.cutting import CuttingProcess
-from lathe_rc.plants.cutting_force import SpecificForce
-from lathe_rc.plants.deflection import PAPER, REALISTIC, Elasticity
-from lathe_rc.plants.flank import Flank
+from lathe_rc.plants.cutting_force import PAPER, REALISTIC, Elasticity, Flank, SpecificForce
 from lathe_rc.transfer import TransferFunction
 
 PRESETS = {"paper": (PAPER, 1e-3), "realistic": (REALISTIC, 5e-5)}  # and a step that resolves the mode [s]

@@ -24,8 +24,7 @@ from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
 from lathe_rc.cell.stages.feed_drive import FeedDriveParameters, FeedDriveStage
 from lathe_rc.cell.stages.learning_controller import LearningController
-from lathe_rc.cell.stages.supervisor import MEMBERS_LOST
-from lathe_rc.cell.stages.supervisor_parameters import SupervisorParameters
+from lathe_rc.cell.stages.supervisor import MEMBERS_LOST, SupervisorParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion
 from lathe_rc.errors import InputError, LatheError

@@ -27,10 +27,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.control.interpolation import linear
 from lathe_rc.errors import InputError
 from lathe_rc.files import replacing
 from lathe_rc.jit import kernel
-from lathe_rc.signals.interpolation import linear
 from lathe_rc.signals.table import read_table
 
 Array = npt.NDArray[np.float64]

@@ -20,10 +20,11 @@ All that happens in a sample is solved together: the force of sample n bends the
 chip of sample n. ap is linear in the force as long as there is contact, so that this is one division. Both lags take
 what drives them as linear between samples.
 
-The part's surface is remembered over the angle (`lathe_rc.plants.cut_surface`), and the chip reads it a revolution
+The part's surface is remembered over the angle (`lathe_rc.plants.chip`), and the chip reads it a revolution
 later. Where nothing is cut nothing is left to meet: the blank is there, which depth + d says already.
 
-Source: spec/feed-and-force.md, "Cutting process"; paper 004, W3 and W4; of process damping: `lathe_rc.plants.flank`.
+Source: spec/feed-and-force.md, "Cutting process"; paper 004, W3 and W4; of process damping:
+`lathe_rc.plants.cutting_force`.
 """
 
 from collections.abc import Sequence
@@ -41,6 +42,7 @@ from lathe_rc.plants.chip import (
     WEAR,
     CutTable,
     Process,
+    blank,
     chip_of,
     failure,
     leave,
@@ -48,16 +50,14 @@ from lathe_rc.plants.chip import (
     press,
     pressed_by,
 )
-from lathe_rc.plants.cut_surface import blank
-from lathe_rc.plants.cutting_force import STEEL, SpecificForce
-from lathe_rc.plants.deflection import RIGID, Elasticity
-from lathe_rc.plants.flank import Flank, Wear
+from lathe_rc.plants.cutting_force import RIGID, STEEL, Elasticity, Flank, SpecificForce, Wear
 from lathe_rc.plants.workpiece import HardSpot, Part
 from lathe_rc.transfer import System, TransferFunction, discretise, rest
 
 Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
+_NEW_EDGE, _NO_DAMPING = Wear(), Flank()
 
 
 @kernel
@@ -104,6 +104,18 @@ def _instant(system: System) -> float:
     return float(system.through + system.output @ system.now)
 
 
+def _check_edge(material: SpecificForce, wear: Wear, flank: Flank, elasticity: Elasticity) -> None:
+    """Refuse numbers of the edge that are out of their range, or not finite."""
+    for values in (material, wear, flank, elasticity):
+        for name, value in values._asdict().items():
+            if not 0.0 <= value < np.inf:
+                raise InputError(f"cutting: {name} {value:g}; allowed: 0 or more")
+    if not (material.kc1 > 0.0 and material.mc < 1.0):
+        raise InputError(f"cutting: {material}; allowed: kc1 above 0 (1700 N/mm² is 1.7e9 Pa), mc below 1")
+    if elasticity.inertia > 0.0 and not elasticity.damping > 0.0:
+        raise InputError("cutting: damping 0 of the edge with inertia; allowed: above 0, or it rings for ever")
+
+
 class CuttingProcess:
     """The cut as a machine; it has not begun before the first sample.
 
@@ -136,11 +148,11 @@ class CuttingProcess:
         depth: float,
         lag: float = 0.075,
         elasticity: Elasticity = RIGID,
-        wear: Wear | None = None,
+        wear: Wear = _NEW_EDGE,
         part: Part | None = None,
         overlap: float = 0.0,
         grid: int = 4096,
-        flank: Flank | None = None,
+        flank: Flank = _NO_DAMPING,
         step: float,
     ) -> None:
         least = float(f"{step / 1000.0:g}")  # the one that is said, to the bit
@@ -150,7 +162,8 @@ class CuttingProcess:
             raise InputError(f"cutting: overlap {overlap:g}; allowed: 0 (no regeneration) up to 1")
         if grid < 16:
             raise InputError(f"cutting: {grid} grid points in a revolution; allowed: 16 or more")
-        part, wear, flank = part or Part(), wear or Wear(), flank or Flank()
+        _check_edge(material, wear, flank, elasticity)
+        part = part or Part()
         following = discretise(TransferFunction((1.0,), (lag, 1.0)), step, "foh")
         mode = discretise(elasticity.shape, step, "foh")
         heights, compliances = part.heights, part.compliances
@@ -161,11 +174,9 @@ class CuttingProcess:
             depth=depth,
             overlap=overlap,
             sign=1.0 if elasticity.away else -1.0,
-            kc1=material.kc1,
-            mc=material.mc,
-            wear_factor=material.wear_factor,
-            per_metre=wear.per_metre,
-            per_second=wear.per_second,
+            material=material,
+            wear=wear,
+            flank=flank,
             radius=part.radius,
             lag=following,
             lag_now=_instant(following),
@@ -176,9 +187,6 @@ class CuttingProcess:
             heights=np.ascontiguousarray(heights, dtype=np.float64),
             compliances=np.ascontiguousarray(compliances, dtype=np.float64),
             grid=grid,
-            pressure=flank.pressure,
-            width=flank.width,
-            land=flank.land,
         )
         self.table = CutTable(
             process=self._whole,

@@ -13,9 +13,22 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.arrays import put
-from lathe_rc.jit import kernel
-from lathe_rc.plants.end_stops import between_stops
+from lathe_rc.jit import inlined, kernel
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
+
+
+@inlined
+def between_stops(position: float, velocity: float, stroke: float) -> tuple[float, float, bool]:
+    """Position [m] and velocity [m/s] between end stops at ± ``stroke`` [m], and whether it is at one of them.
+
+    They are inelastic: the carriage stays there until it is driven back.
+    """
+    if position > stroke:
+        return stroke, min(velocity, 0.0), True
+    if position < -stroke:
+        return -stroke, max(velocity, 0.0), True
+    return position, velocity, False
+
 
 Array = npt.NDArray[np.float64]
 

@@ -67,7 +67,7 @@ class Piezo:
 
     Attributes:
         stack: amplifier and ceramics; the drive takes over its state.
-        tool_frequency, tool_damping: ω2 [rad/s], ζ2 [1] of the tool on a blocked carriage.
+        natural_frequency, damping: ω2 [rad/s], ζ2 [1] of the tool on a blocked carriage.
         mass_ratio: r.
         full_voltage: voltage at the full stroke [V].
         feedback: direct compensation: the measured position of the carriage is taken off the piezo's set point, in the
@@ -76,8 +76,8 @@ class Piezo:
     """
 
     stack: Stack
-    tool_frequency: float
-    tool_damping: float
+    natural_frequency: float
+    damping: float
     mass_ratio: float
     full_voltage: float
     feedback: bool = False
@@ -123,9 +123,9 @@ class ToolDrive:
     """The drives that carry the tool.
 
     Args:
-        carriage_frequency, carriage_damping: ω1 [rad/s], ζ1 [1] of the position loop.
+        natural_frequency, damping: ω1 [rad/s], ζ1 [1] of the position loop.
         delay: τ of the command [s].
-        carriage_stroke: end stops at ± this displacement [m].
+        stroke: end stops at ± this displacement [m].
         moving_mass: m or M [kg].
         force_constant: k of the coil [N/A].
         radial: ρ, the part of the main cutting force that acts along the drives; 0 for none.
@@ -147,10 +147,10 @@ class ToolDrive:
     def __init__(
         self,
         *,
-        carriage_frequency: float,
-        carriage_damping: float,
+        natural_frequency: float,
+        damping: float,
         delay: float,
-        carriage_stroke: float,
+        stroke: float,
         moving_mass: float,
         force_constant: float,
         radial: float = 0.0,
@@ -161,7 +161,7 @@ class ToolDrive:
         method: Discretisation,
         kept: int = 1,
     ) -> None:
-        alone, _ = second_order(carriage_frequency, carriage_damping)
+        alone, _ = second_order(natural_frequency, damping)
         spring, damper = float(-alone[1, 0]), float(-alone[1, 1])
         masses = 2 if piezo else 1
         order = 2 * masses + (coil is not None)
@@ -172,7 +172,7 @@ class ToolDrive:
         tool, mass_of_tool = _CARRIAGE, moving_mass
         if piezo:
             tool, mass_of_tool = _TOOL, piezo.mass_ratio * moving_mass
-            stiff, loss = piezo.tool_frequency**2, 2.0 * piezo.tool_damping * piezo.tool_frequency
+            stiff, loss = piezo.natural_frequency**2, 2.0 * piezo.damping * piezo.natural_frequency
             q = np.array([stiff, loss, -stiff, -loss])
             free[1], free[3] = -piezo.mass_ratio * q, q
             extends[1], extends[3] = -piezo.mass_ratio * stiff, stiff
@@ -207,7 +207,7 @@ class ToolDrive:
             spring=spring,
             damper=damper,
             force_per_current=moving_mass / force_constant,
-            carriage_stroke=carriage_stroke,
+            carriage_stroke=stroke,
             stack=stack.table,
             memory=stack.state,
             full_voltage=piezo.full_voltage if piezo else 0.0,

@@ -28,7 +28,7 @@ from lathe_rc.plants.chip import (
 )
 from lathe_rc.plants.chip import failure as failure_of_cut
 from lathe_rc.plants.coil import CoilTable, applied
-from lathe_rc.plants.end_stops import between_stops
+from lathe_rc.plants.electrodynamic import between_stops
 from lathe_rc.plants.piezo import VOLTAGE, StackTable, extend
 from lathe_rc.signals.noise import quantise
 

@@ -22,7 +22,7 @@ _OWN = {
     "loaded_drive": "loaded_drive:LoadedDriveStage",
     "loaded_series_drive": "loaded_drive:LoadedSeriesDrive",
     "vibration": "vibration:Vibration",
-    "profile": "profile:ProfileStage",
+    "profile": "form:ProfileStage",
     "tool": "tool:Tool",
     "feed_drive": "feed_drive:FeedDriveStage",
     "cutting_process": "cutting_process:CuttingProcessStage",

@@ -13,15 +13,13 @@ from lathe_rc.analysis.learning import Response
 from lathe_rc.arrays import put, put_scaled
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedCommand, limited, remembered
-from lathe_rc.cell.stages.composed import ComposedParameters, prefixed
+from lathe_rc.cell.stages.command_limits import Clipping, LimitedCommand, limited, remembered
 from lathe_rc.cell.stages.cutting_process import READ, TURNS, CutStage, CuttingProcessParameters
-from lathe_rc.cell.stages.drive import Drive, Limits
+from lathe_rc.cell.stages.drive import Drive, Limits, OwnRetraction, followed
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
-from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters
-from lathe_rc.cell.stages.retraction import OwnRetraction, followed
+from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters, SetPoint, sum_up
 from lathe_rc.cell.stages.series_drive import COARSE, FINE, piezo_on_carriage, tool_drive
-from lathe_rc.cell.stages.set_point import SetPoint, sum_up
+from lathe_rc.cell.stages.tables import ComposedParameters, made_of, prefixed
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import CommandLimits, LimiterTable, limiter
 from lathe_rc.errors import InputError
@@ -35,7 +33,8 @@ from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
 _CUT = "cut_"  # begins the parameters of the cut
 _COIL = "coil"  # whose limits are told
-_NO_LIMITS = limiter(CommandLimits(np.inf, np.inf, np.inf, np.inf), 1.0, 1)
+_COIL_LIMITS = ("current_limit", "voltage_limit", "slew_rate")
+_NO_LIMITS = limiter(CommandLimits(), 1.0, 1)
 _REFERENCE = Input("reference", messages.REFERENCE, ("reference", "height"))
 
 
@@ -63,16 +62,9 @@ class LoadedCoarseParameters(ElectrodynamicActuatorParameters):
             InputError: a limit of what is not there.
         """
         if self.loop == "current":
-            return Coil(
-                resistance=self.resistance,
-                inductance=self.inductance,
-                bandwidth=self.bandwidth,
-                back_emf=self.back_emf,
-                current_limit=self.current_limit or np.inf,
-                voltage_limit=self.voltage_limit or np.inf,
-                slew_rate=self.slew_rate or np.inf,
-            )
-        for name in ("current_limit", "voltage_limit", "slew_rate"):
+            limits = {name: getattr(self, name) or np.inf for name in _COIL_LIMITS}
+            return made_of(Coil, self, **limits)
+        for name in _COIL_LIMITS:
             if value := getattr(self, name):
                 raise InputError(f"{node}.coarse_{name} = {value:g} with coarse_loop = ideal; allowed: 0, or current")
         return None
@@ -263,10 +255,10 @@ class LoadedDriveStage(CutStage, Drive):
 
     kind = "loaded_drive"
     Parameters = LoadedDriveParameters
-    announces = (LIMITED, FREE)
     failure = staticmethod(failure)
     rooms = 9
     step = staticmethod(step)
+    _retraction: OwnRetraction
 
     def __init__(self, name: str, parameters: LoadedParameters) -> None:
         super().__init__(name, parameters, parameters.cut, _CUT)
@@ -295,10 +287,10 @@ class LoadedDriveStage(CutStage, Drive):
         self._retraction = OwnRetraction(coarse, coarse.stroke)
         self._clipping = Clipping(name, parameters, _COIL) if coil else None
         # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
-        self._noise = Sensor(coarse.noise_rms, 0.0, parameters.seed, f"{name}/coarse")
-        self._sensor = Sensor(
-            fine.noise_rms if fine else 0.0, fine.resolution if fine else 0.0, parameters.seed, f"{name}/fine"
-        )
+        self._sensors = [
+            Sensor(coarse.noise_rms, 0.0, parameters.seed, f"{name}/coarse"),
+            Sensor(fine.noise_rms if fine else 0.0, fine.resolution if fine else 0.0, parameters.seed, f"{name}/fine"),
+        ]
         inputs = [TURNS, _REFERENCE, Input("coarse/command", messages.COMMAND, ("position",))]
         inputs += self._set_point.inputs if self._set_point else []
         self._slides, place = dict.fromkeys(("cross", "longitudinal"), -1), sum(len(port.fields) for port in inputs)
@@ -318,14 +310,6 @@ class LoadedDriveStage(CutStage, Drive):
             found["fine/command"] = self.drive.fine_response
         return found
 
-    def limits(self) -> Mapping[str, Limits]:
-        """See `Drive`."""
-        return {"coarse/state": self._limits}
-
-    def go_safe(self) -> None:
-        """See `Stage`; the carriage takes the tool out."""
-        self._retraction.begin()
-
     @property
     def memory(self) -> Memory:
         """See `Stage`."""
@@ -337,8 +321,8 @@ class LoadedDriveStage(CutStage, Drive):
             signs=self._set_point.signs if self._set_point else np.empty(0),
             drive=self.drive.table,
             cut=self.cut.table,
-            noise=self._noise.table,
-            sensor=self._sensor.table,
+            noise=self._sensors[0].table,
+            sensor=self._sensors[1].table,
             allowance=self._allowance.table,
             force_sensor=self._force_sensor.table,
             **self._slides,
@@ -347,23 +331,16 @@ class LoadedDriveStage(CutStage, Drive):
             room=self.room,
         )
 
-    def prepare(self, first: int, samples: int) -> None:
-        """See `Stage`."""
-        super().prepare(first, samples)
-        self._noise.draw(samples)
-        self._sensor.draw(samples)
-
     def tell(self, first: int, end: int) -> list[Sparse]:
         """See `Stage`."""
-        found = [message for limited in self._limited for message in limited.tell(first, end)]
+        found = super().tell(first, end)
         if self._clipping:
             found += self._clipping.told(first, remembered(self.drive.table.coil.limited, first, end))
         return found
 
     def finish(self, index: int) -> list[Sparse]:
         """See `Stage`."""
-        found = [message for limited in self._limited for message in limited.finish(index)]
-        return found + (self._clipping.finish(index) if self._clipping else [])
+        return super().finish(index) + (self._clipping.finish(index) if self._clipping else [])
 
 
 class LoadedSeriesDrive(LoadedDriveStage):
