@@ -401,11 +401,6 @@ class PeriodicController:
         return float(self.state.values[_INTEGRATOR])
 
     @property
-    def switch(self) -> float:
-        """δ̃ [1]."""
-        return float(self.state.values[_SWITCH])
-
-    @property
     def largest_demand(self) -> float:
         """Largest |u| before the limit so far [1]."""
         return float(self.state.values[_DEMAND])

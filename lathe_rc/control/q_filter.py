@@ -68,21 +68,6 @@ class QFilter(ABC):
         """Real response at ``radians`` per grid point, shape (n,)."""
 
 
-class Unity(QFilter):
-    """Q = 1: nothing is forgotten."""
-
-    def __init__(self, cycle: int) -> None:
-        super().__init__(0, cycle)
-
-    def smooth(self, points: Array, smoothed: Array) -> None:
-        """See `QFilter`."""
-        smoothed[:] = points
-
-    def response(self, radians: Array) -> Array:
-        """See `QFilter`."""
-        return np.ones_like(radians)
-
-
 @kernel
 def two_sided(ratio: float, reach: int, points: Array, scratch: Array, smoothed: Array) -> None:
     """Both recursions of `Exponential` at once; ``scratch`` is as long as ``points``."""

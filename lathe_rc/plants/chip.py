@@ -79,7 +79,6 @@ _TURN = 2.0 * np.pi
 
 WEAR, _EDGE = 0, 1  #: places in the state
 DONE, _STANDS, _TURNS_BACK, DRAWN_IN = 0, 1, 2, 3  #: why a kernel stopped
-APART, BACKWARDS = 0, 1  #: places in the counts
 
 
 class Process(NamedTuple):
@@ -127,7 +126,6 @@ class CutTable(NamedTuple):
         lag_state, mode_state: of F and w.
         state: VB, and where the edge was; NaN before the first sample.
         surface: what it left.
-        counts: see `CuttingProcess.apart` and `CuttingProcess.backwards`.
     """
 
     process: Process
@@ -135,7 +133,6 @@ class CutTable(NamedTuple):
     mode_state: Array
     state: Array
     surface: SurfaceTable
-    counts: npt.NDArray[np.int64]
 
 
 @inlined

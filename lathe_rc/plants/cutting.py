@@ -35,8 +35,6 @@ import numpy.typing as npt
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.chip import (
-    APART,
-    BACKWARDS,
     DONE,
     DRAWN_IN,
     WEAR,
@@ -90,8 +88,6 @@ def cut_along(
         )
         if np.isnan(chip):
             return k, DRAWN_IN
-        cut.counts[BACKWARDS] += feed_velocity[k] < 0.0
-        cut.counts[APART] += chip < 0.0
         depth_of_cut[k] = chip = max(chip, 0.0)
         base = cross_position[k] + displacement[k]
         force[k], deflection[k] = press(cut, chip, stiffness, compliance, speed[k], base, pressed)
@@ -132,9 +128,6 @@ class CuttingProcess:
         step: sampling step [s].
 
     Attributes:
-        apart: samples so far in which the edge was clear of the part although there was material; before the first
-            contact too.
-        backwards: samples so far in which the feed went back; no chip has a negative thickness, and 0 was taken.
         table: for `cut_along`.
 
     Raises:
@@ -194,7 +187,6 @@ class CuttingProcess:
             mode_state=rest(mode),
             state=np.array([wear.initial, np.nan]),
             surface=blank(grid),
-            counts=np.zeros(2, dtype=np.int64),
         )
 
     def damage(self, *, shorter: float = 0.0, spots: Sequence[HardSpot] = ()) -> None:
@@ -204,16 +196,6 @@ class CuttingProcess:
             depth=self._whole.depth - shorter, spots=np.concatenate((self._whole.spots, further))
         )
         self.table = self.table._replace(process=process)
-
-    @property
-    def apart(self) -> int:
-        """See the class."""
-        return int(self.table.counts[APART])
-
-    @property
-    def backwards(self) -> int:
-        """See the class."""
-        return int(self.table.counts[BACKWARDS])
 
     def block(
         self,

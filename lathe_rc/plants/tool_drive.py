@@ -44,7 +44,7 @@ from lathe_rc.plants.coil import Coil, coil_table
 from lathe_rc.plants.cutting import CuttingProcess
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
 from lathe_rc.plants.piezo import Stack, StackTable
-from lathe_rc.plants.tool_motion import SATURATED, STOPPED, MotionTable, Weights, advance_loaded, failure
+from lathe_rc.plants.tool_motion import MotionTable, Weights, advance_loaded, failure
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -222,7 +222,6 @@ class ToolDrive:
             before=np.zeros(2),
             reading=np.zeros(1),
             line=np.zeros(self._coarse.delay + 3),
-            counts=np.zeros(2, np.int64),
         )
         if coil:
             self._check(coil)
@@ -263,16 +262,6 @@ class ToolDrive:
                 f"current loop of {coil.bandwidth:g} rad/s at a step of {self.step:.4g} s: largest pole {radius:.4g}; "
                 "allowed: below 1 (less bandwidth or a higher sample rate; above the drive's own frequency)"
             )
-
-    @property
-    def stopped(self) -> int:
-        """Samples so far that the carriage spent at an end stop."""
-        return int(self.table.counts[STOPPED])
-
-    @property
-    def saturated(self) -> int:
-        """Samples so far in which the piezo's set point or voltage was cut off."""
-        return int(self.table.counts[SATURATED])
 
     def _closed(self) -> tuple[Array, Array]:
         """Transition of state and current loop's integral without limits, and the weight of the wanted position."""

@@ -14,8 +14,6 @@ from lathe_rc.errors import LatheError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.placed import sized
 from lathe_rc.plants.chip import (
-    APART,
-    BACKWARDS,
     DONE,
     DRAWN_IN,
     WEAR,
@@ -37,7 +35,6 @@ Array = npt.NDArray[np.float64]
 _ROUNDS = 32  # at most, to find the carriage's position and the extension of the same sample
 _TURN = 2.0 * np.pi
 _TORN_OFF = DRAWN_IN + 1  # why the kernel stopped, beside the reasons of the cut
-STOPPED, SATURATED = 0, 1  #: what is counted
 
 
 @sized
@@ -77,7 +74,6 @@ class MotionTable(NamedTuple):
         before: e [m] and radial force [N] of the last sample.
         reading: of the carriage's sensor in the last sample [m], shape (1,).
         line: a ring of past commands: sample n stands at n modulo its length.
-        counts: samples at an end stop, and in which the piezo saturated.
     """
 
     series: bool
@@ -103,7 +99,6 @@ class MotionTable(NamedTuple):
     before: Array
     reading: Array
     line: Array
-    counts: npt.NDArray[np.int64]
 
 
 @inlined
@@ -179,11 +174,10 @@ def _solve(
 
     The extension then needs the carriage's position of this sample and moves it by a thousandth of itself.
     """
-    memory, e, cuts, chip = drive.memory, 0.0, False, 0.0
+    memory, e, chip = drive.memory, 0.0, 0.0
     if not drive.feedback:
         if drive.series:
-            e, cuts = extend(drive.stack, memory, set_point)
-            drive.counts[SATURATED] += cuts
+            e, _ = extend(drive.stack, memory, set_point)
         if cut is not None:
             chip = _chip(drive, cut, free, e, here, stiffness, c)
         return e, chip
@@ -192,7 +186,7 @@ def _solve(
         guess = x1
         drive.reading[0] = quantise(guess + noise, drive.resolution)
         put(trial, memory)
-        e, cuts = extend(drive.stack, trial, set_point - drive.reading[0])
+        e, _ = extend(drive.stack, trial, set_point - drive.reading[0])
         force = 0.0
         if cut is not None:
             chip = _chip(drive, cut, free, e, here, stiffness, c)
@@ -201,7 +195,6 @@ def _solve(
         if x1 == guess:
             break
     put(memory, trial)
-    drive.counts[SATURATED] += cuts
     return e, chip
 
 
@@ -212,8 +205,7 @@ def _settle(drive: MotionTable, free: Array, e: float, pushes: float, noise: flo
     for i in range(fine.shape[0]):
         state[i] = free[i] + fine[i, 0] * e + load[i, 0] * pushes
     drive.before[0], drive.before[1] = e, pushes
-    state[0], state[1], stops = between_stops(state[0], state[1], drive.carriage_stroke)  # the tool swings on
-    drive.counts[STOPPED] += stops
+    state[0], state[1] = between_stops(state[0], state[1], drive.carriage_stroke)  # the tool swings on
     if not drive.feedback:
         drive.reading[0] = quantise(state[0] + noise, drive.resolution)
 
@@ -318,8 +310,6 @@ def advance_loaded(
         e, chip = _solve(drive, cut, free, trial, set_point[k], noise[k], here, stiffness, c)
         if np.isnan(chip):
             return k, DRAWN_IN
-        cut.counts[BACKWARDS] += feed_velocity[k] < 0.0
-        cut.counts[APART] += chip < 0.0
         depth_of_cut[k] = chip = max(chip, 0.0)
         force[k], deflection[k] = press(cut, chip, stiffness, c, speed[k], 0.0, 0.0)
         _settle(drive, free, e, drive.radial * force[k], noise[k])

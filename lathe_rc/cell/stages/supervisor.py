@@ -4,7 +4,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -241,107 +241,63 @@ class Supervisor(Stage):
             )
         return asked
 
+    def _watch(
+        self, kind: type[Monitor], name: str, subject: str, limit: float, asked: str = "", **options: Any
+    ) -> None:
+        """Add a monitor; ``asked``: first word of the parameter with its reaction, if not its own name."""
+        self.monitors.append(kind(name, subject, limit, self._reaction(f"{asked or name}_reaction"), **options))
+
     def _watch_spindle(self) -> None:
-        table, add = self.parameters, self.monitors.append
-        if table.speed_limit:
-            reaction = self._reaction("speed_reaction")
-            speed = table.nominal_speed
-            add(Threshold("speed", "encoder", table.speed_limit, reaction, signal=(0, "speed"), offset=speed))
-        if table.acceleration_limit:
-            add(
-                Rate(
-                    "acceleration",
-                    "encoder",
-                    table.acceleration_limit,
-                    self._reaction("acceleration_reaction"),
-                    signal=(0, "speed"),
-                    window=table.acceleration_window,
-                    step=table.step,
-                    before=table.nominal_speed,
-                )
-            )
+        table, nominal = self.parameters, self.parameters.nominal_speed
+        if limit := table.speed_limit:
+            self._watch(Threshold, "speed", "encoder", limit, signal=(0, "speed"), offset=nominal)
+        if limit := table.acceleration_limit:
+            over = {"window": table.acceleration_window, "step": table.step, "before": nominal}
+            self._watch(Rate, "acceleration", "encoder", limit, signal=(0, "speed"), **over)
         if table.index_limit:
-            add(IndexPulses(table.index_limit, self._reaction("index_reaction"), encoder=0))
+            self.monitors.append(IndexPulses(table.index_limit, self._reaction("index_reaction"), encoder=0))
 
     def _watch_error(self) -> None:
-        table, add = self.parameters, self.monitors.append
+        table = self.parameters
         tool = self._reads("tool", messages.TOOL, ("measured_error",)) if table.error_limit or table.growth_limit else 0
-        if table.error_limit:
-            reaction = self._reaction("error_reaction")
-            add(
-                Threshold(
-                    "error",
-                    "tool",
-                    table.error_limit,
-                    reaction,
-                    signal=(tool, "measured_error"),
-                    after=table.error_after,
-                )
-            )
-        if table.growth_limit:
-            reaction = self._reaction("growth_reaction")
-            add(
-                Growth(
-                    table.growth_limit,
-                    reaction,
-                    tool=tool,
-                    cycles=table.growth_cycles,
-                    floor=table.growth_floor,
-                )
-            )
+        if limit := table.error_limit:
+            self._watch(Threshold, "error", "tool", limit, signal=(tool, "measured_error"), after=table.error_after)
+        if limit := table.growth_limit:
+            how = {"cycles": table.growth_cycles, "floor": table.growth_floor}
+            self.monitors.append(Growth(limit, self._reaction("growth_reaction"), tool=tool, **how))
 
     def _watch_drives(self) -> None:
-        table, add = self.parameters, self.monitors.append
+        table = self.parameters
         for drive, limit in self._each("following_limit", table.drives):
-            state = self._reads(f"{drive}/state", messages.STATE, _SENSOR)
-            command = self._reads(f"{drive}/command", messages.COMMAND, _COMMAND)
-            add(
-                Threshold(
-                    "following",
-                    drive,
-                    limit,
-                    self._reaction("following_reaction"),
-                    signal=(command, "position"),
-                    other=(state, "measured_position"),
-                    samples=self._samples(table.following_time),
-                )
-            )
-        for what, of, name, field, seconds in (
-            ("stroke", table.drives, "stroke_limit", "measured_position", 0.0),
-            ("effort", table.drives, "effort_limit", "effort", table.effort_time),
-            ("slide", table.slides, "slide_limit", "measured_position", 0.0),
+            state = self._reads(f"{drive}/state", messages.STATE, _SENSOR), "measured_position"
+            command = self._reads(f"{drive}/command", messages.COMMAND, _COMMAND), "position"
+            samples = self._samples(table.following_time)
+            self._watch(Threshold, "following", drive, limit, signal=command, other=state, samples=samples)
+        for what, of, field, seconds in (
+            ("stroke", table.drives, "measured_position", 0.0),
+            ("effort", table.drives, "effort", table.effort_time),
+            ("slide", table.slides, "measured_position", 0.0),
         ):
-            for subject, limit in self._each(name, of):
-                state = self._reads(f"{subject}/state", messages.STATE, _SENSOR)
-                reaction, samples = self._reaction(f"{what}_reaction"), self._samples(seconds)
-                add(Threshold(what, subject, limit, reaction, signal=(state, field), samples=samples))
+            for subject, limit in self._each(f"{what}_limit", of):
+                signal = self._reads(f"{subject}/state", messages.STATE, _SENSOR), field
+                self._watch(Threshold, what, subject, limit, signal=signal, samples=self._samples(seconds))
 
     def _watch_margins(self) -> None:
         for drive, limit in self._each("margin_limit", self.parameters.drives):
-            reaction, after = self._reaction("margin_reaction"), self.parameters.margin_after
             signal = (self._reads(f"{drive}/margin", messages.MARGIN, _MARGIN), *_MARGIN)
-            self.monitors.append(Below("stability_margin", drive, limit, reaction, signal=signal, after=after))
+            after = self.parameters.margin_after
+            self._watch(Below, "stability_margin", drive, limit, "margin", signal=signal, after=after)
 
     def _watch_cut(self) -> None:
         table = self.parameters
         if not (table.force_limit or table.force_low):
             return
-        place, reaction = self._reads("cut", messages.CUT, ("measured_force",)), self._reaction("force_reaction")
-        signal, samples = (place, "measured_force"), self._samples(table.force_time)
-        if table.force_limit:
-            self.monitors.append(Threshold("force", "cut", table.force_limit, reaction, signal=signal, samples=samples))
-        if table.force_low:
-            self.monitors.append(
-                Below(
-                    "force_low",
-                    "cut",
-                    table.force_low,
-                    reaction,
-                    signal=signal,
-                    samples=samples,
-                    after=table.force_after,
-                )
-            )
+        signal = self._reads("cut", messages.CUT, ("measured_force",)), "measured_force"
+        lasts = {"signal": signal, "samples": self._samples(table.force_time)}
+        if limit := table.force_limit:
+            self._watch(Threshold, "force", "cut", limit, **lasts)
+        if limit := table.force_low:
+            self._watch(Below, "force_low", "cut", limit, "force", after=table.force_after, **lasts)
 
     def _watch_for_others(self) -> None:
         table, own = self.parameters, ("monitor_signals", "monitor_limits", "monitor_reactions")
