@@ -69,31 +69,14 @@ class PeriodicGains:
 
 PRESETS = {
     "published": PeriodicGains(
-        40.0,
-        200.0,
-        150.0,
-        0.17,
-        0.01,
-        15.0,
-        0.5,
-        0.1,
-        110.0,
+        40.0, 200.0, 150.0, 0.17, 0.01, 15.0, 0.5, 0.1, 110.0,
         "paper 002, eqs 20 and 21; not for a quantised measurement",
     ),
     # By the analysis: T and T* so that with σ = 0.1 s the learning factor is below 1 at every corner and level of y_F.
     "quantised": PeriodicGains(
-        2.5,
-        1.0,
-        1.0,
-        0.4,
-        0.055,
-        15.0,
-        0.5,
-        0.1,
-        10.0,
-        "for steps of 1e-4 in y and u; checked on all 32 corners of eq. 1",
+        2.5, 1.0, 1.0, 0.4, 0.055, 15.0, 0.5, 0.1, 10.0, "for steps of 1e-4 in y and u; checked on all 32 corners of eq. 1"
     ),
-}
+}  # fmt: skip
 
 
 def check_law(

@@ -58,23 +58,16 @@ _TURN = 2.0 * np.pi
 _NEW_EDGE, _NO_DAMPING = Wear(), Flank()
 
 
+#: arrays of a block in the order of the kernel: what the cut takes, and what it makes
+GIVEN = ("angle", "speed", "height", "cross_position", "displacement", "feed_velocity", "allowance")
+MADE = ("force", "deflection", "depth_of_cut", "feed", "wear")
+
+
 @kernel
-def cut_along(
-    cut: CutTable,
-    angle: Array,
-    speed: Array,
-    height: Array,
-    cross_position: Array,
-    displacement: Array,
-    feed_velocity: Array,
-    allowance: Array,
-    force: Array,
-    deflection: Array,
-    depth_of_cut: Array,
-    feed: Array,
-    wear: Array,
-) -> tuple[int, int]:
-    """Step through a block, see `CuttingProcess.block`; returns the sample at which it stopped and why."""
+def cut_along(cut: CutTable, given: tuple[Array, ...], made: tuple[Array, ...]) -> tuple[int, int]:
+    """Step through a block, see `GIVEN` and `MADE`; returns the sample at which it stopped and why."""
+    angle, speed, height, cross_position, displacement, feed_velocity, allowance = given
+    force, deflection, depth_of_cut, feed, wear = made
     per_radian = cut.process.grid / _TURN
     for k in range(angle.size):
         place = angle[k] * per_radian
@@ -197,45 +190,20 @@ class CuttingProcess:
         )
         self.table = self.table._replace(process=process)
 
-    def block(
-        self,
-        *,
-        angle: Array,
-        speed: Array,
-        height: Array,
-        cross_position: Array,
-        displacement: Array,
-        feed_velocity: Array,
-        allowance: Array,
-        force: Array,
-        deflection: Array,
-        depth_of_cut: Array,
-        feed: Array,
-        wear: Array,
-    ) -> None:
-        """Step through a block; arrays of shape (n,), the last five filled.
+    def block(self, **arrays: Array) -> None:
+        """Step through a block.
 
         Args:
-            angle: true spindle angle [rad]; with regeneration it must not fall.
-            speed: true spindle speed [rad/s], above 0.
-            height: of the edge along the part [m].
-            cross_position: x of the cross feed, out of the part [m].
-            displacement: z of the tool drive, out of the part [m].
-            feed_velocity: of the longitudinal feed [m/s].
-            allowance: d [m].
-            force: F [N].
-            deflection: σ·c·w of the edge, out of the part [m].
-            depth_of_cut: ap [m].
-            feed: f [m/rev].
-            wear: VB [m].
+            **arrays: of shape (n,), by the names of `GIVEN`: true spindle angle [rad], which must not fall with
+                regeneration, true spindle speed [rad/s], above 0, height of the edge along the part [m], x of the cross
+                feed and z of the tool drive, out of the part [m], velocity of the longitudinal feed [m/s], d [m]; and,
+                filled, of `MADE`: F [N], deflection σ·c·w of the edge out of the part [m], ap [m], f [m/rev], VB [m].
 
         Raises:
             LatheError: the spindle stands, or turns back or jumps under regeneration; or the force draws the edge into
                 the part faster than it can cut.
         """
-        reached, reason = cut_along(
-            self.table, angle, speed, height, cross_position, displacement, feed_velocity, allowance, force, deflection,
-            depth_of_cut, feed, wear,
-        )  # fmt: skip
+        made = tuple(arrays[name] for name in MADE)
+        reached, reason = cut_along(self.table, tuple(arrays[name] for name in GIVEN), made)
         if reason != DONE:
-            raise failure(reason, angle[reached], speed[reached], feed[reached])
+            raise failure(reason, *(float(arrays[name][reached]) for name in ("angle", "speed", "feed")))

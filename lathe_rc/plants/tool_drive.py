@@ -41,24 +41,18 @@ import numpy.typing as npt
 from lathe_rc.errors import InputError
 from lathe_rc.plants.chip import DONE
 from lathe_rc.plants.coil import Coil, coil_table
-from lathe_rc.plants.cutting import CuttingProcess
+from lathe_rc.plants.cutting import MADE, CuttingProcess
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
 from lathe_rc.plants.piezo import Stack, StackTable
-from lathe_rc.plants.tool_motion import MotionTable, Weights, advance_loaded, failure
+from lathe_rc.plants.tool_motion import GIVEN, MotionTable, Weights, advance_loaded, failure
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
 _CARRIAGE, _TOOL = 0, 2  # places of the positions in the state: x1, x1', x2, x2'
 
-# What a block takes and makes, in the order of the kernel.
-_GIVEN = (
-    "command", "set_point", "noise", "met", "angle", "speed", "height", "cross_position", "feed_velocity", "allowance",
-)  # fmt: skip
-_MADE = (
-    "position", "velocity", "current", "measured", "extension", "extension_velocity", "voltage",
-    "force", "deflection", "depth_of_cut", "feed", "wear",
-)  # fmt: skip
+# The motion that a block makes, in the order of the kernel.
+_MOTION = ("position", "velocity", "current", "measured", "extension", "extension_velocity", "voltage")
 
 
 @dataclass(frozen=True)
@@ -248,12 +242,14 @@ class ToolDrive:
             LatheError: drives and cut cannot go on, see `failure`.
         """
         none = np.zeros_like(given["command"])
-        taken = [given.get(name, none) for name in _GIVEN]
-        made = {name: np.zeros_like(none) for name in _MADE}
-        reached, reason = advance_loaded(self.table, cut.table, first, *taken, *made.values())
+        taken = tuple(given.get(name, none) for name in GIVEN)
+        motion, of_cut = ({name: np.zeros_like(none) for name in names} for names in (_MOTION, MADE))
+        reached, reason = advance_loaded(
+            self.table, cut.table, first, taken, tuple(motion.values()), tuple(of_cut.values())
+        )
         if reason != DONE:
-            raise failure(reason, given["angle"][reached], given["speed"][reached], made["feed"][reached])
-        return made
+            raise failure(reason, given["angle"][reached], given["speed"][reached], of_cut["feed"][reached])
+        return motion | of_cut
 
     def _check(self, coil: Coil) -> None:
         radius = float(np.abs(np.linalg.eigvals(self._closed()[0])).max())

@@ -225,18 +225,7 @@ def _motion(drive: MotionTable, delayed: float) -> tuple[float, float, float, fl
 
 @kernel
 def advance(
-    drive: MotionTable,
-    first: int,
-    command: Array,
-    set_point: Array,
-    noise: Array,
-    carriage: Array,
-    carriage_velocity: Array,
-    current: Array,
-    measured: Array,
-    extension: Array,
-    extension_velocity: Array,
-    voltage: Array,
+    drive: MotionTable, first: int, command: Array, set_point: Array, noise: Array, motion: tuple[Array, ...]
 ) -> None:
     """Step drives in air through a block.
 
@@ -246,22 +235,24 @@ def advance(
         command: set point of the carriage [m], shape (n,) as all that follow.
         set_point: of the piezo, without what the feedback takes off [m].
         noise: of the carriage's position sensor [m].
-        carriage: filled, as all that follow: true position [m].
-        carriage_velocity: [m/s].
-        current: of the coil [A].
-        measured: position of the carriage as its sensor reads it [m].
-        extension: of the piezo, the tool against the carriage [m].
-        extension_velocity: [m/s].
-        voltage: at the piezo [V].
+        motion: filled: true position [m] and velocity [m/s] of the carriage, current of the coil [A], position as the
+            carriage's sensor reads it [m]; extension of the piezo, the tool against the carriage [m], its velocity
+            [m/s], voltage at the piezo [V].
     """
+    position, velocity, current, measured, extension, rate, voltage = motion
     free, trial, nowhere = np.empty(drive.state.size), np.empty(drive.memory.size), (0.0, 0.0, 0.0, 0.0, 0.0)
     for k in range(command.size):
         delayed = _begin(drive, first + k, command[k], free)
         e, _ = _solve(drive, None, free, trial, set_point[k], noise[k], nowhere, 0.0, 0.0)
         _settle(drive, free, e, 0.0, noise[k])
-        (
-            carriage[k], carriage_velocity[k], current[k], measured[k], extension[k], extension_velocity[k], voltage[k]
-        ) = _motion(drive, delayed)  # fmt: skip
+        now = _motion(drive, delayed)
+        position[k], velocity[k], current[k], measured[k], extension[k], rate[k], voltage[k] = now
+
+
+#: arrays of a block that `advance_loaded` takes, in its order
+GIVEN = (
+    "command", "set_point", "noise", "met", "angle", "speed", "height", "cross_position", "feed_velocity", "allowance",
+)  # fmt: skip
 
 
 @kernel
@@ -269,34 +260,26 @@ def advance_loaded(
     drive: MotionTable,
     cut: CutTable,
     first: int,
-    command: Array,
-    set_point: Array,
-    noise: Array,
-    met: Array,
-    angle: Array,
-    speed: Array,
-    height: Array,
-    cross_position: Array,
-    feed_velocity: Array,
-    allowance: Array,
-    carriage: Array,
-    carriage_velocity: Array,
-    current: Array,
-    measured: Array,
-    extension: Array,
-    extension_velocity: Array,
-    voltage: Array,
-    force: Array,
-    deflection: Array,
-    depth_of_cut: Array,
-    feed: Array,
-    wear: Array,
+    given: tuple[Array, ...],
+    motion: tuple[Array, ...],
+    of_cut: tuple[Array, ...],
 ) -> tuple[int, int]:
     """Step drives and cut through a block, see `lathe_rc.plants.tool_drive.ToolDrive.block`.
+
+    Args:
+        drive: see `advance`.
+        cut: what the tool cuts; its state goes on.
+        first: index of the first sample.
+        given: see `GIVEN`.
+        motion: filled, see `advance`.
+        of_cut: filled, see `lathe_rc.plants.cutting.MADE`.
 
     Returns:
         The sample where it stopped, and why.
     """
+    command, set_point, noise, met, angle, speed, height, cross_position, feed_velocity, allowance = given
+    position, velocity, current, measured, extension, rate, voltage = motion
+    force, deflection, depth_of_cut, feed, wear = of_cut
     per_radian = cut.process.grid / _TURN
     free, trial = np.empty(drive.state.size), np.empty(drive.memory.size)
     for k in range(command.size):
@@ -313,13 +296,12 @@ def advance_loaded(
         depth_of_cut[k] = chip = max(chip, 0.0)
         force[k], deflection[k] = press(cut, chip, stiffness, c, speed[k], 0.0, 0.0)
         _settle(drive, free, e, drive.radial * force[k], noise[k])
-        (
-            carriage[k], carriage_velocity[k], current[k], measured[k], extension[k], extension_velocity[k], voltage[k]
-        ) = _motion(drive, delayed)  # fmt: skip
-        moved = carriage[k]
+        now = _motion(drive, delayed)
+        position[k], velocity[k], current[k], measured[k], extension[k], rate[k], voltage[k] = now
+        moved = position[k]
         if drive.series:
             moved += extension[k]
-            if drive.stiff * (e - extension[k]) - drive.loss * extension_velocity[k] > drive.tension:
+            if drive.stiff * (e - extension[k]) - drive.loss * rate[k] > drive.tension:
                 return k, _TORN_OFF
         leave(cut, place, chip, cross_position[k] + (moved - met[k]) + deflection[k])
     return command.size, DONE

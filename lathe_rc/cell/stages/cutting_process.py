@@ -219,10 +219,8 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     else:
         put_scaled(feed_velocity, memory.feed, speed)
     allow(memory.allowance, angle, allowance)
-    reached, reason = cut_along(
-        memory.cut, angle, speed, height, cross_position, displacement, feed_velocity, allowance, force, deflection,
-        depth_of_cut, feed, wear,
-    )  # fmt: skip
+    given = (angle, speed, height, cross_position, displacement, feed_velocity, allowance)
+    reached, reason = cut_along(memory.cut, given, (force, deflection, depth_of_cut, feed, wear))
     if reason != DONE:
         return reached, reason
     measure(memory.sensor, force, measured_force)

@@ -33,20 +33,8 @@ _STATUS = "coarse/learning"  # topic
 _MOST = 1024  # entries of a table of margins
 _LEAST_Q = 1e-6  # [s] from which on a wider Q is looked for
 _QS = 30  # that are tried, each a quarter wider than the one before
-_LEADS = (
-    1.0,
-    0.9,
-    1.1,
-    0.8,
-    1.2,
-    0.7,
-    1.3,
-    1.5,
-    1.75,
-    2.0,
-    2.25,
-    2.5,
-)  # that are tried, in lags: more where a drive rings
+# Leads that are tried, in lags: more where a drive rings.
+_LEADS = (1.0, 0.9, 1.1, 0.8, 1.2, 0.7, 1.3, 1.5, 1.75, 2.0, 2.25, 2.5)
 
 
 class LearningController(Learner):

@@ -189,20 +189,16 @@ class Memory(NamedTuple):
     room: Samples
 
 
-# Places of the inputs: encoder, form, command; then what makes the set point of the piezo, and the slides.
-_ANGLE, _SPEED, _WANTED, _HEIGHT, _COMMAND, _MORE = range(6)
+# Inputs: angle and speed, form and height, command; from here on what makes the piezo's set point, and the slides.
+_MORE = 5
 
 
 @kernel
 def _advance(
-    memory: Memory, first: int, inputs: Fields, coarse: Fields, fine: Fields, of_cut: Fields
+    memory: Memory, first: int, inputs: Fields, motion: Fields, fine_measured: Samples, of_cut: Fields
 ) -> tuple[int, int]:
     """The step of both stages; the fine drive's arrays are room where there is none."""
-    angle, speed, wanted, height, command = (
-        inputs[_ANGLE], inputs[_SPEED], inputs[_WANTED], inputs[_HEIGHT], inputs[_COMMAND],
-    )  # fmt: skip
-    position, velocity, effort, measured = coarse
-    extension, extension_velocity, voltage, fine_measured = fine
+    angle, speed, wanted, height, command = inputs[:_MORE]
     force, measured_force, depth_of_cut, feed, allowance, wear, deflection = of_cut
     n, room = angle.size, memory.room
     met, cross_position, feed_velocity, noise, still = room[0, :n], room[1, :n], room[2, :n], room[3, :n], room[4, :n]
@@ -217,16 +213,14 @@ def _advance(
         put_scaled(feed_velocity, memory.feed, speed)
     allow(memory.allowance, angle, allowance)
     measure(memory.noise, still, noise)
-    given = limited(memory.limits, first, followed(memory.retraction, command))
+    command = limited(memory.limits, first, followed(memory.retraction, command))
     set_point = limited(memory.limits_fine, first, sum_up(memory.signs, inputs, _MORE, n))
-    reached, reason = advance_loaded(
-        memory.drive, memory.cut, first, given, set_point, noise, met, angle, speed, height, cross_position,
-        feed_velocity, allowance, position, velocity, effort, measured, extension, extension_velocity, voltage, force,
-        deflection, depth_of_cut, feed, wear,
-    )  # fmt: skip
+    given = (command, set_point, noise, met, angle, speed, height, cross_position, feed_velocity, allowance)
+    made = (force, deflection, depth_of_cut, feed, wear)
+    reached, reason = advance_loaded(memory.drive, memory.cut, first, given, motion, made)
     if reason != DONE:
         return reached, reason
-    measure(memory.sensor, extension, fine_measured)
+    measure(memory.sensor, motion[4], fine_measured)
     measure(memory.force_sensor, force, measured_force)
     return reached, DONE
 
@@ -234,15 +228,15 @@ def _advance(
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
-    n, room = inputs[_ANGLE].size, memory.room
-    fine = (room[5, :n], room[6, :n], room[7, :n], room[8, :n])
-    return _advance(memory, first, inputs, outputs[:4], fine, outputs[4:])
+    n, room = inputs[0].size, memory.room
+    motion = (outputs[0], outputs[1], outputs[2], outputs[3], room[5, :n], room[6, :n], room[7, :n])
+    return _advance(memory, first, inputs, motion, room[8, :n], outputs[4:])
 
 
 @kernel
 def step_series(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
-    return _advance(memory, first, inputs, outputs[:4], outputs[4:8], outputs[8:])
+    return _advance(memory, first, inputs, outputs[:7], outputs[7], outputs[8:])
 
 
 class LoadedDriveStage(CutStage, Drive):

@@ -77,12 +77,12 @@ class Memory(NamedTuple):
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
-    angle, speed, index_pulse, angle_true, speed_true = outputs
+    angle_true, speed_true = outputs[3], outputs[4]
     follow_law(memory.encoder, first, angle_true, speed_true)
     reached, reason = turn(memory.spindle, first, inputs[0], angle_true, speed_true, memory.room[0])
     if reason != DONE:
         return reached, reason
-    read_off(memory.encoder, first, angle, speed, index_pulse, angle_true, speed_true)
+    read_off(memory.encoder, first, outputs)
     return reached, DONE
 
 

@@ -78,16 +78,12 @@ class Memory(NamedTuple):
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     command = inputs[0]
-    position, velocity, effort, measured, fine_position, fine_velocity, fine_effort, fine_measured = outputs
     noise = np.empty(command.size)
     measure(memory.noise, np.zeros(command.size), noise)
     given = limited(memory.limits, first, followed(memory.retraction, command))
     wanted = limited(memory.limits_fine, first, sum_up(memory.signs, inputs, 1, command.size))
-    advance(
-        memory.drive, first, given, wanted, noise, position, velocity, effort, measured, fine_position, fine_velocity,
-        fine_effort,
-    )  # fmt: skip
-    measure(memory.sensor, fine_position, fine_measured)
+    advance(memory.drive, first, given, wanted, noise, outputs[:7])
+    measure(memory.sensor, outputs[4], outputs[7])
     return command.size, DONE
 
 

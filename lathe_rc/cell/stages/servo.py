@@ -20,7 +20,7 @@ from lathe_rc.cell.stages.obedience import (
 )
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.cell.stages.trajectory import Trajectory, TrajectoryParameters
-from lathe_rc.control.pid import Pid, PidGains, PidTable, control_along, lets_learn
+from lathe_rc.control.pid import Pid, PidGains, PidTable, control_along, enable_integrator
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
 from lathe_rc.safety.state_machine import Reaction
@@ -115,7 +115,7 @@ def pid_along(
             stop = piece(who.obedience, start, reaction)
             if stop == start:
                 return start, OBEY
-            lets_learn(state, may_learn(who.obedience), obeyed(who.obedience) >= Reaction.HOLD.value)
+            enable_integrator(state, may_learn(who.obedience), obeyed(who.obedience) >= Reaction.HOLD.value)
         control_along(pid, state, first + start, wanted[start:stop], measured[start:stop], command[start:stop])
         if who.listens:
             apply(who.obedience, command[start:stop])

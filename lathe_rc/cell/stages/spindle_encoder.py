@@ -52,9 +52,8 @@ class SpindleEncoderParameters(TimeMasterParameters, SpeedLawParameters):
 @kernel
 def step(memory: EncoderTable, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
-    angle, speed, index_pulse, angle_true, speed_true = outputs
-    encode(memory, first, angle, speed, index_pulse, angle_true, speed_true)
-    return angle.size, DONE
+    encode(memory, first, outputs)
+    return outputs[0].size, DONE
 
 
 class SpindleEncoder(TimeMaster):
