@@ -182,10 +182,10 @@ def _chips(cut: CuttingProcess, turning: dict[str, Array], displacement: Array) 
 
 def _drive(given: CouplingParameters) -> ToolDrive:
     return ToolDrive(
-        carriage_frequency=_FREQUENCY,
-        carriage_damping=_DAMPING,
+        natural_frequency=_FREQUENCY,
+        damping=_DAMPING,
         delay=_DELAY,
-        carriage_stroke=1e-2,
+        stroke=1e-2,
         moving_mass=_MASS,
         force_constant=30.0,
         radial=given.radial_ratio,

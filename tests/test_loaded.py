@@ -38,15 +38,15 @@ def loaded(*, series=False, coil=None, radial=0.4, step=STEP, servo=None, stack=
         step=step, method="foh",
     )  # fmt: skip
     return ToolDrive(
-        carriage_frequency=servo["natural_frequency"],
-        carriage_damping=servo["damping"],
+        natural_frequency=servo["natural_frequency"],
+        damping=servo["damping"],
         delay=DELAY,
-        carriage_stroke=servo.get("stroke", 1e-3),
+        stroke=servo.get("stroke", 1e-3),
         moving_mass=servo["moving_mass"],
         force_constant=FORCE_CONSTANT,
         radial=radial,
         coil=coil,
-        piezo=Piezo(linear, full_voltage=100.0, **stack, **piezo) if series else None,
+        piezo=Piezo(linear, *stack.values(), full_voltage=100.0, **piezo) if series else None,
         step=step,
         method="foh",
         kept=8192,
@@ -351,7 +351,6 @@ def test_an_end_stop_holds_the_drive_against_the_force():
     made = machine.block(cutting(lag=0.0), 0, turning(4000))
     assert made["position"][-1] == 10e-6
     assert made["depth_of_cut"][-1] == pytest.approx(0.29e-3, rel=1e-12)
-    assert machine.stopped > 3000
 
 
 def test_a_stack_is_torn_off_its_preload():

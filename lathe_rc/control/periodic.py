@@ -74,7 +74,8 @@ PRESETS = {
     ),
     # By the analysis: T and T* so that with σ = 0.1 s the learning factor is below 1 at every corner and level of y_F.
     "quantised": PeriodicGains(
-        2.5, 1.0, 1.0, 0.4, 0.055, 15.0, 0.5, 0.1, 10.0, "for steps of 1e-4 in y and u; checked on all 32 corners of eq. 1"
+        2.5, 1.0, 1.0, 0.4, 0.055, 15.0, 0.5, 0.1, 10.0,
+        "for steps of 1e-4 in y and u; checked on all 32 corners of eq. 1",
     ),
 }  # fmt: skip
 

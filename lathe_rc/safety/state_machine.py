@@ -17,14 +17,24 @@ class State(IntEnum):
 class Reaction(IntEnum):
     """The reaction to an alarm; the higher one prevails."""
 
-    NONE = 0  #: nothing
-    WARN = 1  #: the alarm is published and recorded
-    FREEZE = 2  #: the controllers stop learning, and go on with what they have learned
-    FALL_BACK = 3  #: the controllers stop learning; if so asked, they lead by the nominal speed
-    HOLD = 4  #: the commands of the tool stay as they are; the feeds stop
-    RETRACT = 5  #: the tool moves out of the part along a bounded profile; the feeds stop
-    STOP = 6  #: as retract; only a new run ends it
+    NONE = 0
+    WARN = 1
+    FREEZE = 2
+    FALL_BACK = 3
+    HOLD = 4
+    RETRACT = 5
+    STOP = 6
 
+
+MEANING = {
+    Reaction.NONE: "nothing",
+    Reaction.WARN: "the alarm is published and recorded",
+    Reaction.FREEZE: "the controllers stop learning, and go on with what they have learned",
+    Reaction.FALL_BACK: "the controllers stop learning; if so asked, they lead by the nominal speed",
+    Reaction.HOLD: "the commands of the tool stay as they are; the feeds stop",
+    Reaction.RETRACT: "the tool moves out of the part along a bounded profile; the feeds stop",
+    Reaction.STOP: "as retract; only a new run ends it",
+}
 
 RETRACTED, RESET = "retracted", "reset"  #: what else changes the state: the tool is out, somebody says so
 

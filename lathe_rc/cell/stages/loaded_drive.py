@@ -198,7 +198,7 @@ def _advance(
     memory: Memory, first: int, inputs: Fields, motion: Fields, fine_measured: Samples, of_cut: Fields
 ) -> tuple[int, int]:
     """The step of both stages; the fine drive's arrays are room where there is none."""
-    angle, speed, wanted, height, command = inputs[:_MORE]
+    angle, speed, wanted, height, command = inputs[0], inputs[1], inputs[2], inputs[3], inputs[4]
     force, measured_force, depth_of_cut, feed, allowance, wear, deflection = of_cut
     n, room = angle.size, memory.room
     met, cross_position, feed_velocity, noise, still = room[0, :n], room[1, :n], room[2, :n], room[3, :n], room[4, :n]

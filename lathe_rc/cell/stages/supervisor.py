@@ -252,7 +252,7 @@ class Supervisor(Stage):
         if limit := table.speed_limit:
             self._watch(Threshold, "speed", "encoder", limit, signal=(0, "speed"), offset=nominal)
         if limit := table.acceleration_limit:
-            over = {"window": table.acceleration_window, "step": table.step, "before": nominal}
+            over: dict[str, Any] = {"window": table.acceleration_window, "step": table.step, "before": nominal}
             self._watch(Rate, "acceleration", "encoder", limit, signal=(0, "speed"), **over)
         if table.index_limit:
             self.monitors.append(IndexPulses(table.index_limit, self._reaction("index_reaction"), encoder=0))
@@ -263,7 +263,7 @@ class Supervisor(Stage):
         if limit := table.error_limit:
             self._watch(Threshold, "error", "tool", limit, signal=(tool, "measured_error"), after=table.error_after)
         if limit := table.growth_limit:
-            how = {"cycles": table.growth_cycles, "floor": table.growth_floor}
+            how: dict[str, Any] = {"cycles": table.growth_cycles, "floor": table.growth_floor}
             self.monitors.append(Growth(limit, self._reaction("growth_reaction"), tool=tool, **how))
 
     def _watch_drives(self) -> None:
@@ -293,7 +293,7 @@ class Supervisor(Stage):
         if not (table.force_limit or table.force_low):
             return
         signal = self._reads("cut", messages.CUT, ("measured_force",)), "measured_force"
-        lasts = {"signal": signal, "samples": self._samples(table.force_time)}
+        lasts: dict[str, Any] = {"signal": signal, "samples": self._samples(table.force_time)}
         if limit := table.force_limit:
             self._watch(Threshold, "force", "cut", limit, **lasts)
         if limit := table.force_low:
