@@ -7,8 +7,7 @@ from matplotlib.figure import Figure
 
 from lathe_papers.formulas.regeneration import Regeneration, lobes
 from lathe_rc.plants.cutting import CuttingProcess
-from lathe_rc.plants.cutting_force import STEEL, SpecificForce
-from lathe_rc.plants.deflection import PAPER, REALISTIC, RIGID, Elasticity
+from lathe_rc.plants.cutting_force import PAPER, REALISTIC, RIGID, STEEL, Elasticity, SpecificForce
 from lathe_rc.plants.workpiece import HardSpot, Part
 from lathe_rc.signals.allowance import PAPER_RMS, Allowance, mean_reverting
 from lathe_rc.transfer import TransferFunction

@@ -18,8 +18,7 @@ from rich.console import Group
 from lathe_papers.formulas.loaded import compliance
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.plants.cutting import CuttingProcess
-from lathe_rc.plants.cutting_force import SpecificForce
-from lathe_rc.plants.deflection import RIGID
+from lathe_rc.plants.cutting_force import RIGID, SpecificForce
 from lathe_rc.plants.spindle import LoadedSpindle, SpeedLoop
 from lathe_rc.plants.tool_drive import ToolDrive
 from lathe_rc.plants.workpiece import Part
@@ -183,10 +182,10 @@ def _chips(cut: CuttingProcess, turning: dict[str, Array], displacement: Array) 
 
 def _drive(given: CouplingParameters) -> ToolDrive:
     return ToolDrive(
-        carriage_frequency=_FREQUENCY,
-        carriage_damping=_DAMPING,
+        natural_frequency=_FREQUENCY,
+        damping=_DAMPING,
         delay=_DELAY,
-        carriage_stroke=1e-2,
+        stroke=1e-2,
         moving_mass=_MASS,
         force_constant=30.0,
         radial=given.radial_ratio,

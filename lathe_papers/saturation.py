@@ -18,7 +18,7 @@ from lathe_papers.formulas import hyperstability
 from lathe_papers.formulas.hyperstability import BOX, NAMES, NOMINAL, Learning, Positivity
 from lathe_papers.formulas.periodic_example import Case, Outcome, ideal_input, limited_ideal_error, simulate, times
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.control.periodic_gains import PRESETS, PeriodicGains
+from lathe_rc.control.periodic import PRESETS, PeriodicGains
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

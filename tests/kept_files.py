@@ -15,7 +15,7 @@ from lathe_rc.cell import program, scenario, state_file
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.control import memory_file
 from lathe_rc.errors import LatheError
-from lathe_rc.signals import kept_table
+from lathe_rc.signals import profile_table
 from lathe_rc.sweep import row, study, tune
 from lathe_rc.sweep.folder import Folder, Request
 from lathe_rc.sweep.space import Space
@@ -124,7 +124,7 @@ def _state(folder: Path) -> Kept:
 
 def _table(_folder: Path) -> Kept:
     def read() -> object:
-        return kept_table.kept(b"one", lambda: np.linspace(0.0, 1.0, 64)).tobytes()
+        return profile_table.kept(b"one", lambda: np.linspace(0.0, 1.0, 64)).tobytes()
 
     read()
     (path,) = (jit.cache_folder() / "tables").iterdir()

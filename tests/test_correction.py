@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.interpolation import derivative_responses, read_derivatives
 from lathe_rc.control.lead import LeadLaw, Preview
-from lathe_rc.control.q_filter import Unity
+from lathe_rc.control.q_filter import Exponential
 from lathe_rc.control.repetitive import RepetitiveController
 from lathe_rc.errors import InputError
 from lathe_rc.plants.linear import discretise, second_order
@@ -28,7 +28,7 @@ def follow(law, lead_law, *, points, lead_time=TAU, constant=0.0, spindle=SWING,
     controller = RepetitiveController(
         grid=GRID,
         revolutions=1,
-        q=Unity(GRID),
+        q=Exponential(0.0, GRID),
         gain=1.0,
         soft_start=0.0,
         preview=Preview(lead_law, lead_time, spindle, STEP, 1, constant),

@@ -30,8 +30,7 @@ def measure(law, counts=0, window=64, lengths=(12000,), errors=EncoderErrors()):
     """Signals of an encoder that works in blocks of ``lengths``."""
     signals = messages.allocate(messages.ENCODER, sum(lengths))
     encoder = Encoder(law, STEP, counts, window, errors)
-    in_blocks(lengths, lambda first, *parts: encoder.block(first, **dict(zip(signals, parts, strict=True))),
-              *signals.values())  # fmt: skip
+    in_blocks(lengths, encoder.block, *signals.values())
     return signals
 
 
@@ -167,7 +166,7 @@ def test_counts_round_what_is_seen_and_cuts_change_nothing(count, lengths):
 )
 def test_errors_that_would_turn_the_angle_back_are_refused(values, message):
     with pytest.raises(InputError, match=message):
-        EncoderErrors(**values)
+        EncoderErrors(**values).check()
 
 
 def test_learning_leaves_what_the_encoder_misreads():

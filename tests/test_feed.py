@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_rc.control.limits import CommandLimits
 from lathe_rc.errors import InputError
-from lathe_rc.plants.feed import FeedDrive
+from lathe_rc.plants.feed import FeedDrive, follow
 from lathe_rc.plants.feed_models import APPROXIMATE_LAGS, FULL_LAGS, dc_screw, fourth_order, sampled
 from lathe_rc.transfer import LinearSystem, TransferFunction
 
@@ -180,6 +180,32 @@ def test_limited_fourth_order_drive_comes_to_rest_where_the_free_one_does():
 
 
 # --- backlash, sensor
+
+
+def behind(motor, half):
+    """Places of a load behind a gap."""
+    load, places = 0.0, []
+    for place in motor:
+        load = follow(load, half, place)
+        places.append(load)
+    return np.array(places)
+
+
+MOVES = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=20)
+
+
+def test_load_lags_by_half_the_gap_either_way():
+    motor = np.concatenate((np.linspace(0.0, 1.0, 101), np.linspace(1.0, 0.0, 101)))
+    load = behind(motor, 0.1)
+    assert_allclose(load[:101], np.maximum(motor[:101] - 0.1, 0.0), atol=1e-15)
+    assert_allclose(load[101:], np.minimum(motor[101:] + 0.1, 0.9), atol=1e-15)
+
+
+@given(MOVES, st.floats(0.0, 0.5))
+def test_load_stays_within_the_gap_and_stops_on_the_way_change_nothing(motor, half):
+    assert np.all(np.abs(behind(motor, half) - motor) <= half * (1 + 1e-12) + 1e-15)
+    fine = np.concatenate([np.linspace(a, b, 8)[1:] for a, b in zip([0.0, *motor[:-1]], motor, strict=True)])
+    assert_allclose(behind(fine, half)[6::7], behind(motor, half), atol=1e-12)
 
 
 @pytest.mark.parametrize("feedback", ["motor", "load"])

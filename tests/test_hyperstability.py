@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 from lathe_papers.formulas import hyperstability as hs
 from lathe_papers.formulas.periodic_loop import disturbance, steady_derivatives, transient
-from lathe_rc.control.periodic_gains import PRESETS
+from lathe_rc.control.periodic import PRESETS
 from lathe_rc.signals.example_002 import PERIOD, fill_disturbance, fill_reference
 
 PUBLISHED = PRESETS["published"]

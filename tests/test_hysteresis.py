@@ -2,7 +2,6 @@
 """Hysteresis: loops, inverses, rate independence; identification from loops, files and recordings."""
 
 import itertools
-import os
 
 import numpy as np
 import pytest
@@ -110,15 +109,6 @@ def test_first_harmonic_is_the_describing_function(amplitude):
     harmonic = 2j / points * (last * np.exp(-2j * np.pi * np.arange(points) / points)).sum()
     expected = describing_function(amplitude, THRESHOLDS, WEIGHTS, PROPORTIONAL)
     assert harmonic / amplitude == pytest.approx(expected, abs=1e-6)
-
-
-@given(st.floats(1e-3, 1e4), st.floats(-0.99, 1.0), st.floats(1e-3, 0.999))
-def test_any_bouc_wen_with_an_inverse_is_taken(beta, ratio, part):
-    gamma = ratio * beta
-    model = BoucWen(part * (beta + gamma) / (2.0 * beta), beta, gamma)
-    assert 1.0 <= model.gain < np.inf
-    path = np.array([0.5, 1.0, -1.0, -0.2, 0.4, -0.9])
-    assert_allclose(run(model.inverse(), run(model, path)), path, atol=1e-9)
 
 
 @given(bouc_wen_models(), paths)
@@ -346,7 +336,7 @@ HEAD = "command_um,displacement_um\n"
 
 def write(tmp_path, text):
     path = tmp_path / "loop.csv"
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    path.write_text(text)
     return path
 
 
@@ -364,12 +354,6 @@ def test_file_gives_the_loop(tmp_path):
         ("", "header ''; allowed: command_um,displacement_um"),
         ("displacement_um,command_um\n0,1\n", "header 'displacement_um,command_um'"),
         (HEAD, "no points; give one and a half loops"),
-        (HEAD + "0,1\n2\n", ":3: 1 values; allowed: 2, as in the header"),
-        (HEAD + "0,1\n\n2,x\n", ":4: 'x' is not a number"),
-        (HEAD + "0,nan\n", ":2: 'nan'; allowed: finite numbers"),
-        (HEAD + "1e999,0\n", ":2: '1e999'; allowed: finite numbers"),
-        (HEAD + '0,"1\n', ":2: not CSV"),
-        (b"\xff\xfe\x00a", "not a text file"),
     ],
 )
 def test_bad_file_is_refused(tmp_path, text, message):
@@ -379,29 +363,6 @@ def test_bad_file_is_refused(tmp_path, text, message):
     assert str(path) in str(refusal.value)
     assert message in str(refusal.value)
     assert len(str(refusal.value).splitlines()) == 1
-
-
-@given(st.binary(max_size=200))
-def test_junk_is_refused(tmp_path_factory, junk):
-    with pytest.raises(InputError):
-        read_csv(write(tmp_path_factory.mktemp("junk"), HEAD.encode() + b"0,\x00\n" + junk))
-
-
-def test_what_is_no_file_is_refused_unread(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    for path in (tmp_path, tmp_path / "pipe"):
-        with pytest.raises(InputError, match=r"cannot be read \(not a file\); check the path of the hysteresis loop"):
-            read_csv(path)
-    with pytest.raises(InputError, match=r"cannot be read \(No such file or directory\)"):
-        read_csv(tmp_path / "no.csv")
-
-
-def test_file_that_is_far_too_large_is_refused_unread(tmp_path):
-    path = tmp_path / "large.csv"
-    with path.open("wb") as file:
-        file.truncate(2**40)
-    with pytest.raises(InputError, match="larger than 64 MiB"):
-        read_csv(path)
 
 
 def test_recording_gives_the_loop():

@@ -16,8 +16,7 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.plants.coil import Coil
 from lathe_rc.plants.cutting import CuttingProcess
-from lathe_rc.plants.cutting_force import SpecificForce
-from lathe_rc.plants.deflection import RIGID
+from lathe_rc.plants.cutting_force import RIGID, SpecificForce
 from lathe_rc.plants.piezo import Stack
 from lathe_rc.plants.tool_drive import Piezo, ToolDrive
 from lathe_rc.plants.workpiece import Part
@@ -26,7 +25,7 @@ from lathe_rc.transfer import TransferFunction
 STEP = 1 / 64000
 SPEED = 100.0  # [rad/s]
 SERVO = {"natural_frequency": 1038.0, "damping": 0.804, "moving_mass": 1.2}
-STACK = {"tool_frequency": 14600.0, "tool_damping": 0.299, "mass_ratio": 0.1}
+STACK = {"natural_frequency": 14600.0, "damping": 0.299, "mass_ratio": 0.1}
 COIL = Coil(resistance=2.0, inductance=2e-3, bandwidth=12e3)
 FORCE_CONSTANT = 30.0
 DELAY = 23 * STEP  # whole samples: what the servo follows is linear from sample to sample
@@ -39,10 +38,10 @@ def loaded(*, series=False, coil=None, radial=0.4, step=STEP, servo=None, stack=
         step=step, method="foh",
     )  # fmt: skip
     return ToolDrive(
-        carriage_frequency=servo["natural_frequency"],
-        carriage_damping=servo["damping"],
+        natural_frequency=servo["natural_frequency"],
+        damping=servo["damping"],
         delay=DELAY,
-        carriage_stroke=servo.get("stroke", 1e-3),
+        stroke=servo.get("stroke", 1e-3),
         moving_mass=servo["moving_mass"],
         force_constant=FORCE_CONSTANT,
         radial=radial,
@@ -197,7 +196,7 @@ def test_momentum_and_energy_of_the_electrodynamic_drive_and_the_cut_are_in_bala
 
 def test_momentum_and_energy_of_drives_in_series_and_the_cut_are_in_balance():
     step, w1, z1 = STEP / 4, SERVO["natural_frequency"], SERVO["damping"]
-    w2, z2, mass = STACK["tool_frequency"], STACK["tool_damping"], SERVO["moving_mass"]
+    w2, z2, mass = STACK["natural_frequency"], STACK["damping"], SERVO["moving_mass"]
     tool = STACK["mass_ratio"] * mass
     time = step * np.arange(48_000)
     e = 5e-6 * np.sin(3000.0 * time)
@@ -300,7 +299,7 @@ def chatter(machine, stiffness, period, samples, kick):
 @pytest.mark.parametrize("name", ["alone", "series"])
 def test_the_cut_chatters_beyond_the_limit_of_the_drive_s_compliance(name, factor):
     """1 % below the limit a kick dies away, 1 % above it grows, as the characteristic root says."""
-    servo, stack = {**SERVO, "damping": 0.1}, {**STACK, "tool_damping": 0.05}
+    servo, stack = {**SERVO, "damping": 0.1}, {**STACK, "damping": 0.05}
     formula = compliance(**servo) if name == "alone" else compliance_in_series(**SERVO, **stack)
     top = tuple(0.4 * each for each in formula.numerator)
     cut = Regeneration(TransferFunction(top, formula.denominator))
@@ -354,7 +353,6 @@ def test_an_end_stop_holds_the_drive_against_the_force():
     made = machine.block(cutting(lag=0.0), 0, turning(4000))
     assert made["position"][-1] == 10e-6
     assert made["depth_of_cut"][-1] == pytest.approx(0.29e-3, rel=1e-12)
-    assert machine.stopped > 3000
 
 
 def test_a_stack_is_torn_off_its_preload():

@@ -6,11 +6,11 @@ import pytest
 from cells import in_blocks, scenario
 from numpy.testing import assert_allclose
 
-from lathe_papers.formulas.spindle import speed_over_load
 from lathe_rc import harness, hosts
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.plants.spindle import Belt, LoadedSpindle, SpeedLoop
+from lathe_rc.transfer import TransferFunction
 
 STEP = 1 / 64000
 SPEED = 100.0  # [rad/s]
@@ -150,6 +150,23 @@ def _part_of_a_step(state, torque, before, after, since, step):
 
 
 # --- speed over load
+
+
+def speed_over_load(*, inertia, motor_inertia, belt, loop):
+    """δ' over the load's torque [rad/s over N·m], without the torque limit and the sampling of the loop.
+
+    With a rigid belt -p/((J + Jm)·p² + Kp·p + Ki).
+
+    """
+    whole = inertia + motor_inertia
+    proportional, integral = loop.gains(whole)
+    if belt is None:
+        return TransferFunction((-1.0, 0.0), (whole, proportional, integral))
+    twist = np.array([belt.damping, belt.stiffness])
+    motor = np.polyadd([motor_inertia, proportional, integral], twist)
+    spindle = np.polyadd([inertia, 0.0, 0.0], twist)
+    bottom = np.polysub(np.polymul(spindle, motor), np.polymul(twist, twist))
+    return TransferFunction(tuple(-np.polymul([1.0, 0.0], motor)), tuple(bottom))
 
 
 @pytest.mark.parametrize("frequency", [5.0, 30.0, 200.0, 500.0, 1500.0])

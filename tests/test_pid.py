@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.control.pid import FORCE, POSITION, Pid, PidGains
+from lathe_rc.control.pid import FORCE, POSITION, Pid, PidGains, enable_integrator
 from lathe_rc.errors import InputError
 from lathe_rc.transfer import LinearSystem
 
@@ -179,10 +179,10 @@ def test_an_integral_that_stands_goes_on_where_it_was():
     pid = make(PidGains(2.0, 30.0, 0.0, 1.0))
     error = np.full(3000, 0.1)
     first = drive(pid, error[:1000])
-    pid.integrates = False
+    enable_integrator(pid.state, on=False, waits=False)
     second = drive(pid, error[1000:2000])
     assert_allclose(second, first[-1], rtol=1e-12)
-    pid.integrates = True
+    enable_integrator(pid.state, on=True, waits=False)
     third = drive(pid, error[2000:])
     whole = drive(make(PidGains(2.0, 30.0, 0.0, 1.0)), error[:2000])
     assert_allclose(third, whole[1000:], rtol=1e-12)
@@ -192,9 +192,9 @@ def test_an_integral_that_stands_goes_on_where_it_was():
 def test_a_set_point_comes_from_the_measurement_after_a_wait(options):
     pid = make(PidGains(1.0, 0.0, 0.0, 1.0), **options)
     drive(pid, np.ones(64_000))
-    pid.waits = True
+    enable_integrator(pid.state, on=True, waits=True)
     assert_allclose(drive(pid, np.ones(100), np.full(100, 0.3)), 0.0, atol=1e-12)
-    pid.waits = False
+    enable_integrator(pid.state, on=True, waits=False)
     error = drive(pid, np.ones(64_000), np.full(64_000, 0.3))
     assert error[0] < 0.01
     assert_allclose(error[-1], 0.7, rtol=1e-9)
@@ -202,5 +202,5 @@ def test_a_set_point_comes_from_the_measurement_after_a_wait(options):
 
 def test_a_set_point_that_comes_at_once_does_so_after_a_wait_too():
     pid = make(PidGains(1.0, 0.0, 0.0, 1.0))
-    pid.waits = True
+    enable_integrator(pid.state, on=True, waits=True)
     assert_allclose(drive(pid, np.ones(10), np.full(10, 0.3)), 0.7)

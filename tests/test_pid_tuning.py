@@ -8,8 +8,7 @@ from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis.pid_tuning import evaluate, fastest, response, tune
-from lathe_rc.analysis.state_space import delay, state_space
+from lathe_rc.analysis.pid_tuning import delay, evaluate, fastest, response, state_space, tune
 from lathe_rc.control.decoupler import FULL_W1, PAPER, compensators, gain, lags
 from lathe_rc.control.pid import FORCE, POSITION, PidGains
 from lathe_rc.errors import InputError

@@ -78,11 +78,6 @@ def test_drive_answers_a_sine_as_its_response_says(kind, lag, method):
     assert machine.saturated == 0
 
 
-def test_response_of_the_resonance_is_the_plant():
-    machine = make_drive()
-    assert np.array_equal(machine.linear.response(TABLE), machine.linear.plant.response(TABLE))
-
-
 @pytest.mark.parametrize("lag", [0.0, 40e-6])
 def test_response_nears_the_ideal(lag):
     expected = ideal(TABLE, WN, ZETA) / (1 + 1j * TABLE * lag)
@@ -193,15 +188,6 @@ def test_loop_without_linearisation(kind, loop):
     position = drive(make_drive(kind, linearised=False), set_point)[0][-points:]
     rising, falling = position[0], position[points // 2]
     assert (falling - rising) / np.ptp(position) == pytest.approx(loop, abs=2e-3)
-
-
-@pytest.mark.parametrize(("scale", "left"), [(1.0, 0.0), (0.85, 0.02)])
-def test_identification_error_leaves_what_the_spec_says(scale, left):
-    """spec/learning.md: weights 15 % low leave about 2 % RMS of the half-stroke."""
-    points = 64000
-    set_point = STROKE * np.sin(2 * np.pi * np.arange(2 * points) / points)
-    error = (drive(make_drive("plays", scale=scale), set_point)[0] - set_point)[-points:]
-    assert np.sqrt(np.mean(error**2)) / STROKE == pytest.approx(left, abs=2e-3)
 
 
 # --- creep

@@ -14,10 +14,9 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.jit import cache_folder
 from lathe_rc.signals import profile_table
-from lathe_rc.signals.kept_table import kept
 from lathe_rc.signals.measured_profile import Measured, doubts, read_csv
 from lathe_rc.signals.profile import Harmonics, Piston, Polygon
-from lathe_rc.signals.profile_table import ProfileTable
+from lathe_rc.signals.profile_table import ProfileTable, kept
 
 TURN = 2 * np.pi
 ANGLES = np.linspace(-TURN, 2 * TURN, 4001)

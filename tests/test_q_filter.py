@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.control.q_filter import Exponential, Gaussian, LowPass, MovingAverage, Unity, Weights
+from lathe_rc.control.q_filter import Exponential, Gaussian, LowPass, MovingAverage, Weights
 from lathe_rc.errors import InputError
 
 CYCLE = 4096
@@ -118,8 +118,6 @@ def test_chunk_fits_into_the_smallest_memory(kind):
 def test_no_width_is_no_filter():
     for kind in (Exponential, MovingAverage, Gaussian):
         assert_allclose(kind(0.0, CYCLE).response(np.array([0.5, 3.0])), 1.0)
-    points = np.arange(256.0)
-    assert np.array_equal(smooth(Unity(256), points), points)
 
 
 @pytest.mark.parametrize("kind", KINDS)

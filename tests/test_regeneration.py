@@ -12,9 +12,7 @@ from numpy.testing import assert_allclose
 from lathe_papers.formulas.regeneration import Regeneration, lobes
 from lathe_rc.errors import InputError
 from lathe_rc.plants.cutting import CuttingProcess
-from lathe_rc.plants.cutting_force import SpecificForce
-from lathe_rc.plants.deflection import PAPER, REALISTIC, Elasticity
-from lathe_rc.plants.flank import Flank
+from lathe_rc.plants.cutting_force import PAPER, REALISTIC, Elasticity, Flank, SpecificForce, flank_damping
 from lathe_rc.transfer import TransferFunction
 
 PRESETS = {"paper": (PAPER, 1e-3), "realistic": (REALISTIC, 5e-5)}  # and a step that resolves the mode [s]
@@ -159,7 +157,7 @@ def test_process_damping_raises_the_limit_as_a_damper_of_the_mode_does(name):
     plain = Regeneration(elasticity.transfer, elasticity.away).worst()
     period = plain.period(1)
     flank = Flank(pressure=4e13, width=0.2e-3, land=0.1e-3)
-    asked = elasticity.damping / elasticity.compliance / flank.damping(0.05 * 2 * np.pi / period)
+    asked = elasticity.damping / elasticity.compliance / flank_damping(flank, 0.05 * 2 * np.pi / period, 0.0)
     damped = replace(elasticity, damping=2 * elasticity.damping)
     cutting = Regeneration(damped.transfer, damped.away)
     limit, found = cutting.at(period), []

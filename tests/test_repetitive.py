@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.interpolation import cubic, cubic_response
 from lathe_rc.control.lead import LeadLaw, Preview
-from lathe_rc.control.q_filter import Exponential, Unity
+from lathe_rc.control.q_filter import Exponential
 from lathe_rc.control.repetitive import LEARNING_DELAY, AngleLostError, RepetitiveController, largest_feedback_delay
 from lathe_rc.errors import LatheError
 from lathe_rc.signals import speed
@@ -42,7 +42,7 @@ def make(*, lead_law=LeadLaw.VARIABLE, lead_time=LEAD, speed_law=None, window=1,
         "step": STEP,
     } | changes
     cycle = settings["grid"] * settings["revolutions"]
-    return RepetitiveController(**settings, q=(q or Unity)(cycle))
+    return RepetitiveController(**settings, q=q(cycle) if q else Exponential(0.0, cycle))
 
 
 def exponential(width):

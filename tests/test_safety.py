@@ -24,10 +24,9 @@ from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
 from lathe_rc.cell.stages.feed_drive import FeedDriveParameters, FeedDriveStage
 from lathe_rc.cell.stages.learning_controller import LearningController
-from lathe_rc.cell.stages.supervisor import MEMBERS_LOST
-from lathe_rc.cell.stages.supervisor_parameters import SupervisorParameters
+from lathe_rc.cell.stages.supervisor import MEMBERS_LOST, SupervisorParameters
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion
+from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion, take_over
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety import state_machine
 from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Lookout, Rate, Threshold
@@ -77,7 +76,7 @@ def taken_over(lengths, changes, wave):
         for begin, end in itertools.pairwise(marks):
             if begin in changes:
                 takeover.change(changes[begin])
-            takeover.apply(out[begin:end])
+            take_over(takeover.table, out[begin:end])
     return out
 
 
@@ -104,10 +103,10 @@ def test_a_takeover_goes_no_further_the_wrong_way_than_it_takes_to_stop(velocity
     """
     bounds = Bounds(0.05, 50.0, 1e5)
     takeover = Takeover(bounds, goal, STEP)
-    takeover.apply(position + velocity * STEP * np.array([-1.0, 0.0]))
+    take_over(takeover.table, position + velocity * STEP * np.array([-1.0, 0.0]))
     takeover.change(Mode.HOLD if hold else Mode.RETRACT)
     out = np.zeros(20_000)
-    takeover.apply(out)
+    take_over(takeover.table, out)
     stopping = np.abs(motion(0.0, min(abs(velocity), 0.05), None, bounds, STEP)[-1]) + 1e-12
     low, high = (position, position) if hold else sorted((position, goal))
     assert low - stopping <= out.min()
@@ -121,12 +120,12 @@ def test_a_takeover_goes_no_further_the_wrong_way_than_it_takes_to_stop(velocity
 def test_a_command_that_is_given_back_comes_near_its_own_along_a_bounded_motion(velocity, held, wanted):
     bounds = Bounds(0.05, 50.0, 1e5)
     takeover = Takeover(bounds, held, STEP)
-    takeover.apply(np.full(2, held))
+    take_over(takeover.table, np.full(2, held))
     takeover.change(Mode.RETRACT)
-    takeover.apply(wanted + velocity * STEP * np.array([-1.0, 0.0]))
+    take_over(takeover.table, wanted + velocity * STEP * np.array([-1.0, 0.0]))
     takeover.change(Mode.FOLLOW)
     out = np.full(20_000, wanted)
-    takeover.apply(out)
+    take_over(takeover.table, out)
     # Noise that looks like a velocity adds no more than a motion that begins as fast as it may.
     most = np.abs(motion(abs(held - wanted), 0.05, 0.0, bounds, STEP)).max()
     assert np.abs(out - wanted).max() <= max(most, abs(held - wanted)) * 1.05 + 1e-12
@@ -139,23 +138,23 @@ def test_a_command_that_has_diverged_is_retracted_and_given_back_in_time_all_the
     """A way of 1e6 m at 0.1 m/s would take memory for months, and the tool would stay where it is."""
     reach = Bounds(0.1, 50.0, 1e5).reach(0.01)
     takeover = Takeover(Bounds(0.1, 50.0, 1e5), goal, STEP, reach=reach)
-    takeover.apply(np.full(100, far))
+    take_over(takeover.table, np.full(100, far))
     takeover.change(mode)
     assert (takeover.skipped > 0.0) == (mode is Mode.RETRACT and abs(far - goal) > reach)
     for _ in range(2):
         out = np.full(1000, far)
-        takeover.apply(out)
+        take_over(takeover.table, out)
         assert out[-1] == (goal if mode is Mode.RETRACT else far)
         assert np.abs(out - out[-1]).max() <= reach
     takeover.change(Mode.FOLLOW)
     given_back = np.full(1000, far)
-    takeover.apply(given_back)
+    take_over(takeover.table, given_back)
     assert given_back[-1] == far
 
 
 def test_a_command_that_is_not_finite_is_not_taken_over():
     takeover = Takeover(Bounds(0.1, 50.0, 1e5), 0.0, STEP)
-    takeover.apply(np.array([0.0, np.nan]))
+    take_over(takeover.table, np.array([0.0, np.nan]))
     with pytest.raises(LatheError, match=r"^a command of nan with a rate of nan is taken over; allowed: finite"):
         takeover.change(Mode.RETRACT)
 
@@ -217,11 +216,11 @@ def test_what_a_slide_may_be_commanded_is_within_reach(node):
 def test_a_command_with_steps_is_taken_over_without_its_velocity():
     takeover = Takeover(Bounds(10.0, 1000.0, math.inf), 0.0, STEP, carries=False)
     steps = np.where(np.arange(40_000) % 2 > 0, 0.51, 0.5)
-    takeover.apply(steps[:100])
+    take_over(takeover.table, steps[:100])
     takeover.change(Mode.RETRACT)
-    takeover.apply(steps[100:20_000])
+    take_over(takeover.table, steps[100:20_000])
     takeover.change(Mode.FOLLOW)
-    takeover.apply(steps[20_000:])
+    take_over(takeover.table, steps[20_000:])
     stopping = steps[99:20_000]
     assert stopping[-1] == 0.0
     assert stopping.max() == stopping[0]

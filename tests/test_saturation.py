@@ -12,7 +12,7 @@ from rich.console import Console
 from lathe_papers.formulas.hyperstability import NOMINAL, corners
 from lathe_papers.formulas.periodic_example import Case, limited_ideal_error, simulate
 from lathe_rc import cli
-from lathe_rc.control.periodic_gains import PRESETS
+from lathe_rc.control.periodic import PRESETS
 from lathe_rc.errors import InputError
 from lathe_rc.study import STUDIES
 

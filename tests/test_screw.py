@@ -69,4 +69,4 @@ def test_cuts_leave_no_trace(lengths):
 )
 def test_what_cannot_be_is_refused(values, message):
     with pytest.raises(InputError, match=message):
-        Screw(**values)
+        Screw(**values).check()

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The piezo on the carriage: two masses, their limits, direct compensation within a sample; the stage."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 from cells import cuts, in_blocks
@@ -54,18 +52,18 @@ def make_stack(kind=None, lag=0.0, step=STEP, stroke=STROKE):
 
 def make_drive(stack=None, *, ratio=0.1, feedback=False, step=STEP, tool_damping=Z2, **options):
     values = {
-        "carriage_frequency": W1,
-        "carriage_damping": Z1,
+        "natural_frequency": W1,
+        "damping": Z1,
         "delay": TAU,
-        "carriage_stroke": 1.0,
+        "stroke": 1.0,
         "moving_mass": 1.2,
         "force_constant": 30.0,
         "method": "foh",
     }
     piezo = Piezo(
         stack or make_stack(step=step),
-        tool_frequency=W2,
-        tool_damping=tool_damping,
+        natural_frequency=W2,
+        damping=tool_damping,
         mass_ratio=ratio,
         full_voltage=100.0,
         feedback=feedback,
@@ -77,7 +75,10 @@ def drive(machine, command, set_point, noise=None, lengths=None):
     """Rows: carriage, its velocity, current, measured, extension, its velocity, voltage."""
     noise = np.zeros_like(command) if noise is None else noise
     motion = np.empty((7, command.size))
-    in_blocks(lengths or [command.size], partial(move, machine.table), command, set_point, noise, *motion)
+    in_blocks(
+        lengths or [command.size], lambda first, *parts: move(machine.table, first, *parts[:3], parts[3:]),
+        command, set_point, noise, *motion,
+    )  # fmt: skip
     return motion
 
 
@@ -136,7 +137,6 @@ def test_tool_and_carriage_answer_as_their_responses_say(feedback, lag):
     carriage, tool = motion[0], motion[0] + motion[4]
     assert_allclose(amplitude(carriage, SLOW), 4e-6 * machine.coarse_response(SLOW), rtol=1e-8)
     assert_allclose(amplitude(tool, FAST), 4e-6 * machine.fine_response(FAST), rtol=1e-8)
-    assert (machine.stopped, machine.saturated) == (0, 0)
 
 
 def test_foh_is_exact_for_inputs_linear_between_samples():
@@ -217,7 +217,7 @@ def test_carriage_that_accelerates_bends_the_piezo():
 def test_momentum_is_kept_without_a_servo():
     """M·x1 + m·x2 rests while the piezo works, the servo being slow and loose."""
     set_point = 0.5 * STROKE * np.sin(np.arange(2000) / 7)
-    motion = drive(make_drive(ratio=0.25, carriage_frequency=1e-3, delay=0.0), np.zeros(2000), set_point)
+    motion = drive(make_drive(ratio=0.25, natural_frequency=1e-3, delay=0.0), np.zeros(2000), set_point)
     centre = motion[0] + 0.25 * (motion[0] + motion[4])
     assert np.abs(motion[0]).max() > 1e-6
     assert_allclose(centre, 0.0, atol=1e-4 * STROKE)
@@ -225,12 +225,11 @@ def test_momentum_is_kept_without_a_servo():
 
 def test_end_stop_holds_the_carriage_and_lets_the_tool_swing():
     command = np.where(np.arange(6400) < 3200, 3e-3, -0.5e-3)
-    machine = make_drive(carriage_stroke=1e-3)
+    machine = make_drive(stroke=1e-3)
     motion = drive(machine, command, np.zeros(6400))
     carriage, velocity, extension, rate = motion[0], motion[1], motion[4], motion[5]
     at_stop = carriage == 1e-3
     assert carriage.max() == 1e-3
-    assert at_stop.sum() == machine.stopped
     assert np.all(velocity[at_stop] <= 0.0)
     arrived, left = np.flatnonzero(at_stop)[[0, -1]]
     assert np.all(at_stop[arrived : left + 1])
@@ -288,7 +287,7 @@ def test_feedback_without_a_delay_leaves_the_formula():
 
 def test_feedback_that_would_oscillate_is_refused():
     """A loose servo and a slow amplifier; simulated in spite of the refusal, the same drive swings itself up."""
-    options = {"carriage_damping": 0.005, "tool_damping": 0.005}
+    options = {"damping": 0.005, "tool_damping": 0.005}
     with pytest.raises(InputError, match=r"oscillates over the carriage with m/M = 0.1: largest pole 1\.0") as refusal:
         make_drive(make_stack(lag=1e-3), feedback=True, **options)
     assert len(str(refusal.value).splitlines()) == 1
@@ -297,7 +296,7 @@ def test_feedback_that_would_oscillate_is_refused():
     late = 0.0
     for first in range(64_000):
         carriage = np.empty((7, 1))
-        move(machine.table, first, np.full(1, 1e-6 * (first < 100)), np.full(1, -late), np.zeros(1), *carriage)
+        move(machine.table, first, np.full(1, 1e-6 * (first < 100)), np.full(1, -late), np.zeros(1), tuple(carriage))
         late = carriage[0, 0]
         size.append(abs(late))
     assert max(size[-6400:]) > 3 * max(size[6400:12_800])
@@ -312,10 +311,9 @@ def test_step_too_coarse_for_the_feedback_is_refused():
 def test_cuts_change_nothing(lengths, kind, feedback, delay):
     random = np.random.default_rng(4)
     command, set_point, noise = random.normal(size=(3, sum(lengths))) * [[2e-3], [STROKE], [1e-8]]
-    options = {"feedback": feedback, "delay": delay, "carriage_stroke": 1e-4, "resolution": 1e-9}
+    options = {"feedback": feedback, "delay": delay, "stroke": 1e-4, "resolution": 1e-9}
     whole, cut = (make_drive(make_stack(kind, 40e-6), **options) for _ in range(2))
     assert np.array_equal(drive(cut, command, set_point, noise, lengths), drive(whole, command, set_point, noise))
-    assert (cut.stopped, cut.saturated) == (whole.stopped, whole.saturated)
 
 
 # --- stage

@@ -15,7 +15,7 @@ import control
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.analysis.state_space import Lti, delay, state_space
+from lathe_rc.analysis.pid_tuning import Lti, delay, state_space
 from lathe_rc.control.decoupler import FULL_W1, PRESETS, Channels, compensators, gain
 from lathe_rc.control.pid import FORCE, POSITION, PidGains
 from lathe_rc.errors import InputError

@@ -18,7 +18,7 @@ import control
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.control.periodic_gains import PeriodicGains
+from lathe_rc.control.periodic import PeriodicGains
 from lathe_rc.plants.feed_models import fourth_order
 from lathe_rc.transfer import TransferFunction
 

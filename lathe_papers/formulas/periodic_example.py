@@ -8,8 +8,7 @@ import numpy.typing as npt
 
 from lathe_papers.formulas.hyperstability import plant, required_input
 from lathe_papers.formulas.periodic_loop import PeriodicLoop, disturbance, steady_derivatives, transient
-from lathe_rc.control.periodic import PeriodicController, samples_in
-from lathe_rc.control.periodic_gains import PRESETS, PeriodicGains
+from lathe_rc.control.periodic import PRESETS, PeriodicController, PeriodicGains, samples_in
 from lathe_rc.signals.example_002 import PERIOD
 from lathe_rc.transfer import LinearSystem
 

@@ -7,21 +7,46 @@ At the crossover ωc the loop's gain is 1 and its phase is the phase margin abov
 
 two equations for the three gains; the third is I/ωc = |C(jωc)|/integral_ratio, which bounds the lag of the integral.
 Paper 004 tuned with Matlab's PID Tuner.
+
+Systems are those of python-control. The companion form of paper 004's compensators has coefficients from 1 to 10¹², and
+the poles of a loop around it come out wrong by several rad/s: each system is balanced by itself before it is connected
+to others.
 """
 
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import control
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.analysis.state_space import Lti, Plant, delay, state_space
 from lathe_rc.control.pid import PidGains
 from lathe_rc.errors import InputError
-from lathe_rc.transfer import TransferFunction
+from lathe_rc.transfer import TransferFunction, realise
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
+
+Lti: TypeAlias = Any  # control.lti.LTI, which has no types
+Plant: TypeAlias = TransferFunction | Lti
+
+_PADE = 4  # order: up to ωτ = 2 its phase is right to 1e-4 rad
+
+
+def state_space(plant: Plant) -> Lti:
+    """A balanced realisation of a transfer function; any other system of python-control as it realises it."""
+    if not isinstance(plant, TransferFunction):
+        return control.ss(plant)
+    a, b, c, d = realise(plant)
+    return control.ss(a, b[:, None], c[None, :], [[d]])
+
+
+def delay(seconds: float) -> Lti:
+    """e^{-p·seconds} by Padé."""
+    if seconds == 0.0:
+        return control.ss([], [], [], [[1.0]])
+    return state_space(TransferFunction(*(tuple(part) for part in control.pade(seconds, _PADE))))
+
 
 _FREQUENCIES = 600  # of a Bode plot, from which margins are read
 _SAMPLES = 4000  # of a step response

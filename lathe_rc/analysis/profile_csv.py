@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.errors import InputError
-from lathe_rc.files import replacing
+from lathe_rc.signals.table import write_table
 
 Array = npt.NDArray[np.float64]
 
@@ -54,10 +54,4 @@ def write(path: Path, radius: Array, *, heights: Array | None = None, comment: s
     if not np.all(np.isfinite(radius)):
         raise InputError(f"{path}: the profile holds numbers that are not finite; write revolutions without them")
     header, rows = _columns(radius, heights)
-    if comment:
-        header = f"# {' '.join(comment.split())}\n{header}"
-    try:
-        with replacing(path) as file:
-            np.savetxt(file, rows, fmt="%.12g", delimiter=",", header=header, comments="", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+    write_table(path, header, rows, comment, digits=12)

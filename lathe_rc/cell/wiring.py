@@ -21,9 +21,9 @@ from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stage import Input, Output, Stage
 from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.stages.drive import Drive
+from lathe_rc.cell.stages.form import ProfileStage
 from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.stages.learning_controller import LearningController
-from lathe_rc.cell.stages.profile import ProfileStage
 from lathe_rc.cell.stages.supervisor import Supervisor
 from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.stages.tool import Tool

@@ -129,24 +129,15 @@ def begin(m: AngleMemory, first: int, angle: Array, past_angle: Array, error: Ar
 
 @kernel
 def find(
-    start: int,
-    point: int,
-    stop: int,
-    cycle: int,
-    per_radian: float,
-    looks_ahead: int,
-    ended: int,
-    angles: Array,
-    angle: Array,
-    lead: Array,
-    sample: Integers,
-    place: Array,
+    m: AngleMemory, start: int, point: int, stop: int, angles: Array, angle: Array, lead: Array
 ) -> tuple[int, int, int, int]:
     """Assign the grid points from ``point`` up to ``stop`` to the samples in whose interval of angle they lie.
 
     Stops after the sample in which a cycle ends. Returns the sample that is reached, the number of points, why it
     stopped (`SMOOTH`: at the last point), and whether a cycle ended in the sample at hand.
     """
+    cycle, per_radian, looks_ahead, ended = m.cycle, m.grid / _TURN, m.looks_ahead, m.whole[ENDED]
+    sample, place = m.sample, m.work[6]
     for j in range(stop - point):
         place[j] = (point + j) / per_radian
     place[stop - point] = np.inf
@@ -174,24 +165,10 @@ def find(
 
 
 @kernel
-def _learn_piece(
-    point: int,
-    count: int,
-    cycle: int,
-    learning: int,
-    gain: float,
-    ramp: float,
-    sample: Integers,
-    place: Array,
-    angles: Array,
-    errors: Array,
-    work: Array,
-    chunk: Array,
-    memory: Array,
-    whole: Integers,
-    real: Array,
-) -> None:
+def _learn_piece(m: AngleMemory, point: int, count: int, learning: int, angles: Array, errors: Array) -> None:
     """Learn ``count`` grid points from ``point`` on, each from the middle of four errors."""
+    cycle, gain, ramp, sample, place, work = m.cycle, m.gain, m.ramp, m.sample, m.work[6], m.work
+    chunk, memory, whole, real = m.chunk, m.memory, m.whole, m.real
     mask = memory.size - 1
     for j in range(count):
         k = sample[j]
@@ -245,7 +222,6 @@ def _learn(
 ) -> tuple[int, int]:
     """Learn from sample ``start`` of the block until something has to be done outside; see `_step`."""
     cycle, memory, chunk, whole = m.cycle, m.memory, m.chunk, m.whole
-    per_radian = m.grid / _TURN
     k = max(start, min(arrives, angle.size))
     reason = DONE
     last = whole[NEXT] + memory.size - cycle - ROOM
@@ -259,13 +235,8 @@ def _learn(
                 whole[CHUNK] = point // chunk.size * chunk.size
                 _smooth(whole[CHUNK], cycle, m.reach, m.ratio, memory, m.scratch, chunk)
             stop = min(stop, whole[CHUNK] + chunk.size)
-        k, count, reason, whole[ENDED] = find(
-            k, point, stop, cycle, per_radian, m.looks_ahead, whole[ENDED], angles, angle, lead, m.sample, m.work[6]
-        )
-        _learn_piece(
-            point, count, cycle, learning, m.gain, m.ramp, m.sample, m.work[6], angles, errors, m.work, chunk, memory,
-            whole, m.real,
-        )  # fmt: skip
+        k, count, reason, whole[ENDED] = find(m, k, point, stop, angles, angle, lead)
+        _learn_piece(m, point, count, learning, angles, errors)
         whole[NEXT] += count
         if reason == SMOOTH:
             reason = DONE
@@ -273,17 +244,9 @@ def _learn(
 
 
 @kernel
-def _command(
-    law: int,
-    per_radian: float,
-    place: float,
-    rate: float,
-    bend: float,
-    settings: Array,
-    memory: Array,
-    real: Array,
-) -> float:
+def _command(m: AngleMemory, place: float, rate: float, bend: float) -> float:
     """Set point of the drive for the memory at ``place`` [grid point]."""
+    law, per_radian, settings, memory, real = m.law, m.grid / _TURN, m.settings, m.memory, m.real
     i = int(np.floor(place))
     u = place - i
     a1, a2 = settings[0], settings[1]
@@ -317,7 +280,7 @@ def _send(m: AngleMemory, start: int, stop: int, angle: Array, told: Array) -> N
         return
     for k in range(start, stop):
         place = (angle[k] + lead[k]) * per_radian - m.cycle
-        told[k] = _command(m.law, per_radian, place, rate[k], bend[k], m.settings, m.memory, m.real)
+        told[k] = _command(m, place, rate[k], bend[k])
 
 
 @inlined

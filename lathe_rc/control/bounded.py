@@ -218,7 +218,3 @@ class Takeover:
         """The velocity of the last two samples as far as a motion may have it: what is faster is noise, or a step."""
         highest = self._bounds.velocity if self._carries else 0.0
         return float(np.clip((command[1] - command[0]) / self._step, -highest, highest))
-
-    def apply(self, command: Array) -> None:
-        """Make of what the controller wants what the drive gets; in place, shape (n,) [m]."""
-        take_over(self.table, command)

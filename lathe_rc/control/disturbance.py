@@ -13,7 +13,7 @@ E = (Wi/Ŵi)·e^{pτ̂} - 1, and it still converges to x = r as long as |E| is b
 
 **Observer** (in time). L·w - L·F̂, L = 1/(1 + p/ωo)³: what the memory does not know yet.
 
-**Identification** of a1 and a2: `lathe_rc.control.disturbed_identification`. What the result is wrong by repeats and is
+**Identification** of a1 and a2: `lathe_rc.control.identification`. What the result is wrong by repeats and is
 learned as a part of f.
 
 Source: spec/robust.md.
@@ -25,15 +25,19 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.control.disturbance_memory import MemoryTable, empty_memory, expected, forget_all, learn, revolution_ended
-from lathe_rc.control.disturbed_identification import (
+from lathe_rc.control.identification import (
+    STAGES,
     FitTable,
+    LowPass,
+    derivatives,
     fade,
     fitted,
     forget_measurements,
+    low_pass,
     no_measurements,
+    pass_through,
     sum_up,
 )
-from lathe_rc.control.drive_regression import STAGES, LowPass, derivatives, low_pass, pass_through
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.profile_table import derivatives_at
 
@@ -102,35 +106,35 @@ class DisturbanceTable(NamedTuple):
 def disturbance(
     *,
     step: float,
-    nominal: float,
+    nominal_speed: float,
     model: tuple[float, float, float],
-    late: int,
-    observer: float,
-    learner: float,
-    gain: float,
+    feedback_delay: int,
+    observer_bandwidth: float,
+    learning_bandwidth: float,
+    learning_gain: float,
     follows_speed: bool,
-    waves: float,
-    points: int,
-    identifier: float,
-    identifies: bool,
-    forgetting: float,
+    learned_waves: float,
+    points_per_revolution: int,
+    identification_bandwidth: float,
+    identify: bool,
+    identification_forgetting: float,
 ) -> DisturbanceTable:
     """Nothing is known yet.
 
     Args:
         step: sampling step [s].
-        nominal: speed Ω0 [rad/s].
+        nominal_speed: speed Ω0 [rad/s].
         model: natural frequency [rad/s], damping and delay [s] of the drive.
-        late: samples until a position is seen.
-        observer: bandwidth of the observer [rad/s]; 0: there is none.
-        learner: bandwidth of what is learned [rad/s].
-        gain: part of what is new that the memory takes up in the long run, below 1; 0: there is no memory.
+        feedback_delay: samples until a position is seen.
+        observer_bandwidth: bandwidth of the observer [rad/s]; 0: there is none.
+        learning_bandwidth: bandwidth of what is learned [rad/s].
+        learning_gain: part of what is new that the memory takes up in the long run, below 1; 0: there is no memory.
         follows_speed: whether how a value changes with the speed is learned.
-        waves: per revolution that are learned, see `lathe_rc.control.disturbance_memory.smoothing`.
-        points: of the memory per revolution, a power of two.
-        identifier: bandwidth of the identification [rad/s].
-        identifies: whether the model is identified.
-        forgetting: what a revolution leaves of the measurements before.
+        learned_waves: per revolution that are learned, see `lathe_rc.control.disturbance_memory.smoothing`.
+        points_per_revolution: of the memory per revolution, a power of two.
+        identification_bandwidth: bandwidth of the identification [rad/s].
+        identify: whether the model is identified.
+        identification_forgetting: what a revolution leaves of the measurements before.
 
     Raises:
         InputError: S is wider than a revolution.
@@ -141,19 +145,21 @@ def disturbance(
     return DisturbanceTable(
         step=step,
         model=given.copy(),
-        late=late,
-        begins=late + int(_SWINGS_IN * given[0] / step),
+        late=feedback_delay,
+        begins=feedback_delay + int(_SWINGS_IN * given[0] / step),
         whole=whole,
         part=max(delay / step - whole, 0.0),
-        commands=np.zeros(1 << (late + whole + 2).bit_length()),
-        observer=low_pass(observer, step),
-        observes=observer > 0.0,
+        commands=np.zeros(1 << (feedback_delay + whole + 2).bit_length()),
+        observer=low_pass(observer_bandwidth, step),
+        observes=observer_bandwidth > 0.0,
         learned=np.zeros(STAGES + 1),
-        learner=low_pass(learner, step),
-        memory=empty_memory(nominal, gain, waves, points, follows_speed=follows_speed),
-        identifier=low_pass(identifier, step),
-        identifies=identifies,
-        fit=no_measurements(given, points, forgetting),
+        learner=low_pass(learning_bandwidth, step),
+        memory=empty_memory(
+            nominal_speed, learning_gain, learned_waves, points_per_revolution, follows_speed=follows_speed
+        ),
+        identifier=low_pass(identification_bandwidth, step),
+        identifies=identify,
+        fit=no_measurements(given, points_per_revolution, identification_forgetting),
         point=np.zeros(6),
         state=np.zeros(5, np.int64),
     )

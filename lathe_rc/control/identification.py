@@ -1,8 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification of a drive while it runs, from its command u and its measured position x.
 
-Least squares (`lathe_rc.control.drive_regression`, with λ for ω) over the cycles that have ended, older ones with a
-forgetting factor. One harmonic is enough for both coefficients; the speed of the spindle may vary.
+    u(t - τ) = x + a1·dx/dt + a2·d²x/dt²        a1 = 2ζ/ωn, a2 = 1/ωn², τ known
+
+Both sides pass the same low-pass (ω/(p + ω))³, whose stages give the filtered derivatives: nothing is differentiated.
+
+**Learning controller**: least squares over the cycles that have ended, older ones with a forgetting factor. One
+harmonic is enough for both coefficients; the speed of the spindle may vary.
+
+**Under a disturbance** f that is unknown, but repeats with the angle: the difference from the last revolution at the
+same angle has no f. It needs a speed that varies; otherwise the equation itself counts, with a small weight, and beside
+it the model that was given, the more the larger f is.
 """
 
 from dataclasses import dataclass
@@ -11,19 +19,82 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.control.drive_regression import (
-    STAGES,
-    LowPass,
-    add_products,
-    coefficients,
-    derivatives,
-    excited,
-    low_pass,
-    pass_through,
-)
-from lathe_rc.jit import kernel
+from lathe_rc.arrays import put_scaled
+from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
+
+STAGES = 3  #: first-order stages of each low-pass
+_LEAST_EXCITED = 1e-6  # determinant of the normal equations, 1 for independent regressors
+
+
+class LowPass(NamedTuple):
+    """1/(1 + p/ω)³ by the bilinear rule, for the two signals of a drive.
+
+    Attributes:
+        bandwidth: ω [rad/s].
+        keep, take: of a stage.
+        position, command: their values before and after each stage, shape (4,) [m].
+    """
+
+    bandwidth: float
+    keep: float
+    take: float
+    position: Array
+    command: Array
+
+
+def low_pass(bandwidth: float, step: float) -> LowPass:
+    """A low-pass of a ``bandwidth`` [rad/s] at rest at 0; ``step`` in s."""
+    half = 0.5 * bandwidth * step
+    return LowPass(
+        bandwidth, (1.0 - half) / (1.0 + half), half / (1.0 + half), np.zeros(STAGES + 1), np.zeros(STAGES + 1)
+    )
+
+
+@inlined
+def pass_through(stages: Array, value: float, keep: float, take: float) -> None:
+    """Step a low-pass of one signal."""
+    new = value
+    for stage in range(STAGES):
+        old = stages[stage]
+        stages[stage] = new
+        new = keep * stages[stage + 1] + take * (new + old)
+    stages[STAGES] = new
+
+
+@inlined
+def derivatives(stages: Array, bandwidth: float) -> tuple[float, float]:
+    """First two derivatives of what has passed a low-pass."""
+    first = bandwidth * (stages[STAGES - 1] - stages[STAGES])
+    return first, bandwidth**2 * (stages[STAGES - 2] - 2.0 * stages[STAGES - 1] + stages[STAGES])
+
+
+@inlined
+def add_products(sums: Array, place: int, velocity: float, acceleration: float, rest: float) -> None:
+    """Add what a sample says of dx/dt, d²x/dt² and u - x to five ``sums``, ``place`` on: vv, va, aa, vr and ar."""
+    sums[place] += velocity * velocity
+    sums[place + 1] += velocity * acceleration
+    sums[place + 2] += acceleration * acceleration
+    sums[place + 3] += velocity * rest
+    sums[place + 4] += acceleration * rest
+
+
+@inlined
+def excited(vv: float, va: float, aa: float) -> bool:
+    """Whether sums of the squares of dx/dt and d²x/dt² and of their product tell the two apart.
+
+    That is relative to independent regressors: the units of the two differ by orders of magnitude.
+    """
+    return bool(vv * aa - va * va > _LEAST_EXCITED * vv * aa > 0.0)
+
+
+@inlined
+def coefficients(vv: float, va: float, aa: float, vr: float, ar: float) -> tuple[float, float]:
+    """a1 [s] and a2 [s²] by least squares, from the same sums and those of the products with u - x."""
+    determinant = vv * aa - va * va
+    return (vr * aa - ar * va) / determinant, (ar * vv - vr * va) / determinant
+
 
 _LOOK_BACK = 2  # samples of the command that a delay with a fraction needs
 
@@ -146,3 +217,88 @@ class DriveIdentifier:
                 found = Identified(frequency, float(a1 * frequency / 2.0), float(np.sqrt(unexplained / command)))
         self.table.sums[:] *= self._forgetting
         return found
+
+
+_WHOLE = 3e-4  # weight of the equation itself beside its difference from the last revolution
+_UNSURE = (0.3, 0.4)  # standard deviations of a1 and a2 as they are given, relative
+
+
+class FitTable(NamedTuple):
+    """The measurements of the drive.
+
+    Attributes:
+        given: a1 [s] and a2 [s²] as they are told, shape (2,).
+        before: dx/dt, d²x/dt² and u - x of the last revolution, shape (3, n).
+        sums: of the normal equations, differences first.
+        means: how many, sums of dx/dt, d²x/dt², u - x and (u - x)²: a steady force counts for nothing.
+        forgetting: what a revolution leaves of both.
+    """
+
+    given: Array
+    before: Array
+    sums: Array
+    means: Array
+    forgetting: float
+
+
+def no_measurements(given: Array, points: int, forgetting: float) -> FitTable:
+    """Nothing has been measured; ``points`` of the grid per revolution."""
+    return FitTable(given, np.zeros((3, points)), np.zeros(10), np.zeros(5), forgetting)
+
+
+def forget_measurements(m: FitTable) -> None:
+    """Nothing has been measured again."""
+    for array in (m.before, m.sums, m.means):
+        array[:] = 0.0
+
+
+@inlined
+def sum_up(
+    m: FitTable,
+    here: int,
+    again: bool,  # noqa: FBT001 - kernels take their arguments by position
+    velocity: float,
+    acceleration: float,
+    rest: float,
+) -> None:
+    """Take dx/dt, d²x/dt² and u - x at grid point ``here``, ``again`` if they were taken a revolution ago as well."""
+    sums, before = m.sums, m.before
+    if again:
+        v, a, r = velocity - before[0, here], acceleration - before[1, here], rest - before[2, here]
+        add_products(sums, 0, v, a, r)
+    add_products(sums, 5, velocity, acceleration, rest)
+    mean = m.means
+    mean[0] += 1.0
+    mean[1] += velocity
+    mean[2] += acceleration
+    mean[3] += rest
+    mean[4] += rest * rest
+    before[0, here], before[1, here], before[2, here] = velocity, acceleration, rest
+
+
+@inlined
+def fitted(m: FitTable) -> tuple[float, float]:
+    """a1 [s] and a2 [s²]; not above 0 if the measurements say nothing."""
+    count, v, a, r, rr = m.means[0], m.means[1], m.means[2], m.means[3], m.means[4]
+    whole, s = m.sums[5:].copy(), m.sums[:5].copy()
+    for k, mean in enumerate((v * v, v * a, a * a, v * r, a * r)):
+        whole[k] -= mean / count
+    if not excited(whole[0], whole[1], whole[2]):
+        return 0.0, 0.0
+    a1, a2 = coefficients(whole[0], whole[1], whole[2], whole[3], whole[4])
+    # The force is as large in the waves that the drive moves in as in the others, where it is what is left.
+    left = _WHOLE * max(rr - r * r / count - a1 * whole[3] - a2 * whole[4], 0.0)
+    sure1, sure2 = left / (_UNSURE[0] * m.given[0]) ** 2, left / (_UNSURE[1] * m.given[1]) ** 2
+    s += _WHOLE * whole
+    s[0] += sure1
+    s[2] += sure2
+    s[3] += sure1 * m.given[0]
+    s[4] += sure2 * m.given[1]
+    return coefficients(s[0], s[1], s[2], s[3], s[4])
+
+
+@inlined
+def fade(m: FitTable) -> None:
+    """A revolution has ended: what was measured before counts less."""
+    put_scaled(m.sums, m.forgetting, m.sums)
+    put_scaled(m.means, m.forgetting, m.means)

@@ -137,9 +137,9 @@ def control(pid: PidTable, state: Array, n: int, set_point: float, measurement: 
 
 
 @kernel
-def lets_learn(state: Array, learns: bool, waits: bool) -> None:  # noqa: FBT001 - kernels take their arguments by position
+def enable_integrator(state: Array, on: bool, waits: bool) -> None:  # noqa: FBT001 - kernels take them by position
     """Set in the state of a `Pid` whether it integrates, and whether another gives the command."""
-    state[_STANDS], state[_WAITS] = 0.0 if learns else 1.0, 1.0 if waits else 0.0
+    state[_STANDS], state[_WAITS] = 0.0 if on else 1.0, 1.0 if waits else 0.0
 
 
 @kernel
@@ -207,24 +207,6 @@ class Pid:
             divisor=divisor,
         )
         self.state = np.zeros(_SIZE)
-
-    @property
-    def integrates(self) -> bool:
-        """Whether the integral goes on; it stands still otherwise."""
-        return not self.state[_STANDS]
-
-    @integrates.setter
-    def integrates(self, on: bool) -> None:
-        self.state[_STANDS] = not on
-
-    @property
-    def waits(self) -> bool:
-        """Whether another gives the command."""
-        return bool(self.state[_WAITS])
-
-    @waits.setter
-    def waits(self, on: bool) -> None:
-        self.state[_WAITS] = on
 
     @property
     def saturated(self) -> int:

@@ -27,11 +27,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.control.interpolation import linear
 from lathe_rc.errors import InputError
-from lathe_rc.files import replacing
 from lathe_rc.jit import kernel
-from lathe_rc.signals.interpolation import linear
-from lathe_rc.signals.table import read_table
+from lathe_rc.signals.table import read_table, write_table
 
 Array = npt.NDArray[np.float64]
 ForceLaw = Callable[[Array], Array]  #: force [N] by depth of cut [m], at each height; never falling with the depth
@@ -168,15 +167,7 @@ class Predistortion:
         Raises:
             InputError: a place that cannot be written to.
         """
-        header = ",".join(_COLUMNS)
-        if comment:
-            header = f"# {' '.join(comment.split())}\n{header}"
-        try:
-            with replacing(path) as file:
-                rows = np.stack((self.heights * 1e3, self.offsets * 1e6), axis=1)
-                np.savetxt(file, rows, fmt="%.15g", delimiter=",", header=header, comments="", encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+        write_table(path, ",".join(_COLUMNS), np.stack((self.heights * 1e3, self.offsets * 1e6), axis=1), comment)
 
     @classmethod
     def load(cls, path: Path) -> "Predistortion":

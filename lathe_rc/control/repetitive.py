@@ -16,30 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.control.angle_memory import (
-    AHEAD,
-    ASKS,
-    BEHIND,
-    CHUNK,
-    CYCLE_ENDED,
-    DONE,
-    INTEGERS,
-    JOINED,
-    LEARNS,
-    LOG,
-    LOGGED,
-    NEXT,
-    NO_CHUNK,
-    PIECE,
-    PLACE,
-    REALS,
-    REPLACED,
-    ROOM,
-    SMOOTH,
-    AngleMemory,
-    advance,
-    begin,
-)
+from lathe_rc.control import angle_memory
+from lathe_rc.control.angle_memory import AngleMemory
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.lead import Preview, look_ahead
 from lathe_rc.control.q_filter import QFilter
@@ -116,8 +94,9 @@ class RepetitiveController:
     ) -> None:
         self._cycle, self._q, self._nominal, self._step = grid * revolutions, q, nominal, step
         self.preview = preview
-        whole, real = np.zeros(INTEGERS, dtype=np.int64), np.zeros(REALS)
-        whole[LEARNS], whole[JOINED], real[PLACE] = 1, np.isinf(join_below), np.nan
+        whole, real = np.zeros(angle_memory.INTEGERS, dtype=np.int64), np.zeros(angle_memory.REALS)
+        whole[angle_memory.LEARNS], whole[angle_memory.JOINED] = 1, np.isinf(join_below)
+        real[angle_memory.PLACE] = np.nan
         self.table = AngleMemory(
             delay=delay,
             grid=grid,
@@ -134,18 +113,18 @@ class RepetitiveController:
             chunk=np.empty(q.chunk),
             scratch=np.empty((2, q.chunk + 2 * q.reach)),
             **{name: np.empty(shape) for name, shape in _ROOM.items()},
-            sample=np.empty(PIECE, dtype=np.int64),
-            work=np.empty((7, PIECE + 1)),
+            sample=np.empty(angle_memory.PIECE, dtype=np.int64),
+            work=np.empty((7, angle_memory.PIECE + 1)),
             whole=whole,
             real=real,
-            log=np.empty((LOG, 5)),
+            log=np.empty((angle_memory.LOG, 5)),
         )
         self._cycles = 0
         self._rms_before = np.nan
         self.correction = correction
         if q.ratio < 0.0:
             self.smooth()  # compiles what the first chunk needs
-        whole[CHUNK] = NO_CHUNK
+        whole[angle_memory.CHUNK] = angle_memory.NO_CHUNK
 
     def __getstate__(self) -> dict[str, Any]:
         """The state between two blocks, without scratch arrays."""
@@ -162,20 +141,20 @@ class RepetitiveController:
     @property
     def learning(self) -> bool:
         """Whether the memory changes; otherwise it stays as it is."""
-        return bool(self.table.whole[LEARNS])
+        return bool(self.table.whole[angle_memory.LEARNS])
 
     @learning.setter
     def learning(self, on: bool) -> None:
-        self.table.whole[LEARNS] = on
+        self.table.whole[angle_memory.LEARNS] = on
 
     @property
     def joined(self) -> bool:
         """False as long as the error before the channel is beyond ``join_below``."""
-        return bool(self.table.whole[JOINED])
+        return bool(self.table.whole[angle_memory.JOINED])
 
     @joined.setter
     def joined(self, on: bool) -> None:
-        self.table.whole[JOINED] = on
+        self.table.whole[angle_memory.JOINED] = on
 
     @property
     def correction(self) -> Correction:
@@ -199,12 +178,12 @@ class RepetitiveController:
         self._replaced()
 
     def _replaced(self) -> None:
-        self.table.whole[CHUNK] = NO_CHUNK
-        self.table.whole[REPLACED] = 1
+        self.table.whole[angle_memory.CHUNK] = angle_memory.NO_CHUNK
+        self.table.whole[angle_memory.REPLACED] = 1
 
     def memory(self) -> Array:
         """The newest value at each grid point of the cycle [m], from angle 0 on, shape (cycle,)."""
-        memory, end = self.table.memory, self.table.whole[NEXT]
+        memory, end = self.table.memory, self.table.whole[angle_memory.NEXT]
         newest = np.arange(end - self._cycle, end)
         points = np.empty(self._cycle)
         points[newest % self._cycle] = memory[newest & (memory.size - 1)]
@@ -213,7 +192,7 @@ class RepetitiveController:
     def remember(self, points: Array) -> None:
         """Replace what was learned by ``points`` as `memory` gives them; the channel counts as joined."""
         memory = self.table.memory
-        places = np.arange(memory.size) + self.table.whole[NEXT] - memory.size
+        places = np.arange(memory.size) + self.table.whole[angle_memory.NEXT] - memory.size
         memory[places & (memory.size - 1)] = points[places % self._cycle]
         self._replaced()
         self.joined = True
@@ -251,27 +230,27 @@ class RepetitiveController:
             self.table = self.table._replace(windows=np.empty((2, n + 3)), ahead=np.empty((3, n)))
         table = self.table
         look_ahead(self.preview.table, first, wanted, speed, *table.ahead[:, :n])
-        begin(table, first, angle, past_angle, error)
-        table.whole[ASKS] = 1
-        reached, reason = 0, SMOOTH
-        while reason in (CYCLE_ENDED, SMOOTH):
-            reached, reason = advance(table, first, reached, angle, command)
-            if reason == SMOOTH:
+        angle_memory.begin(table, first, angle, past_angle, error)
+        table.whole[angle_memory.ASKS] = 1
+        reached, reason = 0, angle_memory.SMOOTH
+        while reason in (angle_memory.CYCLE_ENDED, angle_memory.SMOOTH):
+            reached, reason = angle_memory.advance(table, first, reached, angle, command)
+            if reason == angle_memory.SMOOTH:
                 self.smooth()
-            elif reason == CYCLE_ENDED:
+            elif reason == angle_memory.CYCLE_ENDED:
                 yield from self.ended()
-        if reason != DONE:
+        if reason != angle_memory.DONE:
             raise self.lost(reason, first, reached, angle, speed, past_angle)
 
     @staticmethod
     def lost(reason: int, first: int, reached: int, angle: Array, speed: Array, past_angle: Array) -> AngleLostError:
         """Why the memory cannot be read at sample ``reached`` of a block; its arrays are those of `block`."""
-        if reason == AHEAD:
+        if reason == angle_memory.AHEAD:
             why = (
                 f"the memory is read at {angle[reached]:.6g} rad before it is learned; the spindle turns at "
                 f"{speed[reached]:.5g} rad/s: reduce its speed, the lead or the feedback delay"
             )
-        elif reason == BEHIND:
+        elif reason == angle_memory.BEHIND:
             why = (
                 f"at {angle[reached]:.6g} rad the memory is no longer kept; the spindle has turned back, or its angle "
                 "is wrong"
@@ -283,17 +262,17 @@ class RepetitiveController:
     def smooth(self) -> None:
         """Apply Q to the cycle before, for the chunk of grid points that learning has come to."""
         table, size, reach = self.table, self._q.chunk, self._q.reach
-        base = int(table.whole[NEXT]) // size * size
+        base = int(table.whole[angle_memory.NEXT]) // size * size
         before = np.arange(base - self._cycle - reach, base - self._cycle + size + reach)
         self._q.smooth(table.memory[before & (table.memory.size - 1)], table.chunk)
-        table.whole[CHUNK] = base
+        table.whole[angle_memory.CHUNK] = base
 
     def ended(self) -> list[Cycle]:
         """The cycles that have ended since the last call."""
-        if not self.table.whole[LOGGED]:
+        if not self.table.whole[angle_memory.LOGGED]:
             return []
-        logged = self.table.log[: self.table.whole[LOGGED]].tolist()
-        self.table.whole[LOGGED] = 0
+        logged = self.table.log[: self.table.whole[angle_memory.LOGGED]].tolist()
+        self.table.whole[angle_memory.LOGGED] = 0
         return [self._cycle_of(*row) for row in logged]
 
     def _cycle_of(self, sample: float, squares: float, largest: float, learning: float, joined: float) -> Cycle:
@@ -306,7 +285,7 @@ class RepetitiveController:
 
 def memory_size(cycle: int, q: QFilter) -> int:
     """Grid points that the memory of a ``cycle`` holds: with what Q needs before it, a power of two for the index."""
-    return 1 << (cycle + q.chunk + q.reach + ROOM).bit_length()
+    return 1 << (cycle + q.chunk + q.reach + angle_memory.ROOM).bit_length()
 
 
 def largest_feedback_delay(

@@ -1,4 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plants: tool drives and the tool itself. The modules in ``__all__`` are public, all others may change."""
+"""The plants. The modules in ``__all__`` are public, all others may change.
+
+Tool drives: `electrodynamic`, `piezo` with `hysteresis`, `tool_drive` with `tool_motion` and `coil` (both in series,
+and under the cutting force); `linear` discretises them. Cut: `cutting` with `chip`, `cutting_force`, `workpiece`.
+Slides: `feed` with `feed_models`, `friction`, `screw`. `spindle`: one that the cut slows.
+"""
 
 __all__ = ["feed", "feed_models", "hysteresis"]

@@ -3,6 +3,10 @@
 
 The equations are those of `lathe_rc.plants.cutting`. Here they stand sample by sample, so that what moves the edge can
 be solved together with the chip, see `lathe_rc.plants.tool_drive`.
+
+The surface that the edge leaves is remembered over the angle until it is met again a revolution later: over the angle,
+so that it is found again at any speed. What the edge leaves between two samples goes to the grid points between their
+angles.
 """
 
 from typing import NamedTuple
@@ -10,22 +14,71 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.control.interpolation import linear
 from lathe_rc.errors import LatheError
-from lathe_rc.jit import inlined
-from lathe_rc.plants.cut_surface import SurfaceTable, goes_on, read, remember
-from lathe_rc.plants.cutting_force import cutting_stiffness
-from lathe_rc.plants.flank import flank_damping
+from lathe_rc.jit import inlined, kernel
+from lathe_rc.plants.cutting_force import Flank, SpecificForce, Wear, cutting_stiffness, flank_damping
 from lathe_rc.plants.workpiece import hardness, missing
-from lathe_rc.signals.interpolation import linear
 from lathe_rc.transfer import System, step
 
 Array = npt.NDArray[np.float64]
+
+# Places in what is known of the last sample: its place on the grid, what it left, the next grid point.
+_PLACE, _LEFT, _NEXT = 0, 1, 2
+
+
+class SurfaceTable(NamedTuple):
+    """A remembered surface, for kernels.
+
+    Attributes:
+        ring: by grid point, modulo its size, which is a power of two [m].
+        last: the last sample's place on the grid, what it left there, and the next grid point; NaN before the first.
+    """
+
+    ring: Array
+    last: Array
+
+
+def blank(grid: int) -> SurfaceTable:
+    """Nothing has been cut; ``grid`` points in a revolution."""
+    # A power of two, so that a mask wraps the index; a sample may be up to a revolution long.
+    return SurfaceTable(np.zeros(1 << (2 * grid + 2).bit_length()), np.array([np.nan, 0.0, 0.0]))
+
+
+@inlined
+def goes_on(last: Array, place: float, grid: int) -> bool:
+    """Whether ``place`` [grid point] is less than a revolution beyond that of the last sample, and not before it."""
+    return bool(0.0 <= place - (place if np.isnan(last[_PLACE]) else last[_PLACE]) < grid)
+
+
+@kernel
+def surface_at(ring: Array, place: float) -> float:
+    """The remembered surface [m] at ``place`` [grid point]."""
+    i = int(np.floor(place))
+    mask = ring.size - 1
+    left = ring[i & mask]
+    return float(left + (ring[(i + 1) & mask] - left) * (place - i))
+
+
+@kernel
+def remember(ring: Array, last: Array, place: float, left: float) -> None:
+    """Lay down what the edge left [m] between the last sample and this one, at ``place`` [grid point]."""
+    mask = ring.size - 1
+    if np.isnan(last[_PLACE]):
+        last[_PLACE], last[_LEFT], last[_NEXT] = place, left, np.ceil(place)
+    while last[_NEXT] <= place:
+        u = 0.0
+        if place > last[_PLACE]:
+            u = (last[_NEXT] - last[_PLACE]) / (place - last[_PLACE])
+        ring[int(last[_NEXT]) & mask] = last[_LEFT] + (left - last[_LEFT]) * u
+        last[_NEXT] += 1.0
+    last[_PLACE], last[_LEFT] = place, left
+
 
 _TURN = 2.0 * np.pi
 
 WEAR, _EDGE = 0, 1  #: places in the state
 DONE, _STANDS, _TURNS_BACK, DRAWN_IN = 0, 1, 2, 3  #: why a kernel stopped
-APART, BACKWARDS = 0, 1  #: places in the counts
 
 
 class Process(NamedTuple):
@@ -36,26 +89,23 @@ class Process(NamedTuple):
         depth: [m].
         overlap: µ.
         sign: σ.
-        kc1, mc, wear_factor: see `lathe_rc.plants.cutting_force.SpecificForce`.
-        per_metre, per_second, radius: of the wear.
+        material, wear, flank: as given.
+        radius: of the part, for the cutting path [m].
         lag, mode: of F and w.
         lag_now, mode_now: what a unit of their input changes in their output of the same sample.
         gaps: shape (m, 2).
         spots: shape (m, 5).
         heights, compliances: shape (m,).
         grid: points in a revolution.
-        pressure, width, land: see `lathe_rc.plants.flank.Flank`.
     """
 
     step: float
     depth: float
     overlap: float
     sign: float
-    kc1: float
-    mc: float
-    wear_factor: float
-    per_metre: float
-    per_second: float
+    material: SpecificForce
+    wear: Wear
+    flank: Flank
     radius: float
     lag: System
     lag_now: float
@@ -66,9 +116,6 @@ class Process(NamedTuple):
     heights: Array
     compliances: Array
     grid: int
-    pressure: float
-    width: float
-    land: float
 
 
 class CutTable(NamedTuple):
@@ -79,7 +126,6 @@ class CutTable(NamedTuple):
         lag_state, mode_state: of F and w.
         state: VB, and where the edge was; NaN before the first sample.
         surface: what it left.
-        counts: see `CuttingProcess.apart` and `CuttingProcess.backwards`.
     """
 
     process: Process
@@ -87,7 +133,6 @@ class CutTable(NamedTuple):
     mode_state: Array
     state: Array
     surface: SurfaceTable
-    counts: npt.NDArray[np.int64]
 
 
 @inlined
@@ -106,9 +151,9 @@ def _free(system: System, state: Array) -> float:
 @inlined
 def pressed_by(process: Process, speed: float, wear: float) -> float:
     """The loss of the flank's force for each metre that the edge moves out of the part in a sample [N/m], times σ."""
-    if process.pressure == 0.0:
+    if process.flank.pressure == 0.0:
         return 0.0
-    damping = flank_damping(process.pressure, process.width, process.land + wear, process.radius * speed)
+    damping = flank_damping(process.flank, process.radius * speed, wear)
     return float(process.sign * damping / process.step)
 
 
@@ -123,7 +168,7 @@ def meet(
     if process.overlap > 0.0 and not goes_on(cut.surface.last, place, process.grid):
         return _TURNS_BACK, 0.0, 0.0, 0.0
     feed = max(feed_velocity * _TURN / speed, 0.0)
-    stiffness = cutting_stiffness(process.kc1, process.mc, process.wear_factor, feed, state[WEAR])
+    stiffness = cutting_stiffness(process.material, feed, state[WEAR])
     stiffness *= hardness(process.spots, angle, height)
     return DONE, feed, stiffness, process.sign * linear(process.heights, process.compliances, height)
 
@@ -162,7 +207,7 @@ def chip_of(
     process, lag_now = cut.process, cut.process.lag_now
     chip = process.depth + allowance - cross_position - displacement
     if process.overlap > 0.0:
-        chip += process.overlap * read(cut.surface.ring, place - process.grid)
+        chip += process.overlap * surface_at(cut.surface.ring, place - process.grid)
     follows = 1.0 + process.mode_now * pressed * compliance
     bend = (process.mode_now * lag_now * stiffness * compliance + lag_now * stiffness * give) / follows
     if not 1.0 + bend > 0.0:
@@ -189,8 +234,8 @@ def press(
         force -= pressed * (_moved(cut, base) + compliance * (free + process.mode_now * force)) / follows
     deflection = compliance * step(process.mode, cut.mode_state, force)
     if chip > 0.0:
-        path = process.per_metre * process.radius * speed
-        state[WEAR] += (path + process.per_second) * process.step
+        path = process.wear.per_metre * process.radius * speed
+        state[WEAR] += (path + process.wear.per_second) * process.step
     return force, deflection
 
 

@@ -20,10 +20,11 @@ All that happens in a sample is solved together: the force of sample n bends the
 chip of sample n. ap is linear in the force as long as there is contact, so that this is one division. Both lags take
 what drives them as linear between samples.
 
-The part's surface is remembered over the angle (`lathe_rc.plants.cut_surface`), and the chip reads it a revolution
+The part's surface is remembered over the angle (`lathe_rc.plants.chip`), and the chip reads it a revolution
 later. Where nothing is cut nothing is left to meet: the blank is there, which depth + d says already.
 
-Source: spec/feed-and-force.md, "Cutting process"; paper 004, W3 and W4; of process damping: `lathe_rc.plants.flank`.
+Source: spec/feed-and-force.md, "Cutting process"; paper 004, W3 and W4; of process damping:
+`lathe_rc.plants.cutting_force`.
 """
 
 from collections.abc import Sequence
@@ -34,13 +35,12 @@ import numpy.typing as npt
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.chip import (
-    APART,
-    BACKWARDS,
     DONE,
     DRAWN_IN,
     WEAR,
     CutTable,
     Process,
+    blank,
     chip_of,
     failure,
     leave,
@@ -48,35 +48,26 @@ from lathe_rc.plants.chip import (
     press,
     pressed_by,
 )
-from lathe_rc.plants.cut_surface import blank
-from lathe_rc.plants.cutting_force import STEEL, SpecificForce
-from lathe_rc.plants.deflection import RIGID, Elasticity
-from lathe_rc.plants.flank import Flank, Wear
+from lathe_rc.plants.cutting_force import RIGID, STEEL, Elasticity, Flank, SpecificForce, Wear
 from lathe_rc.plants.workpiece import HardSpot, Part
 from lathe_rc.transfer import System, TransferFunction, discretise, rest
 
 Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
+_NEW_EDGE, _NO_DAMPING = Wear(), Flank()
+
+
+#: arrays of a block in the order of the kernel: what the cut takes, and what it makes
+GIVEN = ("angle", "speed", "height", "cross_position", "displacement", "feed_velocity", "allowance")
+MADE = ("force", "deflection", "depth_of_cut", "feed", "wear")
 
 
 @kernel
-def cut_along(
-    cut: CutTable,
-    angle: Array,
-    speed: Array,
-    height: Array,
-    cross_position: Array,
-    displacement: Array,
-    feed_velocity: Array,
-    allowance: Array,
-    force: Array,
-    deflection: Array,
-    depth_of_cut: Array,
-    feed: Array,
-    wear: Array,
-) -> tuple[int, int]:
-    """Step through a block, see `CuttingProcess.block`; returns the sample at which it stopped and why."""
+def cut_along(cut: CutTable, given: tuple[Array, ...], made: tuple[Array, ...]) -> tuple[int, int]:
+    """Step through a block, see `GIVEN` and `MADE`; returns the sample at which it stopped and why."""
+    angle, speed, height, cross_position, displacement, feed_velocity, allowance = given
+    force, deflection, depth_of_cut, feed, wear = made
     per_radian = cut.process.grid / _TURN
     for k in range(angle.size):
         place = angle[k] * per_radian
@@ -90,8 +81,6 @@ def cut_along(
         )
         if np.isnan(chip):
             return k, DRAWN_IN
-        cut.counts[BACKWARDS] += feed_velocity[k] < 0.0
-        cut.counts[APART] += chip < 0.0
         depth_of_cut[k] = chip = max(chip, 0.0)
         base = cross_position[k] + displacement[k]
         force[k], deflection[k] = press(cut, chip, stiffness, compliance, speed[k], base, pressed)
@@ -102,6 +91,18 @@ def cut_along(
 def _instant(system: System) -> float:
     """The change of the output for a unit of the input of the same sample."""
     return float(system.through + system.output @ system.now)
+
+
+def _check_edge(material: SpecificForce, wear: Wear, flank: Flank, elasticity: Elasticity) -> None:
+    """Refuse numbers of the edge that are out of their range, or not finite."""
+    for values in (material, wear, flank, elasticity):
+        for name, value in values._asdict().items():
+            if not 0.0 <= value < np.inf:
+                raise InputError(f"cutting: {name} {value:g}; allowed: 0 or more")
+    if not (material.kc1 > 0.0 and material.mc < 1.0):
+        raise InputError(f"cutting: {material}; allowed: kc1 above 0 (1700 N/mm² is 1.7e9 Pa), mc below 1")
+    if elasticity.inertia > 0.0 and not elasticity.damping > 0.0:
+        raise InputError("cutting: damping 0 of the edge with inertia; allowed: above 0, or it rings for ever")
 
 
 class CuttingProcess:
@@ -120,9 +121,6 @@ class CuttingProcess:
         step: sampling step [s].
 
     Attributes:
-        apart: samples so far in which the edge was clear of the part although there was material; before the first
-            contact too.
-        backwards: samples so far in which the feed went back; no chip has a negative thickness, and 0 was taken.
         table: for `cut_along`.
 
     Raises:
@@ -136,11 +134,11 @@ class CuttingProcess:
         depth: float,
         lag: float = 0.075,
         elasticity: Elasticity = RIGID,
-        wear: Wear | None = None,
+        wear: Wear = _NEW_EDGE,
         part: Part | None = None,
         overlap: float = 0.0,
         grid: int = 4096,
-        flank: Flank | None = None,
+        flank: Flank = _NO_DAMPING,
         step: float,
     ) -> None:
         least = float(f"{step / 1000.0:g}")  # the one that is said, to the bit
@@ -150,7 +148,8 @@ class CuttingProcess:
             raise InputError(f"cutting: overlap {overlap:g}; allowed: 0 (no regeneration) up to 1")
         if grid < 16:
             raise InputError(f"cutting: {grid} grid points in a revolution; allowed: 16 or more")
-        part, wear, flank = part or Part(), wear or Wear(), flank or Flank()
+        _check_edge(material, wear, flank, elasticity)
+        part = part or Part()
         following = discretise(TransferFunction((1.0,), (lag, 1.0)), step, "foh")
         mode = discretise(elasticity.shape, step, "foh")
         heights, compliances = part.heights, part.compliances
@@ -161,11 +160,9 @@ class CuttingProcess:
             depth=depth,
             overlap=overlap,
             sign=1.0 if elasticity.away else -1.0,
-            kc1=material.kc1,
-            mc=material.mc,
-            wear_factor=material.wear_factor,
-            per_metre=wear.per_metre,
-            per_second=wear.per_second,
+            material=material,
+            wear=wear,
+            flank=flank,
             radius=part.radius,
             lag=following,
             lag_now=_instant(following),
@@ -176,9 +173,6 @@ class CuttingProcess:
             heights=np.ascontiguousarray(heights, dtype=np.float64),
             compliances=np.ascontiguousarray(compliances, dtype=np.float64),
             grid=grid,
-            pressure=flank.pressure,
-            width=flank.width,
-            land=flank.land,
         )
         self.table = CutTable(
             process=self._whole,
@@ -186,7 +180,6 @@ class CuttingProcess:
             mode_state=rest(mode),
             state=np.array([wear.initial, np.nan]),
             surface=blank(grid),
-            counts=np.zeros(2, dtype=np.int64),
         )
 
     def damage(self, *, shorter: float = 0.0, spots: Sequence[HardSpot] = ()) -> None:
@@ -197,55 +190,20 @@ class CuttingProcess:
         )
         self.table = self.table._replace(process=process)
 
-    @property
-    def apart(self) -> int:
-        """See the class."""
-        return int(self.table.counts[APART])
-
-    @property
-    def backwards(self) -> int:
-        """See the class."""
-        return int(self.table.counts[BACKWARDS])
-
-    def block(
-        self,
-        *,
-        angle: Array,
-        speed: Array,
-        height: Array,
-        cross_position: Array,
-        displacement: Array,
-        feed_velocity: Array,
-        allowance: Array,
-        force: Array,
-        deflection: Array,
-        depth_of_cut: Array,
-        feed: Array,
-        wear: Array,
-    ) -> None:
-        """Step through a block; arrays of shape (n,), the last five filled.
+    def block(self, **arrays: Array) -> None:
+        """Step through a block.
 
         Args:
-            angle: true spindle angle [rad]; with regeneration it must not fall.
-            speed: true spindle speed [rad/s], above 0.
-            height: of the edge along the part [m].
-            cross_position: x of the cross feed, out of the part [m].
-            displacement: z of the tool drive, out of the part [m].
-            feed_velocity: of the longitudinal feed [m/s].
-            allowance: d [m].
-            force: F [N].
-            deflection: σ·c·w of the edge, out of the part [m].
-            depth_of_cut: ap [m].
-            feed: f [m/rev].
-            wear: VB [m].
+            **arrays: of shape (n,), by the names of `GIVEN`: true spindle angle [rad], which must not fall with
+                regeneration, true spindle speed [rad/s], above 0, height of the edge along the part [m], x of the cross
+                feed and z of the tool drive, out of the part [m], velocity of the longitudinal feed [m/s], d [m]; and,
+                filled, of `MADE`: F [N], deflection σ·c·w of the edge out of the part [m], ap [m], f [m/rev], VB [m].
 
         Raises:
             LatheError: the spindle stands, or turns back or jumps under regeneration; or the force draws the edge into
                 the part faster than it can cut.
         """
-        reached, reason = cut_along(
-            self.table, angle, speed, height, cross_position, displacement, feed_velocity, allowance, force, deflection,
-            depth_of_cut, feed, wear,
-        )  # fmt: skip
+        made = tuple(arrays[name] for name in MADE)
+        reached, reason = cut_along(self.table, tuple(arrays[name] for name in GIVEN), made)
         if reason != DONE:
-            raise failure(reason, angle[reached], speed[reached], feed[reached])
+            raise failure(reason, *(float(arrays[name][reached]) for name in ("angle", "speed", "feed")))

@@ -1,59 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Main cutting force by the chip (Kienzle), with wear.
+"""Force of the cut and what it does to the edge: material, wear, flank, elasticity.
 
-    Pz = kc1·ap·f0·(f/f0)^{1-mc}·(1 + cw·VB),  f0 = 1 mm
+    Pz = kc1·ap·f0·(f/f0)^{1-mc}·(1 + cw·VB),  f0 = 1 mm                        (Kienzle, with wear)
 
-In SI units the force has to name the feed f0 for which kc1 holds; in mm and N/mm² it is 1 and does not show. Source:
-spec/feed-and-force.md, "Cutting process", from the W4 of paper 004: 233.3 N/mm is f = 0.071 mm/rev in steel.
+In SI units the force has to name the feed f0 for which kc1 holds; in mm and N/mm² it is 1 and does not show. A flank
+that is worn presses on the surface, which damps (process damping). The force bends the edge: W3 of paper 004.
+
+Values are checked where they come from, in the table of the cutting process; `CuttingProcess` checks them again, so
+that they are plain tuples here, which kernels take as they are.
+
+Source: spec/feed-and-force.md, "Cutting process", from the W4 of paper 004: 233.3 N/mm is f = 0.071 mm/rev in steel;
+D. W. Wu, J. Engineering for Industry 111 (1989) 37 (force by the volume that is pressed in); E. Budak, L. T. Tunc, CIRP
+Annals 59 (2010).
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
-from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined
-
-Array = npt.NDArray[np.float64]
+from lathe_rc.transfer import TransferFunction
 
 _REFERENCE_FEED = 1e-3  # f0 [m]
 
 
-@inlined
-def cutting_stiffness(kc1: float, mc: float, cw: float, feed: float, wear: float) -> float:
-    """Pz/ap [N/m]."""
-    return float(kc1 * _REFERENCE_FEED * (feed / _REFERENCE_FEED) ** (1.0 - mc) * (1.0 + cw * wear))
-
-
-@dataclass(frozen=True)
-class SpecificForce:
-    """The material's part in the cutting force.
+class SpecificForce(NamedTuple):
+    """Effect of the material on the cutting force.
 
     Attributes:
         kc1: specific force at a feed of 1 mm [Pa].
         mc: exponent of its fall with the feed [1].
         wear_factor: cw, relative rise of the force with the wear VB [1/m].
-
-    Raises:
-        InputError: a value that is out of its range.
     """
 
     kc1: float = 1.7e9
     mc: float = 0.25
     wear_factor: float = 0.0
 
-    def __post_init__(self) -> None:
-        if not 0.0 < self.kc1 < np.inf:
-            raise InputError(f"specific cutting force {self.kc1:g} Pa; allowed: above 0 (1700 N/mm² is 1.7e9 Pa)")
-        if not 0.0 <= self.mc < 1.0:
-            raise InputError(f"exponent mc = {self.mc:g} of the specific cutting force; allowed: 0 up to below 1")
-        if not 0.0 <= self.wear_factor < np.inf:
-            raise InputError(f"wear factor {self.wear_factor:g} 1/m of the cutting force; allowed: 0 or more")
-
     def stiffness(self, feed: float, wear: float = 0.0) -> float:
         """Pz/ap [N/m] at ``feed`` [m/rev] and the wear VB ``wear`` [m]."""
-        return cutting_stiffness(self.kc1, self.mc, self.wear_factor, feed, wear)
+        return cutting_stiffness(self, feed, wear)
 
     def feed_for(self, stiffness: float, wear: float = 0.0) -> float:
         """The feed [m/rev] at which Pz/ap is ``stiffness`` [N/m]."""
@@ -62,3 +46,76 @@ class SpecificForce:
 
 
 STEEL = SpecificForce()
+
+
+@inlined
+def cutting_stiffness(material: SpecificForce, feed: float, wear: float) -> float:
+    """Pz/ap [N/m]."""
+    relative = (feed / _REFERENCE_FEED) ** (1.0 - material.mc)
+    return float(material.kc1 * _REFERENCE_FEED * relative * (1.0 + material.wear_factor * wear))
+
+
+class Wear(NamedTuple):
+    """Wear VB of the tool; it grows while there is a chip.
+
+    Attributes:
+        initial: [m].
+        per_metre: for each metre of the cutting path [m/m].
+        per_second: for each second in the cut [m/s].
+    """
+
+    initial: float = 0.0
+    per_metre: float = 0.0
+    per_second: float = 0.0
+
+
+class Flank(NamedTuple):
+    """The flank that presses on the surface: process damping.
+
+    Attributes:
+        pressure: Ksp, force by the volume that is pressed in [N/m³]; 0: no process damping.
+        width: B, of the flank along the edge that faces the surface [m].
+        land: W of a new edge, to which the wear VB is added [m].
+    """
+
+    pressure: float = 0.0
+    width: float = 0.2e-3
+    land: float = 0.0
+
+
+@inlined
+def flank_damping(flank: Flank, speed: float, wear: float) -> float:
+    """Force on the edge by its speed out of the part [N·s/m], at a cutting speed [m/s] and a wear VB [m]."""
+    land = flank.land + wear
+    return flank.pressure * flank.width * land * land / (2.0 * speed)
+
+
+class Elasticity(NamedTuple):
+    """W3 = c/(1 + b·p + a·p²): deflection of the edge by the force.
+
+    Attributes:
+        compliance: c [m/N].
+        inertia: a [s²]; 0 with b = 0 for a spring alone.
+        damping: b [s].
+        away: the force pushes the edge away from the part; False draws it into the part.
+    """
+
+    compliance: float
+    inertia: float
+    damping: float
+    away: bool
+
+    @property
+    def shape(self) -> TransferFunction:
+        """W3/c."""
+        return TransferFunction((1.0,), (self.inertia, self.damping, 1.0))
+
+    @property
+    def transfer(self) -> TransferFunction:
+        """W3 [m/N]."""
+        return TransferFunction((self.compliance,), (self.inertia, self.damping, 1.0))
+
+
+RIGID = Elasticity(0.0, 0.0, 0.0, away=True)
+PAPER = Elasticity(3.85e-7, 0.003, 0.0005, away=False)  #: as printed in paper 004: 2.9 Hz, ζ = 0.005
+REALISTIC = Elasticity(3.85e-7, 0.003**2, 0.0005, away=True)  #: 53 Hz, ζ = 0.083

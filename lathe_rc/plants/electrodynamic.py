@@ -13,9 +13,22 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.arrays import put
-from lathe_rc.jit import kernel
-from lathe_rc.plants.end_stops import between_stops
+from lathe_rc.jit import inlined, kernel
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
+
+
+@inlined
+def between_stops(position: float, velocity: float, stroke: float) -> tuple[float, float]:
+    """Position [m] and velocity [m/s] between end stops at ± ``stroke`` [m].
+
+    They are inelastic: the carriage stays there until it is driven back.
+    """
+    if position > stroke:
+        return stroke, min(velocity, 0.0)
+    if position < -stroke:
+        return -stroke, max(velocity, 0.0)
+    return position, velocity
+
 
 Array = npt.NDArray[np.float64]
 
@@ -30,7 +43,6 @@ class CoarseTable(NamedTuple):
         stroke: [m].
         state: position and velocity.
         line: the commands before the next block that are still on their way, the oldest first.
-        stopped: samples at an end stop so far, shape (1,).
     """
 
     transition: Array
@@ -42,7 +54,6 @@ class CoarseTable(NamedTuple):
     stroke: float
     state: Array
     line: Array
-    stopped: npt.NDArray[np.int64]
 
 
 @kernel
@@ -54,21 +65,18 @@ def advance(drive: CoarseTable, command: Array, position: Array, velocity: Array
     a00, a01, a10, a11 = a[0, 0], a[0, 1], a[1, 0], a[1, 1]
     w00, w01, w02, w10, w11, w12 = w[0, 0], w[0, 1], w[0, 2], w[1, 0], w[1, 1], w[1, 2]
     x, v = state[0], state[1]
-    stopped = 0
     sent = np.concatenate((line, command))
     for k in range(command.size):
         u0, u1, u2 = sent[k + 2], sent[k + 1], sent[k]
         new_x = a00 * x + a01 * v + w00 * u0 + w01 * u1 + w02 * u2
         new_v = a10 * x + a11 * v + w10 * u0 + w11 * u1 + w12 * u2
         x, v = new_x, new_v
-        x, v, stops = between_stops(x, v, stroke)
-        stopped += stops
+        x, v = between_stops(x, v, stroke)
         delayed = (1.0 - part) * u0 + part * u1
         position[k], velocity[k] = x, v
         current[k] = (spring * (delayed - x) - damper * v) * force_per_current
     state[0], state[1] = x, v
     put(line, sent[command.size :])
-    drive.stopped[0] += stopped
 
 
 class ElectrodynamicDrive:
@@ -113,13 +121,7 @@ class ElectrodynamicDrive:
             stroke=stroke,
             state=np.zeros(2),
             line=np.zeros(self.plant.delay + 2),
-            stopped=np.zeros(1, np.int64),
         )
-
-    @property
-    def stopped(self) -> int:
-        """Samples spent at an end stop so far."""
-        return int(self.table.stopped[0])
 
     def block(self, command: Array, position: Array, velocity: Array, current: Array) -> None:
         """Step through a block; arrays of shape (n,) [m, m, m/s, A]. At rest at 0 before the first."""

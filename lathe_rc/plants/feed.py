@@ -4,7 +4,7 @@
     command → sampling → ± limit, held → model with a limited speed → screw → backlash → slide
                                            ↑ friction
 
-Limits of the command are in `lathe_rc.plants.feed_limits`, friction in `lathe_rc.plants.friction`, errors of the screw
+Limits of the command are in `lathe_rc.plants.feed`, friction in `lathe_rc.plants.friction`, errors of the screw
 in `lathe_rc.plants.screw`.
 
 The command is in the unit of the model (`lathe_rc.plants.feed_models`): [m] where it is a wanted position, [V], or a
@@ -14,6 +14,16 @@ equation is exact. The position of a sample does not depend on the command of th
 The states are the position of the motor and its derivatives, so that a limit of the speed can hold them: a motor that
 would go beyond its greatest speed stays at it without acceleration, as if its command were no larger than what that
 speed needs. Nothing is left to unwind when the command falls.
+
+Limits of the command are those of the motion that it asks for. What the command u asks for is where the model settles:
+of a model that integrates the speed k·u, of any other the position k·u, with its gain k.
+
+    position  |k·u| ≤ stroke, |k·du/dt| ≤ velocity, |k·d²u/dt²| ≤ acceleration, |k·d³u/dt³| ≤ jerk
+    speed     |x∞| ≤ stroke, |k·u| ≤ velocity, |k·du/dt| ≤ acceleration, |k·d²u/dt²| ≤ jerk
+
+x∞ is where the motor would come to rest if the command were 0 from now on: with the denominator p·(a1 + a2·p + …) the
+motor's position x + (a2·dx/dt + a3·d²x/dt² + …)/a1, which moves with k·u. How they are kept is in
+`lathe_rc.control.limits`.
 """
 
 from typing import Literal, NamedTuple
@@ -21,12 +31,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.control.limits import CommandLimits, rest
+from lathe_rc.control.limits import CommandLimits, keep_position, keep_velocity, rest
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.placed import sized
-from lathe_rc.plants.backlash import follow
-from lathe_rc.plants.feed_limits import LimitTable, keep_within, limit_table
 from lathe_rc.plants.feed_models import realise, settles
 from lathe_rc.plants.friction import LUGRE, NONE, STRIBECK, Friction, FrictionTable, bend, no_friction, slide
 from lathe_rc.plants.linear import discretise
@@ -36,6 +44,62 @@ from lathe_rc.transfer import TransferFunction
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
+
+
+@kernel
+def follow(load: float, half: float, motor: float) -> float:
+    """Where the load is once the motor has moved straight to ``motor``.
+
+    Args:
+        load: where it was, within ``half`` of where the motor was [m].
+        half: half the width of the gap [m].
+        motor: where the motor is now [m].
+    """
+    return min(max(load, motor - half), motor + half)
+
+
+class LimitTable(NamedTuple):
+    """Limits of a drive's command for kernels, as `lathe_rc.control.limits` has them; all in the command's unit.
+
+    Attributes:
+        limits: of the position or the velocity that the command is.
+        step: from one taken command to the next [s].
+        coming: of a velocity: weights of the states in x∞, shape (m,); of a position: empty.
+    """
+
+    limits: CommandLimits
+    step: float
+    coming: Array
+
+
+@inlined
+def keep_within(limits: LimitTable, memory: Array, state: Array, command: float) -> bool:
+    """Keep a command within its limits; ``state`` is the drive's. The first of ``memory`` is what is given."""
+    if limits.coming.size == 0:
+        return keep_position(limits.limits, limits.step, memory, command)
+    coming = 0.0
+    for row in range(limits.coming.size):
+        coming += limits.coming[row] * state[row]
+    return keep_velocity(limits.limits, limits.step, memory, coming, command)
+
+
+def limit_table(model: TransferFunction, limits: CommandLimits, command_limit: float, step: float) -> LimitTable:
+    """The limits of a drive's command, taken every ``step`` [s]."""
+    gain, integrates = settles(model)
+    if limits.any and not gain:
+        raise InputError(
+            f"feed drive {model}: its command stands for neither a position nor a speed, so that there is no limit of "
+            "stroke, velocity, acceleration or jerk for it; allowed: a gain, and one pole at 0 at most"
+        )
+    gain = gain or 1.0
+    scaled = CommandLimits(*(limit / gain for limit in limits))
+    if integrates:
+        bottom = np.trim_zeros(np.array(model.denominator), "f")
+        coming = bottom[-2::-1] / (bottom[-2] * gain) if limits.any else np.empty(0)
+        return LimitTable(scaled._replace(velocity=min(scaled.velocity, command_limit)), step, coming)
+    return LimitTable(scaled._replace(stroke=min(scaled.stroke, command_limit)), step, np.empty(0))
+
+
 Feedback = Literal["motor", "load"]
 
 # Places in a drive's state, from the end; before them the motor's position, speed, … and room for their next values.

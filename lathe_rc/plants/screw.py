@@ -12,7 +12,6 @@ Within a step ΔT is exact for a speed that does not change in it. Source: ISO 2
 error) and ISO 230-3 (thermal effects) name the errors; the law of warming is that of a body of one temperature.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,34 +22,7 @@ from lathe_rc.jit import inlined
 _TURN = 2.0 * np.pi
 
 
-class ScrewTable(NamedTuple):
-    """A `Screw` for kernels.
-
-    Attributes:
-        real: whether it has an error at all.
-        slope, amplitude, phase, expansion, heating, surroundings, anchor: see `Screw`.
-        wave: 2π/P [rad/m].
-        offset: sin ψ.
-        time: T [s].
-        nears: part of what is missing that ΔT makes up in a step.
-    """
-
-    real: bool
-    slope: float
-    amplitude: float
-    wave: float
-    phase: float
-    offset: float
-    expansion: float
-    heating: float
-    surroundings: float
-    anchor: float
-    time: float
-    nears: float
-
-
-@dataclass(frozen=True)
-class Screw:
+class Screw(NamedTuple):
     """Errors of a screw.
 
     Attributes:
@@ -63,9 +35,6 @@ class Screw:
         surroundings: A, rise of the temperature at rest in the end [K].
         time: T [s].
         anchor: x0, where the bearing stands that holds the screw [m].
-
-    Raises:
-        InputError: a value that is out of its range, or a wave so steep that the nut would go back.
     """
 
     slope: float = 0.0
@@ -78,7 +47,12 @@ class Screw:
     time: float = 1800.0
     anchor: float = 0.0
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Refuse what is no screw.
+
+        Raises:
+            InputError: a value that is out of its range, or a wave so steep that the nut would go back.
+        """
         for name, value in (("lead", self.lead), ("time", self.time)):
             if not 0.0 < value < np.inf:
                 raise InputError(f"screw: {name} = {value:g}; allowed: above 0")
@@ -89,46 +63,56 @@ class Screw:
                 "allowed: one that leaves the nut going on with the motor"
             )
 
-    @property
-    def real(self) -> bool:
-        """Whether it has an error at all."""
-        return bool(self.slope or self.amplitude or self.heating or self.surroundings)
-
-    def table(self, step: float) -> ScrewTable:
-        """For kernels, at a sampling step [s]."""
+    def table(self, step: float) -> "ScrewTable":
+        """For kernels, at a sampling step [s]; raises as `check`."""
+        self.check()
         return ScrewTable(
-            real=self.real,
-            slope=self.slope,
-            amplitude=self.amplitude,
+            self,
+            real=bool(self.slope or self.amplitude or self.heating or self.surroundings),
             wave=_TURN / self.lead,
-            phase=self.phase,
             offset=float(np.sin(self.phase)),
-            expansion=self.expansion,
-            heating=self.heating,
-            surroundings=self.surroundings,
-            anchor=self.anchor,
-            time=self.time,
             nears=float(-np.expm1(-step / self.time)),
         )
+
+
+class ScrewTable(NamedTuple):
+    """A `Screw` for kernels.
+
+    Attributes:
+        errors: of the screw.
+        real: whether it has an error at all.
+        wave: 2π/P [rad/m].
+        offset: sin ψ.
+        nears: part of what is missing that ΔT makes up in a step.
+    """
+
+    errors: Screw
+    real: bool
+    wave: float
+    offset: float
+    nears: float
 
 
 @inlined
 def warm(table: ScrewTable, rise: float, speed: float) -> float:
     """ΔT at the end of a step [K]."""
-    return rise + table.nears * (table.heating * abs(speed) + table.surroundings - rise)
+    errors = table.errors
+    return rise + table.nears * (errors.heating * abs(speed) + errors.surroundings - rise)
 
 
 @inlined
 def nut(table: ScrewTable, rise: float, place: float) -> float:
     """Where the nut is [m] when the motor is at ``place`` [m]; ``rise`` is ΔT [K]."""
-    wave = table.amplitude * (np.sin(table.wave * place + table.phase) - table.offset)
-    return float(place + table.slope * place + wave + table.expansion * rise * (place - table.anchor))
+    errors = table.errors
+    wave = errors.amplitude * (np.sin(table.wave * place + errors.phase) - table.offset)
+    return float(place + errors.slope * place + wave + errors.expansion * rise * (place - errors.anchor))
 
 
 @inlined
 def nut_speed(table: ScrewTable, rise: float, place: float, speed: float) -> float:
     """Speed of the nut [m/s]."""
-    pitch = table.slope + table.amplitude * table.wave * np.cos(table.wave * place + table.phase)
-    rising = (table.heating * abs(speed) + table.surroundings - rise) / table.time
-    growth = table.expansion * (rise * speed + rising * (place - table.anchor))
+    errors = table.errors
+    pitch = errors.slope + errors.amplitude * table.wave * np.cos(table.wave * place + errors.phase)
+    rising = (errors.heating * abs(speed) + errors.surroundings - rise) / errors.time
+    growth = errors.expansion * (rise * speed + rising * (place - errors.anchor))
     return float(speed + pitch * speed + growth)

@@ -41,24 +41,18 @@ import numpy.typing as npt
 from lathe_rc.errors import InputError
 from lathe_rc.plants.chip import DONE
 from lathe_rc.plants.coil import Coil, coil_table
-from lathe_rc.plants.cutting import CuttingProcess
+from lathe_rc.plants.cutting import MADE, CuttingProcess
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
 from lathe_rc.plants.piezo import Stack, StackTable
-from lathe_rc.plants.tool_motion import SATURATED, STOPPED, MotionTable, Weights, advance_loaded, failure
+from lathe_rc.plants.tool_motion import GIVEN, MotionTable, Weights, advance_loaded, failure
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
 _CARRIAGE, _TOOL = 0, 2  # places of the positions in the state: x1, x1', x2, x2'
 
-# What a block takes and makes, in the order of the kernel.
-_GIVEN = (
-    "command", "set_point", "noise", "met", "angle", "speed", "height", "cross_position", "feed_velocity", "allowance",
-)  # fmt: skip
-_MADE = (
-    "position", "velocity", "current", "measured", "extension", "extension_velocity", "voltage",
-    "force", "deflection", "depth_of_cut", "feed", "wear",
-)  # fmt: skip
+# The motion that a block makes, in the order of the kernel.
+_MOTION = ("position", "velocity", "current", "measured", "extension", "extension_velocity", "voltage")
 
 
 @dataclass(frozen=True)
@@ -67,7 +61,7 @@ class Piezo:
 
     Attributes:
         stack: amplifier and ceramics; the drive takes over its state.
-        tool_frequency, tool_damping: ω2 [rad/s], ζ2 [1] of the tool on a blocked carriage.
+        natural_frequency, damping: ω2 [rad/s], ζ2 [1] of the tool on a blocked carriage.
         mass_ratio: r.
         full_voltage: voltage at the full stroke [V].
         feedback: direct compensation: the measured position of the carriage is taken off the piezo's set point, in the
@@ -76,8 +70,8 @@ class Piezo:
     """
 
     stack: Stack
-    tool_frequency: float
-    tool_damping: float
+    natural_frequency: float
+    damping: float
     mass_ratio: float
     full_voltage: float
     feedback: bool = False
@@ -123,9 +117,9 @@ class ToolDrive:
     """The drives that carry the tool.
 
     Args:
-        carriage_frequency, carriage_damping: ω1 [rad/s], ζ1 [1] of the position loop.
+        natural_frequency, damping: ω1 [rad/s], ζ1 [1] of the position loop.
         delay: τ of the command [s].
-        carriage_stroke: end stops at ± this displacement [m].
+        stroke: end stops at ± this displacement [m].
         moving_mass: m or M [kg].
         force_constant: k of the coil [N/A].
         radial: ρ, the part of the main cutting force that acts along the drives; 0 for none.
@@ -147,10 +141,10 @@ class ToolDrive:
     def __init__(
         self,
         *,
-        carriage_frequency: float,
-        carriage_damping: float,
+        natural_frequency: float,
+        damping: float,
         delay: float,
-        carriage_stroke: float,
+        stroke: float,
         moving_mass: float,
         force_constant: float,
         radial: float = 0.0,
@@ -161,7 +155,7 @@ class ToolDrive:
         method: Discretisation,
         kept: int = 1,
     ) -> None:
-        alone, _ = second_order(carriage_frequency, carriage_damping)
+        alone, _ = second_order(natural_frequency, damping)
         spring, damper = float(-alone[1, 0]), float(-alone[1, 1])
         masses = 2 if piezo else 1
         order = 2 * masses + (coil is not None)
@@ -172,7 +166,7 @@ class ToolDrive:
         tool, mass_of_tool = _CARRIAGE, moving_mass
         if piezo:
             tool, mass_of_tool = _TOOL, piezo.mass_ratio * moving_mass
-            stiff, loss = piezo.tool_frequency**2, 2.0 * piezo.tool_damping * piezo.tool_frequency
+            stiff, loss = piezo.natural_frequency**2, 2.0 * piezo.damping * piezo.natural_frequency
             q = np.array([stiff, loss, -stiff, -loss])
             free[1], free[3] = -piezo.mass_ratio * q, q
             extends[1], extends[3] = -piezo.mass_ratio * stiff, stiff
@@ -207,7 +201,7 @@ class ToolDrive:
             spring=spring,
             damper=damper,
             force_per_current=moving_mass / force_constant,
-            carriage_stroke=carriage_stroke,
+            carriage_stroke=stroke,
             stack=stack.table,
             memory=stack.state,
             full_voltage=piezo.full_voltage if piezo else 0.0,
@@ -222,7 +216,6 @@ class ToolDrive:
             before=np.zeros(2),
             reading=np.zeros(1),
             line=np.zeros(self._coarse.delay + 3),
-            counts=np.zeros(2, np.int64),
         )
         if coil:
             self._check(coil)
@@ -249,12 +242,14 @@ class ToolDrive:
             LatheError: drives and cut cannot go on, see `failure`.
         """
         none = np.zeros_like(given["command"])
-        taken = [given.get(name, none) for name in _GIVEN]
-        made = {name: np.zeros_like(none) for name in _MADE}
-        reached, reason = advance_loaded(self.table, cut.table, first, *taken, *made.values())
+        taken = tuple(given.get(name, none) for name in GIVEN)
+        motion, of_cut = ({name: np.zeros_like(none) for name in names} for names in (_MOTION, MADE))
+        reached, reason = advance_loaded(
+            self.table, cut.table, first, taken, tuple(motion.values()), tuple(of_cut.values())
+        )
         if reason != DONE:
-            raise failure(reason, given["angle"][reached], given["speed"][reached], made["feed"][reached])
-        return made
+            raise failure(reason, given["angle"][reached], given["speed"][reached], of_cut["feed"][reached])
+        return motion | of_cut
 
     def _check(self, coil: Coil) -> None:
         radius = float(np.abs(np.linalg.eigvals(self._closed()[0])).max())
@@ -263,16 +258,6 @@ class ToolDrive:
                 f"current loop of {coil.bandwidth:g} rad/s at a step of {self.step:.4g} s: largest pole {radius:.4g}; "
                 "allowed: below 1 (less bandwidth or a higher sample rate; above the drive's own frequency)"
             )
-
-    @property
-    def stopped(self) -> int:
-        """Samples so far that the carriage spent at an end stop."""
-        return int(self.table.counts[STOPPED])
-
-    @property
-    def saturated(self) -> int:
-        """Samples so far in which the piezo's set point or voltage was cut off."""
-        return int(self.table.counts[SATURATED])
 
     def _closed(self) -> tuple[Array, Array]:
         """Transition of state and current loop's integral without limits, and the weight of the wanted position."""

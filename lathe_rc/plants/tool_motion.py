@@ -14,8 +14,6 @@ from lathe_rc.errors import LatheError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.placed import sized
 from lathe_rc.plants.chip import (
-    APART,
-    BACKWARDS,
     DONE,
     DRAWN_IN,
     WEAR,
@@ -28,7 +26,7 @@ from lathe_rc.plants.chip import (
 )
 from lathe_rc.plants.chip import failure as failure_of_cut
 from lathe_rc.plants.coil import CoilTable, applied
-from lathe_rc.plants.end_stops import between_stops
+from lathe_rc.plants.electrodynamic import between_stops
 from lathe_rc.plants.piezo import VOLTAGE, StackTable, extend
 from lathe_rc.signals.noise import quantise
 
@@ -37,7 +35,6 @@ Array = npt.NDArray[np.float64]
 _ROUNDS = 32  # at most, to find the carriage's position and the extension of the same sample
 _TURN = 2.0 * np.pi
 _TORN_OFF = DRAWN_IN + 1  # why the kernel stopped, beside the reasons of the cut
-STOPPED, SATURATED = 0, 1  #: what is counted
 
 
 @sized
@@ -77,7 +74,6 @@ class MotionTable(NamedTuple):
         before: e [m] and radial force [N] of the last sample.
         reading: of the carriage's sensor in the last sample [m], shape (1,).
         line: a ring of past commands: sample n stands at n modulo its length.
-        counts: samples at an end stop, and in which the piezo saturated.
     """
 
     series: bool
@@ -103,7 +99,6 @@ class MotionTable(NamedTuple):
     before: Array
     reading: Array
     line: Array
-    counts: npt.NDArray[np.int64]
 
 
 @inlined
@@ -179,11 +174,10 @@ def _solve(
 
     The extension then needs the carriage's position of this sample and moves it by a thousandth of itself.
     """
-    memory, e, cuts, chip = drive.memory, 0.0, False, 0.0
+    memory, e, chip = drive.memory, 0.0, 0.0
     if not drive.feedback:
         if drive.series:
-            e, cuts = extend(drive.stack, memory, set_point)
-            drive.counts[SATURATED] += cuts
+            e, _ = extend(drive.stack, memory, set_point)
         if cut is not None:
             chip = _chip(drive, cut, free, e, here, stiffness, c)
         return e, chip
@@ -192,7 +186,7 @@ def _solve(
         guess = x1
         drive.reading[0] = quantise(guess + noise, drive.resolution)
         put(trial, memory)
-        e, cuts = extend(drive.stack, trial, set_point - drive.reading[0])
+        e, _ = extend(drive.stack, trial, set_point - drive.reading[0])
         force = 0.0
         if cut is not None:
             chip = _chip(drive, cut, free, e, here, stiffness, c)
@@ -201,7 +195,6 @@ def _solve(
         if x1 == guess:
             break
     put(memory, trial)
-    drive.counts[SATURATED] += cuts
     return e, chip
 
 
@@ -212,8 +205,7 @@ def _settle(drive: MotionTable, free: Array, e: float, pushes: float, noise: flo
     for i in range(fine.shape[0]):
         state[i] = free[i] + fine[i, 0] * e + load[i, 0] * pushes
     drive.before[0], drive.before[1] = e, pushes
-    state[0], state[1], stops = between_stops(state[0], state[1], drive.carriage_stroke)  # the tool swings on
-    drive.counts[STOPPED] += stops
+    state[0], state[1] = between_stops(state[0], state[1], drive.carriage_stroke)  # the tool swings on
     if not drive.feedback:
         drive.reading[0] = quantise(state[0] + noise, drive.resolution)
 
@@ -233,18 +225,7 @@ def _motion(drive: MotionTable, delayed: float) -> tuple[float, float, float, fl
 
 @kernel
 def advance(
-    drive: MotionTable,
-    first: int,
-    command: Array,
-    set_point: Array,
-    noise: Array,
-    carriage: Array,
-    carriage_velocity: Array,
-    current: Array,
-    measured: Array,
-    extension: Array,
-    extension_velocity: Array,
-    voltage: Array,
+    drive: MotionTable, first: int, command: Array, set_point: Array, noise: Array, motion: tuple[Array, ...]
 ) -> None:
     """Step drives in air through a block.
 
@@ -254,22 +235,24 @@ def advance(
         command: set point of the carriage [m], shape (n,) as all that follow.
         set_point: of the piezo, without what the feedback takes off [m].
         noise: of the carriage's position sensor [m].
-        carriage: filled, as all that follow: true position [m].
-        carriage_velocity: [m/s].
-        current: of the coil [A].
-        measured: position of the carriage as its sensor reads it [m].
-        extension: of the piezo, the tool against the carriage [m].
-        extension_velocity: [m/s].
-        voltage: at the piezo [V].
+        motion: filled: true position [m] and velocity [m/s] of the carriage, current of the coil [A], position as the
+            carriage's sensor reads it [m]; extension of the piezo, the tool against the carriage [m], its velocity
+            [m/s], voltage at the piezo [V].
     """
+    position, velocity, current, measured, extension, rate, voltage = motion
     free, trial, nowhere = np.empty(drive.state.size), np.empty(drive.memory.size), (0.0, 0.0, 0.0, 0.0, 0.0)
     for k in range(command.size):
         delayed = _begin(drive, first + k, command[k], free)
         e, _ = _solve(drive, None, free, trial, set_point[k], noise[k], nowhere, 0.0, 0.0)
         _settle(drive, free, e, 0.0, noise[k])
-        (
-            carriage[k], carriage_velocity[k], current[k], measured[k], extension[k], extension_velocity[k], voltage[k]
-        ) = _motion(drive, delayed)  # fmt: skip
+        now = _motion(drive, delayed)
+        position[k], velocity[k], current[k], measured[k], extension[k], rate[k], voltage[k] = now
+
+
+#: arrays of a block that `advance_loaded` takes, in its order
+GIVEN = (
+    "command", "set_point", "noise", "met", "angle", "speed", "height", "cross_position", "feed_velocity", "allowance",
+)  # fmt: skip
 
 
 @kernel
@@ -277,34 +260,26 @@ def advance_loaded(
     drive: MotionTable,
     cut: CutTable,
     first: int,
-    command: Array,
-    set_point: Array,
-    noise: Array,
-    met: Array,
-    angle: Array,
-    speed: Array,
-    height: Array,
-    cross_position: Array,
-    feed_velocity: Array,
-    allowance: Array,
-    carriage: Array,
-    carriage_velocity: Array,
-    current: Array,
-    measured: Array,
-    extension: Array,
-    extension_velocity: Array,
-    voltage: Array,
-    force: Array,
-    deflection: Array,
-    depth_of_cut: Array,
-    feed: Array,
-    wear: Array,
+    given: tuple[Array, ...],
+    motion: tuple[Array, ...],
+    of_cut: tuple[Array, ...],
 ) -> tuple[int, int]:
     """Step drives and cut through a block, see `lathe_rc.plants.tool_drive.ToolDrive.block`.
+
+    Args:
+        drive: see `advance`.
+        cut: what the tool cuts; its state goes on.
+        first: index of the first sample.
+        given: see `GIVEN`.
+        motion: filled, see `advance`.
+        of_cut: filled, see `lathe_rc.plants.cutting.MADE`.
 
     Returns:
         The sample where it stopped, and why.
     """
+    command, set_point, noise, met, angle, speed, height, cross_position, feed_velocity, allowance = given
+    position, velocity, current, measured, extension, rate, voltage = motion
+    force, deflection, depth_of_cut, feed, wear = of_cut
     per_radian = cut.process.grid / _TURN
     free, trial = np.empty(drive.state.size), np.empty(drive.memory.size)
     for k in range(command.size):
@@ -318,18 +293,15 @@ def advance_loaded(
         e, chip = _solve(drive, cut, free, trial, set_point[k], noise[k], here, stiffness, c)
         if np.isnan(chip):
             return k, DRAWN_IN
-        cut.counts[BACKWARDS] += feed_velocity[k] < 0.0
-        cut.counts[APART] += chip < 0.0
         depth_of_cut[k] = chip = max(chip, 0.0)
         force[k], deflection[k] = press(cut, chip, stiffness, c, speed[k], 0.0, 0.0)
         _settle(drive, free, e, drive.radial * force[k], noise[k])
-        (
-            carriage[k], carriage_velocity[k], current[k], measured[k], extension[k], extension_velocity[k], voltage[k]
-        ) = _motion(drive, delayed)  # fmt: skip
-        moved = carriage[k]
+        now = _motion(drive, delayed)
+        position[k], velocity[k], current[k], measured[k], extension[k], rate[k], voltage[k] = now
+        moved = position[k]
         if drive.series:
             moved += extension[k]
-            if drive.stiff * (e - extension[k]) - drive.loss * extension_velocity[k] > drive.tension:
+            if drive.stiff * (e - extension[k]) - drive.loss * rate[k] > drive.tension:
                 return k, _TORN_OFF
         leave(cut, place, chip, cross_position[k] + (moved - met[k]) + deflection[k])
     return command.size, DONE

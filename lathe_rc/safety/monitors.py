@@ -4,22 +4,13 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import code_of_others
-from lathe_rc.safety.rules import (
-    GROWTH,
-    INDEX,
-    RATE,
-    SUMS,
-    THRESHOLD,
-    TURN,
-    Array,
-    Watch,
-    clear,
-)
+from lathe_rc.safety.rules import GROWTH, INDEX, RATE, SUMS, THRESHOLD, TURN, Array, Watch, clear
 from lathe_rc.safety.state_machine import Reaction
 
 _LONGEST_NAME = 64  # of a monitor [B], as SafetyStatus.msg says
@@ -39,165 +30,131 @@ class Alarm:
     value: float
 
 
+@dataclass(eq=False)
 class Watcher:
     """Watches signals; raises one alarm, and no other before it is reset.
 
-    Args:
+    Attributes:
         name: of the monitor.
         subject: what it watches.
         limit: threshold.
         reaction: what it asks for.
-
-    Attributes:
-        name, subject, limit, reaction: as given.
     """
 
-    def __init__(self, name: str, subject: str, limit: float, reaction: Reaction) -> None:
-        self.name, self.subject, self.limit, self.reaction = name, subject, limit, reaction
+    name: str
+    subject: str
+    limit: float
+    reaction: Reaction
 
     def reset(self) -> None:
         """Watch as from the first sample."""
 
 
+@dataclass(eq=False, kw_only=True)
 class Monitor(Watcher):
     """Watches by one of the `rules`.
 
-    Args:
-        name, subject, limit, reaction: see `Watcher`.
+    Attributes:
         rule: which.
         signal: place of the input and field.
         other: the same of a second signal; None: there is none.
         memory: what the rule knows, its limits among it; its `Lookout` has it from then on.
-
-    Attributes:
-        rule, signal, other, memory: as given.
     """
 
-    def __init__(
-        self,
-        name: str,
-        subject: str,
-        limit: float,
-        reaction: Reaction,
-        *,
-        rule: int,
-        signal: tuple[int, str],
-        other: tuple[int, str] | None = None,
-        memory: Sequence[float] | Array,
-    ) -> None:
-        super().__init__(name, subject, limit, reaction)
-        self.rule, self.signal, self.other = rule, signal, other
-        self.memory = np.array(memory, np.float64)
+    rule: ClassVar[int]
+    signal: tuple[int, str]
+    other: tuple[int, str] | None = None
+
+    def __post_init__(self) -> None:
+        self.memory: Array = np.array(self.start(), np.float64)
+
+    @abstractmethod
+    def start(self) -> Sequence[float] | Array:
+        """The memory before the first sample."""
 
     def told(self, value: float) -> float:
         """The alarm's text for the rule's finding, in the unit of the limit."""
         return value
 
+    def reset(self) -> None:
+        """See `Watcher`."""
+        self.memory[:] = self.start()
 
+
+@dataclass(eq=False, kw_only=True)
 class Threshold(Monitor):
     """|signal - other - offset| beyond the limit for some samples in a row.
 
-    Args:
-        name, subject, limit, reaction: see `Watcher`.
-        signal: place of the input and field.
-        other: the same of what is subtracted; None: nothing.
+    Attributes:
         offset: subtracted as well.
         samples: how many; 1: at once.
         after: revolutions of the encoder, the first input, until it watches.
     """
 
-    def __init__(
-        self,
-        name: str,
-        subject: str,
-        limit: float,
-        reaction: Reaction,
-        *,
-        signal: tuple[int, str],
-        other: tuple[int, str] | None = None,
-        offset: float = 0.0,
-        samples: int = 1,
-        after: float = 0.0,
-    ) -> None:
-        memory = (offset, -limit, limit, samples, 0.0, after * TURN, np.nan)
-        super().__init__(name, subject, limit, reaction, rule=THRESHOLD, signal=signal, other=other, memory=memory)
+    rule = THRESHOLD
+    offset: float = 0.0
+    samples: int = 1
+    after: float = 0.0
+
+    def start(self) -> Sequence[float]:
+        """See `Monitor`."""
+        return self.offset, -self.limit, self.limit, self.samples, 0.0, self.after * TURN, np.nan
 
     def told(self, value: float) -> float:
         """See `Monitor`."""
-        return abs(value - float(self.memory[0]))
-
-    def reset(self) -> None:
-        """See `Watcher`."""
-        self.memory[4], self.memory[6] = 0.0, np.nan
+        return abs(value - self.offset)
 
 
 class Below(Threshold):
     """A signal below the limit for some samples in a row; nothing is subtracted from it."""
 
-    def __init__(
-        self,
-        name: str,
-        subject: str,
-        limit: float,
-        reaction: Reaction,
-        *,
-        signal: tuple[int, str],
-        samples: int = 1,
-        after: float = 0.0,
-    ) -> None:
-        super().__init__(name, subject, limit, reaction, signal=signal, samples=samples, after=after)
-        self.memory[:3] = 0.0, limit, np.inf
+    def start(self) -> Sequence[float]:
+        """See `Monitor`."""
+        return 0.0, self.limit, np.inf, *super().start()[3:]
 
     def told(self, value: float) -> float:
         """See `Monitor`."""
         return value
 
 
+@dataclass(eq=False, kw_only=True)
 class Rate(Monitor):
-    """How fast a signal changes, over a window of samples.
+    """How fast a signal changes, over a window of samples; the limit is a rate.
 
-    Args:
-        name, subject, limit, reaction: see `Watcher`; the limit is a rate.
-        signal: place of the input and field.
+    Attributes:
         window: over so many samples.
         step: sampling step [s].
         before: the signal before the first sample.
     """
 
-    def __init__(
-        self,
-        name: str,
-        subject: str,
-        limit: float,
-        reaction: Reaction,
-        *,
-        signal: tuple[int, str],
-        window: int,
-        step: float,
-        before: float,
-    ) -> None:
-        self._span = window * step
-        memory = np.concatenate(((limit * self._span, np.nan), np.full(window, before)))
-        super().__init__(name, subject, limit, reaction, rule=RATE, signal=signal, memory=memory)
+    rule = RATE
+    window: int
+    step: float
+    before: float
+
+    def start(self) -> Array:
+        """See `Monitor`."""
+        return np.concatenate(((self.limit * (self.window * self.step), np.nan), np.full(self.window, self.before)))
 
     def told(self, value: float) -> float:
         """See `Monitor`."""
-        return value / self._span
+        return value / (self.window * self.step)
+
+    def reset(self) -> None:
+        """See `Watcher`; the samples before it count on."""
 
 
 class IndexPulses(Monitor):
     """One revolution of the measured angle from index pulse to index pulse, and never backwards."""
 
+    rule = INDEX
+
     def __init__(self, limit: float, reaction: Reaction, *, encoder: int) -> None:
-        signal, memory = (encoder, "angle"), (limit, np.nan, np.nan, 0.0)
-        super().__init__("index_pulses", "encoder", limit, reaction, rule=INDEX, signal=signal, memory=memory)
+        super().__init__("index_pulses", "encoder", limit, reaction, signal=(encoder, "angle"))
 
-    def reset(self) -> None:
-        """See `Watcher`."""
-        self.memory[1:] = np.nan, np.nan, 0.0
-
-
-_UNKNOWN = (-1.0, np.nan, 0.0, np.nan, *[0.0] * SUMS)  # what is known of the growth at first
+    def start(self) -> Sequence[float]:
+        """See `Monitor`."""
+        return self.limit, np.nan, np.nan, 0.0
 
 
 class Growth(Monitor):
@@ -211,20 +168,15 @@ class Growth(Monitor):
         floor: RMS error below which it does not count [m].
     """
 
-    def __init__(self, limit: float, reaction: Reaction, *, tool: int, cycles: int, floor: float) -> None:
-        super().__init__(
-            "error_growth",
-            "tool",
-            limit,
-            reaction,
-            rule=GROWTH,
-            signal=(tool, "measured_error"),
-            memory=(limit, floor, cycles, *_UNKNOWN),
-        )
+    rule = GROWTH
 
-    def reset(self) -> None:
-        """See `Watcher`."""
-        self.memory[3:] = _UNKNOWN
+    def __init__(self, limit: float, reaction: Reaction, *, tool: int, cycles: int, floor: float) -> None:
+        self._cycles, self._floor = cycles, floor
+        super().__init__("error_growth", "tool", limit, reaction, signal=(tool, "measured_error"))
+
+    def start(self) -> Sequence[float]:
+        """See `Monitor`; nothing is known of the growth."""
+        return self.limit, self._floor, self._cycles, -1.0, np.nan, 0.0, np.nan, *[0.0] * SUMS
 
 
 class PlainMonitor(ABC):

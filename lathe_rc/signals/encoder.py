@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spindle encoder: true and measured angle, measured speed, index pulse."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,7 @@ from lathe_rc.signals.encoder_errors import EncoderErrors, ErrorsTable, rate, se
 from lathe_rc.signals.speed import SpeedLaw, evaluate_along
 
 Array = npt.NDArray[np.float64]
+Fields = tuple[npt.NDArray[Any], ...]
 
 _TURN = 2.0 * np.pi
 _PERFECT = EncoderErrors()
@@ -39,18 +40,10 @@ class EncoderTable(NamedTuple):
 
 
 @kernel
-def encode(
-    encoder: EncoderTable,
-    first: int,
-    angle: Array,
-    speed: Array,
-    index_pulse: npt.NDArray[np.uint8],
-    angle_true: Array,
-    speed_true: Array,
-) -> None:
+def encode(encoder: EncoderTable, first: int, samples: Fields) -> None:
     """Fill the samples from index ``first`` on, see `Encoder.block`."""
-    follow_law(encoder, first, angle_true, speed_true)
-    read_off(encoder, first, angle, speed, index_pulse, angle_true, speed_true)
+    follow_law(encoder, first, samples[3], samples[4])
+    read_off(encoder, first, samples)
 
 
 @kernel
@@ -60,16 +53,9 @@ def follow_law(encoder: EncoderTable, first: int, angle_true: Array, speed_true:
 
 
 @kernel
-def read_off(
-    encoder: EncoderTable,
-    first: int,
-    angle: Array,
-    speed: Array,
-    index_pulse: npt.NDArray[np.uint8],
-    angle_true: Array,
-    speed_true: Array,
-) -> None:
-    """Fill what is measured of the true angle and speed."""
+def read_off(encoder: EncoderTable, first: int, samples: Fields) -> None:
+    """Fill what is measured of the true angle and speed, see `Encoder.block`."""
+    angle, speed, index_pulse, angle_true, speed_true = samples
     step, counts, history, revolution = encoder.step, encoder.counts, encoder.history, encoder.revolution
     before = revolution[0]
     if encoder.errors.real:
@@ -128,14 +114,12 @@ class Encoder:
             seen_along(table, history, history)
         self.table = EncoderTable(step, law.nominal, law.lines, law.tachogram, counts, table, history, np.array([-1.0]))
 
-    def block(
-        self,
-        first: int,
-        angle: Array,
-        speed: Array,
-        index_pulse: npt.NDArray[np.uint8],
-        angle_true: Array,
-        speed_true: Array,
-    ) -> None:
-        """Fill the samples from index ``first`` on; arrays of shape (n,) [rad, rad/s, 1, rad, rad/s]."""
-        encode(self.table, first, angle, speed, index_pulse, angle_true, speed_true)
+    def block(self, first: int, *samples: npt.NDArray[Any]) -> None:
+        """Fill the samples from index ``first`` on.
+
+        Args:
+            first: see above.
+            samples: measured angle and speed, index pulse, true angle and speed, shape (n,) each [rad, rad/s, 1, rad,
+                rad/s].
+        """
+        encode(self.table, first, samples)

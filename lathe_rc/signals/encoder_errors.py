@@ -12,7 +12,6 @@ first order. The index mark is on the disc, so the angle is 0 there.
 Source: P. L. M. Heydemann, Applied Optics 20 (1981) 3382 (the ellipse of two signals in quadrature).
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -27,28 +26,7 @@ _TURN = 2.0 * np.pi
 _GREATEST = 0.5  # of the sum of a signal's errors, and of the eccentricity: the angle that is seen still rises
 
 
-class ErrorsTable(NamedTuple):
-    """`EncoderErrors` for kernels.
-
-    Attributes:
-        real: whether there are any.
-        eccentricity, phase, periods, cosine_offset, sine_offset, mismatch, skew: see `EncoderErrors`.
-        zero: what is seen at the angle 0, before it is set to 0 [rad].
-    """
-
-    real: bool
-    eccentricity: float
-    phase: float
-    periods: float
-    cosine_offset: float
-    sine_offset: float
-    mismatch: float
-    skew: float
-    zero: float
-
-
-@dataclass(frozen=True)
-class EncoderErrors:
+class EncoderErrors(NamedTuple):
     """Errors of an encoder's disc and signals.
 
     Attributes:
@@ -58,9 +36,6 @@ class EncoderErrors:
         cosine_offset, sine_offset: p and q, as parts of the amplitude.
         mismatch: g, how much larger the sine is than the cosine, as a part of it.
         skew: a [rad].
-
-    Raises:
-        InputError: no signal period, or errors so large that the angle that is seen could fall.
     """
 
     eccentricity: float = 0.0
@@ -71,7 +46,12 @@ class EncoderErrors:
     mismatch: float = 0.0
     skew: float = 0.0
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Refuse errors of no encoder.
+
+        Raises:
+            InputError: no signal period, or errors so large that the angle that is seen could fall.
+        """
         if not self.periods >= 1:
             raise InputError(f"encoder: {self.periods} signal periods in a revolution; allowed: 1 or more")
         if not abs(self.eccentricity) <= _GREATEST:
@@ -88,26 +68,31 @@ class EncoderErrors:
         return self.cosine_offset, self.sine_offset, self.mismatch, self.skew
 
     @property
-    def table(self) -> ErrorsTable:
-        """For kernels."""
-        table = ErrorsTable(
-            real=bool(self.eccentricity) or any(self._signals),
-            eccentricity=self.eccentricity,
-            phase=self.phase,
-            periods=float(self.periods),
-            cosine_offset=self.cosine_offset,
-            sine_offset=self.sine_offset,
-            mismatch=self.mismatch,
-            skew=self.skew,
-            zero=0.0,
-        )
+    def table(self) -> "ErrorsTable":
+        """For kernels; raises as `check`."""
+        self.check()
+        table = ErrorsTable(self, real=bool(self.eccentricity) or any(self._signals), zero=0.0)
         zero = np.zeros(1)
         seen_along(table, zero, zero)
         return table._replace(zero=float(zero[0]))
 
 
+class ErrorsTable(NamedTuple):
+    """`EncoderErrors` for kernels.
+
+    Attributes:
+        errors: of disc and signals.
+        real: whether there are any.
+        zero: what is seen at the angle 0, before it is set to 0 [rad].
+    """
+
+    errors: EncoderErrors
+    real: bool
+    zero: float
+
+
 @inlined
-def _raw(errors: ErrorsTable, angle: float) -> float:
+def _raw(errors: EncoderErrors, angle: float) -> float:
     """The encoder's angle [rad], before it is set to 0 at the angle 0."""
     turned = angle + errors.eccentricity * np.sin(angle + errors.phase)
     place = errors.periods * turned
@@ -119,14 +104,15 @@ def _raw(errors: ErrorsTable, angle: float) -> float:
 
 
 @inlined
-def seen(errors: ErrorsTable, angle: float) -> float:
+def seen(table: ErrorsTable, angle: float) -> float:
     """The encoder's reading of an angle [rad]."""
-    return _raw(errors, angle) - errors.zero
+    return _raw(table.errors, angle) - table.zero
 
 
 @inlined
-def rate(errors: ErrorsTable, angle: float) -> float:
+def rate(table: ErrorsTable, angle: float) -> float:
     """How fast what is seen rises with the angle."""
+    errors = table.errors
     turned = angle + errors.eccentricity * np.sin(angle + errors.phase)
     place = errors.periods * turned
     x, y = (
@@ -138,7 +124,7 @@ def rate(errors: ErrorsTable, angle: float) -> float:
 
 
 @kernel
-def seen_along(errors: ErrorsTable, angle: Array, found: Array) -> None:
+def seen_along(table: ErrorsTable, angle: Array, found: Array) -> None:
     """The encoder's reading of angles, shape (n,)."""
     for k in range(angle.size):
-        found[k] = seen(errors, angle[k])
+        found[k] = seen(table, angle[k])

@@ -95,3 +95,25 @@ def parse_table(
         for taken, (_, row) in zip(numbers, rows[1:], strict=True):
             taken[0] = float(Decimal(row[0]) - first)
     return header, np.array(numbers).reshape(-1, len(header))
+
+
+def write_table(path: Path, header: str, rows: Array, comment: str = "", *, digits: int = 15) -> None:
+    """Write a CSV file that `read_table` takes, whole or not at all.
+
+    Args:
+        path: of the file; an existing one is replaced.
+        header: names of the columns, with commas between.
+        rows: shape (n, columns).
+        comment: a line at the top; empty: none.
+        digits: significant ones of a number.
+
+    Raises:
+        InputError: a place that cannot be written to.
+    """
+    if comment:
+        header = f"# {' '.join(comment.split())}\n{header}"
+    try:
+        with files.replacing(path) as file:
+            np.savetxt(file, rows, fmt=f"%.{digits}g", delimiter=",", header=header, comments="", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from None

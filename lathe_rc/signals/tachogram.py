@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.errors import InputError
-from lathe_rc.files import replacing
-from lathe_rc.signals.table import read_table
+from lathe_rc.signals.table import read_table, write_table
 
 Array = npt.NDArray[np.float64]
 
@@ -81,13 +80,7 @@ def write(path: Path, time: Array, rpm: Array, comment: str) -> None:
     Raises:
         InputError: a place that cannot be written to.
     """
-    header = f"# {' '.join(comment.split())}\n{','.join(_COLUMNS)}"
-    try:
-        with replacing(path) as file:
-            rows = np.stack((time, rpm), axis=1)
-            np.savetxt(file, rows, fmt="%.15g", delimiter=",", header=header, comments="", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+    write_table(path, ",".join(_COLUMNS), np.stack((time, rpm), axis=1), comment)
 
 
 class Thinner:

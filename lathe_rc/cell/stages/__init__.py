@@ -1,5 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stages of the cell: physics and control laws with their parameters and ports."""
+"""The stages of the cell: physics and control laws with their parameters and ports.
+
+Time and angle: `time_master`, `spindle_encoder` (with `speed_law`), `loaded_spindle`, `encoder_device`.
+Form and tool: `form`, `tool`, `vibration`.
+Tool drives: `drive` and `plant` (common parts), `electrodynamic_actuator`, `piezo_actuator`, `series_drive`, and with
+the cut `loaded_drive`; `cutting_process`.
+Laws of the tool: `law` and `learner` (common parts), `learning_controller` with `learning_parameters` and
+`learning_step`, `form_law` (common part), `disturbance_controller`, `compound_controller`, `resonant_controller`.
+Feed: `feed_drive`, `servo` and `trajectory` (common parts), `position_controller`, `force_controller`, `decoupler`.
+Safety: `supervisor`, `obedience`, `command_limits`. What stages are made of: `tables`, `sampled`.
+"""
 
 from lathe_rc.cell.stage import Stage
 from lathe_rc.extensions import Registry
@@ -22,7 +32,7 @@ _OWN = {
     "loaded_drive": "loaded_drive:LoadedDriveStage",
     "loaded_series_drive": "loaded_drive:LoadedSeriesDrive",
     "vibration": "vibration:Vibration",
-    "profile": "profile:ProfileStage",
+    "profile": "form:ProfileStage",
     "tool": "tool:Tool",
     "feed_drive": "feed_drive:FeedDriveStage",
     "cutting_process": "cutting_process:CuttingProcessStage",

@@ -12,14 +12,13 @@ from lathe_rc.analysis.shaft import STEEL_MODULUS, Shaft, Support
 from lathe_rc.arrays import put, put_scaled, subtract
 from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
+from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.plants.chip import CutTable, failure
 from lathe_rc.plants.cutting import CuttingProcess, cut_along
-from lathe_rc.plants.cutting_force import SpecificForce
-from lathe_rc.plants.deflection import PAPER, REALISTIC, RIGID, Elasticity
-from lathe_rc.plants.flank import Flank, Wear
+from lathe_rc.plants.cutting_force import PAPER, REALISTIC, RIGID, Elasticity, Flank, SpecificForce, Wear
 from lathe_rc.plants.workpiece import HardSpot, Part
 from lathe_rc.safety.faults import Fault
 from lathe_rc.signals.allowance import Allowance, AllowanceTable, allow, mean_reverting, unbounded
@@ -121,15 +120,7 @@ class CuttingProcessParameters(NodeParameters):
         if self.shaft == "none":
             return None
         support: Support = self.shaft
-        return Shaft(
-            self.shaft_length,
-            self.shaft_diameter,
-            support,
-            head=self.shaft_head,
-            tail=self.shaft_tail,
-            carriage=self.shaft_carriage,
-            modulus=self.shaft_modulus,
-        )
+        return made_of(Shaft, self, "shaft_", support=support)
 
     def part(self, node: str, prefix: str = "") -> Part:
         """The part of a node; ``prefix`` begins the parameters where they are part of a table.
@@ -137,27 +128,22 @@ class CuttingProcessParameters(NodeParameters):
         Raises:
             InputError: lists of different lengths, or windows that are none.
         """
-        spots = (
-            self.hard_spot_start,
-            self.hard_spot_width,
-            self.hard_spot_bottom,
-            self.hard_spot_top,
-            self.hard_spot_factor,
-        )
+        names = [f"hard_spot_{what}" for what in ("start", "width", "bottom", "top", "factor")]
+        spots = [getattr(self, name) for name in names]
         if len(self.gap_start) != len(self.gap_width):
             raise InputError(
                 f"{node}.{prefix}gap_start, {prefix}gap_width: {len(self.gap_start)} and {len(self.gap_width)}; give "
                 "as many of each"
             )
         if len({len(values) for values in spots}) > 1:
-            names = ", ".join(f"{prefix}hard_spot_{what}" for what in ("start", "width", "bottom", "top", "factor"))
-            raise InputError(f"{node}.{names}: of lengths {[len(v) for v in spots]}; give as many of each")
+            named = ", ".join(prefix + name for name in names)
+            raise InputError(f"{node}.{named}: of lengths {[len(v) for v in spots]}; give as many of each")
         heights = compliances = None
         shaft = self.flexible()
         if shaft is not None:
             heights = np.linspace(0.0, shaft.length, _HEIGHTS)
             compliances = shaft.compliance(heights)
-        with about(node, *(f"{prefix}hard_spot_{what}" for what in ("start", "width", "bottom", "top"))):
+        with about(node, *(prefix + name for name in names[:-1])):
             hard_spots = [HardSpot(*spot) for spot in zip(*spots, strict=True)]
         with about(node, f"{prefix}gap_start", f"{prefix}gap_width"):
             return Part(
@@ -176,16 +162,15 @@ class CuttingProcessParameters(NodeParameters):
         """The cut of a node, before its first sample; see `part`."""
         part = self.part(node, prefix)
         with about(node, f"{prefix}lag"):
-            return CuttingProcess(
-                material=SpecificForce(self.kc1, self.mc, self.wear_factor),
-                depth=self.depth,
-                lag=self.lag,
+            return made_of(
+                CuttingProcess,
+                self,
+                material=made_of(SpecificForce, self),
                 elasticity=self.deflecting(),
-                wear=Wear(self.wear, self.wear_per_metre, self.wear_per_second),
+                wear=made_of(Wear, self, "wear_", initial=self.wear),
                 part=part,
                 overlap=self.regeneration,
-                flank=Flank(self.flank_pressure, self.flank_width, self.flank_land),
-                step=self.step,
+                flank=made_of(Flank, self, "flank_"),
             )
 
 
@@ -234,10 +219,8 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     else:
         put_scaled(feed_velocity, memory.feed, speed)
     allow(memory.allowance, angle, allowance)
-    reached, reason = cut_along(
-        memory.cut, angle, speed, height, cross_position, displacement, feed_velocity, allowance, force, deflection,
-        depth_of_cut, feed, wear,
-    )  # fmt: skip
+    given = (angle, speed, height, cross_position, displacement, feed_velocity, allowance)
+    reached, reason = cut_along(memory.cut, given, (force, deflection, depth_of_cut, feed, wear))
     if reason != DONE:
         return reached, reason
     measure(memory.sensor, force, measured_force)
@@ -287,6 +270,7 @@ class CutStage(Stage):
 
     def prepare(self, first: int, samples: int) -> None:
         """See `Stage`."""
+        super().prepare(first, samples)
         self._allowance.draw(samples)
         self._force_sensor.draw(samples)
 

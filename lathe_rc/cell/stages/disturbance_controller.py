@@ -17,6 +17,7 @@ from lathe_rc.analysis.learning import Array, Complex, Response
 from lathe_rc.cell.parameters import Value, about, parameter
 from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, feed_forward
 from lathe_rc.cell.stages.law import Now
+from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.control.angle_filter import AngleFilterTable, at, follow
 from lathe_rc.control.disturbance import DisturbanceTable, FormAhead, commanded, disturbance, forget, observed
 from lathe_rc.control.disturbance_memory import LEAK, expected, smoothing
@@ -59,21 +60,8 @@ class DisturbanceControllerParameters(FormLawParameters):
         if points & (points - 1):
             raise InputError(f"{node}.points_per_revolution = {points}; allowed: a power of 2, 64 up to 65536")
         with about(node, "learned_waves"):
-            return disturbance(
-                step=self.step,
-                nominal=self.nominal_speed,
-                model=(self.model_natural_frequency, self.model_damping, self.model_delay),
-                late=self.feedback_delay,
-                observer=self.observer_bandwidth,
-                learner=self.learning_bandwidth,
-                gain=self.learning_gain,
-                follows_speed=self.follows_speed,
-                waves=self.learned_waves,
-                points=points,
-                identifier=self.identification_bandwidth,
-                identifies=self.identify,
-                forgetting=self.identification_forgetting,
-            )
+            model = (self.model_natural_frequency, self.model_damping, self.model_delay)
+            return made_of(disturbance, self, model=model)
 
 
 class Memory(NamedTuple):

@@ -1,12 +1,72 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The common part of all drives of the tool, for the checks before a start."""
+"""The common part of all drives of the tool: limits of commands, sensors, and a retraction without the cell."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Gt
 
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell.stage import Stage
+from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.stage import Sparse, Stage
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand
+from lathe_rc.cell.stages.tables import made_of
+from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, follows, take_over
+from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
+from lathe_rc.signals.noise import Sensor
+
+
+class BoundedParameters(NodeParameters):
+    """Bounds of a command that is taken over."""
+
+    retract_velocity: Annotated[float, Gt(0)] = parameter(0.1, "largest velocity of a takeover", "m/s")
+    retract_acceleration: Annotated[float, Gt(0)] = parameter(50.0, "its largest acceleration", "m/s^2")
+    retract_jerk: Annotated[float, Gt(0)] = parameter(1e5, "its largest jerk", "m/s^3")
+
+    def bounds(self) -> Bounds:
+        """The same for a motion."""
+        return made_of(Bounds, self, "retract_")
+
+
+class RetractionParameters(BoundedParameters):
+    """Of a drive that takes the tool out of the part."""
+
+    safe_position: float = parameter(
+        0.3e-3, "where the drive goes by itself when members of the cell are lost: out of the part", "m"
+    )
+
+
+class OwnRetraction:
+    """The command of a drive, until the drive goes its own way.
+
+    Args:
+        parameters: its table.
+        stroke: of the drive, to each side [m]: a command beyond is where the drive cannot be.
+    """
+
+    def __init__(self, parameters: RetractionParameters, stroke: float) -> None:
+        reach = stroke + abs(parameters.safe_position)
+        self._takeover = Takeover(parameters.bounds(), parameters.safe_position, parameters.step, reach=reach)
+
+    @property
+    def table(self) -> TakeoverTable:
+        """For `followed`."""
+        return self._takeover.table
+
+    def begin(self) -> None:
+        """Retract from the next sample on, whatever is commanded."""
+        self._takeover.change(Mode.RETRACT)
+
+
+@kernel
+def followed(takeover: TakeoverTable, command: Samples) -> Samples:
+    """The command that the drive follows [m], shape (n,)."""
+    own = command if follows(takeover) else command.copy()
+    take_over(takeover, own)
+    return own
 
 
 @dataclass(frozen=True)
@@ -19,7 +79,13 @@ class Limits:
 
 
 class Drive(Stage):
-    """A stage that moves the tool."""
+    """A stage that moves the tool; a subclass sets what it has of the following."""
+
+    announces = (LIMITED, FREE)
+    _limited: Sequence[LimitedCommand] = ()  # its commands
+    _sensors: Sequence[Sensor] = ()
+    _limits: Limits | None = None  # of a drive that carries the whole profile
+    _retraction: OwnRetraction | None = None  # of one that takes the tool out
 
     @abstractmethod
     def responses(self) -> Mapping[str, Response]:
@@ -27,4 +93,23 @@ class Drive(Stage):
 
     def limits(self) -> Mapping[str, Limits]:
         """The limits of the drive, by state topic before remapping; for drives that carry the whole profile."""
-        return {}
+        return {"coarse/state": self._limits} if self._limits else {}
+
+    def go_safe(self) -> None:
+        """See `Stage`; the carriage takes the tool out."""
+        if self._retraction:
+            self._retraction.begin()
+
+    def prepare(self, first: int, samples: int) -> None:
+        """See `Stage`."""
+        super().prepare(first, samples)
+        for sensor in self._sensors:
+            sensor.draw(samples)
+
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """See `Stage`."""
+        return [message for limited in self._limited for message in limited.tell(first, end)]
+
+    def finish(self, index: int) -> list[Sparse]:
+        """See `Stage`."""
+        return [message for limited in self._limited for message in limited.finish(index)]

@@ -10,8 +10,9 @@ from lathe_rc.analysis.learning import Response
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.cell.stages.command_limits import limited
+from lathe_rc.cell.stages.drive import followed
 from lathe_rc.cell.stages.plant import PlantMemory, PlantParameters, SingleDrive
-from lathe_rc.cell.stages.retraction import followed
+from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.jit import kernel
 from lathe_rc.plants.electrodynamic import CoarseTable, ElectrodynamicDrive, advance
 from lathe_rc.plants.linear import Discretisation
@@ -57,16 +58,7 @@ class ElectrodynamicActuator(SingleDrive):
 
     def __init__(self, name: str, parameters: ElectrodynamicActuatorParameters) -> None:
         self.parameters = parameters
-        self.drive = ElectrodynamicDrive(
-            natural_frequency=parameters.natural_frequency,
-            damping=parameters.damping,
-            delay=parameters.delay,
-            stroke=parameters.stroke,
-            moving_mass=parameters.moving_mass,
-            force_constant=parameters.force_constant,
-            step=parameters.step,
-            method=parameters.discretisation,
-        )
+        self.drive = made_of(ElectrodynamicDrive, parameters, method=parameters.discretisation)
         super().__init__(name, parameters)
 
     @property

@@ -11,6 +11,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from lathe_rc import messages, resources
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import Joint, Output, Sparse
+from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.errors import InputError, LatheError, at_most
 from lathe_rc.messages import Samples, Signals
@@ -79,14 +80,8 @@ class EncoderDevice(TimeMaster):
     def __init__(self, name: str, parameters: EncoderDeviceParameters) -> None:
         super().__init__(name, parameters)
         self.live = parameters.source != "file"
-        self.counted = CountedAngle(
-            counts=parameters.counts_per_revolution,
-            step_ns=parameters.step_ns,
-            wraps=parameters.counter_range,
-            inverted=parameters.inverted,
-            max_reverse=parameters.max_reverse,
-            max_gap=parameters.max_gap,
-        )
+        counts, wraps = parameters.counts_per_revolution, parameters.counter_range
+        self.counted = made_of(CountedAngle, parameters, counts=counts, wraps=wraps)
         self._before: Samples | None = None  # the last angles, for the speed
         self._speed = self.shared.nominal_speed  # the last one [rad/s]
         self._revolution = -1.0

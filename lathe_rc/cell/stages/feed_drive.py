@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feed drive of a slide: cross or longitudinal."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import dropwhile
 from typing import Annotated, Literal, NamedTuple
 
@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc import messages
 from lathe_rc.arrays import put
 from lathe_rc.cell.parameters import about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse, Stage
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedParameters, remembered
 from lathe_rc.cell.stages.obedience import (
     OBEY,
@@ -19,13 +19,15 @@ from lathe_rc.cell.stages.obedience import (
     FeedObedientParameters,
     Obedience,
     ObedienceTable,
+    Obedient,
     apply,
     listens,
     piece,
 )
+from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-from lathe_rc.messages import Samples, Signals
+from lathe_rc.messages import Samples
 from lathe_rc.plants import feed_models
 from lathe_rc.plants.feed import Feedback, FeedDrive, FeedTable, advance
 from lathe_rc.plants.friction import Friction, mobility
@@ -141,16 +143,8 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
         if self.model == "sampled":
             gain, lags = self.sampled_gain, [self.sampled_lag]
         with about(node, "friction_coulomb", "friction_static"):
-            return Friction(
-                self.friction,
-                mobility(gain, max(lags), self.motor_force),
-                coulomb=self.friction_coulomb,
-                static=self.friction_static,
-                speed=self.friction_speed,
-                viscous=self.friction_viscous,
-                stiffness=self.friction_stiffness,
-                damping=self.friction_damping,
-            )
+            moves = mobility(gain, max(lags), self.motor_force)
+            return made_of(Friction, self, "friction_", law=self.friction, mobility=moves)
 
     def screw(self, node: str) -> Screw:
         """The screw of a node.
@@ -158,18 +152,10 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
         Raises:
             InputError: see `Screw`.
         """
+        screw = made_of(Screw, self, "pitch_", "screw_")
         with about(node, "pitch_slope", "pitch_amplitude", "pitch_lead"):
-            return Screw(
-                slope=self.pitch_slope,
-                lead=self.pitch_lead,
-                amplitude=self.pitch_amplitude,
-                phase=self.pitch_phase,
-                expansion=self.screw_expansion,
-                heating=self.screw_heating,
-                surroundings=self.screw_surroundings,
-                time=self.screw_time,
-                anchor=self.screw_anchor,
-            )
+            screw.check()
+        return screw
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
         """See `NodeParameters`."""
@@ -234,7 +220,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     return n, DONE
 
 
-class FeedDriveStage(Stage):
+class FeedDriveStage(Obedient):
     """See `lathe_rc.plants.feed`.
 
     Attributes:
@@ -254,14 +240,13 @@ class FeedDriveStage(Stage):
         limits = parameters.command_limits()
         rubbing, screw = parameters.rubbing(name), parameters.screw(name)
         with about(name, *_COEFFICIENTS[parameters.model]):
-            self.drive = FeedDrive(
-                parameters.transfer(),
-                step=parameters.step,
-                divisor=parameters.divisor,
+            self.drive = made_of(
+                FeedDrive,
+                parameters,
+                model=parameters.transfer(),
                 command_limit=parameters.command_limit or np.inf,
                 speed_limit=parameters.speed_limit or np.inf,
-                backlash=parameters.backlash,
-                feedback=parameters.feedback,
+                resolution=0.0,  # rounds what its own sensor sees, and here the sensor of the stage does
                 limits=limits,
                 friction=rubbing,
                 screw=screw,
@@ -270,7 +255,9 @@ class FeedDriveStage(Stage):
         cuts = limits.any or bool(parameters.command_limit)
         self._clipped = np.zeros(messages.MAX_BLOCK if cuts else 1, np.uint8)
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
-        self._obedience, self._safe = self._obeys(), False
+        limit = parameters.command_limit
+        self._obedience: Obedience = parameters.obedience(name, speed=self.drive.integrates, limit=limit, settled=0)
+        self._safe = False
         self._said: list[Sparse] = []  # of going safe, to be told with the sample that comes next
         axis = parameters.axis
         self.declare(
@@ -281,10 +268,6 @@ class FeedDriveStage(Stage):
             outputs=[Output(f"{axis}/state", messages.STATE, Joint("position", "velocity", "effort"))],
             tells=True,
         )
-
-    def _obeys(self) -> Obedience:
-        limit = self.parameters.command_limit
-        return self.parameters.obedience(self.name, speed=self.drive.integrates, limit=limit, settled=0)
 
     def go_safe(self) -> None:
         """See `Stage`; the slide stops, and nobody is listened to any more."""
@@ -314,12 +297,6 @@ class FeedDriveStage(Stage):
     def prepare(self, first: int, samples: int) -> None:
         """See `Stage`."""
         self._sensor.draw(samples)
-
-    def serve(
-        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
-    ) -> list[Sparse]:
-        """See `Stage`: obey."""
-        return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)
 
     def tell(self, first: int, end: int) -> list[Sparse]:
         """See `Stage`."""

@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Force controller: holds the main cutting force by the longitudinal feed (paper 004)."""
 
-from collections.abc import Sequence
 from typing import Annotated, NamedTuple
 
 from annotated_types import Ge, Gt
 
 from lathe_rc import messages
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import Fields, Input, Output, Reached, Sparse, Stage
-from lathe_rc.cell.stages.obedience import listens
-from lathe_rc.cell.stages.servo import Listener, ServoParameters, listener, pid_along
-from lathe_rc.cell.stages.trajectory import Course, Trajectory, follow
+from lathe_rc.cell.stage import Fields, Input, Output, Reached
+from lathe_rc.cell.stages.obedience import Listener, listens
+from lathe_rc.cell.stages.servo import Servo, ServoParameters, pid_along
+from lathe_rc.cell.stages.trajectory import Course, follow
 from lathe_rc.control.pid import FORCE, PidTable
 from lathe_rc.jit import kernel
-from lathe_rc.messages import Samples, Signals
-from lathe_rc.safety.state_machine import Reaction
+from lathe_rc.messages import Samples
 
 
 class ForceControllerParameters(ServoParameters):
@@ -52,7 +50,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     return pid_along(memory.pid, memory.state, memory.who, first, start, flags[0], wanted, force, command)
 
 
-class ForceController(Stage):
+class ForceController(Servo):
     """See `lathe_rc.control.pid`.
 
     Attributes:
@@ -67,11 +65,7 @@ class ForceController(Stage):
     def __init__(self, name: str, parameters: ForceControllerParameters) -> None:
         super().__init__(name, parameters)
         self.parameters = parameters
-        self.trajectory = Trajectory(name, parameters)
-        self.pid = parameters.pid(
-            name, parameters.proportional, parameters.integral, parameters.derivative, parameters.derivative_filter
-        )
-        self._obedience = parameters.obeys(name)
+        self.pid = parameters.pid(name)
         self.declare(
             inputs=[
                 # The angle itself is not used: the spindle's blocks say which samples are due.
@@ -82,22 +76,7 @@ class ForceController(Stage):
             outputs=[Output("longitudinal/command", messages.SERVO)],
         )
 
-    def warnings(self, seconds: float) -> list[str]:
-        """See `Stage`."""
-        return [f"{self.name}.{doubt}" for doubt in self.trajectory.doubts(seconds)]
-
     @property
     def memory(self) -> Memory:
         """See `Stage`."""
-        return Memory(self.trajectory.course, self.pid.table, self.pid.state, listener(self._obedience))
-
-    def prepare(self, first: int, samples: int) -> None:
-        """See `Stage`."""
-        self.trajectory.prepare(first, samples)
-
-    def serve(
-        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
-    ) -> list[Sparse]:
-        """See `Stage`: obey."""
-        assert self._obedience is not None, "nobody else listens"
-        return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)
+        return Memory(self.trajectory.course, self.pid.table, self.pid.state, self.listener)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The desired form of the part as parameters, and what evaluates it under the tool."""
+"""The desired form of the part: its parameters, its table under the tool, and the node that publishes it alone."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,12 +11,12 @@ from annotated_types import Ge, Gt, Le, Lt
 from lathe_rc import messages, resources
 from lathe_rc.arrays import put
 from lathe_rc.cell.parameters import NodeParameters, Value, about, parameter
-from lathe_rc.cell.stage import Input
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
+from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
-from lathe_rc.plants.tool import equal
 from lathe_rc.signals.measured_profile import Measured, doubts, read_csv
 from lathe_rc.signals.part_profile import PartProfile, checked
 from lathe_rc.signals.profile import Harmonics, Piston, Polygon, Profile
@@ -96,16 +96,10 @@ class FormParameters(NodeParameters):
             with about(node, "profile_file"):
                 return read_csv(resources.find(Path(self.profile_file)))
         if self.profile == "piston":
-            return Piston(
-                self.piston_ovality,
-                self.piston_ovality_middle,
-                self.piston_barrel,
-                self.piston_length,
-                self.piston_widest,
-            )
+            return made_of(Piston, self, "piston_")
         if self.profile == "polygon":
             with about(node, "polygon_corner_radius"):
-                return Polygon(self.polygon_sides, self.polygon_inscribed_radius, self.polygon_corner_radius)
+                return made_of(Polygon, self, "polygon_")
         order, amplitude = self.harmonic_order, self.harmonic_amplitude
         if not order and not amplitude:
             order, amplitude = [2], [225e-6]
@@ -136,6 +130,15 @@ class FormTable(NamedTuple):
     feed: float
     start: float
     part: int
+
+
+@kernel
+def equal(one: Samples, other: Samples) -> bool:
+    """Whether two signals of shape (n,) are equal, sample by sample."""
+    differs = False
+    for k in range(one.size):
+        differs |= one[k] != other[k]
+    return not differs
 
 
 @kernel
@@ -213,3 +216,42 @@ class Form:
             self.inputs.append(Input("longitudinal/state", messages.STATE, ("position", "measured_position")))
             if parameters.part_revolutions:
                 raise InputError(f"{node}.part_revolutions with height_from = slide; allowed: 0, a slide does not jump")
+
+
+@kernel
+def step(memory: FormTable, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
+    """See `lathe_rc.cell.stage`."""
+    reference, expected, height = outputs
+    evaluate(memory, inputs, reference, expected, height)
+    return height.size, DONE
+
+
+class ProfileStage(Stage):
+    """Evaluates the form at the spindle angle and the height.
+
+    Attributes:
+        parameters: its table.
+        form: of the part.
+    """
+
+    kind = "profile"
+    Parameters = FormParameters
+    step = staticmethod(step)
+
+    def __init__(self, name: str, parameters: FormParameters) -> None:
+        super().__init__(name, parameters)
+        self.parameters = parameters
+        self.form = Form(name, parameters)
+        self.declare(
+            inputs=self.form.inputs,
+            outputs=[Output("reference", messages.REFERENCE, Joint("reference"))],
+        )
+
+    def warnings(self, seconds: float) -> list[str]:
+        """See `Stage`."""
+        return self.form.doubts
+
+    @property
+    def memory(self) -> FormTable:
+        """See `Stage`."""
+        return self.form.table

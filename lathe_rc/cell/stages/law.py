@@ -14,23 +14,12 @@ from lathe_rc.analysis.learning import Array, Complex, Response, supremum
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
 from lathe_rc.cell.stages.learner import Learner, LearnerParameters
-from lathe_rc.cell.stages.obedience import (
-    NOBODY,
-    OBEY,
-    OUT_OF_REACH,
-    Obedience,
-    ObedienceTable,
-    apply,
-    listens,
-    may_learn,
-    piece,
-)
+from lathe_rc.cell.stages.obedience import OBEY, OUT_OF_REACH, Listener, apply, listens, may_learn, piece
 from lathe_rc.cell.stages.sampled import Sampled, checked
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import code_of_others
 from lathe_rc.jit import inlined
 from lathe_rc.messages import Samples, Signals
-from lathe_rc.safety.state_machine import Reaction
 
 _TURN = 2.0 * np.pi
 _DIVERGED = 1  # why a step stops
@@ -117,7 +106,7 @@ class LawMemory(NamedTuple):
     Attributes:
         law: its own.
         guard: against a loop that diverges.
-        obedience: to the supervisor, if it ``listens``.
+        who: may have to obey.
         delay: of the error [sample].
         period: sampling step [s].
         senses: whether it reads the drive's measured position.
@@ -126,10 +115,9 @@ class LawMemory(NamedTuple):
 
     law: Any
     guard: GuardTable
-    obedience: ObedienceTable
+    who: Listener
     delay: int
     period: float
-    listens: bool
     senses: bool
     learns: npt.NDArray[np.int64]
 
@@ -140,14 +128,14 @@ def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
     def step(memory: LawMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
         """See `lathe_rc.cell.stage`."""
         angle, speed, error_angle, error, form = inputs[0], inputs[1], inputs[2], inputs[3], inputs[4]
-        position, command = inputs[-1], outputs[0]
+        position, command, who = inputs[-1], outputs[0], memory.who
         while start < command.size:
             stop, learning = command.size, memory.learns[0] != 0
-            if memory.listens:
-                stop = piece(memory.obedience, start, flags[0])
+            if who.listens:
+                stop = piece(who.obedience, start, flags[0])
                 if stop == start:
                     return start, OBEY
-                learning = learning and may_learn(memory.obedience)
+                learning = learning and may_learn(who.obedience)
             for k in range(start, stop):
                 n = first + k
                 if n >= memory.delay and _grows(memory.guard, error_angle[k], error[k], form[k]):
@@ -155,8 +143,8 @@ def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
                 sensed = position[k] if memory.senses else 0.0
                 now = Now(n, n * memory.period, angle[k], speed[k], error[k], error_angle[k], learning, sensed)
                 command[k] = sample(memory.law, now)
-            if memory.listens:
-                apply(memory.obedience, command[start:stop])
+            if who.listens:
+                apply(who.obedience, command[start:stop])
             start = stop
         return command.size, DONE
 
@@ -212,7 +200,7 @@ class Law(Sampled, Learner):
         delay = parameters.feedback_delay
         self._guard = GuardTable(parameters.stop_ratio**2, np.zeros(5), np.zeros(2, np.int64))
         self._learns = np.ones(1, np.int64)
-        self._obedience: Obedience | None = self._make_obedience(delay)
+        self._obedience = self._make_obedience(delay)
         self.declare(
             inputs=[
                 Input("encoder", messages.ENCODER, ("angle", "speed")),
@@ -268,19 +256,8 @@ class Law(Sampled, Learner):
     @property
     def memory(self) -> LawMemory:
         """See `Stage`."""
-        listens = self._obedience is not None
-        obedience = self._obedience.table if self._obedience else NOBODY
-        parameters = self.parameters
-        return LawMemory(
-            self.law,
-            self._guard,
-            obedience,
-            parameters.feedback_delay,
-            parameters.step,
-            listens,
-            self.senses,
-            self._learns,
-        )
+        delay, period = self.parameters.feedback_delay, self.parameters.step
+        return LawMemory(self.law, self._guard, self.listener, delay, period, self.senses, self._learns)
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
@@ -291,7 +268,6 @@ class Law(Sampled, Learner):
             LatheError: the loop diverges.
         """
         if reason == OBEY:
-            assert self._obedience is not None, "nobody else listens"
-            return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)
+            return super().serve(reason, first, reached, inputs, outputs)
         ended, allowed = np.sqrt(self._guard.sums[[_ENDED, _ALLOWED]]).tolist()
         raise self._diverged(first + reached, ended, allowed)

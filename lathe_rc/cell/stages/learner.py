@@ -10,9 +10,8 @@ from annotated_types import Ge, Gt, Le
 
 from lathe_rc.analysis.learning import Response
 from lathe_rc.cell.parameters import ObedientParameters, RestartParameters, Value, parameter
-from lathe_rc.cell.stage import Stage
-from lathe_rc.cell.stages.obedience import Obedience
-from lathe_rc.cell.stages.retraction import BoundedParameters
+from lathe_rc.cell.stages.drive import BoundedParameters
+from lathe_rc.cell.stages.obedience import Obedience, Obedient
 from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Takeover
 from lathe_rc.errors import DivergedError
@@ -36,7 +35,7 @@ class LearnerParameters(ObedientParameters, BoundedParameters, RestartParameters
     )
 
 
-class Learner(Stage):
+class Learner(Obedient):
     """A controller that learns a drive.
 
     Attributes:

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-learning controller of one channel."""
+"""Self-learning controller of one channel, and its stability margin: how far its loop is from diverging."""
 
+from bisect import bisect_left
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,37 +15,26 @@ from lathe_rc.analysis.learning import LearningLoop, Response
 from lathe_rc.cell.parameters import Value, about
 from lathe_rc.cell.stage import Input, Output, Sparse
 from lathe_rc.cell.stages.learner import Learner
-from lathe_rc.cell.stages.learning_margin import Margins
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
 from lathe_rc.cell.stages.learning_step import LOST_AT, Memory, step
-from lathe_rc.cell.stages.obedience import NOBODY, OBEY, OUT_OF_REACH, listens
+from lathe_rc.cell.stages.obedience import OBEY, OUT_OF_REACH, listens
+from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.control import angle_memory, memory_file
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.identification import DriveIdentifier, Identified
 from lathe_rc.control.repetitive import Cycle, RepetitiveController, largest_feedback_delay
 from lathe_rc.errors import InputError
 from lathe_rc.messages import MAX_BLOCK, Signals
-from lathe_rc.safety.state_machine import Reaction
+from lathe_rc.plants.linear import discretise, second_order
 
 _SETTLED = 4.0  # lead times until a drive has followed
 _FILE_ACTIONS = ("save", "load")
 _STATUS = "coarse/learning"  # topic
+_MOST = 1024  # entries of a table of margins
 _LEAST_Q = 1e-6  # [s] from which on a wider Q is looked for
 _QS = 30  # that are tried, each a quarter wider than the one before
-_LEADS = (
-    1.0,
-    0.9,
-    1.1,
-    0.8,
-    1.2,
-    0.7,
-    1.3,
-    1.5,
-    1.75,
-    2.0,
-    2.25,
-    2.5,
-)  # that are tried, in lags: more where a drive rings
+# Leads that are tried, in lags: more where a drive rings.
+_LEADS = (1.0, 0.9, 1.1, 0.8, 1.2, 0.7, 1.3, 1.5, 1.75, 2.0, 2.25, 2.5)
 
 
 class LearningController(Learner):
@@ -99,14 +91,8 @@ class LearningController(Learner):
         settled = round(_SETTLED * parameters.lead_time / parameters.step) + delay
         self._obedience = self._make_obedience(settled)
         inputs += listens(parameters)
-        self._identifier = DriveIdentifier(
-            model_delay=parameters.model_delay,
-            feedback_delay=delay,
-            bandwidth=parameters.identification_bandwidth,
-            forgetting=parameters.identification_forgetting,
-            step=parameters.step,
-            block=MAX_BLOCK if parameters.identify else 0,
-        )
+        block = MAX_BLOCK if parameters.identify else 0
+        self._identifier = made_of(DriveIdentifier, parameters, "identification_", block=block)
         outputs = [Output("coarse/command", messages.COMMAND)]
         if parameters.publish_margin:
             outputs.append(Output("coarse/margin", messages.MARGIN))
@@ -238,7 +224,7 @@ class LearningController(Learner):
             control=self._controller.table,
             preview=self._controller.preview.table,
             identifier=self._identifier.table,
-            obedience=self._obedience.table if self._obedience else NOBODY,
+            who=self.listener,
             nominal=parameters.nominal_speed,
             period=parameters.step,
             by_time=parameters.law == "time_periodic",
@@ -246,7 +232,6 @@ class LearningController(Learner):
             rates=self.correction.law is not CorrectionLaw.NONE,
             finer=len(parameters.finer),
             identifies=parameters.identify,
-            listens=self._obedience is not None,
             margin=self._margin,
             state=self._state,
         )
@@ -260,8 +245,7 @@ class LearningController(Learner):
             AngleLostError: the memory cannot be read at the angle that was measured.
         """
         if reason == OBEY:
-            assert self._obedience is not None, "nobody else listens"
-            return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)
+            return super().serve(reason, first, reached, inputs, outputs)
         if reason == angle_memory.SMOOTH:
             self._controller.smooth()
             return []
@@ -323,3 +307,79 @@ class LearningController(Learner):
             self._joined = True
             sparse.append(Sparse(f"{self.name}/events", messages.EVENT, cycle.sample_index, {"action": "joined"}))
         return sparse
+
+
+class Margins:
+    """1 - sup|Q - γZ| of a drive model, tabulated as it is asked for: one costs as much as a cycle of samples.
+
+    Args:
+        parameters: of the stage.
+    """
+
+    def __init__(self, parameters: LearningControllerParameters) -> None:
+        self._parameters = parameters
+        self._models: dict[tuple[str, ...], Identified] = {}
+        self._responses: dict[tuple[str, ...], Response] = {}
+        self._suprema: dict[tuple[object, ...], float] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state without responses, which are computed when they are asked for."""
+        return {**self.__dict__, "_responses": {}}
+
+    def _response(self, model: Identified) -> Response:
+        # Three digits of a model are more than its margin is good for, and a steady one is computed once.
+        key = _three_digits(model.natural_frequency, model.damping)
+        if key not in self._models:
+            _make_room(self._models)
+            self._models[key] = model
+        model = self._models[key]
+        if key not in self._responses:
+            _make_room(self._responses)
+            self._responses[key] = self._computed(model)
+        return self._responses[key]
+
+    def _computed(self, model: Identified) -> Response:
+        parameters = self._parameters
+        a, b = second_order(model.natural_frequency, model.damping)
+        return discretise(a, b, parameters.model_delay, parameters.step, "foh").response
+
+    def untabulated(self, stage: "LearningController", speed: float, model: Identified) -> float:
+        """The margin at ``speed`` [rad/s] of this very model; what was tabulated before and after does not matter."""
+        return 1.0 - stage.loop(self._computed(model)).supremum(speed)
+
+    def _supremum(self, stage: "LearningController", speed: float, model: Identified) -> float:
+        inverted = stage.correction
+        models = (model.natural_frequency, model.damping, inverted.natural_frequency, inverted.damping)
+        key = (speed, _three_digits(*models))
+        if key not in self._suprema:
+            _make_room(self._suprema)
+            self._suprema[key] = stage.loop(self._response(model)).supremum(speed)
+        return self._suprema[key]
+
+    def at(self, stage: "LearningController", speed: float, model: Identified) -> float:
+        """The margin at ``speed`` [rad/s], between tabulated speeds by interpolation."""
+        speeds = _tabulated(self._parameters.nominal_speed)
+        after = bisect_left(speeds, speed)
+        if not 0 < after < len(speeds):
+            return 1.0 - stage.loop(self._response(model)).supremum(speed)
+        below, above = speeds[after - 1], speeds[after]
+        lower, upper = self._supremum(stage, below, model), self._supremum(stage, above, model)
+        return 1.0 - ((upper - lower) / (above - below) * (speed - below) + lower)
+
+
+@lru_cache(maxsize=16)
+def _tabulated(nominal: float) -> list[float]:
+    """The speeds of the table [rad/s], from half of the nominal one up to one and a half times it."""
+    speeds: list[float] = (nominal / 40 * np.arange(20, 61)).tolist()
+    return speeds
+
+
+def _make_room(table: dict[Any, Any]) -> None:
+    """Let the oldest entry go from a full table: a model that wanders would fill it for ever."""
+    if len(table) >= _MOST:
+        del table[next(iter(table))]
+
+
+@lru_cache
+def _three_digits(*numbers: float) -> tuple[str, ...]:
+    return tuple(f"{number:.3g}" for number in numbers)

@@ -13,8 +13,7 @@ from lathe_rc.cell.stages.learner import LearnerParameters
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.lead import LeadLaw, Preview
-from lathe_rc.control.q_check import check
-from lathe_rc.control.q_filter import Exponential, Gaussian, LowPass, MovingAverage, QFilter
+from lathe_rc.control.q_filter import Exponential, Gaussian, LowPass, MovingAverage, QFilter, check
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 

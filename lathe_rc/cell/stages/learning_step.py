@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.cell.stage import DONE, Fields, Reached
-from lathe_rc.cell.stages.obedience import OBEY, ObedienceTable, apply, may_learn, obeyed, piece
+from lathe_rc.cell.stages.obedience import OBEY, Listener, apply, may_learn, obeyed, piece
 from lathe_rc.control import angle_memory
 from lathe_rc.control.angle_memory import AngleMemory
 from lathe_rc.control.identification import IdentifierTable, accumulate, command_sent
@@ -28,7 +28,7 @@ class Memory(NamedTuple):
         control: the memory of the channel.
         preview: its lead law.
         identifier: of its drive, if it ``identifies``.
-        obedience: to the supervisor, if it ``listens``.
+        who: may have to obey.
         nominal: speed of the spindle [rad/s].
         period: sampling step [s].
         by_time: whether time stands for the angle.
@@ -42,7 +42,7 @@ class Memory(NamedTuple):
     control: AngleMemory
     preview: PreviewTable
     identifier: IdentifierTable
-    obedience: ObedienceTable
+    who: Listener
     nominal: float
     period: float
     by_time: bool
@@ -50,7 +50,6 @@ class Memory(NamedTuple):
     rates: bool
     finer: int
     identifies: bool
-    listens: bool
     margin: Samples
     state: npt.NDArray[np.int64]
 
@@ -73,7 +72,7 @@ def _begin(memory: Memory, first: int, start: int, stop: int, inputs: Fields) ->
     """Look ahead along a piece of a block, and take its errors."""
     control, samples = memory.control, stop - start
     speed, error = inputs[1][start:stop], inputs[3][start:stop]
-    if memory.by_time or (memory.falls_back and obeyed(memory.obedience) >= Reaction.FALL_BACK.value):
+    if memory.by_time or (memory.falls_back and obeyed(memory.who.obedience) >= Reaction.FALL_BACK.value):
         speed = np.full(samples, memory.nominal)
     if memory.finer:
         error = error.copy()
@@ -91,22 +90,22 @@ def _begin(memory: Memory, first: int, start: int, stop: int, inputs: Fields) ->
 @inlined
 def _lose(memory: Memory, start: int, stop: int, command: Samples) -> None:
     """Without an angle the command stays, from sample ``start`` of a block on."""
-    command[start:stop] = command[start - 1] if start > memory.state[_BEGIN] else memory.obedience.takeover.given[1]
+    command[start:stop] = command[start - 1] if start > memory.state[_BEGIN] else memory.who.obedience.takeover.given[1]
 
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
-    control, state, command = memory.control, memory.state, outputs[0]
+    control, state, who, command = memory.control, memory.state, memory.who, outputs[0]
     n = command.size
     while start < n or state[_INSIDE]:
         if not state[_INSIDE]:
             stop = n
-            if memory.listens:
-                stop = piece(memory.obedience, start, flags[0])
+            if who.listens:
+                stop = piece(who.obedience, start, flags[0])
                 if stop == start:
                     return start, OBEY
-                control.whole[angle_memory.LEARNS] = may_learn(memory.obedience)
+                control.whole[angle_memory.LEARNS] = may_learn(who.obedience)
             state[_INSIDE], state[_BEGIN], state[_END] = 1, start, stop
             if not state[_LOST]:
                 _begin(memory, first, start, stop, inputs)
@@ -118,7 +117,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
             angle = _angle(memory, first + begin, 0, inputs[0][begin:stop])
             reached, reason = angle_memory.advance(control, first + begin, start - begin, angle, command[begin:stop])
             reached += begin
-            if reason in (angle_memory.AHEAD, angle_memory.BEHIND, angle_memory.JUMPED) and memory.listens:
+            if reason in (angle_memory.AHEAD, angle_memory.BEHIND, angle_memory.JUMPED) and who.listens:
                 state[_LOST], state[LOST_AT] = 1, first + reached
                 _lose(memory, reached, stop, command)
                 reached, reason = stop, DONE
@@ -129,8 +128,8 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
             outputs[published][start:reached] = memory.margin[0]
         if reason != DONE:
             return reached, reason
-        if memory.listens:
-            apply(memory.obedience, command[begin:stop])
+        if who.listens:
+            apply(who.obedience, command[begin:stop])
         state[_INSIDE] = 0
         start = stop
     return n, DONE

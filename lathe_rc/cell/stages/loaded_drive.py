@@ -13,15 +13,13 @@ from lathe_rc.analysis.learning import Response
 from lathe_rc.arrays import put, put_scaled
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedCommand, limited, remembered
-from lathe_rc.cell.stages.composed import ComposedParameters, prefixed
+from lathe_rc.cell.stages.command_limits import Clipping, LimitedCommand, limited, remembered
 from lathe_rc.cell.stages.cutting_process import READ, TURNS, CutStage, CuttingProcessParameters
-from lathe_rc.cell.stages.drive import Drive, Limits
+from lathe_rc.cell.stages.drive import Drive, Limits, OwnRetraction, followed
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
-from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters
-from lathe_rc.cell.stages.retraction import OwnRetraction, followed
+from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters, SetPoint, sum_up
 from lathe_rc.cell.stages.series_drive import COARSE, FINE, piezo_on_carriage, tool_drive
-from lathe_rc.cell.stages.set_point import SetPoint, sum_up
+from lathe_rc.cell.stages.tables import ComposedParameters, made_of, prefixed
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import CommandLimits, LimiterTable, limiter
 from lathe_rc.errors import InputError
@@ -35,7 +33,8 @@ from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
 _CUT = "cut_"  # begins the parameters of the cut
 _COIL = "coil"  # whose limits are told
-_NO_LIMITS = limiter(CommandLimits(np.inf, np.inf, np.inf, np.inf), 1.0, 1)
+_COIL_LIMITS = ("current_limit", "voltage_limit", "slew_rate")
+_NO_LIMITS = limiter(CommandLimits(), 1.0, 1)
 _REFERENCE = Input("reference", messages.REFERENCE, ("reference", "height"))
 
 
@@ -63,16 +62,9 @@ class LoadedCoarseParameters(ElectrodynamicActuatorParameters):
             InputError: a limit of what is not there.
         """
         if self.loop == "current":
-            return Coil(
-                resistance=self.resistance,
-                inductance=self.inductance,
-                bandwidth=self.bandwidth,
-                back_emf=self.back_emf,
-                current_limit=self.current_limit or np.inf,
-                voltage_limit=self.voltage_limit or np.inf,
-                slew_rate=self.slew_rate or np.inf,
-            )
-        for name in ("current_limit", "voltage_limit", "slew_rate"):
+            limits = {name: getattr(self, name) or np.inf for name in _COIL_LIMITS}
+            return made_of(Coil, self, **limits)
+        for name in _COIL_LIMITS:
             if value := getattr(self, name):
                 raise InputError(f"{node}.coarse_{name} = {value:g} with coarse_loop = ideal; allowed: 0, or current")
         return None
@@ -197,20 +189,16 @@ class Memory(NamedTuple):
     room: Samples
 
 
-# Places of the inputs: encoder, form, command; then what makes the set point of the piezo, and the slides.
-_ANGLE, _SPEED, _WANTED, _HEIGHT, _COMMAND, _MORE = range(6)
+# Inputs: angle and speed, form and height, command; from here on what makes the piezo's set point, and the slides.
+_MORE = 5
 
 
 @kernel
 def _advance(
-    memory: Memory, first: int, inputs: Fields, coarse: Fields, fine: Fields, of_cut: Fields
+    memory: Memory, first: int, inputs: Fields, motion: Fields, fine_measured: Samples, of_cut: Fields
 ) -> tuple[int, int]:
     """The step of both stages; the fine drive's arrays are room where there is none."""
-    angle, speed, wanted, height, command = (
-        inputs[_ANGLE], inputs[_SPEED], inputs[_WANTED], inputs[_HEIGHT], inputs[_COMMAND],
-    )  # fmt: skip
-    position, velocity, effort, measured = coarse
-    extension, extension_velocity, voltage, fine_measured = fine
+    angle, speed, wanted, height, command = inputs[0], inputs[1], inputs[2], inputs[3], inputs[4]
     force, measured_force, depth_of_cut, feed, allowance, wear, deflection = of_cut
     n, room = angle.size, memory.room
     met, cross_position, feed_velocity, noise, still = room[0, :n], room[1, :n], room[2, :n], room[3, :n], room[4, :n]
@@ -225,16 +213,14 @@ def _advance(
         put_scaled(feed_velocity, memory.feed, speed)
     allow(memory.allowance, angle, allowance)
     measure(memory.noise, still, noise)
-    given = limited(memory.limits, first, followed(memory.retraction, command))
+    command = limited(memory.limits, first, followed(memory.retraction, command))
     set_point = limited(memory.limits_fine, first, sum_up(memory.signs, inputs, _MORE, n))
-    reached, reason = advance_loaded(
-        memory.drive, memory.cut, first, given, set_point, noise, met, angle, speed, height, cross_position,
-        feed_velocity, allowance, position, velocity, effort, measured, extension, extension_velocity, voltage, force,
-        deflection, depth_of_cut, feed, wear,
-    )  # fmt: skip
+    given = (command, set_point, noise, met, angle, speed, height, cross_position, feed_velocity, allowance)
+    made = (force, deflection, depth_of_cut, feed, wear)
+    reached, reason = advance_loaded(memory.drive, memory.cut, first, given, motion, made)
     if reason != DONE:
         return reached, reason
-    measure(memory.sensor, extension, fine_measured)
+    measure(memory.sensor, motion[4], fine_measured)
     measure(memory.force_sensor, force, measured_force)
     return reached, DONE
 
@@ -242,15 +228,15 @@ def _advance(
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
-    n, room = inputs[_ANGLE].size, memory.room
-    fine = (room[5, :n], room[6, :n], room[7, :n], room[8, :n])
-    return _advance(memory, first, inputs, outputs[:4], fine, outputs[4:])
+    n, room = inputs[0].size, memory.room
+    motion = (outputs[0], outputs[1], outputs[2], outputs[3], room[5, :n], room[6, :n], room[7, :n])
+    return _advance(memory, first, inputs, motion, room[8, :n], outputs[4:])
 
 
 @kernel
 def step_series(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
-    return _advance(memory, first, inputs, outputs[:4], outputs[4:8], outputs[8:])
+    return _advance(memory, first, inputs, outputs[:7], outputs[7], outputs[8:])
 
 
 class LoadedDriveStage(CutStage, Drive):
@@ -263,10 +249,10 @@ class LoadedDriveStage(CutStage, Drive):
 
     kind = "loaded_drive"
     Parameters = LoadedDriveParameters
-    announces = (LIMITED, FREE)
     failure = staticmethod(failure)
     rooms = 9
     step = staticmethod(step)
+    _retraction: OwnRetraction
 
     def __init__(self, name: str, parameters: LoadedParameters) -> None:
         super().__init__(name, parameters, parameters.cut, _CUT)
@@ -295,10 +281,10 @@ class LoadedDriveStage(CutStage, Drive):
         self._retraction = OwnRetraction(coarse, coarse.stroke)
         self._clipping = Clipping(name, parameters, _COIL) if coil else None
         # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
-        self._noise = Sensor(coarse.noise_rms, 0.0, parameters.seed, f"{name}/coarse")
-        self._sensor = Sensor(
-            fine.noise_rms if fine else 0.0, fine.resolution if fine else 0.0, parameters.seed, f"{name}/fine"
-        )
+        self._sensors = [
+            Sensor(coarse.noise_rms, 0.0, parameters.seed, f"{name}/coarse"),
+            Sensor(fine.noise_rms if fine else 0.0, fine.resolution if fine else 0.0, parameters.seed, f"{name}/fine"),
+        ]
         inputs = [TURNS, _REFERENCE, Input("coarse/command", messages.COMMAND, ("position",))]
         inputs += self._set_point.inputs if self._set_point else []
         self._slides, place = dict.fromkeys(("cross", "longitudinal"), -1), sum(len(port.fields) for port in inputs)
@@ -318,14 +304,6 @@ class LoadedDriveStage(CutStage, Drive):
             found["fine/command"] = self.drive.fine_response
         return found
 
-    def limits(self) -> Mapping[str, Limits]:
-        """See `Drive`."""
-        return {"coarse/state": self._limits}
-
-    def go_safe(self) -> None:
-        """See `Stage`; the carriage takes the tool out."""
-        self._retraction.begin()
-
     @property
     def memory(self) -> Memory:
         """See `Stage`."""
@@ -337,8 +315,8 @@ class LoadedDriveStage(CutStage, Drive):
             signs=self._set_point.signs if self._set_point else np.empty(0),
             drive=self.drive.table,
             cut=self.cut.table,
-            noise=self._noise.table,
-            sensor=self._sensor.table,
+            noise=self._sensors[0].table,
+            sensor=self._sensors[1].table,
             allowance=self._allowance.table,
             force_sensor=self._force_sensor.table,
             **self._slides,
@@ -347,23 +325,16 @@ class LoadedDriveStage(CutStage, Drive):
             room=self.room,
         )
 
-    def prepare(self, first: int, samples: int) -> None:
-        """See `Stage`."""
-        super().prepare(first, samples)
-        self._noise.draw(samples)
-        self._sensor.draw(samples)
-
     def tell(self, first: int, end: int) -> list[Sparse]:
         """See `Stage`."""
-        found = [message for limited in self._limited for message in limited.tell(first, end)]
+        found = super().tell(first, end)
         if self._clipping:
             found += self._clipping.told(first, remembered(self.drive.table.coil.limited, first, end))
         return found
 
     def finish(self, index: int) -> list[Sparse]:
         """See `Stage`."""
-        found = [message for limited in self._limited for message in limited.finish(index)]
-        return found + (self._clipping.finish(index) if self._clipping else [])
+        return super().finish(index) + (self._clipping.finish(index) if self._clipping else [])
 
 
 class LoadedSeriesDrive(LoadedDriveStage):

@@ -12,6 +12,7 @@ from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Reached, Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, remembered
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderParameters
+from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.plants.spindle import Belt, LoadedSpindle, SpeedLoop, SpindleTable, failure, turn
@@ -46,17 +47,15 @@ class LoadedSpindleParameters(SpindleEncoderParameters):
         Raises:
             InputError: a speed loop that oscillates.
         """
-        belt = Belt(self.belt_stiffness, self.belt_damping) if self.belt_stiffness else None
+        belt = made_of(Belt, self, "belt_") if self.belt_stiffness else None
         with about(node, "speed_bandwidth", "speed_integral_time", "belt_stiffness", "belt_damping"):
-            return LoadedSpindle(
-                inertia=self.inertia,
-                motor_inertia=self.motor_inertia,
+            return made_of(
+                LoadedSpindle,
+                self,
+                "part_",
                 belt=belt,
-                loop=SpeedLoop(self.speed_bandwidth, self.speed_integral_time, self.torque_limit or np.inf),
-                radius=self.part_radius,
-                largest_load=self.largest_load,
+                loop=made_of(SpeedLoop, self, "speed_", torque_limit=self.torque_limit or np.inf),
                 largest_deviation=self.largest_deviation * self.nominal_speed,
-                step=self.step,
                 kept=messages.MAX_BLOCK,
             )
 
@@ -78,12 +77,12 @@ class Memory(NamedTuple):
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
-    angle, speed, index_pulse, angle_true, speed_true = outputs
+    angle_true, speed_true = outputs[3], outputs[4]
     follow_law(memory.encoder, first, angle_true, speed_true)
     reached, reason = turn(memory.spindle, first, inputs[0], angle_true, speed_true, memory.room[0])
     if reason != DONE:
         return reached, reason
-    read_off(memory.encoder, first, angle, speed, index_pulse, angle_true, speed_true)
+    read_off(memory.encoder, first, outputs)
     return reached, DONE
 
 

@@ -2,6 +2,7 @@
 """Reactions of a controller or a feed drive to the supervisor."""
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -10,12 +11,12 @@ from annotated_types import Gt
 
 from lathe_rc import messages
 from lathe_rc.cell.parameters import ObedientParameters, parameter
-from lathe_rc.cell.stage import Input, Sparse
+from lathe_rc.cell.stage import Input, Sparse, Stage
 from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, take_over
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-from lathe_rc.messages import Samples
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.safety.state_machine import Reaction
 
 OUT_OF_REACH = "out of reach"  #: event of a takeover that could not begin where the command was
@@ -173,3 +174,35 @@ class Obedience:
         if not skipped:
             return []
         return [Sparse(f"{self._name}/events", messages.EVENT, index, {"action": f"{OUT_OF_REACH}: by {skipped:g}"})]
+
+
+class Listener(NamedTuple):
+    """The obedience of a node, if it has any, for kernels.
+
+    Attributes:
+        obedience: to the supervisor, if it ``listens``.
+        listens: see above.
+    """
+
+    obedience: ObedienceTable
+    listens: bool
+
+
+class Obedient(Stage):
+    """A stage that obeys the supervisor, whose reactions are its last input; a subclass sets its obedience, if any."""
+
+    _obedience: Obedience | None = None
+
+    @property
+    def listener(self) -> Listener:
+        """Its obedience for kernels."""
+        obedience = self._obedience
+        return Listener(obedience.table if obedience else NOBODY, obedience is not None)
+
+    def serve(
+        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
+    ) -> list[Sparse]:
+        """See `Stage`: obey, where the step has stopped for that (`OBEY`)."""
+        if reason != OBEY or self._obedience is None:
+            return []
+        return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)

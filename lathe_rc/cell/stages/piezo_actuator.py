@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fine piezo tool drive."""
+"""Fine piezo tool drive, and its set point: a learned command, the reference, displacements to compensate."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import lru_cache
 from typing import Annotated, Literal, NamedTuple
@@ -11,11 +11,11 @@ from annotated_types import Ge, Gt, Le
 
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell.parameters import about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Joint, Output, Reached, Sparse
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
+from lathe_rc.cell.parameters import NodeParameters, about, parameter
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
+from lathe_rc.cell.stages.command_limits import LimitedCommand, LimitedParameters, limited
 from lathe_rc.cell.stages.drive import Drive
-from lathe_rc.cell.stages.set_point import SetPoint, SetPointParameters, sum_up
+from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.control.limits import LimiterTable
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
@@ -29,6 +29,74 @@ from lathe_rc.plants.hysteresis import (
 from lathe_rc.plants.linear import Discretisation
 from lathe_rc.plants.piezo import FineTable, PiezoDrive, Stack, advance_fine
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
+
+
+class SetPointParameters(NodeParameters):
+    """The set point is command + reference - what is compensated, each where it is chosen."""
+
+    use_command: bool = parameter(default=True, doc="the set point has the learned command in it")
+    use_reference: bool = parameter(
+        default=False, doc="the set point has the desired displacement at the measured angle in it"
+    )
+    compensates: list[str] = parameter(
+        [],
+        "displacements whose measurement is taken off the set point, by the first word of their state topic; direct "
+        "compensation (paper 001, Fig. 4) is the reference with coarse, or vibration alone",
+    )
+
+
+class SetPoint:
+    """The sum that a table chooses.
+
+    Args:
+        node: that it is for.
+        table: its parameters.
+        inside: compensated displacements that the drive itself knows and no topic has to bring.
+        prefix: of the parameters, where the table is part of another one.
+
+    Attributes:
+        inputs: what it reads.
+        signs: with which each of them counts, shape (n,).
+
+    Raises:
+        InputError: nothing is chosen, or something twice.
+    """
+
+    def __init__(self, node: str, table: SetPointParameters, inside: Sequence[str] = (), prefix: str = "") -> None:
+        if len(set(table.compensates)) < len(table.compensates):
+            raise InputError(f"{node}.{prefix}compensates = {table.compensates}; allowed: each displacement once")
+        if not (table.use_command or table.use_reference or table.compensates):
+            names = ", ".join(prefix + name for name in ("use_command", "use_reference", "compensates"))
+            raise InputError(f"{node}.{names}: there is no set point; allowed: one of them or more")
+        inputs = []
+        if table.use_command:
+            inputs.append(Input("fine/command", messages.COMMAND, ("position",)))
+        if table.use_reference:
+            inputs.append(Input("reference", messages.REFERENCE, ("expected",)))
+        added = len(inputs)
+        inputs += [
+            Input(f"{name}/state", messages.STATE, ("measured_position",))
+            for name in table.compensates
+            if name not in inside
+        ]
+        self.inputs = inputs
+        self.signs = np.array([1.0] * added + [-1.0] * (len(inputs) - added))
+
+
+@kernel
+def sum_up(signs: Samples, inputs: tuple[Samples, ...], begin: int, samples: int) -> Samples:
+    """The set point [m], shape (n,), from the inputs of a `SetPoint`, the first of which is number ``begin``."""
+    set_point = np.zeros(samples)
+    for place in range(signs.size):
+        part = inputs[begin + place]
+        if signs[place] > 0.0:
+            for k in range(samples):
+                set_point[k] += part[k]
+        else:
+            for k in range(samples):
+                set_point[k] -= part[k]
+    return set_point
+
 
 _Named = Callable[..., AbstractContextManager[None]]
 
@@ -125,15 +193,13 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
         with named("identified_scale"):
             inverse = model.identified(self.identified_scale).inverse() if model else None
         with named("amplifier_lag", "creep_shortest"):
-            return Stack(
-                stroke=self.stroke,
-                amplifier_lag=self.amplifier_lag,
+            return made_of(
+                Stack,
+                self,
                 slew_rate=self.slew_rate / self.full_voltage or np.inf,
                 hysteresis=hysteresis,
                 inverse=inverse,
-                creep_per_decade=self.creep_per_decade,
                 creep_times=self.creep_shortest * 10.0 ** np.arange(self.creep_decades, dtype=np.float64),
-                step=self.step,
                 method=self.discretisation,
             )
 
@@ -176,46 +242,26 @@ class PiezoActuator(Drive):
 
     kind = "piezo_actuator"
     Parameters = PiezoActuatorParameters
-    announces = (LIMITED, FREE)
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: PiezoActuatorParameters) -> None:
         super().__init__(name, parameters)
         self.parameters = parameters
-        self.drive = PiezoDrive(
-            parameters.stack(name),
-            natural_frequency=parameters.natural_frequency,
-            damping=parameters.damping,
-            full_voltage=parameters.full_voltage,
-            step=parameters.step,
-            method=parameters.discretisation,
-        )
+        self.drive = made_of(PiezoDrive, parameters, stack=parameters.stack(name), method=parameters.discretisation)
         self.set_point = SetPoint(name, parameters)
-        self._limited = LimitedCommand(name, parameters)
-        self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
+        self._limited = [LimitedCommand(name, parameters)]
+        self._sensors = [Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)]
         self.declare(
             inputs=self.set_point.inputs,
             outputs=[Output("fine/state", messages.STATE, Joint("position", "velocity", "effort"))],
-            tells=self._limited.on,
+            tells=self._limited[0].on,
         )
 
     def responses(self) -> Mapping[str, Response]:
         """See `Drive`."""
         return {"fine/command": self.drive.linear.response}
 
-    def finish(self, index: int) -> list[Sparse]:
-        """See `Stage`."""
-        return self._limited.finish(index)
-
     @property
     def memory(self) -> Memory:
         """See `Stage`."""
-        return Memory(self.set_point.signs, self._limited.table, self.drive.table, self._sensor.table)
-
-    def prepare(self, first: int, samples: int) -> None:
-        """See `Stage`."""
-        self._sensor.draw(samples)
-
-    def tell(self, first: int, end: int) -> list[Sparse]:
-        """See `Stage`."""
-        return self._limited.tell(first, end)
+        return Memory(self.set_point.signs, self._limited[0].table, self.drive.table, self._sensors[0].table)

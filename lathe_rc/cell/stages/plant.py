@@ -11,10 +11,9 @@ from annotated_types import Ge, Gt
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Array, Complex, Response
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, LimitedParameters, limited
-from lathe_rc.cell.stages.drive import Drive, Limits
-from lathe_rc.cell.stages.retraction import OwnRetraction, RetractionParameters, followed
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
+from lathe_rc.cell.stages.command_limits import LimitedCommand, LimitedParameters, limited
+from lathe_rc.cell.stages.drive import Drive, Limits, OwnRetraction, RetractionParameters, followed
 from lathe_rc.cell.stages.sampled import Sampled, checked
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import LimiterTable
@@ -57,18 +56,19 @@ class SingleDrive(Drive):
         parameters: its table.
     """
 
-    announces = (LIMITED, FREE)
     parameters: PlantParameters
+    _retraction: OwnRetraction
 
     def __init__(self, name: str, parameters: PlantParameters) -> None:
         super().__init__(name, parameters)
         self._retraction = OwnRetraction(parameters, parameters.stroke)
-        self._limited = LimitedCommand(name, parameters)
-        self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
+        self._limits = Limits(parameters.stroke, parameters.max_velocity, parameters.max_acceleration)
+        self._limited = [LimitedCommand(name, parameters)]
+        self._sensors = [Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)]
         self.declare(
             inputs=[Input("coarse/command", messages.COMMAND, ("position",))],
             outputs=[Output("coarse/state", messages.STATE, Joint("position", "velocity", "effort"))],
-            tells=self._limited.on,
+            tells=self._limited[0].on,
         )
 
     @property
@@ -76,31 +76,10 @@ class SingleDrive(Drive):
     def machine(self) -> Any:
         """Its own part of the memory."""
 
-    def limits(self) -> Mapping[str, Limits]:
-        """See `Drive`."""
-        table = self.parameters
-        return {"coarse/state": Limits(table.stroke, table.max_velocity, table.max_acceleration)}
-
-    def go_safe(self) -> None:
-        """See `Stage`."""
-        self._retraction.begin()
-
-    def finish(self, index: int) -> list[Sparse]:
-        """See `Stage`."""
-        return self._limited.finish(index)
-
     @property
     def memory(self) -> PlantMemory:
         """See `Stage`."""
-        return PlantMemory(self._retraction.table, self._limited.table, self.machine, self._sensor.table)
-
-    def prepare(self, first: int, samples: int) -> None:
-        """See `Stage`."""
-        self._sensor.draw(samples)
-
-    def tell(self, first: int, end: int) -> list[Sparse]:
-        """See `Stage`."""
-        return self._limited.tell(first, end)
+        return PlantMemory(self._retraction.table, self._limited[0].table, self.machine, self._sensors[0].table)
 
 
 Moved = tuple[float, float, float]  #: position [m], velocity [m/s], and effort [N or V] of a drive

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Position controller of a slide: PID, sampled link, or the periodic law."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -12,20 +11,19 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc import messages, resources
 from lathe_rc.cell.native import Step
 from lathe_rc.cell.parameters import about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
+from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
 from lathe_rc.cell.stages.feed_drive import Axis
-from lathe_rc.cell.stages.obedience import OBEY, apply, listens, may_learn, piece
-from lathe_rc.cell.stages.servo import Listener, ServoParameters, listener, pid_along
-from lathe_rc.cell.stages.trajectory import Course, Trajectory, follow
+from lathe_rc.cell.stages.obedience import OBEY, Listener, apply, listens, may_learn, piece
+from lathe_rc.cell.stages.servo import Servo, ServoParameters, pid_along
+from lathe_rc.cell.stages.tables import made_of
+from lathe_rc.cell.stages.trajectory import Course, follow
 from lathe_rc.control import periodic
-from lathe_rc.control.periodic import PeriodicController, PeriodicLaw, PeriodicState
-from lathe_rc.control.periodic_gains import PRESETS
+from lathe_rc.control.periodic import PRESETS, PeriodicController, PeriodicLaw, PeriodicState
 from lathe_rc.control.pid import POSITION, Pid, PidTable
 from lathe_rc.control.predistortion import PathTable, Predistortion, offset_along
 from lathe_rc.control.sampled_link import HeldLink, SampledLink, correct_along
 from lathe_rc.jit import kernel
-from lathe_rc.messages import Samples, Signals
-from lathe_rc.safety.state_machine import Reaction
+from lathe_rc.messages import Samples
 from lathe_rc.signals.example_002 import PERIOD
 
 
@@ -230,7 +228,7 @@ def periodic_step(
     return start, DONE
 
 
-class PositionController(Stage):
+class PositionController(Servo):
     """See `lathe_rc.control.pid`, `lathe_rc.control.sampled_link` and `lathe_rc.control.periodic`.
 
     Attributes:
@@ -244,7 +242,6 @@ class PositionController(Stage):
     def __init__(self, name: str, parameters: PositionControllerParameters) -> None:
         super().__init__(name, parameters)
         self.parameters = parameters
-        self.trajectory = Trajectory(name, parameters)
         self.law = self._make()
         self._path = None
         axis, delay = parameters.axis, parameters.feedback_delay
@@ -260,7 +257,6 @@ class PositionController(Stage):
                 self._path = Predistortion.load(resources.find(Path(parameters.predistortion_file)))
             inputs.append(Input("longitudinal/state", messages.STATE, ("measured_position",), delay))
         self._held, self._log, self._logged = np.zeros(2), np.empty((_PERIODS, 8)), np.zeros(1, np.int64)
-        self._obedience = parameters.obeys(name)
         self.declare(inputs=[*inputs, *listens(parameters)], outputs=[Output(f"{axis}/command", messages.SERVO)])
         if parameters.law == "periodic_hyperstable":
             self.sparse_topics[f"{axis}/periodic"] = messages.PERIODIC
@@ -268,33 +264,19 @@ class PositionController(Stage):
     def _make(self) -> Pid | SampledLink | PeriodicController:
         parameters = self.parameters
         if parameters.law == "pid":
-            return parameters.pid(
-                self.name,
-                parameters.proportional,
-                parameters.integral,
-                parameters.derivative,
-                parameters.derivative_filter,
-            )
+            return parameters.pid(self.name)
         if parameters.law == "sampled_link":
             known = parameters.link == "ripple_free" and parameters.link_knows_delay
             with about(self.name, "link_gain", "link_lag", "divisor", "feedback_delay", "link"):
-                return SampledLink(
-                    parameters.link,
-                    gain=parameters.link_gain,
-                    lag=parameters.link_lag,
-                    step=parameters.step,
-                    divisor=parameters.divisor,
-                    delay=parameters.feedback_delay * parameters.step if known else 0.0,
-                    limit=parameters.command_limit,
-                )
+                delay, limit = parameters.feedback_delay * parameters.step if known else 0.0, parameters.command_limit
+                return made_of(SampledLink, parameters, "link_", law=parameters.link, delay=delay, limit=limit)
         with about(self.name, "period", "memory_filter", "divisor"):
-            return PeriodicController(
-                PRESETS[parameters.periodic_gains],
-                period=parameters.period,
+            return made_of(
+                PeriodicController,
+                parameters,
+                gains=PRESETS[parameters.periodic_gains],
                 limit=parameters.command_limit,
                 step_s=parameters.step * parameters.divisor,
-                memory_filter=parameters.memory_filter,
-                anti_windup=parameters.anti_windup,
                 measurement_step=parameters.adc_step / parameters.periodic_unit,
                 command_step=parameters.dac_step,
             )
@@ -305,17 +287,13 @@ class PositionController(Stage):
         steps: dict[str, Step] = {"pid": pid_step, "sampled_link": link_step, "periodic_hyperstable": periodic_step}
         return steps[self.parameters.law]
 
-    def warnings(self, seconds: float) -> list[str]:
-        """See `Stage`."""
-        return [f"{self.name}.{doubt}" for doubt in self.trajectory.doubts(seconds)]
-
     @property
     def memory(self) -> PidMemory | LinkMemory | PeriodicMemory:
         """See `Stage`."""
         path = self._path.table if self._path else _NO_PATH
         edge = 2 if self.parameters.measures == "edge" else 0
         height = (3 if edge else 2) if self._path else 0
-        wanted = Wanted(self.trajectory.course, path, edge, height, listener(self._obedience))
+        wanted = Wanted(self.trajectory.course, path, edge, height, self.listener)
         if isinstance(self.law, Pid):
             return PidMemory(wanted, self.law.table, self.law.state)
         if isinstance(self.law, SampledLink):
@@ -324,19 +302,6 @@ class PositionController(Stage):
             wanted, self.law.law, self.law.state, self.parameters.periodic_unit, self.parameters.divisor, self._held,
             self._log, self._logged,
         )  # fmt: skip
-
-    def prepare(self, first: int, samples: int) -> None:
-        """See `Stage`."""
-        self.trajectory.prepare(first, samples)
-
-    def serve(
-        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
-    ) -> list[Sparse]:
-        """See `Stage`: obey, if there is somebody to obey."""
-        if reason != OBEY:
-            return []
-        assert self._obedience is not None, "nobody else listens"
-        return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)
 
     def tell(self, first: int, end: int) -> list[Sparse]:
         """See `Stage`: what the periodic law achieved where a period has ended."""

@@ -11,14 +11,12 @@ from pydantic import create_model
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
 from lathe_rc.cell.parameters import about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand, limited
-from lathe_rc.cell.stages.composed import ComposedParameters, prefixed
-from lathe_rc.cell.stages.drive import Drive, Limits
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
+from lathe_rc.cell.stages.command_limits import LimitedCommand, limited
+from lathe_rc.cell.stages.drive import Drive, Limits, OwnRetraction, followed
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
-from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters
-from lathe_rc.cell.stages.retraction import OwnRetraction, followed
-from lathe_rc.cell.stages.set_point import SetPoint, sum_up
+from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters, SetPoint, sum_up
+from lathe_rc.cell.stages.tables import ComposedParameters, made_of, prefixed
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import LimiterTable
 from lathe_rc.jit import kernel
@@ -80,16 +78,12 @@ class Memory(NamedTuple):
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
     command = inputs[0]
-    position, velocity, effort, measured, fine_position, fine_velocity, fine_effort, fine_measured = outputs
     noise = np.empty(command.size)
     measure(memory.noise, np.zeros(command.size), noise)
     given = limited(memory.limits, first, followed(memory.retraction, command))
     wanted = limited(memory.limits_fine, first, sum_up(memory.signs, inputs, 1, command.size))
-    advance(
-        memory.drive, first, given, wanted, noise, position, velocity, effort, measured, fine_position, fine_velocity,
-        fine_effort,
-    )  # fmt: skip
-    measure(memory.sensor, fine_position, fine_measured)
+    advance(memory.drive, first, given, wanted, noise, outputs[:7])
+    measure(memory.sensor, outputs[4], outputs[7])
     return command.size, DONE
 
 
@@ -102,31 +96,13 @@ def piezo_on_carriage(name: str, fine: PiezoActuatorParameters, mass_ratio: floa
         mass_ratio: mass of the tool over that of the carriage.
         preload: of the stack [N].
     """
-    return Piezo(
-        stack=fine.stack(name, FINE),
-        tool_frequency=fine.natural_frequency,
-        tool_damping=fine.damping,
-        mass_ratio=mass_ratio,
-        full_voltage=fine.full_voltage,
-        feedback=COARSE in fine.compensates,
-        preload=preload,
-    )
+    stack, feedback = fine.stack(name, FINE), COARSE in fine.compensates
+    return made_of(Piezo, fine, stack=stack, mass_ratio=mass_ratio, feedback=feedback, preload=preload)
 
 
 def tool_drive(coarse: ElectrodynamicActuatorParameters, shared: ComposedParameters, **beside: Any) -> ToolDrive:
     """The machine of a coarse drive's table, and of what is given ``beside`` it, see `ToolDrive`."""
-    return ToolDrive(
-        carriage_frequency=coarse.natural_frequency,
-        carriage_damping=coarse.damping,
-        delay=coarse.delay,
-        carriage_stroke=coarse.stroke,
-        moving_mass=coarse.moving_mass,
-        force_constant=coarse.force_constant,
-        resolution=coarse.resolution,
-        step=shared.step,
-        method=shared.discretisation,
-        **beside,
-    )
+    return made_of(ToolDrive, coarse, method=shared.discretisation, **beside)
 
 
 class SeriesDriveStage(Drive):
@@ -139,7 +115,7 @@ class SeriesDriveStage(Drive):
 
     kind = "series_drive"
     Parameters = SeriesDriveParameters
-    announces = (LIMITED, FREE)
+    _retraction: OwnRetraction
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: SeriesParameters) -> None:
@@ -151,11 +127,13 @@ class SeriesDriveStage(Drive):
             self.drive = tool_drive(coarse, parameters, piezo=piezo)
         self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
         self._retraction = OwnRetraction(coarse, coarse.stroke)
-        self._limited = LimitedCommand(name, coarse, "coarse"), LimitedCommand(name, fine, "fine")
+        self._limited = [LimitedCommand(name, coarse, "coarse"), LimitedCommand(name, fine, "fine")]
         self._set_point = SetPoint(name, fine, inside=(COARSE,), prefix=FINE)
         # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
-        self._coarse_noise = Sensor(coarse.noise_rms, 0.0, parameters.seed, f"{name}/coarse")
-        self._fine_sensor = Sensor(fine.noise_rms, fine.resolution, parameters.seed, f"{name}/fine")
+        self._sensors = [
+            Sensor(coarse.noise_rms, 0.0, parameters.seed, f"{name}/coarse"),
+            Sensor(fine.noise_rms, fine.resolution, parameters.seed, f"{name}/fine"),
+        ]
         self.declare(
             inputs=[Input("coarse/command", messages.COMMAND, ("position",)), *self._set_point.inputs],
             outputs=[
@@ -169,32 +147,9 @@ class SeriesDriveStage(Drive):
         """See `Drive`."""
         return {"coarse/command": self.drive.coarse_response, "fine/command": self.drive.fine_response}
 
-    def limits(self) -> Mapping[str, Limits]:
-        """See `Drive`."""
-        return {"coarse/state": self._limits}
-
-    def go_safe(self) -> None:
-        """See `Stage`; the carriage takes the tool out."""
-        self._retraction.begin()
-
-    def finish(self, index: int) -> list[Sparse]:
-        """See `Stage`."""
-        return [message for limited in self._limited for message in limited.finish(index)]
-
     @property
     def memory(self) -> Memory:
         """See `Stage`."""
         limits, limits_fine = (limited.table for limited in self._limited)
-        return Memory(
-            self._retraction.table, limits, limits_fine, self._set_point.signs, self.drive.table,
-            self._coarse_noise.table, self._fine_sensor.table,
-        )  # fmt: skip
-
-    def prepare(self, first: int, samples: int) -> None:
-        """See `Stage`."""
-        self._coarse_noise.draw(samples)
-        self._fine_sensor.draw(samples)
-
-    def tell(self, first: int, end: int) -> list[Sparse]:
-        """See `Stage`."""
-        return [message for limited in self._limited for message in limited.tell(first, end)]
+        sensors = (sensor.table for sensor in self._sensors)
+        return Memory(self._retraction.table, limits, limits_fine, self._set_point.signs, self.drive.table, *sensors)

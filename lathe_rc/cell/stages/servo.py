@@ -1,25 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """The common part of servo controllers: a PID, converters, and a feedback edge."""
 
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE
 from lathe_rc.cell.stages.obedience import (
-    NOBODY,
     OBEY,
     FeedObedientParameters,
+    Listener,
     Obedience,
-    ObedienceTable,
+    Obedient,
     apply,
     may_learn,
     obeyed,
     piece,
 )
-from lathe_rc.cell.stages.trajectory import TrajectoryParameters
-from lathe_rc.control.pid import Pid, PidGains, PidTable, control_along, lets_learn
+from lathe_rc.cell.stages.tables import made_of
+from lathe_rc.cell.stages.trajectory import Trajectory, TrajectoryParameters
+from lathe_rc.control.pid import Pid, PidGains, PidTable, control_along, enable_integrator
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
 from lathe_rc.safety.state_machine import Reaction
@@ -62,41 +63,37 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
         speed, limit = self.commands == "speed", self.command_limit
         return self.obedience(name, speed=speed, limit=limit, settled=self.feedback_delay)
 
-    def pid(self, node: str, proportional: float, integral: float, derivative: float, filter_: float) -> Pid:
-        """The PID of a node.
+    def pid(self, node: str) -> Pid:
+        """The PID of a node, whose table has gains.
 
         Raises:
             InputError: see `lathe_rc.control.pid`.
         """
         with about(node, "proportional", "integral", "derivative", "derivative_filter"):
-            return Pid(
-                PidGains(proportional, integral, derivative, filter_),
-                low=-self.command_limit,
-                high=self.command_limit,
-                step=self.step,
-                adc=self.adc_step,
-                dac=self.dac_step,
-                ramp=self.set_point_ramp,
-                smoothing=self.set_point_smoothing,
-                divisor=self.divisor,
-            )
+            gains, limit = made_of(PidGains, self, "derivative_"), self.command_limit
+            converters = {"adc": self.adc_step, "dac": self.dac_step}
+            return made_of(Pid, self, "set_point_", gains=gains, low=-limit, high=limit, **converters)
 
 
-class Listener(NamedTuple):
-    """The obedience of a node, if it has any, for kernels.
+class Servo(Obedient):
+    """A servo controller with its set point.
 
     Attributes:
-        obedience: to the supervisor, if it ``listens``.
-        listens: see above.
+        trajectory: of the set point.
     """
 
-    obedience: ObedienceTable
-    listens: bool
+    def __init__(self, name: str, parameters: ServoParameters) -> None:
+        super().__init__(name, parameters)
+        self.trajectory = Trajectory(name, parameters)
+        self._obedience = parameters.obeys(name)
 
+    def warnings(self, seconds: float) -> list[str]:
+        """See `Stage`."""
+        return [f"{self.name}.{doubt}" for doubt in self.trajectory.doubts(seconds)]
 
-def listener(obedience: Obedience | None) -> Listener:
-    """The same of a stage."""
-    return Listener(obedience.table if obedience else NOBODY, obedience is not None)
+    def prepare(self, first: int, samples: int) -> None:
+        """See `Stage`."""
+        self.trajectory.prepare(first, samples)
 
 
 @kernel
@@ -118,7 +115,7 @@ def pid_along(
             stop = piece(who.obedience, start, reaction)
             if stop == start:
                 return start, OBEY
-            lets_learn(state, may_learn(who.obedience), obeyed(who.obedience) >= Reaction.HOLD.value)
+            enable_integrator(state, may_learn(who.obedience), obeyed(who.obedience) >= Reaction.HOLD.value)
         control_along(pid, state, first + start, wanted[start:stop], measured[start:stop], command[start:stop])
         if who.listens:
             apply(who.obedience, command[start:stop])

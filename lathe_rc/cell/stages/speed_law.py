@@ -11,6 +11,7 @@ from annotated_types import Ge, Gt, Le
 
 from lathe_rc import resources
 from lathe_rc.cell.parameters import NodeParameters, about, parameter
+from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.signals import speed, tachogram
@@ -67,9 +68,7 @@ class SpeedLawParameters(NodeParameters):
         if not self.random_rms:
             return law
         with about(node, "random_low", "random_high"):
-            return law + speed.band_limited_random(
-                nominal, self.random_rms, self.random_low, self.random_high, self.random_lines, self.seed
-            )
+            return law + made_of(speed.band_limited_random, self, "random_", nominal=nominal)
 
     def _tachogram(self, node: str) -> speed.SpeedLaw | None:
         """The one of the lists, of the file, or of a law of others, if there is one."""

@@ -12,6 +12,7 @@ from lathe_rc.cell.native import Step
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
+from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
@@ -42,24 +43,17 @@ class SpindleEncoderParameters(TimeMasterParameters, SpeedLawParameters):
         Raises:
             InputError: see `EncoderErrors`.
         """
+        errors = made_of(EncoderErrors, self, "disc_", "signal_")
         with about(node, "signal_cosine_offset", "signal_sine_offset", "signal_mismatch", "signal_skew"):
-            return EncoderErrors(
-                eccentricity=self.disc_eccentricity,
-                phase=self.disc_phase,
-                periods=self.signal_periods,
-                cosine_offset=self.signal_cosine_offset,
-                sine_offset=self.signal_sine_offset,
-                mismatch=self.signal_mismatch,
-                skew=self.signal_skew,
-            )
+            errors.check()
+        return errors
 
 
 @kernel
 def step(memory: EncoderTable, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """See `lathe_rc.cell.stage`."""
-    angle, speed, index_pulse, angle_true, speed_true = outputs
-    encode(memory, first, angle, speed, index_pulse, angle_true, speed_true)
-    return angle.size, DONE
+    encode(memory, first, outputs)
+    return outputs[0].size, DONE
 
 
 class SpindleEncoder(TimeMaster):

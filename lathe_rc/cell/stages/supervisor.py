@@ -4,16 +4,17 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from annotated_types import Ge, Le
 
 from lathe_rc import messages
+from lathe_rc.cell.parameters import NodeParameters, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage, cut
-from lathe_rc.cell.stages.supervisor_parameters import MONITORS, SupervisorParameters
 from lathe_rc.errors import InputError
-from lathe_rc.extensions import code_of_others
+from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.safety import state_machine
@@ -26,12 +27,97 @@ from lathe_rc.safety.monitors import (
     Lookout,
     Monitor,
     Plain,
+    PlainMonitor,
     Rate,
     Threshold,
     Watcher,
 )
 from lathe_rc.safety.rules import Watch, clear, walk
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
+
+Asked = Literal["warn", "freeze", "fall_back", "hold", "retract", "stop"]
+
+#: by name, those of other packages: ours have thresholds of their own
+MONITORS: Registry[PlainMonitor] = Registry("monitor", PlainMonitor, {}, "lathe_rc.monitors")
+
+
+class SupervisorParameters(NodeParameters):
+    """Thresholds, each 0 for a monitor that is off, and what is asked for beyond them."""
+
+    drives: list[str] = parameter(
+        [], "drives of the tool that are watched, by the names of their topics; the first takes the tool out"
+    )
+    slides: list[Literal["cross", "longitudinal"]] = parameter([], "slides that are watched")
+
+    speed_limit: Annotated[float, Ge(0)] = parameter(
+        0.0, "encoder: measured speed, deviation from the nominal", "rad/s"
+    )
+    speed_reaction: Asked = parameter("stop", "what is asked for then")
+    acceleration_limit: Annotated[float, Ge(0)] = parameter(0.0, "encoder: change of the measured speed", "rad/s^2")
+    acceleration_window: Annotated[int, Ge(1), Le(65536)] = parameter(640, "over so many samples", "sample")
+    acceleration_reaction: Asked = parameter("stop", "what is asked for then")
+    index_limit: Annotated[float, Ge(0), Le(3)] = parameter(
+        0.0, "encoder: measured angle from index pulse to index pulse, deviation from a revolution", "rad"
+    )
+    index_reaction: Asked = parameter("retract", "what is asked for then")
+    following_limit: list[Annotated[float, Ge(0)]] = parameter(
+        [], "drives: command - measured position, the drive's own lag included; one for each, or none", "m"
+    )
+    following_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
+    following_reaction: Asked = parameter("retract", "what is asked for then")
+    stroke_limit: list[Annotated[float, Ge(0)]] = parameter(
+        [], "drives: measured position to each side; one for each, or none", "m"
+    )
+    stroke_reaction: Asked = parameter("retract", "what is asked for then")
+    effort_limit: list[Annotated[float, Ge(0)]] = parameter(
+        [], "drives: current or voltage at which one is taken to be saturated; one for each, or none", "A or V"
+    )
+    effort_time: Annotated[float, Ge(0)] = parameter(5e-3, "for so long", "s")
+    effort_reaction: Asked = parameter("freeze", "what is asked for then")
+    error_limit: Annotated[float, Ge(0)] = parameter(0.0, "tool: measured error", "m")
+    error_after: Annotated[float, Ge(0)] = parameter(
+        10.0, "after so many from the start or a reset: they are there to learn", "rev"
+    )
+    error_reaction: Asked = parameter("retract", "what is asked for then")
+    growth_limit: Annotated[float, Ge(0)] = parameter(
+        0.0, "tool: RMS error of a revolution over that of the one before"
+    )
+    growth_cycles: Annotated[int, Ge(1), Le(1000)] = parameter(3, "so many times in a row", "rev")
+    growth_floor: Annotated[float, Ge(0)] = parameter(1e-6, "RMS error that does not count", "m")
+    growth_reaction: Asked = parameter("freeze", "what is asked for then")
+    margin_limit: list[Annotated[float, Ge(0)]] = parameter(
+        [],
+        "drives: smallest stability margin of the channel that commands one, which has publish_margin; one for each, "
+        "or none",
+    )
+    margin_after: Annotated[float, Ge(0)] = parameter(
+        10.0, "after so many from the start or a reset: the drive has to be identified", "rev"
+    )
+    margin_reaction: Asked = parameter("freeze", "what is asked for then")
+    force_limit: Annotated[float, Ge(0)] = parameter(0.0, "cut: measured force", "N")
+    force_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
+    force_low: Annotated[float, Ge(0)] = parameter(0.0, "cut: measured force below this is lost", "N")
+    force_after: Annotated[float, Ge(0)] = parameter(10.0, "after so many from the start or a reset", "rev")
+    force_reaction: Asked = parameter("retract", "what is asked for beyond either")
+    slide_limit: list[Annotated[float, Ge(0)]] = parameter(
+        [], "slides: measured position to each side; one for each, or none", "m"
+    )
+    slide_reaction: Asked = parameter("hold", "what is asked for then")
+    monitors: list[Annotated[str, Named(MONITORS)]] = parameter([], "monitors of others")
+    monitor_signals: list[str] = parameter(
+        [], "what each of them watches, as TOPIC.FIELD, like tool.measured_error or coarse/state.effort"
+    )
+    monitor_others: list[str] = parameter(
+        [], "a second signal for each, an empty text where there is none; empty: for none of them"
+    )
+    monitor_limits: list[float] = parameter([], "threshold of each, in the unit of what it finds")
+    monitor_reactions: list[Asked] = parameter([], "what each of them asks for")
+
+    clear_position: Annotated[float, Ge(0)] = parameter(
+        0.25e-3, "the tool is out of the part where the first drive's measured position is beyond this", "m"
+    )
+    clear_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
+
 
 MEMBERS_LOST = "members_lost"  #: stands for a monitor where the host says that members of the cell are lost
 RESET_REFUSED = "reset refused"  #: the same: while the tool is on its way out, or after a stop
@@ -155,107 +241,63 @@ class Supervisor(Stage):
             )
         return asked
 
+    def _watch(
+        self, kind: type[Monitor], name: str, subject: str, limit: float, asked: str = "", **options: Any
+    ) -> None:
+        """Add a monitor; ``asked``: first word of the parameter with its reaction, if not its own name."""
+        self.monitors.append(kind(name, subject, limit, self._reaction(f"{asked or name}_reaction"), **options))
+
     def _watch_spindle(self) -> None:
-        table, add = self.parameters, self.monitors.append
-        if table.speed_limit:
-            reaction = self._reaction("speed_reaction")
-            speed = table.nominal_speed
-            add(Threshold("speed", "encoder", table.speed_limit, reaction, signal=(0, "speed"), offset=speed))
-        if table.acceleration_limit:
-            add(
-                Rate(
-                    "acceleration",
-                    "encoder",
-                    table.acceleration_limit,
-                    self._reaction("acceleration_reaction"),
-                    signal=(0, "speed"),
-                    window=table.acceleration_window,
-                    step=table.step,
-                    before=table.nominal_speed,
-                )
-            )
+        table, nominal = self.parameters, self.parameters.nominal_speed
+        if limit := table.speed_limit:
+            self._watch(Threshold, "speed", "encoder", limit, signal=(0, "speed"), offset=nominal)
+        if limit := table.acceleration_limit:
+            over: dict[str, Any] = {"window": table.acceleration_window, "step": table.step, "before": nominal}
+            self._watch(Rate, "acceleration", "encoder", limit, signal=(0, "speed"), **over)
         if table.index_limit:
-            add(IndexPulses(table.index_limit, self._reaction("index_reaction"), encoder=0))
+            self.monitors.append(IndexPulses(table.index_limit, self._reaction("index_reaction"), encoder=0))
 
     def _watch_error(self) -> None:
-        table, add = self.parameters, self.monitors.append
+        table = self.parameters
         tool = self._reads("tool", messages.TOOL, ("measured_error",)) if table.error_limit or table.growth_limit else 0
-        if table.error_limit:
-            reaction = self._reaction("error_reaction")
-            add(
-                Threshold(
-                    "error",
-                    "tool",
-                    table.error_limit,
-                    reaction,
-                    signal=(tool, "measured_error"),
-                    after=table.error_after,
-                )
-            )
-        if table.growth_limit:
-            reaction = self._reaction("growth_reaction")
-            add(
-                Growth(
-                    table.growth_limit,
-                    reaction,
-                    tool=tool,
-                    cycles=table.growth_cycles,
-                    floor=table.growth_floor,
-                )
-            )
+        if limit := table.error_limit:
+            self._watch(Threshold, "error", "tool", limit, signal=(tool, "measured_error"), after=table.error_after)
+        if limit := table.growth_limit:
+            how: dict[str, Any] = {"cycles": table.growth_cycles, "floor": table.growth_floor}
+            self.monitors.append(Growth(limit, self._reaction("growth_reaction"), tool=tool, **how))
 
     def _watch_drives(self) -> None:
-        table, add = self.parameters, self.monitors.append
+        table = self.parameters
         for drive, limit in self._each("following_limit", table.drives):
-            state = self._reads(f"{drive}/state", messages.STATE, _SENSOR)
-            command = self._reads(f"{drive}/command", messages.COMMAND, _COMMAND)
-            add(
-                Threshold(
-                    "following",
-                    drive,
-                    limit,
-                    self._reaction("following_reaction"),
-                    signal=(command, "position"),
-                    other=(state, "measured_position"),
-                    samples=self._samples(table.following_time),
-                )
-            )
-        for what, of, name, field, seconds in (
-            ("stroke", table.drives, "stroke_limit", "measured_position", 0.0),
-            ("effort", table.drives, "effort_limit", "effort", table.effort_time),
-            ("slide", table.slides, "slide_limit", "measured_position", 0.0),
+            state = self._reads(f"{drive}/state", messages.STATE, _SENSOR), "measured_position"
+            command = self._reads(f"{drive}/command", messages.COMMAND, _COMMAND), "position"
+            samples = self._samples(table.following_time)
+            self._watch(Threshold, "following", drive, limit, signal=command, other=state, samples=samples)
+        for what, of, field, seconds in (
+            ("stroke", table.drives, "measured_position", 0.0),
+            ("effort", table.drives, "effort", table.effort_time),
+            ("slide", table.slides, "measured_position", 0.0),
         ):
-            for subject, limit in self._each(name, of):
-                state = self._reads(f"{subject}/state", messages.STATE, _SENSOR)
-                reaction, samples = self._reaction(f"{what}_reaction"), self._samples(seconds)
-                add(Threshold(what, subject, limit, reaction, signal=(state, field), samples=samples))
+            for subject, limit in self._each(f"{what}_limit", of):
+                signal = self._reads(f"{subject}/state", messages.STATE, _SENSOR), field
+                self._watch(Threshold, what, subject, limit, signal=signal, samples=self._samples(seconds))
 
     def _watch_margins(self) -> None:
         for drive, limit in self._each("margin_limit", self.parameters.drives):
-            reaction, after = self._reaction("margin_reaction"), self.parameters.margin_after
             signal = (self._reads(f"{drive}/margin", messages.MARGIN, _MARGIN), *_MARGIN)
-            self.monitors.append(Below("stability_margin", drive, limit, reaction, signal=signal, after=after))
+            after = self.parameters.margin_after
+            self._watch(Below, "stability_margin", drive, limit, "margin", signal=signal, after=after)
 
     def _watch_cut(self) -> None:
         table = self.parameters
         if not (table.force_limit or table.force_low):
             return
-        place, reaction = self._reads("cut", messages.CUT, ("measured_force",)), self._reaction("force_reaction")
-        signal, samples = (place, "measured_force"), self._samples(table.force_time)
-        if table.force_limit:
-            self.monitors.append(Threshold("force", "cut", table.force_limit, reaction, signal=signal, samples=samples))
-        if table.force_low:
-            self.monitors.append(
-                Below(
-                    "force_low",
-                    "cut",
-                    table.force_low,
-                    reaction,
-                    signal=signal,
-                    samples=samples,
-                    after=table.force_after,
-                )
-            )
+        signal = self._reads("cut", messages.CUT, ("measured_force",)), "measured_force"
+        lasts: dict[str, Any] = {"signal": signal, "samples": self._samples(table.force_time)}
+        if limit := table.force_limit:
+            self._watch(Threshold, "force", "cut", limit, **lasts)
+        if limit := table.force_low:
+            self._watch(Below, "force_low", "cut", limit, "force", after=table.force_after, **lasts)
 
     def _watch_for_others(self) -> None:
         table, own = self.parameters, ("monitor_signals", "monitor_limits", "monitor_reactions")

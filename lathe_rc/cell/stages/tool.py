@@ -14,7 +14,7 @@ from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sta
 from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, evaluate
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-from lathe_rc.plants.tool import add_drive
+from lathe_rc.messages import Samples
 
 
 class ToolParameters(FormParameters):
@@ -67,6 +67,28 @@ class Memory(NamedTuple):
     drives: int
     cross_slide: bool
     deflects: bool
+
+
+@kernel
+def add_drive(
+    begins: bool,  # noqa: FBT001 - kernels take their arguments by position
+    reference: Samples,
+    expected: Samples,
+    position: Samples,
+    measured: Samples,
+    displacement: Samples,
+    known: Samples,
+    error: Samples,
+) -> None:
+    """Add a drive's motion; all [m] and of shape (n,). The first drive ``begins`` the sum.
+
+    The error is Xd - X of what is true (paper 000, Fig. 1); what can be known of it is what is expected at the measured
+    angle less the measured motions.
+    """
+    for k in range(reference.size):
+        displacement[k] = position[k] if begins else displacement[k] + position[k]
+        known[k] = (expected[k] if begins else known[k]) - measured[k]
+        error[k] = reference[k] - displacement[k]
 
 
 @kernel
@@ -136,7 +158,7 @@ class Tool(Stage):
 
     @property
     def memory(self) -> Memory:
-        """See `Stage` and `lathe_rc.plants.tool`."""
+        """See `Stage`."""
         parameters = self.parameters
         form = self.form.table if self.form else _ELSEWHERE
         begin = 3 if self.form is None else 2 * len(self.form.inputs)

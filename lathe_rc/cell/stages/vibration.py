@@ -10,6 +10,7 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
+from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.errors import InputError, at_most
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
@@ -72,9 +73,7 @@ class Vibration(Stage):
                 np.array(parameters.line_amplitude), np.array(parameters.line_frequency), np.array(phase)
             )
         with about(name, "random_low", "random_high"):
-            drawn = vibration.band_limited_random(
-                parameters.random_rms, parameters.random_low, parameters.random_high, parameters.random_lines, random
-            )
+            drawn = made_of(vibration.band_limited_random, parameters, "random_", random=random)
         self.lines = np.concatenate((given, drawn), axis=1)
         nyquist = np.pi / parameters.step
         for whose, lines in (("line_frequency", given), ("random_high", drawn)):
