@@ -32,11 +32,17 @@ class Damaged(NamedTuple):
     hit: frozenset[int]
 
 
-def records_of(data: bytes) -> list[tuple[int, int, int]]:
-    """Opcode, begin and end of each record outside of chunks."""
-    place, found = MAGIC, []
-    while place < len(data) - MAGIC:
+def records_of(data: bytes, start: int = MAGIC, end: int = -MAGIC) -> list[tuple[int, int, int]]:
+    """Opcode, begin and end of each record; outside of chunks, unless ``data`` are those of one.
+
+    Raises:
+        ValueError, struct.error: one is cut off.
+    """
+    place, stop, found = start, end if end >= 0 else len(data) + end, []
+    while place < stop:
         opcode, length = HEAD.unpack_from(data, place)
+        if place + HEAD.size + length > stop:
+            raise ValueError(f"cut off at {place}")
         found.append((opcode, place, place + HEAD.size + length))
         place = found[-1][2]
     return found

@@ -176,7 +176,7 @@ FIRST = len(MCAP0_MAGIC + HEADER)
         (b"", SCHEMA + STATISTICS + struct.pack("<BQ", 13, 2**32), "cut off at byte"),
         (b"", SCHEMA + STATISTICS + channels(600, b"x" * 2000), "characters of quality of service"),
         (b"", SCHEMA + STATISTICS + channels(5000, b""), "more than 4096 topics"),
-        (b"", SCHEMA + STATISTICS + 1000 * SCHEMA + record(11, bytes(2**20 + 1)), "statistics of 1048577 B"),
+        (b"", SCHEMA + STATISTICS + 1000 * SCHEMA + record(11, bytes(2**20 + 1)), "record of 1048577 B at byte"),
         (b"", SCHEMA + STATISTICS + chunk_index(2**63, 100), "none can be"),
         (chunk(), SCHEMA + STATISTICS + 2 * chunk_index(FIRST, len(chunk())), "two chunks at byte"),
         (chunk(), SCHEMA + STATISTICS + chunk_index(FIRST, len(chunk()), size=2**40), "none can be"),

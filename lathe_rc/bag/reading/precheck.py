@@ -3,40 +3,13 @@
 
 import contextlib
 import sqlite3
-import struct
-from typing import Any, BinaryIO
+from typing import Any
 
 import yaml
 
 from lathe_rc.bag.reading.limits import LONGEST_NAME, MOST_BYTES, MOST_DEPTH, MOST_EVENTS, MOST_TOPICS
 
-_RECORD = struct.Struct("<BQ")  # opcode, length
 _YAML = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # makes texts alone: no dates, no objects
-
-
-def read_record(stream: BinaryIO, limit: int) -> tuple[int, bytes] | None:
-    """Opcode and content of the next record of an MCAP file.
-
-    Args:
-        stream: at a record.
-        limit: where the file or the chunk ends.
-
-    Returns:
-        None at the end.
-
-    Raises:
-        ValueError: it is cut off, or longer than allowed.
-    """
-    place = stream.tell()
-    if place == limit:
-        return None
-    head = stream.read(_RECORD.size)
-    opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, limit)
-    if place + _RECORD.size + length > limit:
-        raise ValueError(f"cut off at byte {place}")
-    if length > MOST_BYTES:
-        raise ValueError(f"record of {length} B at byte {place}; allowed: up to {MOST_BYTES}")
-    return opcode, stream.read(length)
 
 
 def read_yaml(text: str, what: str) -> Any:

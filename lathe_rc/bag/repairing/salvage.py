@@ -35,7 +35,7 @@ from lathe_rc.errors import InputError, shown
 
 ROS2 = "ros2"  #: profile of the files of rosbag2
 
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_MESSAGE = struct.Struct("<IQQ")  # sequence, log time, publish time: ahead of the bytes of a message
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message that is compressed by itself; CDR begins with a zero
 _MOST_DAMAGE = 1000  # places that are told
 _SCHEMALESS = "__schemaless__"  # type of messages without a schema, as rosbags calls it
@@ -253,16 +253,17 @@ class Salvage:
             for record in sound:
                 if record.opcode == Opcode.STATISTICS and not sound.summary_wrong:
                     self._counted = Statistics.read(ReadDataStream(BytesIO(record.content))).message_count
-                for opcode, content in sound.inside(record):
-                    if opcode == Opcode.MESSAGE and len(content) >= _MESSAGE.size:
-                        channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content)
-                        if topic := known.topics.get(channel) or known.topic_of(channel):
-                            yield Message(topic, sequence, log_ns, publish_ns, content[_MESSAGE.size :])
+                for content, found in sound.inside(record):
+                    for opcode, begin, end in found.others.tolist():
+                        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                            known.add(opcode, content[begin:end], checked=record.checked)
+                        else:
+                            self._other(opcode, content[begin:end], 0 if sound.ended else end - begin, told)
+                    for number, log_ns, begin, end in found.messages.tolist():
+                        if topic := known.topics.get(number) or known.topic_of(number):
+                            sequence, _, publish_ns = _MESSAGE.unpack_from(content, begin - _MESSAGE.size)
+                            yield Message(topic, sequence, log_ns, publish_ns, content[begin:end])
                             unchecked += not record.checked
-                    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                        known.add(opcode, content, checked=record.checked)
-                    else:
-                        self._other(opcode, content, 0 if sound.ended else len(content), told)
             known.finish()
             self._ended = sound.ended
             if unchecked and sound.data_wrong:
@@ -280,8 +281,8 @@ class Salvage:
                     self.copied(opcode, content)
             elif opcode == Opcode.ATTACHMENT:
                 self.copied(opcode, content)
-            elif opcode in (Opcode.CHUNK, Opcode.MESSAGE):
-                raise ValueError("a chunk in the chunk, or a message that is too short")  # noqa: TRY301
+            elif opcode == Opcode.CHUNK:
+                raise ValueError("a chunk in the chunk")  # noqa: TRY301
             elif opcode > Opcode.DATA_END:
                 raise ValueError("it is not copied")  # noqa: TRY301
         except ValueError as error:
@@ -368,9 +369,10 @@ class _Definitions:
             self._searched = True
             told, self._sound.told = self._sound.told, lambda _why, _lost: None
             for record in self._sound:
-                for kind, content in self._sound.inside(record):
-                    if (kind, int.from_bytes(content[:2], "little")) not in self._known:
-                        self.add(kind, content, checked=record.checked)
+                for content, found in self._sound.inside(record):
+                    for kind, begin, end in found.others.tolist():
+                        if (kind, int.from_bytes(content[begin : begin + 2], "little")) not in self._known:
+                            self.add(kind, content[begin:end], checked=record.checked)
             self._sound.told = told
         return self._known[key].content if key in self._known else None
 
