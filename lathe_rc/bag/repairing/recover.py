@@ -5,11 +5,9 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from rosbags.interfaces import ConnectionExtRosbag2
-
 from lathe_rc.bag import provenance
 from lathe_rc.bag.repairing.salvage import Salvage, Topic
-from lathe_rc.bag.writing.writer import BagWriter, refuse_existing
+from lathe_rc.bag.writing.writer import BagWriter, ListedTopic, refuse_existing
 from lathe_rc.errors import LatheError, shown
 
 _CHUNK = 2**20  # [B]
@@ -68,19 +66,16 @@ def _copy(salvage: Salvage, writer: BagWriter) -> int:
     saved = 0
 
     def announce(topic: Topic) -> int:
-        ext = ConnectionExtRosbag2(topic.encoding, list(topic.qos))
-        records = topic.schema, topic.channel
-        channels[topic] = writer.copy_channel(topic.name, topic.type, ext, topic.digest, records)
+        listed = ListedTopic(topic.name, topic.type, topic.encoding, topic.qos)
+        channels[topic] = writer.copy_channel(listed, topic.digest, (topic.schema, topic.channel))
         return channels[topic]
 
     salvage.copied = writer.copy_record
     for topic, sequence, log_ns, publish_ns, data in salvage:
         number = channels.get(topic)
-        if number is None:
-            number = announce(topic)
-        writer.copy(number, sequence, log_ns, publish_ns, data)
+        writer.copy(announce(topic) if number is None else number, sequence, log_ns, publish_ns, data)
         saved += 1
-    for topic in salvage.topics.keys() - channels.keys():  # without a message
+    for topic in [each for each in salvage.topics if each not in channels]:  # without a message
         announce(topic)
     missing = f", {salvage.missing} messages missing" if salvage.missing else ""
     writer.tell(salvage.about | {provenance.RECOVERED: f"{saved} messages; {salvage.lost_bytes} B lost{missing}"})

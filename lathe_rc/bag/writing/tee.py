@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 from rosbags.interfaces import Qos
 
-from lathe_rc.bag.writing.mcap_file import RowPlan
+from lathe_rc.bag.writing.rows import RowPlan
 from lathe_rc.bag.writing.writer import Output
 
 
