@@ -204,6 +204,30 @@ def test_index_that_would_cost_memory_or_time_is_refused(tmp_path, monkeypatch, 
         check(mcap(tmp_path / "bad.mcap", data, summary))
 
 
+@pytest.mark.parametrize(
+    "data",
+    [
+        chunk(packed=zstandard.compress(bytes(50_000_000)), size=1000),
+        chunk(size=MOST_BYTES + 1),
+        chunk(packed=b"x" * 30, size=30, compression=b""),
+        chunk(struct.pack("<BQ", 5, 2**60) + bytes(22)),
+        chunk(record(5, struct.pack("<HIQQ", 77, 0, 0, 0))),
+        record(4, struct.pack("<HHI", 1, 99, 2**31)),
+        record(3, struct.pack("<HI", 1, 2**32 - 1) + b"name"),
+        record(12, struct.pack("<II", 2**31, 5)),
+        record(6, b""),
+        record(5, b""),
+        record(0, b"") + record(255, b"?" * 100),
+    ],
+)
+def test_hostile_files_without_an_end_are_refused_in_a_line(tmp_path, data):
+    file = tmp_path / "hostile.mcap"
+    file.write_bytes(MCAP0_MAGIC + HEADER + data)
+    with refused(re.escape(f"{file}: not a readable bag (")):
+        check(file)
+    assert list(Salvage(file)) == []
+
+
 @pytest.mark.parametrize("qos", [ENDLESS, b"[" * 100_000, b"a: b: c", b"? [a]"])
 @pytest.mark.parametrize("place", ["index", "file", "chunk"])
 def test_quality_of_service_that_cannot_be_read_costs_no_message(tmp_path, qos, place):

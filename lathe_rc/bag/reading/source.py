@@ -141,8 +141,12 @@ class Source:
             raise InputError(f"{path}: no topic that can be read ({self.unread[0]}); allowed: messages of ROS 2")
 
     def _open(self) -> None:
-        told = self._metadata()
-        files = files_of(self.path) if self.path.is_dir() else [self.path]
+        if not self.path.exists():
+            raise ValueError("there is no such folder or file")
+        files, told = [self.path], None
+        if self.path.is_dir():
+            files = files_of(self.path)
+            told = self._metadata(files)
         if told:
             self.about, self._packed = told.about, told.packed
             named = told.files
@@ -175,13 +179,8 @@ class Source:
         if len(self.topics) > MOST_TOPICS:
             raise ValueError(f"{len(self.topics)} topics; allowed: up to {MOST_TOPICS}")
 
-    def _metadata(self) -> Metadata | None:
+    def _metadata(self, files: Sequence[Path]) -> Metadata | None:
         """The metadata of a folder; without them, its files count."""
-        if not self.path.exists():
-            raise ValueError("there is no such folder or file")
-        if not self.path.is_dir():
-            return None
-        files = files_of(self.path)
         if not (self.path / metadata.NAME).exists():
             if not files:
                 raise ValueError(f"no {metadata.NAME} in that folder, nor a .mcap or .db3 file")
