@@ -20,7 +20,7 @@ from mcap.writer import MCAP0_MAGIC
 from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.check import check
-from lathe_rc.bag.reading import precheck
+from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_BYTES
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import Feeder
@@ -401,7 +401,7 @@ def test_file_that_is_packed_twice_or_behind_what_zstd_skips_is_looked_at(tmp_pa
 def test_names_and_numbers_of_a_bag_are_what_they_should_be():
     for name in ("", "a\nb", "\x1b[2J", "x" * 1025, 5, None, "\ud800"):
         with pytest.raises(ValueError, match="characters that print"):
-            precheck.check_name(name)
+            metadata.check_name(name)
     with pytest.raises(ValueError, match="does not unpack"):
         unpack("zstd", BOMB, 1000)
     assert shown("\x1b[2Ja\nb") == "\ufffd[2Ja"

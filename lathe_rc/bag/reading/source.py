@@ -21,13 +21,13 @@ from types import TracebackType
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
-from lathe_rc.bag.reading import metadata, precheck
+from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_OPEN, MOST_TOPICS
 from lathe_rc.bag.reading.mcap_storage import open_mcap
 from lathe_rc.bag.reading.metadata import Metadata, Topic
 from lathe_rc.bag.reading.sqlite_storage import open_sqlite
 from lathe_rc.bag.reading.storage import Batch, Message, Span, Storage
-from lathe_rc.bag.reading.unpacking import Budget, unpack, unpack_file, unpacked_size
+from lathe_rc.bag.reading.unpacking import Budget, is_packed, unpack, unpack_file, unpacked_size
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
@@ -206,7 +206,7 @@ class Source:
             return open_mcap(path)
         if head == _SQLITE:
             return open_sqlite(path, self._folder())
-        if not precheck.is_packed(head):
+        if not is_packed(head):
             raise ValueError("a bag of ROS 1" if head.startswith(b"#ROSBAG") else "not an MCAP or SQLite file")
         if depth:
             raise ValueError("compressed twice")
