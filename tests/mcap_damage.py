@@ -45,7 +45,7 @@ def records_of(data: bytes, start: int = MAGIC, end: int = -MAGIC) -> list[tuple
     place, stop, found = start, end if end >= 0 else len(data) + end, []
     while place < stop:
         opcode, length = HEAD.unpack_from(data, place)
-        if place + HEAD.size + length > stop:
+        if place + HEAD.size + length > len(data):
             raise ValueError(f"cut off at {place}")
         found.append((opcode, place, place + HEAD.size + length))
         place = found[-1][2]
