@@ -15,8 +15,8 @@ import zstandard
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
+from mcap_damage import HEAD, records_of
 
-from lathe_rc.bag.reading.precheck import read_record
 from lathe_rc.bag.reading.unpacking import read_chunk
 
 WORDS = (
@@ -89,11 +89,7 @@ class _Record:
 
 
 def _records(data: bytes, start: int = 0, end: int | None = None) -> list[_Record]:
-    stream, end, found = io.BytesIO(data), len(data) if end is None else end, []
-    stream.seek(start)
-    while (place := stream.tell()) < end and (record := read_record(stream, end)):
-        found.append(_Record(*record, place))
-    return found
+    return [_Record(kind, data[a + HEAD.size : b], a) for kind, a, b in records_of(data, start, end or len(data))]
 
 
 def _changed(records: list[_Record], random: Random) -> list[_Record]:

@@ -3,11 +3,15 @@
 
 import struct
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from random import Random
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
+from mcap.records import Message
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import Writer as McapWriter
 
 from lathe_rc import messages
 from lathe_rc.bag.repairing.salvage import Salvage
@@ -32,11 +36,17 @@ class Damaged(NamedTuple):
     hit: frozenset[int]
 
 
-def records_of(data: bytes) -> list[tuple[int, int, int]]:
-    """Opcode, begin and end of each record outside of chunks."""
-    place, found = MAGIC, []
-    while place < len(data) - MAGIC:
+def records_of(data: bytes, start: int = MAGIC, end: int = -MAGIC) -> list[tuple[int, int, int]]:
+    """Opcode, begin and end of each record; outside of chunks, unless ``data`` are those of one.
+
+    Raises:
+        ValueError, struct.error: one is cut off.
+    """
+    place, stop, found = start, end if end >= 0 else len(data) + end, []
+    while place < stop:
         opcode, length = HEAD.unpack_from(data, place)
+        if place + HEAD.size + length > len(data):
+            raise ValueError(f"cut off at {place}")
         found.append((opcode, place, place + HEAD.size + length))
         place = found[-1][2]
     return found
@@ -45,6 +55,28 @@ def records_of(data: bytes) -> list[tuple[int, int, int]]:
 def chunks_of(data: bytes) -> list[tuple[int, int]]:
     """Begin and end of each chunk."""
     return [(begin, end) for opcode, begin, end in records_of(data) if opcode == Opcode.CHUNK]
+
+
+def chunk_ends(data: bytes) -> list[tuple[int, int]]:
+    """End of each chunk, and the messages up to there."""
+    ends, count = [], 0
+    for begin, end in chunks_of(data):
+        chunk = next(StreamReader(BytesIO(data[begin:end]), skip_magic=True, emit_chunks=True).records)
+        count += sum(isinstance(record, Message) for record in breakup_chunk(chunk))  # type: ignore[arg-type]
+        ends.append((end, count))
+    return ends
+
+
+def plain_file(file: Path, count: int) -> bytes:
+    """A file of messages outside of chunks."""
+    with file.open("wb") as stream:
+        writer = McapWriter(stream, use_chunking=False, enable_data_crcs=True)
+        writer.start("ros2", "")
+        channel = writer.register_channel("/x", "json", writer.register_schema("x", "jsonschema", b"{}"))
+        for number in range(count):
+            writer.add_message(channel, number, b"%020d" % number, number)
+        writer.finish()
+    return file.read_bytes()
 
 
 def _hit(data: bytes, first: int, last: int) -> frozenset[int]:

@@ -11,11 +11,8 @@ import numpy as np
 import pytest
 import yaml
 from cells import run, same, scenario
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.records import Chunk, Message
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap_damage import chunk_ends
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness, messages
@@ -47,8 +44,8 @@ class Recorded:
 
     @cached_property
     def chunks(self):
-        """See `chunks_of`."""
-        return chunks_of(self.path)
+        """See `chunk_ends`."""
+        return chunk_ends(file_of(self.path).read_bytes())
 
 
 @pytest.fixture(scope="module")
@@ -86,19 +83,13 @@ def dense_of(result, told):
 # --- content
 
 
-def test_rosbags_reads_every_sample(recorded):
-    result, path = recorded.result, recorded.path
-    found = dense_of(result, [(topic, message) for topic, _, message in read_by_rosbags(path)])
-    assert all(same(found[topic], signals) for topic, signals in result.recording.dense.items())
-
-
-def test_mcap_reads_every_sample(recorded):
-    result, path = recorded.result, recorded.path
-    decoded = [
-        (topic, messages.decode(result.recording.types[topic], data)) for topic, _, _, data in read_by_mcap(path)
-    ]
-    found = dense_of(result, decoded)
-    assert all(same(found[topic], signals) for topic, signals in result.recording.dense.items())
+def test_mcap_and_rosbags_read_every_sample(recorded):
+    recording, types = recorded.result.recording, recorded.result.recording.types
+    by_mcap = [(topic, messages.decode(types[topic], data)) for topic, _, _, data in recorded.messages]
+    by_rosbags = [(topic, message) for topic, _, message in read_by_rosbags(recorded.path)]
+    for told in (by_mcap, by_rosbags):
+        found = dense_of(recorded.result, told)
+        assert all(same(found[topic], signals) for topic, signals in recording.dense.items())
 
 
 def test_our_reader_finds_the_same_digests(recorded):
@@ -155,13 +146,8 @@ def test_block_tells_how_many_sparse_messages_came_before_it(recorded):
     assert all(heard.values())
 
 
-def test_two_runs_give_the_same_messages(recorded, tmp_path):
-    record(tmp_path / "again")
-    assert read_by_mcap(tmp_path / "again") == recorded.messages
-
-
-@pytest.mark.parametrize("recorder", [{"compression": "none"}, {"chunk_size": 4096}, {"chunk_size": 2**26}])
-def test_compression_and_chunks_change_no_message(recorded, tmp_path, recorder):
+@pytest.mark.parametrize("recorder", [{}, {"compression": "none"}, {"chunk_size": 4096}, {"chunk_size": 2**26}])
+def test_neither_another_run_nor_compression_and_chunks_change_a_message(recorded, tmp_path, recorder):
     record(tmp_path / "other", **recorder)
     assert read_by_mcap(tmp_path / "other") == recorded.messages
 
@@ -231,21 +217,6 @@ def test_what_is_no_bag_is_refused(tmp_path, make):
 # --- recovery
 
 
-def chunks_of(path):
-    """End of each chunk in the file and the messages up to there."""
-    ends = []
-    with file_of(path).open("rb") as stream:
-        found = make_reader(stream).get_summary().chunk_indexes
-        stream.seek(0)
-        count = 0
-        for index, chunk in zip(
-            found, (r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)), strict=True
-        ):
-            count += sum(isinstance(record, Message) for record in breakup_chunk(chunk))
-            ends.append((index.chunk_start_offset + index.chunk_length, count))
-    return ends
-
-
 def cut(path, folder, length):
     """A bag as a recorder that was killed after ``length`` bytes leaves it."""
     broken = folder / "cut"
@@ -255,38 +226,26 @@ def cut(path, folder, length):
     return broken
 
 
-@settings(max_examples=10)  # a thousand cuts are in test_recover.py, which does not read what is saved
-@example(0.0)
-@example(1e-5)
-@example(0.999999)
-@example(1.0)
-@given(st.floats(0.0, 1.0))
-def test_every_complete_chunk_of_a_cut_bag_is_saved(recorded, tmp_path_factory, part):
-    result, path = recorded.result, recorded.path
-    length = int(part * file_of(path).stat().st_size)
-    expected = max((count for end, count in recorded.chunks if end <= length), default=0)
-    broken = cut(path, tmp_path_factory.mktemp("cut"), length)
-    assert recover.mend(broken).saved == expected
-    assert read_by_mcap(broken) == recorded.messages[:expected]
-    assert len(read_by_rosbags(broken)) == expected
-    saved = reader.read_bag(broken)
-    for topic, signals in saved.dense.items():
-        whole = result.recording.dense[topic]
-        assert same(signals, {name: whole[name][: signals[name].size] for name in signals})
-    assert [path.name for path in broken.parent.iterdir()] == [broken.name]
+TAILS = {"": b"", "0": bytes(5000), "F": b"\xff" * 5000, "random": np.random.default_rng(1).bytes(5000)}
 
 
-@pytest.mark.parametrize("part", [0.3, 0.5, 0.7])
-@pytest.mark.parametrize("tail", [bytes(5000), b"\xff" * 5000, np.random.default_rng(1).bytes(5000)], ids="0Fr")
-def test_cut_bag_with_a_damaged_end_is_saved_up_to_it(recorded, tmp_path, part, tail):
+@pytest.mark.parametrize("part", [0.0, 1e-5, 0.3, 0.5, 0.7, 0.999999, 1.0])  # a thousand cuts are in test_recover.py
+@pytest.mark.parametrize("tail", TAILS)
+def test_every_complete_chunk_of_a_cut_bag_is_saved(recorded, tmp_path, part, tail):
     """A crashed machine may leave anything where it meant to write."""
     length = int(part * file_of(recorded.path).stat().st_size)
+    expected = max((count for end, count in recorded.chunks if end <= length), default=0)
     broken = cut(recorded.path, tmp_path, length)
     with file_of(broken).open("ab") as stream:
-        stream.write(tail)
-    expected = max(count for end, count in recorded.chunks if end <= length)
+        stream.write(TAILS[tail])
     assert recover.mend(broken).saved == expected
     assert read_by_mcap(broken) == recorded.messages[:expected]
+    assert [path.name for path in tmp_path.iterdir()] == [broken.name]
+    if not tail:
+        assert len(read_by_rosbags(broken)) == expected
+        for topic, signals in reader.read_bag(broken).dense.items():
+            whole = recorded.result.recording.dense[topic]
+            assert same(signals, {name: whole[name][: signals[name].size] for name in signals})
 
 
 def test_saved_bag_keeps_schemas_and_qos(recorded, tmp_path):

@@ -20,7 +20,7 @@ from mcap.writer import MCAP0_MAGIC
 from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.check import check
-from lathe_rc.bag.reading import precheck
+from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_BYTES
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import Feeder
@@ -176,7 +176,7 @@ FIRST = len(MCAP0_MAGIC + HEADER)
         (b"", SCHEMA + STATISTICS + struct.pack("<BQ", 13, 2**32), "cut off at byte"),
         (b"", SCHEMA + STATISTICS + channels(600, b"x" * 2000), "characters of quality of service"),
         (b"", SCHEMA + STATISTICS + channels(5000, b""), "more than 4096 topics"),
-        (b"", SCHEMA + STATISTICS + 1000 * SCHEMA + record(11, bytes(2**20 + 1)), "statistics of 1048577 B"),
+        (b"", SCHEMA + STATISTICS + 1000 * SCHEMA + record(11, bytes(2**20 + 1)), "record of 1048577 B at byte"),
         (b"", SCHEMA + STATISTICS + chunk_index(2**63, 100), "none can be"),
         (chunk(), SCHEMA + STATISTICS + 2 * chunk_index(FIRST, len(chunk())), "two chunks at byte"),
         (chunk(), SCHEMA + STATISTICS + chunk_index(FIRST, len(chunk()), size=2**40), "none can be"),
@@ -202,6 +202,30 @@ def test_index_that_would_cost_memory_or_time_is_refused(tmp_path, monkeypatch, 
     monkeypatch.setattr("lathe_rc.bag.reading.source.MOST_OPEN", 2**27)
     with refused(said):
         check(mcap(tmp_path / "bad.mcap", data, summary))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        chunk(packed=zstandard.compress(bytes(50_000_000)), size=1000),
+        chunk(size=MOST_BYTES + 1),
+        chunk(packed=b"x" * 30, size=30, compression=b""),
+        chunk(struct.pack("<BQ", 5, 2**60) + bytes(22)),
+        chunk(record(5, struct.pack("<HIQQ", 77, 0, 0, 0))),
+        record(4, struct.pack("<HHI", 1, 99, 2**31)),
+        record(3, struct.pack("<HI", 1, 2**32 - 1) + b"name"),
+        record(12, struct.pack("<II", 2**31, 5)),
+        record(6, b""),
+        record(5, b""),
+        record(0, b"") + record(255, b"?" * 100),
+    ],
+)
+def test_hostile_files_without_an_end_are_refused_in_a_line(tmp_path, data):
+    file = tmp_path / "hostile.mcap"
+    file.write_bytes(MCAP0_MAGIC + HEADER + data)
+    with refused(re.escape(f"{file}: not a readable bag (")):
+        check(file)
+    assert list(Salvage(file)) == []
 
 
 @pytest.mark.parametrize("qos", [ENDLESS, b"[" * 100_000, b"a: b: c", b"? [a]"])
@@ -377,7 +401,7 @@ def test_file_that_is_packed_twice_or_behind_what_zstd_skips_is_looked_at(tmp_pa
 def test_names_and_numbers_of_a_bag_are_what_they_should_be():
     for name in ("", "a\nb", "\x1b[2J", "x" * 1025, 5, None, "\ud800"):
         with pytest.raises(ValueError, match="characters that print"):
-            precheck.check_name(name)
+            metadata.check_name(name)
     with pytest.raises(ValueError, match="does not unpack"):
         unpack("zstd", BOMB, 1000)
     assert shown("\x1b[2Ja\nb") == "\ufffd[2Ja"

@@ -24,7 +24,7 @@ from std_srvs.srv import Trigger
 
 from lathe_rc import harness
 from lathe_rc.bag.check import check
-from lathe_rc.bag.reading import qos
+from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.nodes import replayed_qos, replayer
 
@@ -282,7 +282,7 @@ OFFERS = {
 @pytest.mark.parametrize("kind", OFFERS)
 def test_publishers_differ_only_in_what_one_publisher_cannot_offer(kind):
     text, latched, kept = OFFERS[kind]
-    recorded = qos.of_text(text)
+    recorded = metadata.qos_of_text(text)
     assert replayed_qos.differ(recorded) is not latched
     assert (replayed_qos.of(recorded).durability == DurabilityPolicy.TRANSIENT_LOCAL) is latched
     assert kept is None or replayed_qos.kept(recorded) == kept

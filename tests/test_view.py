@@ -351,7 +351,7 @@ TWO = {"/a": messages.COMMAND, "/b": messages.COMMAND}
 
 
 def given(text, types=TWO, *, close=True):
-    """The pieces of 100 samples, and what they lost, of blocks such as "a:0-64 b:0-100"; "+" tells of both topics."""
+    """The pieces of 100 samples, and what they lost, of blocks such as "a:0-64 b:0-100"; "+" stands for both topics."""
     taken = Taken()
     pieces = Pieces(types, 100, taken)
     pieces.message(Sparse("events", messages.EVENT, 150, {"action": "freeze"}))

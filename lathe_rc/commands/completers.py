@@ -60,7 +60,7 @@ def targets(ctx: click.Context, _param: click.Parameter, incomplete: str) -> lis
 
 
 def _kinds_by_node(ctx: click.Context) -> dict[str, str]:
-    """Kinds of the nodes in the scenario of a command line; empty if there is none that can be read."""
+    """Kinds of the nodes in the scenario of a command line; empty without a readable scenario."""
     import yaml
 
     # Click gives up at an option without a value, such as the one that is being typed, and leaves arguments aside.

@@ -68,6 +68,36 @@ def demo(name: str, revolutions: float, folder: Path) -> None:
     interrupted (a keyway, force on the drive and a wandering speed, by the disturbance controller and by its peer).
     """
     process_launcher.server().preload({})  # it imports while this process does
-    from lathe_rc.commands import running
+    _show(DEMOS[name], revolutions, folder)
 
-    running.demo(DEMOS[name], revolutions, folder)
+
+def _show(shown: Demo, revolutions: float, folder: Path) -> None:
+    from rich.console import Console
+
+    from lathe_rc import harness
+    from lathe_rc.commands import outcome, picture, plot, running
+    from lathe_rc.commands import scenario as scenarios
+
+    number = 1
+    while (folder / f"demo-{number}").exists():
+        number += 1
+    place = folder / f"demo-{number}"
+    length = f"spindle_encoder.revolutions={revolutions!r}"
+    scenario = scenarios.load(shown.scenario, [*shown.overrides, length])
+    console = Console()
+    console.print(shown.announcement, highlight=False)
+    folder.mkdir(parents=True, exist_ok=True)
+    result = running.watched(scenario, mode="processes", bag=place)
+    beside = None
+    if shown.peer:
+        peer = harness.run(scenarios.load(shown.scenario, [*shown.overrides, *shown.peer, length]))
+        beside = (shown.peer_name, peer.recording)
+    drawn = place.with_suffix(".png")
+    picture.save(result.recording.plot(shown.title, beside), drawn)
+    console.print(outcome.table(result))
+    plot.show(result, console)
+    if beside:
+        console.print(f"{shown.peer_name}: {', '.join(peer.errors.told()[1:])}", highlight=False)
+    for fact in outcome.facts(result):
+        console.print(fact, highlight=False)
+    console.print(f"bag:    {place}\nfigure: {drawn}", highlight=False, soft_wrap=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``lathe run`` and ``lathe demo``, once their arguments are known and all is imported."""
+"""``lathe run``, once its arguments are known and all is imported."""
 
 import json
 from pathlib import Path
@@ -10,9 +10,8 @@ from rich.console import Console
 
 from lathe_rc import harness, part
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.commands import outcome, picture, plot
+from lathe_rc.commands import outcome, picture
 from lathe_rc.commands import scenario as scenarios
-from lathe_rc.commands.demo import Demo
 from lathe_rc.commands.progress import Watch, watched_budget
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place
@@ -21,7 +20,7 @@ from lathe_rc.process_launcher import Start
 _NO_SNAPSHOTS = "no snapshots: no --bag was given"
 
 
-def _watched(scenario: Scenario, **how: Any) -> harness.Result:
+def watched(scenario: Scenario, **how: Any) -> harness.Result:
     """Run a scenario and show its progress; the keywords are those of `lathe_rc.harness.run`."""
     with Watch(Console(stderr=True)) as watch:
         return harness.run(scenario, watch=watch, **how)
@@ -68,7 +67,7 @@ def run(
         picture.check_place(figure)
     if profile:
         check_place("--profile", profile)
-    result = _watched(
+    result = watched(
         loaded,
         mode=mode,
         groups=split,
@@ -93,30 +92,3 @@ def run(
         alike = " with the same --set" if overrides else ""
         hint = "" if found else f"; lathe budget {scenario}{alike} tells why"
         raise LatheError(f"{loaded.name} is {result.verdict.told()}; allowed: no more than the tolerance{hint}")
-
-
-def demo(shown: Demo, revolutions: float, folder: Path) -> None:
-    """See `lathe_rc.commands.demo`."""
-    number = 1
-    while (folder / f"demo-{number}").exists():
-        number += 1
-    place = folder / f"demo-{number}"
-    length = f"spindle_encoder.revolutions={revolutions!r}"
-    scenario = scenarios.load(shown.scenario, [*shown.overrides, length])
-    console = Console()
-    console.print(shown.announcement, highlight=False)
-    folder.mkdir(parents=True, exist_ok=True)
-    result = _watched(scenario, mode="processes", bag=place)
-    beside = None
-    if shown.peer:
-        peer = harness.run(scenarios.load(shown.scenario, [*shown.overrides, *shown.peer, length]))
-        beside = (shown.peer_name, peer.recording)
-    drawn = place.with_suffix(".png")
-    picture.save(result.recording.plot(shown.title, beside), drawn)
-    console.print(outcome.table(result))
-    plot.show(result, console)
-    if beside:
-        console.print(f"{shown.peer_name}: {', '.join(peer.errors.told()[1:])}", highlight=False)
-    for fact in outcome.facts(result):
-        console.print(fact, highlight=False)
-    console.print(f"bag:    {place}\nfigure: {drawn}", highlight=False, soft_wrap=True)

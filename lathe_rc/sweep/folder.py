@@ -283,7 +283,7 @@ def _read(path: Path) -> bytes:
 
 
 def _refuse_others(path: Path) -> None:
-    """Refuse what is there and no folder of a sweep."""
+    """Refuse a path that exists and is no folder of a sweep."""
     if not os.path.lexists(path):
         return
     with _reading(path):

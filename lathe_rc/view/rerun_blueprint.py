@@ -16,7 +16,7 @@ _COLOURS = ("blue", "orange", "green")  # as words, of the first curves of a plo
 
 
 def _until_cursor(time: rrb.TimeRangeBoundary, revolution: rrb.TimeRangeBoundary) -> list[rrb.VisibleTimeRange]:
-    """What is seen at the time cursor, from these on."""
+    """Ranges that a view shows: from these starts to the time cursor."""
     end = rrb.TimeRangeBoundary.cursor_relative(seq=0)
     starts = {"time": time, "revolution": revolution}
     return [rrb.VisibleTimeRange(timeline, start=start, end=end) for timeline, start in starts.items()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a recording is drawn: fields as curves, thinned out where they are long, and states as bands over time."""
+"""Drawn parts of a recording: fields as curves, thinned out where they are long, and states as bands over time."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

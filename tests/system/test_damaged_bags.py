@@ -8,8 +8,7 @@ import pytest
 from campaign import sized
 from cells import scenario
 from mcap.opcode import Opcode
-from mcap.writer import Writer as McapWriter
-from mcap_damage import check_damage, chunks_of, flips, records_of, saved_of, small_bag, structured
+from mcap_damage import check_damage, chunks_of, flips, plain_file, records_of, saved_of, small_bag, structured
 
 from lathe_rc import harness
 from lathe_rc.bag.repairing.recover import recover
@@ -68,14 +67,7 @@ def test_bag_of_a_cell(tmp_path):
 def test_messages_outside_of_chunks(tmp_path):
     """A damaged head costs at most two messages; no wrong value comes out without a word."""
     file = tmp_path / "plain.mcap"
-    with file.open("wb") as stream:
-        writer = McapWriter(stream, use_chunking=False, enable_data_crcs=True)
-        writer.start("ros2", "")
-        channel = writer.register_channel("/x", "json", writer.register_schema("x", "jsonschema", b"{}"))
-        for number in range(300):
-            writer.add_message(channel, number, b"%020d" % number, number)
-        writer.finish()
-    data = file.read_bytes()
+    data = plain_file(file, 300)
     _, whole = saved_of(file, data)
     end = next(begin for opcode, begin, _ in records_of(data) if opcode == Opcode.DATA_END)
     random = Random(15)  # noqa: S311

@@ -125,7 +125,7 @@ def _selected(source: Source, wanted: Sequence[str]) -> dict[str, str]:
 def _step_ns(source: Source) -> int:
     """Sampling step of the run [ns]; 0 without a block."""
     dense = [topic for topic, found in source.topics.items() if found.type in messages.block_types()]
-    return next((block.step_ns for topic in dense for block in source.blocks(topic)), 0)
+    return next((step_ns for topic in dense if (step_ns := source.step_ns(topic))), 0)
 
 
 def _refuse_existing(place: Path) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The records of a piece of an MCAP file that matter to a reader, found by compiled code."""
+"""The records of a piece of an MCAP file, found by compiled code; for readers, and for the index of our own writer."""
 
 from typing import Any, NamedTuple
 
@@ -9,9 +9,10 @@ import numpy.typing as npt
 from lathe_rc.bag.reading.limits import MOST_ANNOUNCED, TooMuchError
 from lathe_rc.jit import kernel
 
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 2, 3, 4, 5, 6, 15  # opcodes
+_MESSAGE = 5  # opcode
 _HEAD = 9  # bytes of opcode and length ahead of a record
 _BEFORE = 22  # bytes of a message record ahead of its data: channel, sequence, log time, publish time
+BEFORE_DATA = _HEAD + _BEFORE  #: both [B]
 
 Bytes = npt.NDArray[np.uint8]
 Places = npt.NDArray[np.uint64]
@@ -22,7 +23,7 @@ class Found(NamedTuple):
 
     Attributes:
         messages: channel, log time [ns], begin and end of the data of each message, shape (messages, 4).
-        others: opcode, begin and end of the content of each schema, channel, chunk and end mark, shape (others, 3).
+        others: opcode, begin and end of the content of each other record, shape (others, 3).
         end: where the last record that is whole ends.
     """
 
@@ -41,59 +42,58 @@ def _little(data: Bytes, place: int, size: int) -> Any:
 
 
 @kernel
-def _walk(data: Bytes, messages: Places, others: Places) -> tuple[int, int, int]:
-    """Fill both tables as far as they go; returns the numbers of messages, or -1, and of others, and the end."""
+def _walk(data: Bytes, messages: Places, others: Places, alone: bool) -> tuple[int, int, int]:  # noqa: FBT001 - a kernel
+    """Fill both tables as far as they go; returns the numbers of messages and of others, and the end."""
     place, count, further, size = 0, 0, 0, data.size
     while place + _HEAD <= size:
         length = _little(data, place + 1, 8)
         begin = place + _HEAD
         if length > np.uint64(size - begin):
             break
-        opcode, place = data[place], begin + np.int64(length)
-        if opcode == _MESSAGE:
+        end = begin + np.int64(length)
+        if data[place] == _MESSAGE:
             if length < _BEFORE:
-                return -1, further, begin - _HEAD
+                break
             if count < messages.shape[0]:
                 messages[count, 0] = _little(data, begin, 2)
                 messages[count, 1] = _little(data, begin + 6, 8)
                 messages[count, 2] = begin + _BEFORE
-                messages[count, 3] = place
+                messages[count, 3] = end
             count += 1
-        elif _FOOTER <= opcode <= _CHUNK or opcode == _DATA_END:
+        elif alone:
+            break
+        else:
             if further < others.shape[0]:
-                others[further, 0] = opcode
+                others[further, 0] = data[place]
                 others[further, 1] = begin
-                others[further, 2] = place
+                others[further, 2] = end
             further += 1
+        place = end
     return count, further, place
 
 
-def walk_part(part: bytes) -> Found:
-    """The records of a part of a file, of which the last may be cut off.
+def walk(data: bytes | memoryview, *, alone: bool = False) -> Found:
+    """The records of a piece; ``alone``: up to the first that is no message.
 
     Raises:
-        ValueError: a message is shorter than its own head.
-        TooMuchError: there are more schemas and channels than a whole file may have.
+        TooMuchError: there are more records beside the messages than a whole file may have.
     """
-    data = np.frombuffer(part, np.uint8)
-    # What a chunk says of itself is not believed: its records are counted.
-    count, further, end = _walk(data, np.empty((0, 4), np.uint64), np.empty((0, 3), np.uint64))
-    if count < 0:
-        raise ValueError("a message is shorter than its head")
+    array = np.frombuffer(data, np.uint8)
+    # What a piece says of itself is not believed: its records are counted before there is memory for them.
+    count, further, _ = _walk(array, np.empty((0, 4), np.uint64), np.empty((0, 3), np.uint64), alone)
     if further > MOST_ANNOUNCED:
         raise TooMuchError(f"more than {MOST_ANNOUNCED} schemas and channels")
     messages, others = np.empty((count, 4), np.uint64), np.empty((further, 3), np.uint64)
-    _walk(data, messages, others)
-    return Found(messages, others, end)
+    return Found(messages, others, _walk(array, messages, others, alone)[2])
 
 
-def walk(whole: bytes) -> Found:
-    """The records of a chunk.
+def walk_whole(data: bytes) -> Found:
+    """The records of a chunk, or of a part of a file.
 
     Raises:
-        ValueError: a record is longer than the chunk, or shorter than its own head.
+        ValueError: a record is longer than what is left, or a message shorter than its own head.
     """
-    found = walk_part(whole)
-    if found.end != len(whole):
-        raise ValueError("a record is longer than its chunk")
+    found = walk(data)
+    if found.end != len(data):
+        raise ValueError("a record is longer than its chunk, or a message is shorter than its head")
     return found

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MCAP files, by their index where they have one, else by one pass through them.
+"""MCAP files, by their index where they have one, else by a walk through them.
 
 Nothing is believed that a file says of itself: places are looked up where they must be, sizes are compared with the
 file's, records are counted before there is memory for them.
@@ -13,31 +13,23 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
-from mcap.records import Footer, Schema, Statistics
-from mcap.writer import MCAP0_MAGIC
+from mcap.records import Schema, Statistics
 
-from lathe_rc.bag.reading.chunk_messages import Found, Places, walk, walk_part
-from lathe_rc.bag.reading.limits import MOST_ANNOUNCED, MOST_BYTES, MOST_METADATA, MOST_TEXT, TooMuchError
-from lathe_rc.bag.reading.precheck import read_record
+from lathe_rc.bag.reading.chunk_messages import Places, walk_whole
+from lathe_rc.bag.reading.limits import MOST_ANNOUNCED, MOST_BYTES, MOST_METADATA, TooMuchError
+from lathe_rc.bag.reading.sound_records import HEAD, MAGIC, Record, SoundRecords
 from lathe_rc.bag.reading.storage import Batch, Channel, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget, read_chunk
 from lathe_rc.errors import shown
 
-_MAGIC = len(MCAP0_MAGIC)
-_RECORD = struct.Struct("<BQ")  # opcode, length
-_FOOTER = 29 + _MAGIC  # [B] at the end of a file
-_FOOTER_HEAD = _RECORD.pack(Opcode.FOOTER, _FOOTER - _MAGIC - _RECORD.size)
-_CHECKED = 25  # [B] of the footer that the summary's checksum covers
 _INDEX = struct.Struct("<QQQQI")  # of a chunk: first and last time, start, length, bytes of places by channel
 _PLACE = np.dtype([("channel", "<u2"), ("place", "<u8")])
 _NUMBERS = 2**16  # that a channel may have
 _AT_ONCE = 2**14  # messages of a batch
-_PART = 2**22  # of a file without index that is read at once [B]
 _WRONG = (ValueError, struct.error, EndOfFile)  # what broken bytes lead to
 
 
@@ -54,8 +46,9 @@ class _Records(Span):
         """See `Span`."""
         with self.path.open("rb") as stream:
             stream.seek(self.start)
-            whole = self._chunk(stream) if self.in_chunk else stream.read(self.length)
-        found = (walk if self.in_chunk else walk_part)(whole).messages
+            whole = stream.read(self.length)
+        whole = self._unpacked(whole) if self.in_chunk else whole
+        found = walk_whole(whole).messages
         budget.take(len(whole), len(found))
         wanted = np.zeros(_NUMBERS, dtype=bool)
         wanted[list(topics)] = True
@@ -67,11 +60,11 @@ class _Records(Span):
         for first in range(0, len(found), _AT_ONCE):
             yield Batch(whole, topics, found[first : first + _AT_ONCE])
 
-    def _chunk(self, stream: BinaryIO) -> bytes:
-        record = read_record(stream, self.start + self.length)
-        if record is None or record[0] != Opcode.CHUNK:
+    def _unpacked(self, record: bytes) -> bytes:
+        opcode, length = HEAD.unpack_from(record) if len(record) >= HEAD.size else (0, 0)
+        if opcode != Opcode.CHUNK or HEAD.size + length > len(record):
             raise ValueError(f"no chunk at byte {self.start}, where the index has one")
-        whole = read_chunk(record[1], self.start)
+        whole = read_chunk(record[HEAD.size : HEAD.size + length], self.start)
         if len(whole) > self.size:
             raise ValueError(f"chunk at byte {self.start}: {len(whole)} B when unpacked, {self.size} by the index")
         return whole
@@ -91,7 +84,7 @@ def open_mcap(path: Path) -> Storage:
         except _WRONG as error:
             by_index.damage(error)
         scanned = _Mcap(path)
-        scanned.storage.damage, scanned.storage.remarks = by_index.storage.damage, by_index.storage.remarks
+        scanned.storage = Storage(damage=by_index.storage.damage, remarks=by_index.storage.remarks)
         scanned.scan(stream)
         return scanned.storage
 
@@ -149,32 +142,25 @@ class _Mcap:
 
     # ---- index --------------------------------------------------------------------------------------
 
-    def read_summary(self, stream: BinaryIO) -> bool:  # noqa: PLR0911 - one for each thing that may lack
+    def read_summary(self, stream: BinaryIO) -> bool:
         """Read the summary; whether it has all that is needed.
 
         Raises:
             ValueError: it has what cannot be right; mcap and struct raise others.
         """
-        end = self._size - _FOOTER
-        if stream.read(_MAGIC) != MCAP0_MAGIC or end < _MAGIC:
+        records = SoundRecords(stream, self._size, lambda why, _lost: self.damage(why))
+        if not records.find_summary():
+            if records.summary_wrong:
+                self.storage.remarks.append(f"{self._path.name}: the checksum of its summary is wrong: read without it")
             return False
-        read_record(stream, end)  # the header, which other readers need
-        stream.seek(end)
-        footer = stream.read(_FOOTER)
-        if not footer.startswith(_FOOTER_HEAD) or not footer.endswith(MCAP0_MAGIC):
-            return False
-        ends = Footer.read(ReadDataStream(BytesIO(footer[_RECORD.size :])))
-        start = ends.summary_start
-        if not _MAGIC <= start < end:
-            return False
-        if ends.summary_crc and ends.summary_crc != _checksum(stream, start, end + _CHECKED):
-            self.storage.remarks.append(f"{self._path.name}: the checksum of its summary is wrong: read without it")
-            return False
-        statistics, spans = self._indexed_records(stream, start, end), self.storage.spans
+        stream.seek(MAGIC)
+        if HEAD.unpack(stream.read(HEAD.size))[1] > records.summary_start:
+            raise ValueError(f"cut off at byte {MAGIC}")  # the header, which other readers need
+        statistics, spans = self._indexed_records(records), self.storage.spans
         if statistics is None or statistics.chunk_count != len(spans) or bool(statistics.message_count) != bool(spans):
             return False
         counts = statistics.channel_message_counts
-        if not set(counts).union(*(span.channels for span in spans)) <= self._channels.keys():
+        if self.storage.damage or not set(counts).union(*(span.channels for span in spans)) <= self._channels.keys():
             return False
         for number, count in counts.items():
             self._counts[number] = min(count, 2**62)
@@ -182,21 +168,17 @@ class _Mcap:
         self._name_channels()
         return True
 
-    def _indexed_records(self, stream: BinaryIO, start: int, end: int) -> Statistics | None:
-        """Take the records of the summary, up to the offsets of their groups."""
+    def _indexed_records(self, records: SoundRecords) -> Statistics | None:
+        """Take the records of the summary."""
         statistics, chunks = None, []
-        stream.seek(start)
-        while (record := read_record(stream, end)) and record[0] != Opcode.SUMMARY_OFFSET:
-            opcode, content = record
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._announce(opcode, content)
-            elif opcode == Opcode.STATISTICS:
-                if len(content) > MOST_TEXT:
-                    raise ValueError(f"statistics of {len(content)} B; allowed: up to {MOST_TEXT}")
-                statistics = Statistics.read(ReadDataStream(BytesIO(content)))
-            elif opcode == Opcode.CHUNK_INDEX:
-                chunks.append(self._indexed(content, start))
-        free = _MAGIC
+        for record in records.summary():
+            if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._announce(record.opcode, record.content)
+            elif record.opcode == Opcode.STATISTICS:
+                statistics = Statistics.read(ReadDataStream(BytesIO(record.content)))
+            elif record.opcode == Opcode.CHUNK_INDEX:
+                chunks.append(self._indexed(record.content, records.summary_start))
+        free = MAGIC
         for chunk in sorted(chunks, key=lambda chunk: chunk.start):
             if chunk.start < free:
                 raise ValueError(f"the index has two chunks at byte {chunk.start}")
@@ -211,7 +193,7 @@ class _Mcap:
             raise ValueError(f"the index has a chunk of {places // _PLACE.itemsize} channels")
         (name,) = struct.unpack_from("<I", content, _INDEX.size + places + 8)
         packed, size = struct.unpack_from("<QQ", content, _INDEX.size + places + 12 + name)
-        if start < _MAGIC or start + length > end or max(length, size) > MOST_BYTES or packed > length:
+        if start < MAGIC or start + length > end or max(length, size) > MOST_BYTES or packed > length:
             raise ValueError(f"the index has a chunk of {length} B ({size} unpacked) at byte {start}: none can be")
         self._budget.take(size)
         channels = np.frombuffer(content, _PLACE, places // _PLACE.itemsize, _INDEX.size)["channel"]
@@ -220,15 +202,18 @@ class _Mcap:
     # ---- the whole file -----------------------------------------------------------------------------
 
     def scan(self, stream: BinaryIO) -> None:
-        """Look at all records, up to what cannot be read; chunks that are broken are left out."""
-        stream.seek(0)
+        """Walk through all records; damage behind the end of the data costs no message."""
+
+        def told(why: str, _lost: int) -> None:
+            if not records.ended:
+                self.damage(why)
+
+        records = SoundRecords(stream, self._size, told)
         try:
-            if stream.read(_MAGIC) != MCAP0_MAGIC:
-                raise ValueError("not an MCAP file")
-            for place, part, found in self._parts(stream):
-                self._add(place, found.end, found.messages, in_chunk=False)
-                if self._take(place, part, found.others):
+            for record in records:
+                if record.opcode == Opcode.FOOTER:
                     break
+                self._take(record)
         except _WRONG as error:
             self.damage(error)
         self.storage.first_ns = min((span.first_ns for span in self.storage.spans), default=0)
@@ -238,75 +223,34 @@ class _Mcap:
         except ValueError as error:
             self.damage(error)
 
-    def _parts(self, stream: BinaryIO) -> Iterator[tuple[int, bytes, Found]]:
-        """Place, bytes and records of each part."""
-        place = _MAGIC
-        while True:
-            stream.seek(place)
-            part = stream.read(_PART)
-            found = walk_part(part)
-            if not found.end:
-                opcode, length = _RECORD.unpack_from(part) if len(part) >= _RECORD.size else (0, self._size)
-                after = place + _RECORD.size + length
-                if after > self._size:
-                    self.damage(f"cut off at byte {place}")
-                    return
-                if opcode in (Opcode.ATTACHMENT, Opcode.METADATA):
-                    place = after
-                    continue
-                if length > MOST_BYTES:
-                    raise ValueError(f"record of {length} B at byte {place}; allowed: up to {MOST_BYTES}")
-                part += stream.read(after - place - len(part))
-                found = walk_part(part)
-            yield place, part, found
-            place += found.end
-
-    def _take(self, place: int, part: bytes, others: Places) -> bool:
-        """Take the records of a part that are no messages; whether the file ends with one of them."""
-        for opcode, begin, end in others.tolist():
-            if opcode == Opcode.FOOTER:
-                return True
+    def _take(self, record: Record) -> None:
+        if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self._announce(record.opcode, record.content)
+        if record.opcode not in (Opcode.CHUNK, Opcode.MESSAGE):
+            return
+        try:
+            found = walk_whole(record.content)
+        except TooMuchError:
+            raise
+        except ValueError as error:
+            self.damage(f"chunk at byte {record.place}: {error}")
+            return
+        if np.any(found.others[:, 0] == Opcode.CHUNK):
+            self.damage(f"chunk in the chunk at byte {record.place}")
+            return
+        for opcode, begin, end in found.others.tolist():
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._announce(opcode, part[begin:end])
-            elif opcode == Opcode.CHUNK:
-                start = place + begin - _RECORD.size
-                try:
-                    whole = read_chunk(part[begin:end], start)
-                    self._budget.take(len(whole))
-                    found = walk(whole)
-                except TooMuchError:
-                    raise
-                except ValueError as error:
-                    self.damage(error)
-                    continue
-                if np.any(found.others[:, 0] == Opcode.CHUNK):
-                    self.damage(f"chunk in the chunk at byte {start}")
-                    continue
-                for inner, first, last in found.others.tolist():
-                    if inner in (Opcode.SCHEMA, Opcode.CHANNEL):
-                        self._announce(inner, whole[first:last])
-                self._add(start, end - begin + _RECORD.size, found.messages, in_chunk=True, size=len(whole))
-        return False
+                self._announce(opcode, record.content[begin:end])
+        self._add(record, found.messages)
 
-    def _add(self, start: int, length: int, messages: Places, *, in_chunk: bool, size: int = 0) -> None:
+    def _add(self, record: Record, messages: Places) -> None:
         if not len(messages):
             return
         self._budget.take(0, len(messages))
         counts = np.bincount(messages[:, 0].astype(np.int64), minlength=_NUMBERS)
         self._counts += counts
-        times = messages[:, 1]
-        self.storage.spans.append(
-            _Records(
-                int(times.min()), int(times.max()), size or length, frozenset(np.flatnonzero(counts).tolist()),
-                self._path, start, length, in_chunk=in_chunk,
-            )
-        )  # fmt: skip
-
-
-def _checksum(stream: BinaryIO, start: int, end: int) -> int:
-    """CRC-32 of a part of a file."""
-    stream.seek(start)
-    value = 0
-    while (left := end - stream.tell()) > 0 and (piece := stream.read(min(left, _PART))):
-        value = crc32(piece, value)
-    return int(value)
+        times, channels = messages[:, 1], frozenset(np.flatnonzero(counts).tolist())
+        in_chunk, length = record.opcode == Opcode.CHUNK, record.end - record.place
+        first_ns, last_ns, size = int(times.min()), int(times.max()), len(record.content)
+        span = _Records(first_ns, last_ns, size, channels, self._path, record.place, length, in_chunk=in_chunk)
+        self.storage.spans.append(span)

@@ -1,20 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The file metadata.yaml of a bag's folder, of any version of rosbag2."""
+"""Texts of a bag as any version of rosbag2 writes them: names, quality of service, the file metadata.yaml.
+
+Nothing in them may cost a reader unlimited memory or time. What a quality of service does not say is unknown.
+"""
 
 import errno
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum
+from functools import lru_cache
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, TypeVar
 
-from rosbags.interfaces import Qos
+import yaml
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
-from lathe_rc.bag.reading import qos
-from lathe_rc.bag.reading.limits import MOST_FILES, MOST_METADATA, MOST_TEXT, MOST_TOPICS
-from lathe_rc.bag.reading.precheck import check_name, read_yaml
+from lathe_rc.bag.reading.limits import (
+    LONGEST_NAME,
+    MOST_DEPTH,
+    MOST_EVENTS,
+    MOST_FILES,
+    MOST_METADATA,
+    MOST_TEXT,
+    MOST_TOPICS,
+)
 from lathe_rc.files import contents
 
 NAME = "metadata.yaml"
+
+Kind = TypeVar("Kind", bound=Enum)
+
+_YAML = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # makes texts alone: no dates, no objects
 
 
 @dataclass(frozen=True)
@@ -99,7 +115,7 @@ def _topics(listed: list[object]) -> dict[str, Topic]:
         check_name(name)
         check_name(kind)
         offered = told.get("offered_qos_profiles", "")
-        profiles = qos.of_text(offered) if isinstance(offered, str) else qos.of_list(offered)
+        profiles = qos_of_text(offered) if isinstance(offered, str) else qos_of_list(offered)
         topics[name] = Topic(kind, profiles, _number(_of(each, "message_count", str)))
     return topics
 
@@ -120,3 +136,100 @@ def _number(text: str) -> int:
     if not text.lstrip("-").isdecimal() or len(text) > len(str(2**64)):
         raise ValueError(f"{NAME}: {text[:80]!r} where a whole number belongs")
     return int(text)
+
+
+# ---- quality of service ---------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=64)
+def qos_of_text(text: str) -> tuple[Qos, ...]:
+    """Profiles of a topic's publishers from the text of a bag; most topics of a bag have the same.
+
+    Raises:
+        ValueError: no YAML, or one that would grow when it is read.
+    """
+    return qos_of_list(read_yaml(text, "offered_qos_profiles"))
+
+
+def qos_of_list(given: object) -> tuple[Qos, ...]:
+    """Profiles of a topic's publishers: a list of maps, or a map; no others."""
+    listed = given if isinstance(given, list) else [given]
+    return tuple(_profile(each) for each in listed if isinstance(each, dict))
+
+
+def _profile(given: Mapping[str, object]) -> Qos:
+    deadline, lifespan, lease = (
+        QosTime(_natural(part.get("sec")), _natural(part.get("nsec"))) if isinstance(part, dict) else QosTime(0, 0)
+        for part in map(given.get, ("deadline", "lifespan", "liveliness_lease_duration"))
+    )
+    return Qos(
+        _choice(QosHistory, given.get("history")),
+        _natural(given.get("depth")),
+        _choice(QosReliability, given.get("reliability")),
+        _choice(QosDurability, given.get("durability")),
+        deadline,
+        lifespan,
+        _choice(QosLiveliness, given.get("liveliness")),
+        lease,
+        avoid_ros_namespace_conventions=str(given.get("avoid_ros_namespace_conventions")).lower() == "true",
+    )
+
+
+def _choice(kind: type[Kind], given: object) -> Kind:
+    """By number, as up to version 8 of the metadata, or by name."""
+    unknown: Any = kind["UNKNOWN"]
+    by_number = {str(each.value): each for each in kind}
+    return by_number.get(str(given)) or kind.__members__.get(str(given).upper(), unknown)
+
+
+def _natural(given: object) -> int:
+    """0: as if nothing had been said."""
+    text = str(given)
+    return int(text) if text.isascii() and text.isdigit() and len(text) <= len(str(2**64)) else 0
+
+
+# ---- texts and names -----------------------------------------------------------------------------------------
+
+
+def read_yaml(text: str, what: str) -> Any:
+    """Lists, maps and texts of a YAML text; numbers are texts too.
+
+    Raises:
+        ValueError: see `check_yaml`; or a map's key is a collection.
+    """
+    check_yaml(text, what)
+    try:
+        return yaml.load(text, Loader=_YAML)  # noqa: S506 - makes texts alone
+    except yaml.YAMLError as error:
+        raise ValueError(f"{what}: {getattr(error, 'problem', 'not YAML')}") from None
+
+
+def check_yaml(text: str, what: str) -> None:
+    """Refuse a text that would grow when it is read, or take too long.
+
+    Raises:
+        ValueError: it has aliases, is nested too deep or too long, or is no YAML.
+    """
+    depth = 0
+    try:
+        for count, event in enumerate(yaml.parse(text, Loader=_YAML)):
+            if isinstance(event, yaml.AliasEvent):
+                raise ValueError(f"{what}: YAML aliases; ROS 2 writes none")  # noqa: TRY004 - the file's fault
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MOST_DEPTH or count > MOST_EVENTS:
+                raise ValueError(f"{what}: nested deeper than {MOST_DEPTH} or of more than {MOST_EVENTS} parts")
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        raise ValueError(f"{what}: not YAML{f' in line {mark.line + 1}' if mark else ''}") from None
+    except OverflowError:
+        raise ValueError(f"{what}: not YAML (a character beyond Unicode)") from None
+
+
+def check_name(name: object) -> None:
+    """Refuse the name of a topic or type that could not be shown in a line.
+
+    Raises:
+        ValueError: it is no text, too long, or has characters that do not print.
+    """
+    if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= LONGEST_NAME:
+        raise ValueError(f"name {str(name)[:80]!r}; allowed: up to {LONGEST_NAME} characters that print")

@@ -21,13 +21,13 @@ from types import TracebackType
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
-from lathe_rc.bag.reading import metadata, precheck
+from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_OPEN, MOST_TOPICS
 from lathe_rc.bag.reading.mcap_storage import open_mcap
 from lathe_rc.bag.reading.metadata import Metadata, Topic
 from lathe_rc.bag.reading.sqlite_storage import open_sqlite
 from lathe_rc.bag.reading.storage import Batch, Message, Span, Storage
-from lathe_rc.bag.reading.unpacking import Budget, unpack, unpack_file, unpacked_size
+from lathe_rc.bag.reading.unpacking import Budget, is_packed, unpack, unpack_file, unpacked_size
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
@@ -141,8 +141,12 @@ class Source:
             raise InputError(f"{path}: no topic that can be read ({self.unread[0]}); allowed: messages of ROS 2")
 
     def _open(self) -> None:
-        told = self._metadata()
-        files = files_of(self.path) if self.path.is_dir() else [self.path]
+        if not self.path.exists():
+            raise ValueError("there is no such folder or file")
+        files, told = [self.path], None
+        if self.path.is_dir():
+            files = files_of(self.path)
+            told = self._metadata(files)
         if told:
             self.about, self._packed = told.about, told.packed
             named = told.files
@@ -175,13 +179,8 @@ class Source:
         if len(self.topics) > MOST_TOPICS:
             raise ValueError(f"{len(self.topics)} topics; allowed: up to {MOST_TOPICS}")
 
-    def _metadata(self) -> Metadata | None:
+    def _metadata(self, files: Sequence[Path]) -> Metadata | None:
         """The metadata of a folder; without them, its files count."""
-        if not self.path.exists():
-            raise ValueError("there is no such folder or file")
-        if not self.path.is_dir():
-            return None
-        files = files_of(self.path)
         if not (self.path / metadata.NAME).exists():
             if not files:
                 raise ValueError(f"no {metadata.NAME} in that folder, nor a .mcap or .db3 file")
@@ -207,7 +206,7 @@ class Source:
             return open_mcap(path)
         if head == _SQLITE:
             return open_sqlite(path, self._folder())
-        if not precheck.is_packed(head):
+        if not is_packed(head):
             raise ValueError("a bag of ROS 1" if head.startswith(b"#ROSBAG") else "not an MCAP or SQLite file")
         if depth:
             raise ValueError("compressed twice")

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_TOPICS
-from lathe_rc.bag.reading.precheck import check_tables
 from lathe_rc.bag.reading.storage import Batch, Channel, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget
 from lathe_rc.errors import InputError, shown
@@ -174,3 +173,26 @@ def _count_rows(base: sqlite3.Connection) -> list[tuple[int, int, int, int]]:
                 count, first, last = times.setdefault(number, [0, log_ns, log_ns])
                 times[number] = [count + 1, min(first, log_ns), max(last, log_ns)]
     return [(number, *three) for number, three in times.items()]  # type: ignore[misc]
+
+
+def check_tables(base: sqlite3.Connection) -> None:
+    """Refuse a SQLite file whose answers are more than what it holds: views, triggers, columns that are computed.
+
+    Raises:
+        ValueError: it has some, or a message that is too long.
+        sqlite3.Error: it is none.
+    """
+    made = base.execute("SELECT name, type, coalesce(sql, '') FROM sqlite_master").fetchmany(MOST_TOPICS)
+    for name, kind, sql in made:
+        columns = (
+            base.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,)).fetchall() if kind == "table" else []
+        )
+        computed = any(hidden for (hidden,) in columns)
+        if kind not in ("table", "index") or computed or str(sql).upper().startswith("CREATE VIRTUAL"):
+            raise ValueError(f"{str(kind)[:20]} {str(name)[:80]!r} in the database; rosbag2 makes plain tables only")
+    if any(name == "messages" for name, _, _ in made):
+        longest = None
+        with contextlib.suppress(sqlite3.DatabaseError):  # broken somewhere: what can be read of it is looked at later
+            (longest,) = base.execute("SELECT max(length(data)) FROM messages").fetchone()
+        if isinstance(longest, int) and longest > MOST_BYTES:
+            raise ValueError(f"a message of {longest} B; allowed: up to {MOST_BYTES}")

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from rosbags.interfaces import Qos
 
-from lathe_rc.bag.reading import qos
 from lathe_rc.bag.reading.chunk_messages import Places
 from lathe_rc.bag.reading.limits import MOST_TEXT, MOST_TOPICS
-from lathe_rc.bag.reading.precheck import check_name
+from lathe_rc.bag.reading.metadata import check_name, qos_of_text
 from lathe_rc.bag.reading.unpacking import Budget
 
 Message = tuple[str, int, bytes]  #: topic, log time [ns] and bytes
@@ -137,7 +136,7 @@ class Storage:
         if self._offered > MOST_TEXT:
             raise ValueError(f"more than {MOST_TEXT} characters of quality of service")
         try:
-            channel.qos = qos.of_text(offered)
+            channel.qos = qos_of_text(offered)
         except ValueError as error:
             self.remarks.append(f"{channel.topic}: quality of service that cannot be read ({error})")
         self.channels[number] = channel

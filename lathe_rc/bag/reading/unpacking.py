@@ -76,6 +76,11 @@ def unpacked_size(data: bytes) -> int:
         return -1
 
 
+def is_packed(head: bytes) -> bool:
+    """Whether a file that begins like this is compressed as a whole, or what comes first is skipped by zstd."""
+    return head.startswith(b"\x28\xb5\x2f\xfd") or (head[1:4] == b"\x2a\x4d\x18" and head[0] >> 4 == 5)
+
+
 def unpack_file(path: Path) -> Iterator[bytes]:
     """The content of a file that is compressed as a whole, piece by piece.
 

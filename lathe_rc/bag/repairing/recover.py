@@ -2,46 +2,25 @@
 """Making a complete bag of one that was cut off or is broken in places."""
 
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
-
-from rosbags.interfaces import ConnectionExtRosbag2
 
 from lathe_rc.bag import provenance
 from lathe_rc.bag.repairing.salvage import Salvage, Topic
-from lathe_rc.bag.writing.writer import BagWriter, refuse_existing
+from lathe_rc.bag.writing.writer import BagWriter, ListedTopic, refuse_existing
 from lathe_rc.errors import LatheError, shown
 
 _CHUNK = 2**20  # [B]
 
 
-@dataclass(frozen=True)
-class Recovery:
-    """The result of a recovery.
-
-    Attributes:
-        saved: messages.
-        skipped: messages of topics that cannot be copied.
-        missing: messages that the bag counts beyond those that are there.
-        lost_bytes: bytes of the files that gave nothing.
-        damage: what was wrong, one line each.
-        lossy: whether messages are missing, or may be wrong.
-    """
-
-    saved: int
-    skipped: int
-    missing: int
-    lost_bytes: int
-    damage: tuple[str, ...]
-    lossy: bool
-
-
-def recover(path: Path, target: Path) -> Recovery:
+def recover(path: Path, target: Path) -> Salvage:
     """Copy what is whole of a bag to a new one, understood or not.
 
     Args:
         path: folder or file.
         target: folder of the new bag; must not exist. It is removed again if the recovery fails.
+
+    Returns:
+        What was saved, and what was wrong.
 
     Raises:
         InputError: nothing to read from, or the target exists.
@@ -52,43 +31,40 @@ def recover(path: Path, target: Path) -> Recovery:
         salvage = Salvage(path)
         writer = BagWriter(target, compression="zstd", chunk_size=_CHUNK, about={}, profile=salvage.profile)
         try:
-            saved = _copy(salvage, writer)
+            _copy(salvage, writer)
         except BaseException:
             writer.abort()
             shutil.rmtree(target)
             raise
     except OSError as error:
         raise LatheError(f"{path}: cannot be recovered ({error.strerror or shown(error)})") from None
-    return Recovery(saved, salvage.skipped, salvage.missing, salvage.lost_bytes, tuple(salvage.damage), salvage.lossy)
+    return salvage
 
 
-def _copy(salvage: Salvage, writer: BagWriter) -> int:
-    """Copy everything; returns the number of messages."""
+def _copy(salvage: Salvage, writer: BagWriter) -> None:
+    """Copy everything."""
     channels: dict[Topic, int] = {}
-    saved = 0
 
     def announce(topic: Topic) -> int:
-        ext = ConnectionExtRosbag2(topic.encoding, list(topic.qos))
-        records = topic.schema, topic.channel
-        channels[topic] = writer.copy_channel(topic.name, topic.type, ext, topic.digest, records)
+        listed = ListedTopic(topic.name, topic.type, topic.encoding, topic.qos)
+        channels[topic] = writer.copy_channel(listed, topic.digest, (topic.schema, topic.channel))
         return channels[topic]
 
     salvage.copied = writer.copy_record
     for topic, sequence, log_ns, publish_ns, data in salvage:
         number = channels.get(topic)
-        if number is None:
-            number = announce(topic)
-        writer.copy(number, sequence, log_ns, publish_ns, data)
-        saved += 1
-    for topic in salvage.topics.keys() - channels.keys():  # without a message
+        writer.copy(announce(topic) if number is None else number, sequence, log_ns, publish_ns, data)
+        salvage.saved += 1
+    for topic in [each for each in salvage.topics if each not in channels]:  # without a message
         announce(topic)
     missing = f", {salvage.missing} messages missing" if salvage.missing else ""
-    writer.tell(salvage.about | {provenance.RECOVERED: f"{saved} messages; {salvage.lost_bytes} B lost{missing}"})
+    writer.tell(
+        salvage.about | {provenance.RECOVERED: f"{salvage.saved} messages; {salvage.lost_bytes} B lost{missing}"}
+    )
     writer.close()
-    return saved
 
 
-def mend(path: Path) -> Recovery | None:
+def mend(path: Path) -> Salvage | None:
     """Complete a bag in place: index and metadata for every message that reached the disk.
 
     Args:

@@ -2,13 +2,12 @@
 """Every message that is whole in a bag that is not: cut off, or broken in places.
 
 Bytes are copied, not understood: schemas, channels and messages keep every byte but for their numbers.
-
-Longer than 400 lines: MCAP and SQLite files fill the same description of a bag, and each needs the other's limits.
 """
 
 import sqlite3
 import struct
 import tempfile
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
@@ -23,20 +22,23 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema, Statistics
 from rosbags.interfaces import Qos
 
-from lathe_rc.bag.reading import metadata, precheck, qos
-from lathe_rc.bag.reading.limits import MOST_METADATA, MOST_TEXT, MOST_TOPICS
+from lathe_rc import messages
+from lathe_rc.bag.reading import metadata
+from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_METADATA, MOST_TEXT, MOST_TOPICS
+from lathe_rc.bag.reading.metadata import check_name, qos_of_text
 from lathe_rc.bag.reading.sound_records import SoundRecords, Told
 from lathe_rc.bag.reading.source import files_of
-from lathe_rc.bag.reading.sqlite_storage import connect, left_over, with_journal
+from lathe_rc.bag.reading.sqlite_storage import check_tables, connect, left_over, with_journal
 from lathe_rc.bag.reading.unpacking import unpack, unpack_file, unpacked_size
-from lathe_rc.bag.repairing.damaged_database import known_definition, readable_rows, select
 from lathe_rc.bag.writing.mcap_file import channel_content, schema_content
 from lathe_rc.errors import InputError, shown
 
 ROS2 = "ros2"  #: profile of the files of rosbag2
 
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_MESSAGE = struct.Struct("<IQQ")  # sequence, log time, publish time: ahead of the bytes of a message
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message that is compressed by itself; CDR begins with a zero
+_PAGE = 4096  # bytes of a database that are said to be lost where SQLite does not say
+_MOST_ID_BITS = 62  # of a row
 _MOST_DAMAGE = 1000  # places that are told
 _SCHEMALESS = "__schemaless__"  # type of messages without a schema, as rosbags calls it
 
@@ -95,6 +97,7 @@ class Salvage:
         about: texts that the bag says of itself.
         damage: what was wrong and where, one line each.
         lost_bytes: bytes of the files that gave nothing.
+        saved: messages, as `recover` counts them.
         skipped: messages of topics that cannot be copied.
         missing: messages that the bag counts beyond those that are there.
         lossy: whether messages are missing, or may be wrong.
@@ -109,6 +112,7 @@ class Salvage:
     about: dict[str, str] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     lost_bytes: int = 0
+    saved: int = 0
     skipped: int = 0
     missing: int = 0
     lossy: bool = False
@@ -228,9 +232,9 @@ class Salvage:
         Raises:
             ValueError: it cannot be copied.
         """
-        precheck.check_name(topic.name)
+        check_name(topic.name)
         try:
-            topic = replace(topic, qos=qos.of_text(offered))
+            topic = replace(topic, qos=qos_of_text(offered))
         except ValueError as error:
             self._tell(f"{topic.name}: quality of service that is copied, not understood ({shown(error)})")
         if len(self.topics) >= MOST_TOPICS and topic not in self.topics:
@@ -253,16 +257,17 @@ class Salvage:
             for record in sound:
                 if record.opcode == Opcode.STATISTICS and not sound.summary_wrong:
                     self._counted = Statistics.read(ReadDataStream(BytesIO(record.content))).message_count
-                for opcode, content in sound.inside(record):
-                    if opcode == Opcode.MESSAGE and len(content) >= _MESSAGE.size:
-                        channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content)
-                        if topic := known.topics.get(channel) or known.topic_of(channel):
-                            yield Message(topic, sequence, log_ns, publish_ns, content[_MESSAGE.size :])
+                for content, found in sound.inside(record):
+                    for opcode, begin, end in found.others.tolist():
+                        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                            known.add(opcode, content[begin:end], checked=record.checked)
+                        else:
+                            self._other(opcode, content[begin:end], 0 if sound.ended else end - begin, told)
+                    for number, log_ns, begin, end in found.messages.tolist():
+                        if topic := known.topics.get(number) or known.topic_of(number):
+                            sequence, _, publish_ns = _MESSAGE.unpack_from(content, begin - _MESSAGE.size)
+                            yield Message(topic, sequence, log_ns, publish_ns, content[begin:end])
                             unchecked += not record.checked
-                    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                        known.add(opcode, content, checked=record.checked)
-                    else:
-                        self._other(opcode, content, 0 if sound.ended else len(content), told)
             known.finish()
             self._ended = sound.ended
             if unchecked and sound.data_wrong:
@@ -280,8 +285,8 @@ class Salvage:
                     self.copied(opcode, content)
             elif opcode == Opcode.ATTACHMENT:
                 self.copied(opcode, content)
-            elif opcode in (Opcode.CHUNK, Opcode.MESSAGE):
-                raise ValueError("a chunk in the chunk, or a message that is too short")  # noqa: TRY301
+            elif opcode == Opcode.CHUNK:
+                raise ValueError("a chunk in the chunk")  # noqa: TRY301
             elif opcode > Opcode.DATA_END:
                 raise ValueError("it is not copied")  # noqa: TRY301
         except ValueError as error:
@@ -300,9 +305,9 @@ class Salvage:
                 self._lose(file, left_over(left), left)
             with closing(connect(database)) as base:
                 with suppress(sqlite3.DatabaseError):  # of a broken page; the others are read below
-                    precheck.check_tables(base)
+                    check_tables(base)
                 topics, strange = self._sqlite_topics(file, base), 0
-                for number, log_ns, data in readable_rows(base, lambda why, lost: self._lose(file, why, lost)):
+                for number, log_ns, data in _readable_rows(base, lambda why, lost: self._lose(file, why, lost)):
                     topic = topics.get(number)
                     if topic and isinstance(log_ns, int) and log_ns >= 0 and isinstance(data, bytes):
                         yield Message(topic, 0, log_ns, log_ns, data)
@@ -316,14 +321,14 @@ class Salvage:
 
     def _sqlite_topics(self, file: Path, base: sqlite3.Connection) -> dict[Any, Topic]:
         """Topics by number."""
-        definitions = select(base, "message_definitions", ("topic_type", "encoding", "encoded_message_definition"))
+        definitions = _select(base, "message_definitions", ("topic_type", "encoding", "encoded_message_definition"))
         defined = {kind: (encoding, text) for kind, encoding, text in definitions}
         names = ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
         topics: dict[Any, Topic] = {}
-        for number, name, kind, encoding, offered, digest in select(base, "topics", names):
+        for number, name, kind, encoding, offered, digest in _select(base, "topics", names):
             try:
-                precheck.check_name(kind)
-                how, text, known = known_definition(kind)
+                check_name(kind)
+                how, text, known = _known_definition(kind)
                 how, text = defined.get(kind, (how, text))
                 self.count(len(text) + len(offered))
                 said = {"offered_qos_profiles": offered, "topic_type_hash": digest or known}
@@ -368,9 +373,10 @@ class _Definitions:
             self._searched = True
             told, self._sound.told = self._sound.told, lambda _why, _lost: None
             for record in self._sound:
-                for kind, content in self._sound.inside(record):
-                    if (kind, int.from_bytes(content[:2], "little")) not in self._known:
-                        self.add(kind, content, checked=record.checked)
+                for content, found in self._sound.inside(record):
+                    for kind, begin, end in found.others.tolist():
+                        if (kind, int.from_bytes(content[begin : begin + 2], "little")) not in self._known:
+                            self.add(kind, content[begin:end], checked=record.checked)
             self._sound.told = told
         return self._known[key].content if key in self._known else None
 
@@ -400,7 +406,7 @@ class _Definitions:
                 self._sound.told(f"{name}: schema {channel.schema_id} is described nowhere", 0)
             else:
                 kind = Schema.read(ReadDataStream(BytesIO(schema))).name or _SCHEMALESS
-                precheck.check_name(kind)
+                check_name(kind)
         self._salvage.count(len(content) + len(schema or b""))
         digest = channel.metadata.get("topic_type_hash", "")
         topic = Topic(channel.topic, kind, channel.message_encoding, (), digest, schema, content)
@@ -415,3 +421,51 @@ class _Definitions:
         self._salvage.skipped += self._lost.total()
         for why, count in self._lost.items():
             self._sound.told(f"{why}: {count} messages of it are not copied", 0)
+
+
+def _readable_rows(base: sqlite3.Connection, told: Told) -> Iterator[tuple[Any, Any, Any]]:
+    """Topic, time and bytes of the messages on all pages that are whole; no bytes if there are too many."""
+    query = (
+        f"SELECT id, topic_id, timestamp, CASE WHEN length(data) <= {MOST_BYTES} THEN data END"  # noqa: S608 - a constant
+        " FROM messages WHERE id >= ? ORDER BY id"
+    )
+    first = 0
+
+    def readable(step: int) -> bool:
+        try:
+            base.execute(f"{query} LIMIT 1", (first + step,)).fetchone()
+        except sqlite3.DatabaseError:
+            return False
+        return True
+
+    while True:
+        try:
+            for number, *row in base.execute(query, (first,)):
+                yield row[0], row[1], row[2]
+                first = number + 1
+        except sqlite3.DatabaseError as error:
+            told(f"from message {first} on: {error}", _PAGE)
+        else:
+            return
+        step = next((2**k for k in range(_MOST_ID_BITS) if readable(2**k)), None)
+        if step is None:
+            return
+        first += bisect_left(range(step), 1, lo=step // 2, key=readable)
+
+
+def _known_definition(kind: str) -> tuple[str, str, str]:
+    """Encoding, text and hash of a type's definition, empty if this package does not have it."""
+    store = messages.store()
+    if kind not in store.fielddefs:
+        return "", "", ""
+    return "ros2msg", store.generate_msgdef(kind, ros_version=2)[0], store.hash_rihs01(kind)
+
+
+def _select(base: sqlite3.Connection, table: str, columns: tuple[str, ...]) -> list[tuple[Any, ...]]:
+    """Rows of a table as texts, but for a number in the first column; bags of older ROS lack columns and tables."""
+    there = {row[1] for row in base.execute(f"PRAGMA table_info({table})")}
+    if columns[0] not in there:
+        return []
+    listed = ", ".join(name if name in there else "''" for name in columns)
+    rows = base.execute(f"SELECT {listed} FROM {table}").fetchmany(MOST_TOPICS)  # noqa: S608 - of constants
+    return [(first, *(text if isinstance(text, str) else "" for text in rest)) for first, *rest in rows]

@@ -63,7 +63,7 @@ class Merger:
         self._final: int | None = None  # the last row
         self._finals = 0  # topics that have brought it
         self._plan = Plan(self._topics, run_id, step_ns, samples)
-        self._sheet_rows = max(_SHEET // self._plan.mcap.size, 1)  # rows
+        self._sheet_rows = max(_SHEET // self._plan.rows.size, 1)  # rows
         self._sheets: dict[int, Sheet] = {}  # by number
         self._free: list[Sheet] = []
         self._tail: Sheet | None = None  # the last row, if it is shorter
@@ -247,7 +247,7 @@ class Merger:
         if first < end:
             skip = first - self.rows
             data = sheet.bytes[within + skip : within + end - self.rows].reshape(-1).data
-            self._writer.write_rows(sheet.plan.mcap, first_ns + skip * sheet.plan.mcap.period_ns, data)
+            self._writer.write_rows(sheet.plan.rows, first_ns + skip * sheet.plan.rows.period_ns, data)
         self.rows, self.samples = end, (end - 1) * self._length + sheet.plan.samples
         self.log_ns = START_NS + (self.samples - 1) * self._step_ns
         self.complete = self._final is not None and end > self._final

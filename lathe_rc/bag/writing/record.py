@@ -10,8 +10,7 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.snapshots import Snapshots
-from lathe_rc.bag.writing.tee import Both
-from lathe_rc.bag.writing.writer import BagWriter, Output, offered_qos
+from lathe_rc.bag.writing.writer import BagWriter, Both, Output, offered_qos
 from lathe_rc.cell.framing import Framer
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recorder import RecorderParameters

@@ -9,12 +9,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lathe_rc.bag.writing.mcap_file import TIMES, RowPlan, message_head
+from lathe_rc.bag.writing.mcap_file import TIMES, message_head
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.wire import NUMBERS, Layout
 from lathe_rc.messages import START_NS, Samples, Signals
 
 _BILLION = 1_000_000_000
+
+
+class RowPlan(NamedTuple):
+    """Rows of messages that come again and again in the same order and with the same lengths.
+
+    Attributes:
+        size: of a row [B].
+        period_ns: log time between rows.
+    """
+
+    size: int
+    period_ns: int
 
 
 class Dense(NamedTuple):
@@ -47,7 +59,7 @@ class Plan:
         layouts: of the messages.
         places: where they begin.
         template: a row with all its numbers and samples 0, shape (bytes,).
-        mcap: what the file has to know of it.
+        rows: what an `Output` has to know of it.
     """
 
     def __init__(self, topics: list[Dense], run_id: str, step_ns: int, samples: int) -> None:
@@ -60,8 +72,7 @@ class Plan:
             self.places.append(len(template))
             template += layout.template
         self.template = np.frombuffer(template, np.uint8)
-        places = {dense.channel: place for dense, place in zip(topics, self.places, strict=True)}
-        self.mcap = RowPlan(places, len(template), samples * step_ns)
+        self.rows = RowPlan(len(template), samples * step_ns)
 
 
 class Sheet:

@@ -16,8 +16,7 @@ from rosbags.interfaces import Qos
 
 from lathe_rc import messages
 from lathe_rc.bag.snapshot import Snapshot
-from lathe_rc.bag.writing.mcap_file import RowPlan
-from lathe_rc.bag.writing.rows import Dense, Plan
+from lathe_rc.bag.writing.rows import Dense, Plan, RowPlan
 from lathe_rc.bag.writing.writer import BagWriter, refuse_existing
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.errors import InputError, LatheError, at_most

@@ -1,36 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing rosbag2 directories.
+"""Writing rosbag2 directories: an MCAP file, and its metadata as rosbags writes them.
 
-rosbags writes the directory, its metadata and the schemas. Its own MCAP storage has neither a chunk size nor a
-flush, which are what a crash promise needs; `lathe_rc.bag.writing.mcap_file` has. Its YAML takes 0.2 s for a bag,
-during which a cell that is being recorded would wait; libyaml takes some ms.
+The storage of rosbags' own writer has neither a chunk size nor a flush, which are what a crash promise needs;
+`lathe_rc.bag.writing.mcap_file` has. Its YAML takes 0.2 s for a bag, during which a cell that is being recorded would
+wait; libyaml takes some ms.
 """
 
 import shutil
-from collections.abc import Mapping, Sequence
-from functools import cache, partial
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, Protocol, TextIO, cast
+from typing import Any, Literal, NamedTuple, Protocol
 
-import rosbags.rosbag2.writer
 import yaml
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag2,
-    MessageDefinition,
-    MessageDefinitionFormat,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
-from rosbags.rosbag2 import CompressionMode, StoragePlugin
-from rosbags.rosbag2 import Writer as RosbagWriter
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2.metadata import dump_qos_v9
 
 from lathe_rc import messages
-from lathe_rc.bag.writing.mcap_file import McapFile, RowPlan
+from lathe_rc.bag.writing.mcap_file import McapFile
+from lathe_rc.bag.writing.rows import RowPlan
 from lathe_rc.errors import InputError, LatheError
 
 Compression = Literal["zstd", "none"]
@@ -39,6 +28,7 @@ Records = tuple[bytes | None, bytes]
 
 FLUSH_PERIOD = 0.5  #: [s] of wall time after which a recorder writes messages out even if they fill no chunk
 _FOREVER = QosTime(9223372036, 854775807)
+_NEVER = 2**63 - 1  # start of a bag without a message, as rosbags writes it [ns]
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]  # absent without libyaml
@@ -52,18 +42,24 @@ class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[mi
 _Dumper.add_representer(str, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"'))
 
 
-class _Yaml:
-    """The part of ruamel.yaml that rosbags' writer uses."""
-
-    def __init__(self, typ: str) -> None:
-        self.default_flow_style = False
-
-    def dump(self, tree: Any, stream: TextIO) -> None:
-        """Write plain data."""
-        yaml.dump(tree, stream, _Dumper, default_flow_style=self.default_flow_style, allow_unicode=True)
+def _yaml(tree: Any) -> str:
+    return str(yaml.dump(tree, None, _Dumper, default_flow_style=False, allow_unicode=True))
 
 
-rosbags.rosbag2.writer.YAML = _Yaml  # type: ignore[attr-defined,assignment]  # see the top: it has no option for it
+class ListedTopic(NamedTuple):
+    """A topic as metadata list it; some channels of a file may be one.
+
+    Attributes:
+        name: fully qualified.
+        type: of its messages; may be empty.
+        encoding: of its messages.
+        qos: that its publishers offer.
+    """
+
+    name: str
+    type: str
+    encoding: str
+    qos: tuple[Qos, ...]
 
 
 class Output(Protocol):
@@ -113,62 +109,6 @@ def offered_qos(depth: int, durability: Durability) -> Qos:
     )
 
 
-class _McapStorage:
-    """rosbags' storage interface on `McapFile`."""
-
-    def __init__(
-        self, path: Path, compression: CompressionMode, chunk_size: int, profile: str, *, compress: bool
-    ) -> None:
-        assert compression is CompressionMode.NONE, "chunks are compressed, not messages or files"
-        self.path = path / f"{path.name}.mcap"
-        self.file = McapFile(self.path, chunk_size=chunk_size, compress=compress, profile=profile)
-        self._schemas: dict[str, int] = {}
-        self.channels: dict[int, list[int]] = {}  # by connection
-
-    def add_msgtype(self, connection: Connection) -> None:
-        """Add a message type's definition."""
-        self._schemas[connection.msgtype] = self.file.add_schema(connection.msgtype, connection.msgdef.data)
-
-    def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
-        """Add a topic."""
-        assert isinstance(connection.ext, ConnectionExtRosbag2)
-        number = self.file.add_channel(
-            connection.topic,
-            self._schemas[connection.msgtype],
-            connection.ext.serialization_format,
-            {"offered_qos_profiles": offered_qos_profiles, "topic_type_hash": connection.digest},
-        )
-        self.channels[connection.id] = [number]
-
-    def close(self, version: int, metadata: str) -> None:
-        """Finish the file."""
-        self.file.free_room()
-        self.file.add_metadata("rosbag2", {"serialized_metadata": metadata}, last=True)
-        self.file.finish()
-
-
-class _Writer(RosbagWriter):
-    """rosbags' writer with the storage above, which gets the messages directly and counts them itself."""
-
-    def __init__(self, path: Path, chunk_size: int, profile: str, *, compress: bool) -> None:
-        super().__init__(path, version=9, storage_plugin=StoragePlugin.MCAP)
-        make = partial(_McapStorage, chunk_size=chunk_size, profile=profile, compress=compress)
-        self.STORAGE_PLUGINS = {StoragePlugin.MCAP: make}  # type: ignore[dict-item]  # wants a class, only calls it
-
-    @property
-    def mcap(self) -> _McapStorage:
-        """The storage, once open."""
-        return cast("_McapStorage", self.storage)
-
-    def close(self) -> None:
-        """See rosbags; the metadata count the messages that the storage has been given."""
-        file = self.mcap.file
-        self.counts = {key: sum(map(file.counts.__getitem__, each)) for key, each in self.mcap.channels.items()}
-        if file.first_ns is not None and file.last_ns is not None:
-            self.min_timestamp, self.max_timestamp = file.first_ns, file.last_ns
-        super().close()
-
-
 def refuse_existing(path: Path) -> None:
     """Refuse a place where a bag cannot be begun.
 
@@ -205,14 +145,18 @@ class BagWriter:
         profile: str = "ros2",
     ) -> None:
         refuse_existing(path)
-        self._writer = _Writer(path, chunk_size, profile, compress=compression == "zstd")
+        self._path, self._name = path, f"{path.name}.mcap"
         try:
-            self._writer.open()
+            path.mkdir(mode=0o755)
+            self._file = McapFile(
+                path / self._name, chunk_size=chunk_size, compress=compression == "zstd", profile=profile
+            )
         except OSError as error:
             raise InputError(f"{path}: cannot be made ({error.strerror})") from None
-        self._file = self._writer.mcap.file
-        self._channels: dict[str, int] = {}
-        self._copied: dict[bytes | None, int] = {}  # schemas
+        self._about: dict[str, str] = {}
+        self._topics: dict[ListedTopic, tuple[str, list[int]]] = {}  # hash of the type, and channels
+        self._channels: dict[str, int] = {}  # of what is written by topic
+        self._schemas: dict[str | bytes | None, int] = {}
         try:
             self.tell(about)
         except LatheError:
@@ -220,44 +164,45 @@ class BagWriter:
             shutil.rmtree(path)
             raise
 
+    @contextmanager
+    def _on_disk(self) -> Iterator[None]:
+        """Turn errors of the disk into one line."""
+        try:
+            yield
+        except OSError as error:
+            before = "" if self._file.first_ns is None else "what was recorded before is readable: "
+            raise LatheError(f"{self._path}: cannot write ({error.strerror}); {before}make room") from None
+
     def tell(self, about: Mapping[str, str]) -> None:
         """Store texts: in the file at once, where they survive a crash, and in metadata.yaml at the end.
 
         Raises:
             LatheError: the disk does not take it.
         """
-        for key, text in about.items():
-            self._writer.set_custom_data(key, text)
-        if not about:
-            return
-        try:
-            self._file.add_metadata("lathe_rc", about)
-        except OSError as error:
-            raise self._full(error) from None
+        self._about.update(about)
+        if about:
+            with self._on_disk():
+                self._file.add_metadata("lathe_rc", about)
 
     def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
         """Announce a fully qualified topic of a type that this package knows."""
         text, digest = _definition(msgtype)
-        self._added(
-            topic, self._writer.add_connection(topic, msgtype, msgdef=text, rihs01=digest, offered_qos_profiles=[qos])
-        )
+        self.copy_topic(topic, msgtype, [qos], definition=text, digest=digest)
 
     def copy_topic(self, topic: str, msgtype: str, qos: Sequence[Qos], *, definition: str, digest: str) -> None:
         """Announce a topic of a type that this package need not know, with the text and the hash of its definition."""
-        self._added(
-            topic,
-            self._writer.add_connection(
-                topic, msgtype, msgdef=definition, rihs01=digest, offered_qos_profiles=list(qos)
-            ),
-        )
+        if msgtype not in self._schemas:
+            self._schemas[msgtype] = self._file.add_schema(msgtype, definition)
+        said = {"offered_qos_profiles": _yaml(dump_qos_v9(list(qos))).strip(), "topic_type_hash": digest}
+        number = self._file.add_channel(topic, self._schemas[msgtype], "cdr", said)
+        self._channels[topic] = number
+        self._list(ListedTopic(topic, msgtype, "cdr", tuple(qos)), digest, number)
 
-    def copy_channel(self, topic: str, msgtype: str, ext: ConnectionExtRosbag2, digest: str, records: Records) -> int:
+    def copy_channel(self, topic: ListedTopic, digest: str, records: Records) -> int:
         """Announce a topic as another bag does, understood or not.
 
         Args:
-            topic: its name.
-            msgtype: of its messages.
-            ext: their encoding and the quality of service that its publishers offer.
+            topic: how it is listed.
             digest: of the type; may be empty.
             records: contents of the records of its schema, None if it has none, and of its channel.
 
@@ -265,18 +210,14 @@ class BagWriter:
             Its number for `copy`.
         """
         schema, channel = records
-        if schema not in self._copied:
-            self._copied[schema] = self._file.copy_schema(schema) if schema is not None else 0
-        number = self._file.copy_channel(channel, self._copied[schema])
-        for known in self._writer.connections:
-            if (known.topic, known.msgtype, known.ext) == (topic, msgtype, ext):
-                self._writer.mcap.channels[known.id].append(number)
-                return number
-        key = len(self._writer.connections) + 1
-        nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
-        self._writer.connections.append(Connection(key, topic, msgtype, nothing, digest, 0, ext, self._writer))
-        self._writer.mcap.channels[key] = [number]
+        if schema not in self._schemas:
+            self._schemas[schema] = self._file.copy_schema(schema) if schema is not None else 0
+        number = self._file.copy_channel(channel, self._schemas[schema])
+        self._list(topic, digest, number)
         return number
+
+    def _list(self, topic: ListedTopic, digest: str, channel: int) -> None:
+        self._topics.setdefault(topic, (digest, []))[1].append(channel)
 
     def copy(self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
         """Append a message to a channel that has been copied.
@@ -284,10 +225,8 @@ class BagWriter:
         Raises:
             LatheError: the disk does not take it.
         """
-        try:
+        with self._on_disk():
             self._file.add_message(channel, log_ns, data, publish_ns=publish_ns, sequence=sequence)
-        except OSError as error:
-            raise self._full(error) from None
 
     def copy_record(self, opcode: int, content: bytes) -> None:
         """Append an attachment or metadata as another file has it.
@@ -295,13 +234,8 @@ class BagWriter:
         Raises:
             LatheError: the disk does not take it.
         """
-        try:
+        with self._on_disk():
             self._file.copy_record(opcode, content)
-        except OSError as error:
-            raise self._full(error) from None
-
-    def _added(self, topic: str, connection: Connection) -> None:
-        (self._channels[topic],) = self._writer.mcap.channels[connection.id]
 
     def write(self, topic: str, log_ns: int, data: bytes | memoryview) -> None:
         """Append a message to a topic that has been announced.
@@ -309,10 +243,8 @@ class BagWriter:
         Raises:
             LatheError: the disk does not take it.
         """
-        try:
+        with self._on_disk():
             self._file.add_message(self._channels[topic], log_ns, data)
-        except OSError as error:
-            raise self._full(error) from None
 
     def channel(self, topic: str) -> int:
         """The number of a topic in the file."""
@@ -324,14 +256,8 @@ class BagWriter:
         Raises:
             LatheError: the disk does not take it.
         """
-        try:
-            self._file.add_rows(plan, first_ns, data)
-        except OSError as error:
-            raise self._full(error) from None
-
-    def _full(self, error: OSError) -> LatheError:
-        before = "" if self._file.first_ns is None else "what was recorded before is readable: "
-        return LatheError(f"{self._writer.path}: cannot write ({error.strerror}); {before}make room")
+        with self._on_disk():
+            self._file.add_rows(plan.size, data)
 
     def flush(self) -> None:
         """Hand what has been written so far to the operating system.
@@ -339,10 +265,8 @@ class BagWriter:
         Raises:
             LatheError: the disk does not take it.
         """
-        try:
+        with self._on_disk():
             self._file.flush()
-        except OSError as error:
-            raise self._full(error) from None
 
     def abort(self) -> None:
         """Close the file as it is."""
@@ -355,17 +279,105 @@ class BagWriter:
             LatheError: the disk did not take the last messages; the bag is complete but for them, or says so.
         """
         try:
-            self._file.flush()
-        except OSError as error:
-            raise self._full(error) from None
+            self.flush()
         finally:
             self._complete()
 
     def _complete(self) -> None:
         """Write index and metadata, for which the file has kept room."""
+        tree = self._metadata()
         try:
-            self._writer.close()
+            self._file.free_room()
+            self._file.add_metadata("rosbag2", {"serialized_metadata": _yaml(tree).strip()}, last=True)
+            self._file.finish()
+            beside = self._path / "metadata.yaml.tmp"
+            beside.write_text(_yaml({"rosbag2_bagfile_information": tree}), encoding="utf-8")
+            beside.replace(self._path / "metadata.yaml")
         except OSError as error:
             raise LatheError(
-                f"{self._writer.path}: cannot be completed ({error.strerror}); make room, then lathe bag recover it"
+                f"{self._path}: cannot be completed ({error.strerror}); make room, then lathe bag recover it"
             ) from None
+
+    def _metadata(self) -> dict[str, Any]:
+        """The metadata of version 9; they count the messages that the file has."""
+        counts = {topic: sum(map(self._file.counts.__getitem__, each)) for topic, (_, each) in self._topics.items()}
+        first = _NEVER if self._file.first_ns is None else self._file.first_ns
+        span = {
+            "starting_time": {"nanoseconds_since_epoch": first},
+            "duration": {"nanoseconds": max((self._file.last_ns or 0) - first, 0)},
+            "message_count": sum(counts.values()),
+        }
+        topics = [
+            {
+                "topic_metadata": {
+                    "name": topic.name,
+                    "type": topic.type,
+                    "serialization_format": topic.encoding,
+                    "offered_qos_profiles": dump_qos_v9(list(topic.qos)),
+                    "type_description_hash": digest,
+                },
+                "message_count": counts[topic],
+            }
+            for topic, (digest, _) in self._topics.items()
+        ]
+        return {
+            "version": 9,
+            "storage_identifier": "mcap",
+            "relative_file_paths": [self._name],
+            **span,
+            "topics_with_message_count": topics,
+            "compression_format": "",
+            "compression_mode": "",
+            "files": [{"path": self._name, **span}],
+            "custom_data": self._about or None,
+            "ros_distro": "rosbags",
+        }
+
+
+class Both:
+    """Two outputs with the same topics; an `Output`.
+
+    Args:
+        first, second: the outputs.
+    """
+
+    def __init__(self, first: Output, second: Output) -> None:
+        self._first, self._second = first, second
+
+    def tell(self, about: Mapping[str, str]) -> None:
+        """See `Output`."""
+        self._first.tell(about)
+        self._second.tell(about)
+
+    def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
+        """See `Output`."""
+        self._first.add_topic(topic, msgtype, qos)
+        self._second.add_topic(topic, msgtype, qos)
+
+    def channel(self, topic: str) -> int:
+        """See `Output`; the same in both."""
+        number = self._first.channel(topic)
+        assert number == self._second.channel(topic), "topics are announced to both in the same order"
+        return number
+
+    def write(self, topic: str, log_ns: int, data: bytes) -> None:
+        """See `Output`."""
+        self._first.write(topic, log_ns, data)
+        self._second.write(topic, log_ns, data)
+
+    def write_rows(self, plan: RowPlan, first_ns: int, data: bytes | memoryview) -> None:
+        """See `Output`."""
+        self._first.write_rows(plan, first_ns, data)
+        self._second.write_rows(plan, first_ns, data)
+
+    def flush(self) -> None:
+        """See `Output`."""
+        self._first.flush()
+        self._second.flush()
+
+    def close(self) -> None:
+        """See `Output`."""
+        try:
+            self._first.close()
+        finally:
+            self._second.close()
