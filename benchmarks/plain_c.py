@@ -240,7 +240,7 @@ def _spindle(cell: Cell) -> _Structure:
 def _channel(cell: Cell, name: str) -> _Structure:
     memory = _stage(cell, name, LearningController).memory
     table, lead = memory.control, memory.preview
-    extras = memory.identifies, memory.listens, memory.by_time, memory.rates, table.ramp
+    extras = memory.identifies, memory.who.listens, memory.by_time, memory.rates, table.ramp
     assert not any(extras), "no identification, supervisor, correction or soft start, and the angle for the memory"
     assert table.ratio >= 0.0, "an exponential Q"
     assert lead.law == LeadLaw.VARIABLE, "a lead that varies with the speed"
@@ -290,12 +290,14 @@ def _cut(cell: Cell) -> _Structure:
     process, made = memory.cut.process, memory.allowance
     extras = process.spots.size, process.gaps.size, process.overlap, memory.sensor.rms, memory.sensor.resolution
     assert extras == (0, 0, 0.0, 0.0, 0.0), "an even part without regeneration, and an ideal sensor"
-    assert process.pressure == 0.0, "no process damping"
+    assert process.flank.pressure == 0.0, "no process damping"
     assert process.compliances.size == 1, "the same compliance everywhere"
     order, amplitude, phase = made.run_out
     blank = _Allowance.of(made.walk, waves=order.size, order=order, amplitude=amplitude, phase=phase)
     return _Cut.of(
         process,
+        process.material,
+        process.wear,
         compliance=process.compliances[0],
         lag=_system(process.lag),
         mode=_system(process.mode),

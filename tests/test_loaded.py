@@ -25,7 +25,7 @@ from lathe_rc.transfer import TransferFunction
 STEP = 1 / 64000
 SPEED = 100.0  # [rad/s]
 SERVO = {"natural_frequency": 1038.0, "damping": 0.804, "moving_mass": 1.2}
-STACK = {"natural_frequency": 14600.0, "damping": 0.299, "mass_ratio": 0.1}
+STACK = {"tool_frequency": 14600.0, "tool_damping": 0.299, "mass_ratio": 0.1}
 COIL = Coil(resistance=2.0, inductance=2e-3, bandwidth=12e3)
 FORCE_CONSTANT = 30.0
 DELAY = 23 * STEP  # whole samples: what the servo follows is linear from sample to sample
@@ -46,7 +46,7 @@ def loaded(*, series=False, coil=None, radial=0.4, step=STEP, servo=None, stack=
         force_constant=FORCE_CONSTANT,
         radial=radial,
         coil=coil,
-        piezo=Piezo(linear, full_voltage=100.0, **stack, **piezo) if series else None,
+        piezo=Piezo(linear, *stack.values(), full_voltage=100.0, **piezo) if series else None,
         step=step,
         method="foh",
         kept=8192,
@@ -196,7 +196,7 @@ def test_momentum_and_energy_of_the_electrodynamic_drive_and_the_cut_are_in_bala
 
 def test_momentum_and_energy_of_drives_in_series_and_the_cut_are_in_balance():
     step, w1, z1 = STEP / 4, SERVO["natural_frequency"], SERVO["damping"]
-    w2, z2, mass = STACK["natural_frequency"], STACK["damping"], SERVO["moving_mass"]
+    w2, z2, mass = STACK["tool_frequency"], STACK["tool_damping"], SERVO["moving_mass"]
     tool = STACK["mass_ratio"] * mass
     time = step * np.arange(48_000)
     e = 5e-6 * np.sin(3000.0 * time)
@@ -299,7 +299,7 @@ def chatter(machine, stiffness, period, samples, kick):
 @pytest.mark.parametrize("name", ["alone", "series"])
 def test_the_cut_chatters_beyond_the_limit_of_the_drive_s_compliance(name, factor):
     """1 % below the limit a kick dies away, 1 % above it grows, as the characteristic root says."""
-    servo, stack = {**SERVO, "damping": 0.1}, {**STACK, "damping": 0.05}
+    servo, stack = {**SERVO, "damping": 0.1}, {**STACK, "tool_damping": 0.05}
     formula = compliance(**servo) if name == "alone" else compliance_in_series(**SERVO, **stack)
     top = tuple(0.4 * each for each in formula.numerator)
     cut = Regeneration(TransferFunction(top, formula.denominator))
