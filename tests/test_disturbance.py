@@ -323,7 +323,7 @@ def test_the_suite_has_it_within_the_tolerance_and_ahead_of_its_peer_with_everyt
     study = STUDIES["robust"]
     found = study.run(study.parameters(plants=1, revolutions=24, conditions=["all at once"])).to_json()
     assert list(found) == [
-        "conditions", "laws", "tolerance_um", "largest_um", "rms_um", "revolutions", "effort_a", "margin",
+        "conditions", "laws", "seeds", "tolerance_um", "largest_um", "rms_um", "revolutions", "effort_a", "margin",
     ]  # fmt: skip
     for plant in ("told", "worst"):
         (errors,) = found["largest_um"][plant]
