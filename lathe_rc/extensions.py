@@ -232,7 +232,7 @@ def search_path() -> str:
 def is_ours(module: str) -> bool:
     """Tell whether a module is of this distribution: the folder of compiled code changes with its source.
 
-    The source of others is not looked at there; what is kept of their steps is, see `lathe_rc.cell.native`.
+    The source of others is not looked at there; what is kept of their steps is, see `lathe_rc.compiled.step`.
     """
     return module.startswith(("lathe_rc.", "lathe_papers."))
 

@@ -11,11 +11,11 @@ from lathe_rc.analysis.budget import TOLD, Budget, Causes, Decomposition
 from lathe_rc.analysis.metrology import evenly
 from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.cell import batch, models
-from lathe_rc.cell.cures import Loop
 from lathe_rc.cell.parameters import NodeParameters, Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.form import FormParameters
+from lathe_rc.cell.stages.learner import Loop
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
 from lathe_rc.cell.stages.loaded_drive import LoadedParameters
@@ -212,7 +212,8 @@ def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
     low, high = cell.master.speed_range()
     for stage in cell.stages.values():
         if isinstance(stage, LearningController):
-            loop = Loop(stage, [response for response, _ in cell.learned(stage)], stage.checked_speeds(low, high))
+            responses = [response for response, _ in stage.learned(cell.stages.values())]
+            loop = Loop(stage, responses, stage.checked_speeds(low, high))
             flat = loop.flat(min(max(loop.factor({}), _FACTOR), _CONVERGES))
             if flat is None:
                 left_out["Q floor"] = f"{stage.name} converges with no flat Q"

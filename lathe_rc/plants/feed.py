@@ -21,10 +21,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.compiled.struct_view import sized
 from lathe_rc.control.limits import CommandLimits, rest
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
-from lathe_rc.placed import sized
 from lathe_rc.plants.backlash import follow
 from lathe_rc.plants.feed_limits import LimitTable, keep_within, limit_table
 from lathe_rc.plants.feed_models import realise, settles

@@ -10,13 +10,13 @@ import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc import messages, resources
-from lathe_rc.cell.native import Step
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.cell.stages.feed_drive import Axis
 from lathe_rc.cell.stages.obedience import OBEY, apply, listens, may_learn, piece
 from lathe_rc.cell.stages.servo import Listener, ServoParameters, listener, pid_along
 from lathe_rc.cell.stages.trajectory import Course, Trajectory, follow
+from lathe_rc.compiled.step import Step
 from lathe_rc.control import periodic
 from lathe_rc.control.periodic import PeriodicController, PeriodicLaw, PeriodicState
 from lathe_rc.control.periodic_gains import PRESETS
