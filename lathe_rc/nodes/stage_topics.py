@@ -8,9 +8,8 @@ from functools import partial
 
 from lathe_rc import messages
 from lathe_rc.cell import extremes
-from lathe_rc.cell.block import Pool
+from lathe_rc.cell.block import Framer, Pool
 from lathe_rc.cell.delay_buffer import DelayBuffer, longest_delays
-from lathe_rc.cell.framing import Framer
 from lathe_rc.cell.stage import Input, Sparse, Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.wire import Encoder
