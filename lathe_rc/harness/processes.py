@@ -23,7 +23,7 @@ from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.extensions import search_path
 from lathe_rc.harness.domain import free_domain
 from lathe_rc.harness.events import Event, how_it_ended, ignore
-from lathe_rc.namespace import absolute
+from lathe_rc.names import absolute
 from lathe_rc.nodes import stale_shared_memory
 from lathe_rc.nodes.report import THROUGHPUT
 from lathe_rc.starting import Child, Start

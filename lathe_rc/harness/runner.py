@@ -25,7 +25,7 @@ from lathe_rc.harness.processes import Processes
 from lathe_rc.harness.recorded import with_recorder
 from lathe_rc.harness.result import Mode, Result
 from lathe_rc.messages import Signals
-from lathe_rc.namespace import checked
+from lathe_rc.names import checked_namespace
 from lathe_rc.starting import Start
 
 
@@ -84,7 +84,7 @@ def run(
         from lathe_rc.bag.writing.writer import refuse_existing
 
         refuse_existing(place)
-    result = _run(scenario, cell, mode, groups, place, watch, domain, checked(namespace), start)
+    result = _run(scenario, cell, mode, groups, place, watch, domain, checked_namespace(namespace), start)
     result = replace(result, unchecked=cell.unchecked, warnings=cell.warnings, margins=cell.margins)
     if result.bag is not None:
         from lathe_rc.bag.check import write_digests
