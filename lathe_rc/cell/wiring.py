@@ -11,8 +11,7 @@ from functools import cached_property, lru_cache
 from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple
 
-from lathe_rc.cell import extremes
-from lathe_rc.cell.parameters import NodeParameters, remapped
+from lathe_rc.cell.parameters import NodeParameters, explain_overflow, remapped
 from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stage import Input, Output, Stage
 from lathe_rc.cell.stages import MASTERS, STAGES
@@ -181,7 +180,7 @@ class Cell:
         self.unknown, self.unchecked, self.warnings = unknown or {}, list[str](), list[str]()
         self.factors: dict[str, float] = {}
         self._tables = nodes
-        with extremes.refused(nodes):
+        with explain_overflow(nodes):
             made = {name: stage(name, table) for name, table in nodes.items() if kind_of(name, table.stage) in STAGES}
         ports = tuple(map(_ports, made.values()))
         self.wiring = _wire(ports, self.unknown) if self.unknown else _wire_alike(ports)
@@ -286,7 +285,7 @@ class Cell:
                 that would rub, a tool that is not brought out of the part, a memory that would be read before it is
                 learned, a learning loop that does not converge.
         """
-        with extremes.refused(self._tables):
+        with explain_overflow(self._tables):
             self.unchecked.clear()
             seconds = (self.master.expected_samples or math.inf) * self.master.shared.step
             self.warnings = [doubt for stage in self.stages.values() for doubt in stage.warnings(seconds)]

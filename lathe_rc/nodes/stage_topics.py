@@ -7,9 +7,9 @@ from collections.abc import Collection, Sequence
 from functools import partial
 
 from lathe_rc import messages
-from lathe_rc.cell import extremes
 from lathe_rc.cell.block import Framer, Pool
 from lathe_rc.cell.delay_buffer import DelayBuffer, longest_delays
+from lathe_rc.cell.parameters import explain_overflow
 from lathe_rc.cell.stage import Input, Sparse, Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.wire import Encoder
@@ -38,7 +38,7 @@ class StageTopics(CellNode):
 
     def configure_part(self) -> None:
         """Build the stage and compile its kernels: the first block then takes no longer than the next."""
-        with extremes.refused({self.get_name(): self.table}):
+        with explain_overflow({self.get_name(): self.table}):
             self.stage = STAGES[self.kind](self.get_name(), self.table)
         compile_kernels(self.stage)
         self.blocks = 0
