@@ -15,8 +15,8 @@ from pathlib import Path
 from lathe_rc import messages, starting
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.collect import Collector, check_room
-from lathe_rc.cell.durations import Lateness
 from lathe_rc.cell.engine import Engine, Sink
+from lathe_rc.cell.latency_histogram import Lateness
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
