@@ -7,7 +7,7 @@ import numpy as np
 
 from lathe_papers import cells, robust
 from lathe_rc.analysis.learning import Complex
-from lathe_rc.cell.cures import Loop
+from lathe_rc.cell.stages.learner import Loop
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.study import untracked
 

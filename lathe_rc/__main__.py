@@ -8,7 +8,7 @@ if __name__ == "__main__" and not getattr(sys.flags, "safe_path", sys.flags.isol
 
 import gc
 
-from lathe_rc.loading import load
+from lathe_rc.extras import load
 
 if __name__ == "__main__":
     # Of the objects that imports make hardly any is garbage: to look for it after every 700 takes a tenth of a start.

@@ -3,7 +3,7 @@
 
 from typing import TYPE_CHECKING, cast
 
-from lathe_rc.loading import load
+from lathe_rc.extras import load
 
 if TYPE_CHECKING:  # the first ./lathe --help lists the commands before any package is installed
     import click

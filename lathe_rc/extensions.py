@@ -31,7 +31,7 @@ T = TypeVar("T")
 V = TypeVar("V")
 
 
-class Offers(Mapping[str, V], Generic[V]):
+class PluginRegistry(Mapping[str, V], Generic[V]):
     """The classes of one sort, ours and those of other packages, by name.
 
     Iteration gives our names and those that installed packages offer; ``package.module:Name`` is found as well where
@@ -107,11 +107,11 @@ class Offers(Mapping[str, V], Generic[V]):
         return _distribution(_offered(self.group)[name].dist)
 
 
-class Objects(Offers[V]):
-    """Objects of one class, by name; see `Offers`.
+class Objects(PluginRegistry[V]):
+    """Objects of one class, by name; see `PluginRegistry`.
 
     Args:
-        what, own, group: see `Offers`.
+        what, own, group: see `PluginRegistry`.
         kind: their class.
     """
 
@@ -125,11 +125,11 @@ class Objects(Offers[V]):
         return found
 
 
-class Registry(Offers[type[T]], Generic[T]):
-    """Classes of one sort by name; see `Offers`.
+class Registry(PluginRegistry[type[T]], Generic[T]):
+    """Classes of one sort by name; see `PluginRegistry`.
 
     Args:
-        what, own, group: see `Offers`.
+        what, own, group: see `PluginRegistry`.
         base: class that all of them derive from.
     """
 
@@ -232,7 +232,7 @@ def search_path() -> str:
 def is_ours(module: str) -> bool:
     """Tell whether a module is of this distribution: the folder of compiled code changes with its source.
 
-    The source of others is not looked at there; what is kept of their steps is, see `lathe_rc.cell.native`.
+    The source of others is not looked at there; what is kept of their steps is, see `lathe_rc.compiled.step`.
     """
     return module.startswith(("lathe_rc.", "lathe_papers."))
 

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packages that not every installation has, and how to install them."""
+"""Imports: of commands and executables, and of packages that not every installation has."""
 
 import importlib.util
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import ModuleType
 
 from lathe_rc.errors import LatheError
 
@@ -59,3 +62,18 @@ def require(module: str) -> None:
         missing = refusal(module)
         assert missing is not None, "it belongs to an extra"
         raise missing
+
+
+def load(name: str) -> ModuleType:
+    """Import a module. Ctrl-C meanwhile ends the process at once, as any program that has not begun.
+
+    Half an import has nothing to put in order; an exception in the middle of it would be shown with all that was being
+    imported, or turned by a library into another error.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return importlib.import_module(name)
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        return importlib.import_module(name)
+    finally:
+        signal.signal(signal.SIGINT, before)

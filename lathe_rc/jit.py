@@ -36,7 +36,7 @@ _ROOM = 2**22  # that the code of a cell takes, about [B]
 _PACKAGE = Path(__file__).parent
 _KERNELS = (
     "arrays.py",
-    "placed.py",
+    "compiled/*.py",
     "transfer.py",
     "signals/*.py",
     "plants/*.py",
@@ -46,7 +46,6 @@ _KERNELS = (
     "bag/reading/chunk_messages.py",
     "safety/*.py",
     "cell/ahead.py",
-    "cell/native.py",
     "cell/program.py",
     "cell/stages/*.py",
     "../lathe_papers/formulas/*.py",

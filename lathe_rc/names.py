@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suggestions for an unknown name: the names that look like it."""
+"""Names: suggestions for an unknown one, and ROS namespaces of cells, ``/`` or ``/a/b``."""
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-from lathe_rc.errors import shown
+from lathe_rc.errors import InputError, shown
 
+_NAMESPACE = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+")
 _MOST_CLOSE = 3
 _MOST_LISTED = 16  # names that a message lists; more of them are looked up elsewhere
 
@@ -32,3 +34,19 @@ def instead(name: str, known: Iterable[str], *, listing: str = "") -> str:
     if listing and len(names) > _MOST_LISTED:
         return f"{listing} lists what is allowed"
     return f"allowed: {', '.join(map(shown, names)) or 'none'}"
+
+
+def checked_namespace(namespace: str) -> str:
+    """The namespace, if it is one.
+
+    Raises:
+        InputError: it is none.
+    """
+    if not _NAMESPACE.fullmatch(namespace):
+        raise InputError(f"namespace {namespace!r}; allowed: / or /NAME or /NAME/NAME, of letters, digits and _")
+    return namespace
+
+
+def absolute(namespace: str, name: str) -> str:
+    """A name after its namespace has been put before it."""
+    return name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"

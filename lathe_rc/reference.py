@@ -5,21 +5,15 @@ import inspect
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from importlib.resources import files
 
 from lathe_rc import messages
-from lathe_rc.bag.writing.record import signal_depth
-from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Table
-from lathe_rc.cell.replayer import KIND as REPLAYER
-from lathe_rc.cell.replayer import ReplayerParameters
-from lathe_rc.cell.rerun_bridge import KIND as RERUN_BRIDGE
-from lathe_rc.cell.rerun_bridge import RerunBridgeParameters
+from lathe_rc.cell.beside import BESIDE
+from lathe_rc.cell.host_topics import HOST_TOPICS, MEMBERS, signal_depth
+from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stage import Input, Stage
-from lathe_rc.cell.stages import MASTERS, STAGES
-from lathe_rc.cell.topic_recorder import KIND as TOPIC_RECORDER
-from lathe_rc.cell.topic_recorder import TopicRecorderParameters
+from lathe_rc.cell.stages import STAGES
 
 _TYPES = {bool: "bool", int: "integer", float: "double", str: "string"}
 _WHEN = {
@@ -29,87 +23,6 @@ _WHEN = {
     messages.EVENT: "at each event",
 }
 _SCHEDULE = f"{messages.PACKAGE}/srv/Schedule"
-
-
-@dataclass(frozen=True, kw_only=True)
-class HostTopic:
-    """A topic outside the signals: it carries wall time, or how the run goes, and enters no digest.
-
-    Attributes:
-        name: relative, or absolute where the whole ROS domain shares it.
-        type: message type.
-        depth: queue length that publishers offer.
-        latched: the newest messages reach those who come late (durability transient local).
-        publishers: kinds of node that publish it.
-        subscribers: kinds of node that read it.
-        doc: what it is for.
-    """
-
-    name: str
-    type: str
-    depth: int
-    latched: bool
-    publishers: tuple[str, ...]
-    subscribers: tuple[str, ...]
-    doc: str
-
-
-_ALL = tuple(TABLES.own)
-_SPINDLE = MASTERS
-HOST_TOPICS = (
-    HostTopic(
-        name="members",
-        type=f"{messages.PACKAGE}/msg/Member",
-        depth=1,
-        latched=True,
-        publishers=_ALL,
-        subscribers=_ALL,
-        doc="who takes part, and who is ready",
-    ),
-    HostTopic(
-        name="cell_state",
-        type=f"{messages.PACKAGE}/msg/CellState",
-        depth=1,
-        latched=True,
-        publishers=_SPINDLE,
-        subscribers=_ALL,
-        doc="start, end, safe state and failure of the run",
-    ),
-    HostTopic(
-        name="progress",
-        type=f"{messages.PACKAGE}/msg/Progress",
-        depth=1,
-        latched=True,
-        publishers=_ALL,
-        subscribers=_SPINDLE,
-        doc="how far each member has come: the credit of the window",
-    ),
-    HostTopic(
-        name="/diagnostics",
-        type="diagnostic_msgs/msg/DiagnosticArray",
-        depth=100,
-        latched=False,
-        publishers=_ALL,
-        subscribers=("recorder",),
-        doc="state and counters of each node, once a second",
-    ),
-    HostTopic(
-        name="/clock",
-        type="rosgraph_msgs/msg/Clock",
-        depth=10,
-        latched=False,
-        publishers=_SPINDLE,
-        subscribers=(),
-        doc="simulated time of the slowest member",
-    ),
-)
-
-#: nodes that are no members of a cell
-BESIDE: dict[str, type[Table]] = {
-    REPLAYER: ReplayerParameters,
-    RERUN_BRIDGE: RerunBridgeParameters,
-    TOPIC_RECORDER: TopicRecorderParameters,
-}
 
 
 def page() -> str:
@@ -221,13 +134,13 @@ def _edge(port: Input) -> str:
 
 def _host() -> str:
     def who(kinds: Sequence[str]) -> str:
-        return "all nodes" if kinds == _ALL else ", ".join(f"`{kind}`" for kind in kinds) or "nobody in the cell"
+        return "all nodes" if kinds == MEMBERS else ", ".join(f"`{kind}`" for kind in kinds) or "nobody in the cell"
 
     rows = [
         [
             f"`{topic.name}`",
             f"`{topic.type}`",
-            f"reliable, depth {topic.depth}, {'transient local' if topic.latched else 'volatile'}",
+            f"reliable, depth {topic.depth}, {topic.durability}",
             who(topic.publishers),
             who(topic.subscribers),
             topic.doc,

@@ -11,16 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lathe_rc import harness
+from lathe_rc.cell.beside import REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
+from lathe_rc.cell.host_topics import HOST_TOPICS
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
-from lathe_rc.cell.replayer import KIND as REPLAYER
-from lathe_rc.cell.rerun_bridge import KIND as RERUN_BRIDGE
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.topic_recorder import KIND as TOPIC_RECORDER
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import ALIVE
-from lathe_rc.namespace import absolute, checked
-from lathe_rc.reference import HOST_TOPICS
+from lathe_rc.names import absolute, checked_namespace
 from lathe_rc.view.rerun_signals import drawn
 
 OPERATOR = "operator"  #: people with the tools of ROS: they read everything and call every service
@@ -183,7 +181,7 @@ def policy(
     Raises:
         InputError: the scenario cannot be wired, a node in ``groups`` that there is not, or no ROS namespace.
     """
-    checked(namespace)
+    checked_namespace(namespace)
     # The bag's folder is no matter of policy.
     complete = harness.with_recorder(scenario, Path(RECORDER), keep=True)
     maker = _Maker(complete, namespace)

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from lathe_rc.compiled.struct_view import sized
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
-from lathe_rc.placed import sized
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]

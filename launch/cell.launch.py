@@ -29,7 +29,7 @@ from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.namespace import absolute, checked
+from lathe_rc.names import absolute, checked_namespace
 
 ARGUMENTS = {
     "scenario": (
@@ -66,7 +66,7 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     path = resources.find(Path(LaunchConfiguration("scenario").perform(context)))
     scenario = replaced(scenarios.load(path), context.launch_configurations.items())
     Cell(scenario.nodes).check()
-    namespace = checked(LaunchConfiguration("namespace").perform(context))
+    namespace = checked_namespace(LaunchConfiguration("namespace").perform(context))
     bag = place(scenario, LaunchConfiguration("bag").perform(context))
     refuse_existing(bag)
     complete = harness.with_recorder(scenario, bag, keep=True)

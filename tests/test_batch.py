@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from lathe_rc import harness, resources
 from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.engine import Engine
-from lathe_rc.cell.rewind import Start
+from lathe_rc.cell.stage_cache import Start
 from lathe_rc.cell.wiring import Cell, new_stage
 from lathe_rc.errors import InputError, LatheError
 
@@ -96,7 +96,7 @@ def test_what_ran_before_on_a_bench_leaves_no_trace(kinds, named):
     """
     piston = load("piston", 3)
     piston = piston.named() if named else piston
-    bench = batch.Bench()
+    bench = batch.CellRunner()
     for kind in kinds:
         try:
             cell = bench.cell(piston.varied(KINDS[kind]))
@@ -110,7 +110,7 @@ def test_what_ran_before_on_a_bench_leaves_no_trace(kinds, named):
 @pytest.mark.parametrize("path", sorted(Path("config").glob("*.yaml")), ids=lambda path: path.stem)
 def test_stages_of_all_kinds_are_set_back(path):
     """A cell that runs again and again on a bench gives the same, though its stages are made once or twice."""
-    bench, told, stages = batch.Bench(), [], []
+    bench, told, stages = batch.CellRunner(), [], []
     described = scenario.load(path, ["spindle_encoder.revolutions=2"])
     for _ in range(4):
         cell = bench.cell(described)
@@ -168,7 +168,7 @@ class Field:
 
 def test_what_is_asked_for_is_kept_of_a_run_and_nothing_else():
     piston = load("piston", 3)
-    bench = batch.Bench()
+    bench = batch.CellRunner()
     assert np.array_equal(bench.run(bench.cell(piston), Field()), harness.run(piston).recording.dense["/tool"]["error"])
     for looked_at, told in (("tool.reference", "tool.reference"), ("encoder.angle", "encoder")):
         with pytest.raises(KeyError, match=f"{told} is not kept: `heard` of the sink has to name it"):

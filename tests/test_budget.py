@@ -146,7 +146,7 @@ def test_the_part_of_q_is_the_steady_error_of_the_formula():
     cell = scenario(spindle_encoder={"revolutions": 60.0}, tool=form, learning_controller={"q_time": 150e-6})
     wired = Cell(cell.nodes)
     stage = wired.stages["learning_controller"]
-    ((drive, _),) = wired.learned(stage)
+    ((drive, _),) = stage.learned(wired.stages.values())
     left = stage.loop(drive).steady_error(np.array(orders, dtype=float), cell.shared.nominal_speed)
     (q_floor,) = lathe_rc.budget(cell).causes
     assert q_floor.name == "Q floor"

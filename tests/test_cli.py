@@ -362,7 +362,7 @@ def test_a_terminal_without_the_letter_gets_a_question_mark():
 def test_ctrl_c_during_an_import_ends_at_once_and_silently(tmp_path):
     """A node takes a second to import; a traceback of half an import tells nobody anything."""
     (tmp_path / "interrupted.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
-    words = [sys.executable, "-c", "from lathe_rc.loading import load; load('json'); load('interrupted')"]
+    words = [sys.executable, "-c", "from lathe_rc.extras import load; load('json'); load('interrupted')"]
     environment = os.environ | {"PYTHONPATH": f"{Path(__file__).parents[1]}:{tmp_path}"}
     ended = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, check=False)
     assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGINT, b"", b"")

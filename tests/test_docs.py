@@ -18,6 +18,7 @@ from click.testing import CliRunner
 
 from lathe_rc import __version__, cli, reference
 from lathe_rc.cell import ros_yaml, scenario
+from lathe_rc.cell.host_topics import HOST_TOPICS, HostTopic
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.wiring import Cell
@@ -113,8 +114,8 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
 class TestHostTopics:
     """The reference's table of host topics against the nodes themselves."""
 
-    @pytest.mark.parametrize("topic", reference.HOST_TOPICS, ids=lambda topic: topic.name)
-    def test_are_published_and_read_as_the_table_says(self, nodes: dict[str, Any], topic: reference.HostTopic) -> None:
+    @pytest.mark.parametrize("topic", HOST_TOPICS, ids=lambda topic: topic.name)
+    def test_are_published_and_read_as_the_table_says(self, nodes: dict[str, Any], topic: HostTopic) -> None:
         full = topic.name if topic.name.startswith("/") else f"/{topic.name}"
         for kind, node in nodes.items():
             outlets = [outlet for outlet in node.publishers if outlet.topic_name == full]
@@ -126,7 +127,9 @@ class TestHostTopics:
                 assert f"{package}/msg/{outlet.msg_type.__name__}" == topic.type
                 assert outlet.qos_profile.depth == topic.depth
                 assert outlet.qos_profile.reliability.name == "RELIABLE"
-                assert (outlet.qos_profile.durability.name == "TRANSIENT_LOCAL") == topic.latched
+                assert (outlet.qos_profile.durability.name == "TRANSIENT_LOCAL") == (
+                    topic.durability == "transient local"
+                )
 
 
 @functools.cache

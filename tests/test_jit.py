@@ -32,7 +32,7 @@ def stage():
 
 
 def test_a_process_that_cannot_compile_is_an_error(stage, monkeypatch):
-    monkeypatch.setattr(ahead.native, "is_kept", lambda _: False)
+    monkeypatch.setattr(ahead, "is_kept", lambda _: False)
     monkeypatch.setattr(ahead.sys, "executable", "/bin/false")
     with pytest.raises(LatheError, match="a process that compiles"):
         list(ahead.compile_ahead([stage]))

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lathe_rc import harness
-from lathe_rc.cell.durations import Lateness, Percentiles
+from lathe_rc.cell.latency_histogram import Lateness, Percentiles
 from lathe_rc.cli import main
 from lathe_rc.commands import outcome
 

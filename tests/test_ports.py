@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lathe_rc import messages
+from lathe_rc.cell.delay_buffer import DelayBuffer
 from lathe_rc.cell.stages.tool import ToolParameters
-from lathe_rc.cell.track import Track
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.exchange import Run
@@ -69,7 +69,7 @@ def test_blocks_in_one_piece_that_do_not_follow_are_refused_as_single_ones_are()
 
 @given(st.lists(st.integers(1, 5), min_size=1, max_size=40), st.integers(0, 30))
 def test_a_track_shows_the_same_samples_whatever_the_pieces(sizes, delay):
-    track, reached = Track(messages.ENCODER, {"angle": delay}, 10), 0
+    track, reached = DelayBuffer(messages.ENCODER, {"angle": delay}, 10), 0
     for size in sizes:
         track.extend(size)["angle"][:] = np.arange(reached, reached + size)
         reached += size

@@ -9,16 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lathe_rc import messages
-from lathe_rc.cell.native import Native
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.program import Program, Tapes, wired
 from lathe_rc.cell.stage import NEVER, Input, Output, Sparse, Stage
 from lathe_rc.cell.stages.form import FormTable
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.compiled.step import CompiledStep
+from lathe_rc.compiled.struct_view import ports
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import COMMAND, ENCODER
-from lathe_rc.placed import ports
 
 
 @given(
@@ -185,6 +185,6 @@ def test_a_step_of_others_unpacks_its_inputs_wherever_flags_stand_among_them(pla
     inputs.insert(place, flag)
     outputs = [np.zeros(3), np.zeros(3, np.uint8)]
     kinds = [[array.dtype for array in arrays] for arrays in (inputs, outputs)]
-    assert Native(unpacking_step, Doubled(2.0), *kinds)(0, 0, [*inputs, *outputs], 3) == (3, 0)
+    assert CompiledStep(unpacking_step, Doubled(2.0), *kinds)(0, 0, [*inputs, *outputs], 3) == (3, 0)
     assert outputs[0].tolist() == [-2.0, -1.0, 0.0]
     assert outputs[1].tolist() == [7, 8, 9]

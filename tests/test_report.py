@@ -22,7 +22,7 @@ from lathe_rc import __version__, harness, messages, part, resources
 from lathe_rc.bag import provenance, reader
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.cell.budget import changing
-from lathe_rc.cell.durations import LATENCY, LATENESS, Durations
+from lathe_rc.cell.latency_histogram import LATENCY, LATENESS, Durations
 from lathe_rc.cell.scenario import load
 from lathe_rc.commands.report import report
 from lathe_rc.errors import InputError

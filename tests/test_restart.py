@@ -19,8 +19,8 @@ from lathe_rc import files, harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check as check_bag
 from lathe_rc.cell import state_file
+from lathe_rc.cell.delay_buffer import DelayBuffer, longest_delays
 from lathe_rc.cell.scenario import load
-from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import sample_fields
@@ -49,7 +49,7 @@ def commands(cell, table, recording, keep_at, path, size=BLOCK):
     for port in stage.inputs:
         if port.topic not in tracks:
             ports = [each for each in stage.inputs if each.topic == port.topic]
-            tracks[port.topic] = Track(port.type, longest_delays(ports), size)
+            tracks[port.topic] = DelayBuffer(port.type, longest_delays(ports), size)
     whole, said = [], []
     for piece in range(samples(recording) // size):
         if piece in keep_at:

@@ -23,9 +23,7 @@ from rclpy.node import NodeNameNonExistentError
 
 from lathe_rc import cli, harness, process_launcher, security
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.replayer import KIND as REPLAYER
-from lathe_rc.cell.rerun_bridge import KIND as RERUN_BRIDGE
-from lathe_rc.cell.topic_recorder import KIND as TOPIC_RECORDER
+from lathe_rc.cell.beside import REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
 from lathe_rc.nodes.ports import latched_qos
 
 CONFIG = Path(__file__).parents[1] / "config"

@@ -26,7 +26,7 @@ from lathe_rc.bag.snapshot import SNAPSHOT, first_sample
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.snapshots import Snapshots
 from lathe_rc.bag.writing.writer import offered_qos
-from lathe_rc.cell.framing import Framer
+from lathe_rc.cell.block import Framer
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import load
 from lathe_rc.cell.stage import Sparse

@@ -11,7 +11,7 @@ import os
 import numpy as np
 import rclpy.executors
 
-from lathe_rc.cell.durations import Durations
+from lathe_rc.cell.latency_histogram import Durations
 from lathe_rc.nodes import container, process, spindle_node
 
 EXECUTOR, DURATIONS = "LATHE_BENCH_EXECUTOR", "LATHE_BENCH_DURATIONS"

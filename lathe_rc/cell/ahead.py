@@ -16,11 +16,11 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 
 from lathe_rc import allowed_code
-from lathe_rc.cell import native
 from lathe_rc.cell.program import compile_loop
 from lathe_rc.cell.scenario import TABLES, kind_of
 from lathe_rc.cell.stage import Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
+from lathe_rc.compiled.step import is_kept
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.extensions import search_path
 from lathe_rc.jit import can_keep
@@ -29,13 +29,13 @@ _REFUSED = "refused: "  # begins what a process says of a stage whose step canno
 
 
 def uncompiled(stages: Iterable[Stage]) -> list[Stage]:
-    """Those whose steps nobody has compiled on this machine; of those that have the same one, the first."""
+    """Return the stages whose steps are not compiled on this machine; of those with the same step, the first."""
     steps = {stage.native().name: stage for stage in reversed(list(stages)) if stage.is_compiled}
-    return [stage for name, stage in reversed(steps.items()) if not native.is_kept(name)]
+    return [stage for name, stage in reversed(steps.items()) if not is_kept(name)]
 
 
 def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
-    """Compile the steps that nobody has compiled.
+    """Compile the steps of stages that are not compiled on this machine.
 
     Yields:
         The names of the stages that are left, before the first and after each but the last.

@@ -6,9 +6,9 @@
     for outcome in lathe_rc.run_many(cells):
         print(outcome.kept.rms[-1])
 
-A cell gets the bits that it gets alone, though it shares with the one before what does not differ: see `Bench`. Nothing
-is kept of its signals but what is asked for, and cells are made when their turn comes, so that the memory that a batch
-takes does not depend on how many they are.
+A cell gets the bits that it gets alone, though it shares with the one before what does not differ: see `CellRunner`.
+Nothing is kept of its signals but what is asked for, and cells are made when their turn comes, so that the memory that
+a batch takes does not depend on how many they are.
 """
 
 import os
@@ -24,9 +24,9 @@ from lathe_rc.analysis.form_errors import FormErrors, RunningErrors
 from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.recording import Recording
-from lathe_rc.cell.rewind import Stock
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stage_cache import StageCache
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
@@ -114,7 +114,7 @@ def run_many(
     make = keep if callable(keep) else Errors if keep is None else partial(Topics, topics=keep)
     count = threads or os.cpu_count() or 1
     waiting: deque[Future[Outcome[Any]]] = deque()
-    pool, idle = ThreadPoolExecutor(count), deque(Bench() for _ in range(count))
+    pool, idle = ThreadPoolExecutor(count), deque(CellRunner() for _ in range(count))
     try:
         for number, scenario in enumerate(scenarios):
             waiting.append(pool.submit(_outcome, scenario, make, idle))
@@ -127,11 +127,11 @@ def run_many(
         pool.shutdown(cancel_futures=True)
 
 
-class Bench:
+class CellRunner:
     """Runs cells one after the other. Those that are alike share what does not differ: engine, and stages."""
 
     def __init__(self) -> None:
-        self._stock = Stock()
+        self._stages = StageCache()
         self._engine: Engine | None = None
 
     def cell(self, scenario: Scenario) -> Cell:
@@ -140,7 +140,7 @@ class Bench:
         Raises:
             InputError: see `Cell`.
         """
-        return Cell(scenario.nodes, stage=self._stock.take)
+        return Cell(scenario.nodes, stage=self._stages.take)
 
     def run(self, cell: Cell, keeper: Keeper[K_co]) -> K_co:
         """Run a cell that has passed its check to its end.
@@ -154,7 +154,7 @@ class Bench:
         return keeper.kept()
 
 
-def _outcome(scenario: Scenario, keep: Make[K_co], idle: deque[Bench]) -> Outcome[K_co]:
+def _outcome(scenario: Scenario, keep: Make[K_co], idle: deque[CellRunner]) -> Outcome[K_co]:
     bench = idle.pop()
     try:
         cell = bench.cell(scenario)

@@ -2,7 +2,7 @@
 """The parts of a scenario's form error: its runs with causes switched off, offline and as a batch."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,14 +11,13 @@ from lathe_rc.analysis.budget import TOLD, Budget, Causes, Decomposition
 from lathe_rc.analysis.metrology import evenly
 from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.cell import batch, models
-from lathe_rc.cell.cures import Loop
 from lathe_rc.cell.parameters import NodeParameters, Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.form import FormParameters
+from lathe_rc.cell.stages.learner import Loop
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
-from lathe_rc.cell.stages.loaded_drive import LoadedParameters
 from lathe_rc.cell.stages.loaded_spindle import LoadedSpindleParameters
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.cell.stages.tool import ToolParameters
@@ -32,38 +31,32 @@ _PREFIXES = ("", "coarse_", "fine_", "cut_")  # of the parameters of a part; tho
 _FACTOR = 0.9  # of a cycle, which a flat Q may have; or what the scenario's own has, if that is more
 _CONVERGES = 0.98  # but never more than this: the own one may run with allow_unstable
 
-#: Parameters that are a cause in whatever node they stand, with the value that switches it off.
-_ANYWHERE: Mapping[str, Mapping[str, Value]] = {
-    "noise": {"noise_rms": 0.0},
-    "quantisation": {"counts_per_revolution": 0, "resolution": 0.0, "adc_step": 0.0, "dac_step": 0.0},
-    "hysteresis": {"hysteresis": "none", "linearisation": "none", "creep_per_decade": 0.0},
-    "backlash": {"backlash": 0.0},
-    "limits": {
-        "command_stroke": 0.0,
-        "command_velocity": 0.0,
-        "command_acceleration": 0.0,
-        "command_jerk": 0.0,
-        "current_limit": 0.0,
-        "voltage_limit": 0.0,
-        "slew_rate": 0.0,
-        "torque_limit": 0.0,
-    },
-    "faults": {"faults": []},
-}
-#: The same in nodes with certain parameters.
-_SOMEWHERE: Mapping[str, Mapping[type[NodeParameters], Mapping[str, Value]]] = {
-    "force": {ToolParameters: {"deflects": False, "cross_slide": False}, LoadedParameters: {"radial_ratio": 0.0}},
-    "load": {LoadedSpindleParameters: {"part_radius": 0.0}},
-    "vibration": {
-        VibrationParameters: {"random_rms": 0.0, "line_amplitude": [], "line_frequency": [], "line_phase": []}
-    },
+_Off = Mapping[str, Value]
+#: Parameters of nodes with a table of some kind that are a cause, with the values that switch it off.
+_CAUSES: Mapping[str, tuple[type[NodeParameters], _Off]] = {
+    "force": (NodeParameters, {"deflects": False, "cross_slide": False, "radial_ratio": 0.0}),
+    "load": (LoadedSpindleParameters, {"part_radius": 0.0}),
+    "vibration": (
+        VibrationParameters,
+        {"random_rms": 0.0, "line_amplitude": [], "line_frequency": [], "line_phase": []},
+    ),
+    "noise": (NodeParameters, {"noise_rms": 0.0}),
+    "quantisation": (
+        NodeParameters,
+        {"counts_per_revolution": 0, "resolution": 0.0, "adc_step": 0.0, "dac_step": 0.0},
+    ),
+    "hysteresis": (NodeParameters, {"hysteresis": "none", "linearisation": "none", "creep_per_decade": 0.0}),
+    "backlash": (NodeParameters, {"backlash": 0.0}),
+    "limits": (
+        NodeParameters,
+        {f"command_{name}": 0.0 for name in ("stroke", "velocity", "acceleration", "jerk")}
+        | {f"{name}_limit": 0.0 for name in ("current", "voltage", "torque")}
+        | {"slew_rate": 0.0},
+    ),
+    "faults": (NodeParameters, {"faults": []}),
 }
 #: Of these causes, those that make one revolution differ from the next.
-_CHANGING = {
-    "noise": _ANYWHERE["noise"],
-    "quantisation": _ANYWHERE["quantisation"],
-    "vibration": _SOMEWHERE["vibration"][VibrationParameters],
-}
+_CHANGING = {name: _CAUSES[name][1] for name in ("noise", "quantisation", "vibration")}
 _CONSTANT = ("harmonics", "polygon")  # profiles that are the same all along the part
 _SPEED = [name for name in SpeedLawParameters.model_fields if name not in NodeParameters.model_fields]
 
@@ -96,26 +89,17 @@ class _Tail:
     height: Samples
 
 
-@dataclass
 class _Keep:
     """Keeps the last revolutions of a run; see `lathe_rc.cell.batch.Keeper`."""
 
-    cell: Cell
-    samples: int
-    heard: Collection[str] = field(init=False)
-    _kept: dict[str, Samples] = field(init=False)
-
-    def __post_init__(self) -> None:
-        named = {source.type: topic for topic, source in reversed(self.cell.dense.items())}
+    def __init__(self, cell: Cell, samples: int) -> None:
+        named = {source.type: topic for topic, source in reversed(cell.dense.items())}
         if not {messages.ENCODER, messages.TOOL} <= named.keys():
             raise InputError("no form error to budget: the cell has no encoder and tool; allowed: a scenario with both")
-        self._fields = {
-            "angle": (named[messages.ENCODER], "angle_true"),
-            "error": (named[messages.TOOL], "error"),
-            "height": (named[messages.TOOL], "height"),
-        }
-        self.heard = [".".join(place) for place in self._fields.values()]
-        self._kept = {name: np.empty(self.samples) for name in self._fields}
+        encoder, tool = named[messages.ENCODER], named[messages.TOOL]
+        self._fields = {"angle": (encoder, "angle_true"), "error": (tool, "error"), "height": (tool, "height")}
+        self.heard: Collection[str] = [".".join(place) for place in self._fields.values()]
+        self._kept = {name: np.empty(samples) for name in self._fields}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """See `lathe_rc.cell.engine.Sink`."""
@@ -142,26 +126,19 @@ def _not_yet(scenario: Scenario, values: Mapping[str, Value]) -> dict[str, Value
 
 def _simple(scenario: Scenario) -> dict[str, Cause]:
     """The causes that are a value of some parameters."""
-    found: dict[str, Cause] = {}
-    for name, kinds in _SOMEWHERE.items():
-        off = {
-            f"{node}.{each}": value
-            for kind, values in kinds.items()
-            for node, table in scenario.nodes.items()
-            if isinstance(table, kind)
-            for each, value in values.items()
-        }
-        found[name] = Cause(off)
-    for name, values in _ANYWHERE.items():
-        targets = {
-            f"{node}.{prefix}{each}": value
-            for node, table in scenario.nodes.items()
-            for prefix in _PREFIXES
-            for each, value in values.items()
-            if f"{prefix}{each}" in type(table).model_fields
-        }
-        found[name] = Cause(targets)
-    return found
+    return {
+        name: Cause(
+            {
+                f"{node}.{prefix}{each}": value
+                for node, table in scenario.nodes.items()
+                if isinstance(table, kind)
+                for prefix in _PREFIXES
+                for each, value in values.items()
+                if f"{prefix}{each}" in type(table).model_fields
+            }
+        )
+        for name, (kind, values) in _CAUSES.items()
+    }
 
 
 def _learners(scenario: Scenario) -> dict[str, LearningControllerParameters]:
@@ -212,7 +189,8 @@ def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
     low, high = cell.master.speed_range()
     for stage in cell.stages.values():
         if isinstance(stage, LearningController):
-            loop = Loop(stage, [response for response, _ in cell.learned(stage)], stage.checked_speeds(low, high))
+            responses = [response for response, _ in stage.learned(cell.stages.values())]
+            loop = Loop(stage, responses, stage.checked_speeds(low, high))
             flat = loop.flat(min(max(loop.factor({}), _FACTOR), _CONVERGES))
             if flat is None:
                 left_out["Q floor"] = f"{stage.name} converges with no flat Q"

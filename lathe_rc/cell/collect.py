@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.framing import Framer
+from lathe_rc.cell.block import Framer
 from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell

@@ -9,10 +9,10 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.cell.block import NotFiniteError, check_finite
+from lathe_rc.cell.delay_buffer import longest_delays
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.program import Program, Tapes, chunk_of, wired
 from lathe_rc.cell.stage import Sparse, compile_kernels
-from lathe_rc.cell.track import longest_delays
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError
 from lathe_rc.messages import MAX_BLOCK, Samples, Signals

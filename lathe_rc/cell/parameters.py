@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast, get_args, get_origin
 
+import numpy as np
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
@@ -26,6 +27,8 @@ Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[s
 T = TypeVar("T", bound="Table")
 
 _LONGEST = 60  # characters of a value in a summary
+_FAR = 1e9  # times the default, or the same part of it, from which on floating point may fail
+_HUGE = 1e12  # the same where the default is 0
 _NAMES = {bool: "true or false", int: "an integer", float: "a finite number", str: "a text"}
 
 
@@ -334,3 +337,34 @@ def remapped(table: NodeParameters, topic: str) -> str:
         if old == topic:
             return new
     return topic
+
+
+@contextmanager
+def explain_overflow(tables: Mapping[str, NodeParameters]) -> Iterator[None]:
+    """Turn a failure of floating point into a refusal of the parameters that are far from their defaults.
+
+    Args:
+        tables: of the nodes that are made or checked, by name.
+
+    Raises:
+        InputError: numbers became too large or too small, and a parameter is the cause.
+    """
+    try:
+        yield
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        far = [each for name, table in tables.items() for each in _far(name, table)]
+        if not far:
+            raise
+        told = f"{'; '.join(far)}: nothing can be computed with that ({error.args[-1]}); take what a machine has"
+        raise InputError(told) from None
+
+
+def _far(name: str, table: NodeParameters) -> Iterator[str]:
+    for row in type(table).rows().values():
+        value = getattr(table, row.name)
+        if row.type is not float or row.is_list or not value or not isinstance(row.default, float):
+            continue
+        size, usual = abs(value), abs(row.default)
+        if not (usual / _FAR < size < usual * _FAR if usual else size < _HUGE):
+            unit = f" [{row.unit}]" if row.unit else ""
+            yield f"{name}.{row.name} = {value:g}{unit} (default {row.default:g})"

@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.native import BROKEN, AddressTable, Integers, broken
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
+from lathe_rc.compiled.step import BROKEN, AddressTable, broken
+from lathe_rc.compiled.struct_view import Integers, address, call, floats
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
-from lathe_rc.placed import address, call, floats
 
 _CHUNK = 1024  # samples that a stage computes in one go, at most: what stages hand on stays in the cache
 

@@ -3,13 +3,16 @@
 
 YAML leaves the meaning of a scalar to its reader, and rcl's differs from that of every Python library: ``1e-3``
 is a double, ``0x10`` and ``010`` are integers, ``yes`` is true. So the text is parsed by PyYAML and the scalars
-by the C library's own strtol and strtod, as rcl_yaml_param_parser does it.
+by the C library's own strtol and strtod, as rcl_yaml_param_parser does it. Patterns for PyYAML's resolvers would need
+more lines: rcl also reads hexadecimal fractions, ``infinity`` and ``nan(5)``, and a number out of range is a text.
 """
 
 import ctypes
 import errno
 import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -26,42 +29,24 @@ _SPECIAL = re.compile(r"\.(?:nan|NaN|NAN)|[+-]?\.(?:inf|Inf|INF)")
 _PLAIN, _TEXT = "plain", "tag:yaml.org,2002:str"
 
 _libc = ctypes.CDLL(None, use_errno=True)
-_libc.strtol.restype = ctypes.c_long
-_libc.strtol.argtypes = (ctypes.c_char_p, ctypes.POINTER(ctypes.c_char_p), ctypes.c_int)
-_libc.strtod.restype = ctypes.c_double
-_libc.strtod.argtypes = (ctypes.c_char_p, ctypes.POINTER(ctypes.c_char_p))
+_libc.strtol.restype, _libc.strtod.restype = ctypes.c_long, ctypes.c_double
 
 
-def _number(text: str) -> int | float | None:
-    """The number that strtol or strtod read from the whole text; None if neither takes all of it."""
-    data = ctypes.create_string_buffer(text.encode())
-    start = ctypes.cast(data, ctypes.c_char_p)
-    end = ctypes.c_char_p()
-
-    def whole() -> bool:
-        used = (ctypes.cast(end, ctypes.c_void_p).value or 0) - ctypes.addressof(data)
-        return ctypes.get_errno() == 0 and used == len(data) - 1 and used > 0
-
+def _converted(function: Callable[..., Any], text: str, *base: int) -> Any:
+    """The number that strtol or strtod reads from a text; None if it does not take all of it, or is out of range."""
+    data, end = ctypes.create_string_buffer(text.encode()), ctypes.c_char_p()
     ctypes.set_errno(0)
-    integer = int(_libc.strtol(start, ctypes.byref(end), 0))
-    if whole():
-        return integer
-    if _SPECIAL.fullmatch(text):
-        return float(text.replace(".", ""))
-    ctypes.set_errno(0)
-    real = float(_libc.strtod(start, ctypes.byref(end)))
-    return real if whole() else None
+    number = function(data, ctypes.byref(end), *base)
+    return number if text and not end.value and not ctypes.get_errno() else None
 
 
-def scalar(text: str, *, quoted: bool = False) -> bool | int | float | str:
-    """The value that rcl gives a scalar."""
-    if quoted:
-        return text
-    if text in _TRUE:
-        return True
-    if text in _FALSE:
-        return False
-    number = _number(text)
+def scalar(text: str) -> bool | int | float | str:
+    """The value that rcl gives a scalar without quotes."""
+    if text in _TRUE | _FALSE:
+        return text in _TRUE
+    number: int | float | None = _converted(_libc.strtol, text, 0)
+    if number is None:
+        number = float(text.replace(".", "")) if _SPECIAL.fullmatch(text) else _converted(_libc.strtod, text)
     return text if number is None else number
 
 
@@ -73,12 +58,6 @@ class _Loader(yaml.SafeLoader):
         return _PLAIN
 
 
-def _check_text(text: object, where: str) -> None:
-    """Refuse what rcl would cut short or not read at all."""
-    if isinstance(text, str) and ("\0" in text or any("\ud800" <= character <= "\udfff" for character in text)):
-        raise InputError(f"{where}: {text!r}; allowed: text without NUL and surrogates")
-
-
 def _name(node: yaml.Node, where: str) -> str:
     if not isinstance(node, yaml.ScalarNode) or not node.value.isprintable():
         raise InputError(f"{where}:{node.start_mark.line + 1}: a key that is no name")
@@ -87,12 +66,14 @@ def _name(node: yaml.Node, where: str) -> str:
 
 def _value(node: yaml.Node, where: str) -> Value:
     if isinstance(node, yaml.ScalarNode):
-        _check_text(node.value, where)
+        # rcl would cut it short, or not read it at all
+        if "\0" in node.value or any("\ud800" <= character <= "\udfff" for character in node.value):
+            raise InputError(f"{where}: {node.value!r}; allowed: text without NUL and surrogates")
         # Blocks (| and >) count as plain.
         quoted = node.style in ("'", '"')
         if not node.value and not quoted:
             raise InputError(f"{where}: no value; write '' for an empty text")
-        return scalar(node.value, quoted=quoted or node.tag == _TEXT)
+        return str(node.value) if quoted or node.tag == _TEXT else scalar(node.value)
     if isinstance(node, yaml.SequenceNode):
         items = [_value(item, where) for item in node.value]
         kinds = {type(item) for item in items}

@@ -19,21 +19,21 @@ has to know as a whole.
 
 import re
 from abc import ABC
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.native import Native, Step, is_compiled
 from lathe_rc.cell.parameters import NodeParameters, about, remapped
+from lathe_rc.compiled.step import CompiledStep, Step, is_compiled
+from lathe_rc.compiled.struct_view import explain_unfit
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.extensions import is_ours
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.names import instead
-from lathe_rc.placed import unfit
 from lathe_rc.safety import faults
 from lathe_rc.safety.faults import Fault
 from lathe_rc.safety.injection import Injection, Port
@@ -114,6 +114,32 @@ SAFE = "safe"  #: and of the one that only a host may ask for: members of the ce
 NOTHING_TO_REPAIR = "nothing to repair"  #: event of a repair of what is not broken
 
 
+class WiredCell(Protocol):
+    """The cell around a stage as its check sees it, see `lathe_rc.cell.wiring.Cell`."""
+
+    stages: dict[str, "Stage"]
+    unknown: Mapping[str, Any]
+    warnings: list[str]
+    unchecked: list[str]
+    factors: dict[str, float]
+
+    @property
+    def master(self) -> Any:
+        """Time master, see `lathe_rc.cell.stages.time_master.TimeMaster`."""
+
+    def node_of(self, topic: str) -> str | None:
+        """Name of the member that publishes a topic of blocks; None: there is none."""
+
+    def publisher(self, topic: str, question: str) -> "Stage | None":
+        """Stage that publishes a topic; None if it is not known here: then the question stays open."""
+
+    def reader_names(self, topic: str) -> set[str]:
+        """Names of the members that read a topic."""
+
+    def leave_open(self, question: str, name: str) -> None:
+        """Note a question that depends on the parameters of an unknown member."""
+
+
 class Stage(ABC):
     """Base of all stages.
 
@@ -160,6 +186,7 @@ class Stage(ABC):
     inputs: tuple[Input, ...] = ()
     outputs: tuple[Output, ...] = ()
     step: ClassVar[Step | None] = None
+    learns: ClassVar[bool] = False  #: whether a run tells its stability margin
     rooms: ClassVar[int] = 0  #: arrays of a block that the step needs for itself
 
     def __init_subclass__(cls) -> None:
@@ -179,7 +206,7 @@ class Stage(ABC):
         self._triggers += [trigger for text in parameters.faults for trigger in self._break_down(text)]
         self._injection: Injection | None = None
         self.own_inputs, self.tells = 0, False
-        self._native: Native | None = None
+        self._native: CompiledStep | None = None
         self._room: Samples | None = None
         self._scheduled: list[tuple[int, str]] = []
         self._remarks: list[str] = []  # events that came of the one that is carried out
@@ -187,6 +214,23 @@ class Stage(ABC):
     def warnings(self, seconds: float) -> list[str]:
         """Return the doubts about its parameters, one line each, for a run of so many seconds; inf: without end."""
         return []
+
+    def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
+        """Refuse what cannot work in a wired cell, before anything moves; stages with checks of their own call this.
+
+        Args:
+            cell: its ``warnings``, ``unchecked`` and ``factors`` get what is found.
+            cures: see `lathe_rc.cell.wiring.Cell.check`.
+
+        Raises:
+            InputError: a block is longer than a feedback delay.
+        """
+        for port in self.inputs:
+            if 0 < port.delay < self.shared.block_size:
+                raise InputError(
+                    f"{self.name}: feedback of {port.topic} is delayed by {port.delay} samples, block_size = "
+                    f"{self.shared.block_size}; allowed: a block no longer than the delay"
+                )
 
     def declare(self, *, inputs: Sequence[Input] = (), outputs: Sequence[Output] = (), tells: bool = False) -> None:
         """Set the ports; to be called once, at the end of the constructor.
@@ -546,13 +590,13 @@ class Stage(ABC):
         read = [messages.sample_fields(p.type)[n] for p in self.inputs[: self.own_inputs] for n in p.fields]
         return read, [kind for port in self.outputs for kind in messages.sample_fields(port.type).values()]
 
-    def native(self) -> Native:
+    def native(self) -> CompiledStep:
         """The step with the memory as it is now, as a function of addresses."""
         if self._native is None:
             assert self.step is not None, "a stage without a step has its own `process`"
-            if not is_ours(type(self).__module__) and (why := unfit(self.memory)):
+            if not is_ours(type(self).__module__) and (why := explain_unfit(self.memory)):
                 raise InputError(f"{self.name}: memory of a compiled step: {why}")
-            self._native = Native(self.step, self.memory, *self.field_types)
+            self._native = CompiledStep(self.step, self.memory, *self.field_types)
         else:
             self._native.update(self.memory)
         return self._native

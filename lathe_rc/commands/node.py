@@ -9,7 +9,7 @@ import click
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.commands import completers, options
 from lathe_rc.errors import InputError
-from lathe_rc.loading import load
+from lathe_rc.extras import load
 from lathe_rc.nodes.arguments import help_or_refusal
 
 _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}

@@ -12,7 +12,7 @@ from rich.text import Text
 from lathe_rc import harness, part
 from lathe_rc.analysis.budget import Budget, Part
 from lathe_rc.analysis.metrology import Lay
-from lathe_rc.cell.durations import Lateness
+from lathe_rc.cell.latency_histogram import Lateness
 from lathe_rc.commands import plot, tables
 
 _MOST_EVENTS = 12  # printed of a run

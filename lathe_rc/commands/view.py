@@ -10,7 +10,7 @@ import click
 from rich.console import Console
 
 from lathe_rc.bag.reading.source import name_of
-from lathe_rc.cell.rerun_bridge import PORT, RATE, Kind
+from lathe_rc.cell.beside import RERUN_PORT, RERUN_RATE, RerunOutput
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.view.rerun_bag import write
 from lathe_rc.view.rerun_output import Viewer, end, require, viewer
@@ -43,11 +43,11 @@ def _live(values: Mapping[str, object], *, as_json: bool) -> None:
 @click.argument("bag", type=click.Path(path_type=Path), required=False)
 @click.option("-o", "--output", type=click.Path(path_type=Path, dir_okay=False), help="write a .rrd file, show nothing")
 @click.option("--web", is_flag=True, help="show it in a browser")
-@click.option("--port", type=click.IntRange(1, 65535), default=PORT, show_default=True, help="of the web page")
+@click.option("--port", type=click.IntRange(1, 65535), default=RERUN_PORT, show_default=True, help="of the web page")
 @click.option(
     "--rate",
     type=click.FloatRange(min=1),
-    default=RATE,
+    default=RERUN_RATE,
     show_default=True,
     help="points of a curve in a second, at most: smallest and largest values in turn",
 )
@@ -77,7 +77,7 @@ def view(
         raise InputError("--connect, --once and --json are for --live")
     require()
     if bag is None:
-        where: Kind = "save" if output else "serve" if web else "connect" if connect else "spawn"
+        where: RerunOutput = "save" if output else "serve" if web else "connect" if connect else "spawn"
         values = {"output": where, "file": str(output or ""), "url": connect or "", "port": port, "rate": rate}
         _live({**values, "once": once}, as_json=as_json)
     elif output:

@@ -22,7 +22,7 @@ from lathe_rc import allowed_code, process_launcher
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.extensions import search_path
-from lathe_rc.namespace import absolute
+from lathe_rc.names import absolute
 from lathe_rc.nodes.report import THROUGHPUT
 from lathe_rc.process_launcher import Child, Start
 

@@ -11,7 +11,7 @@ from lathe_rc import part
 from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.metrology import Lay, Measurement
 from lathe_rc.analysis.tolerance import Growth, Verdict
-from lathe_rc.cell.durations import Lateness
+from lathe_rc.cell.latency_histogram import Lateness
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.tool import ToolParameters

@@ -15,15 +15,15 @@ from pathlib import Path
 from lathe_rc import messages, process_launcher
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.collect import Collector, check_room
-from lathe_rc.cell.durations import Lateness
 from lathe_rc.cell.engine import Engine, Sink
+from lathe_rc.cell.latency_histogram import Lateness
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.harness.processes import Event, Processes, ignore, with_recorder
 from lathe_rc.harness.result import Mode, Result
 from lathe_rc.messages import Signals
-from lathe_rc.namespace import checked
+from lathe_rc.names import checked_namespace
 from lathe_rc.process_launcher import Start
 
 
@@ -82,7 +82,7 @@ def run(
         from lathe_rc.bag.writing.writer import refuse_existing
 
         refuse_existing(place)
-    result = _run(scenario, cell, mode, groups, place, watch, domain, checked(namespace), start)
+    result = _run(scenario, cell, mode, groups, place, watch, domain, checked_namespace(namespace), start)
     result = replace(result, unchecked=cell.unchecked, warnings=cell.warnings, margins=cell.margins)
     if result.bag is not None:
         from lathe_rc.bag.check import write_digests

@@ -12,7 +12,7 @@ from typing import NoReturn
 
 from lathe_rc import extras
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.loading import load
+from lathe_rc.extras import load
 from lathe_rc.nodes.arguments import exit_with
 
 

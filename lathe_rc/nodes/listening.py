@@ -8,7 +8,7 @@ from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 
-from lathe_rc.bag.writing.record import signal_depth
+from lathe_rc.cell.host_topics import signal_depth
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.membership import Membership
 from lathe_rc.nodes.ports import message_class, signal_qos

@@ -17,8 +17,8 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from lathe_rc import allowed_code, messages, resources
+from lathe_rc.cell.beside import REPLAYED_FILES
 from lathe_rc.cell.parameters import NodeParameters, remapped
-from lathe_rc.cell.replayer import FILES
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wiring import Unknown
@@ -275,7 +275,7 @@ def _may_announce(path: str) -> bool:
     if allowed_code.is_named(path):
         return True
     place, temporary = resources.find(Path(path)).resolve(), Path(tempfile.gettempdir()).resolve()
-    replayed = any(each.parent == temporary and each.name.startswith(FILES) for each in place.parents)
+    replayed = any(each.parent == temporary and each.name.startswith(REPLAYED_FILES) for each in place.parents)
     return replayed or resources.is_own(place)
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from lathe_rc import messages
-from lathe_rc.bag.writing.record import signal_depth
 from lathe_rc.cell.block import Block
+from lathe_rc.cell.host_topics import signal_depth
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.wire import Decoder, NoBlockError
 from lathe_rc.errors import LatheError

@@ -17,10 +17,11 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.snapshot import Snapshot
 from lathe_rc.bag.writing.order import Merger
-from lathe_rc.bag.writing.record import bag_of, signal_depth
+from lathe_rc.bag.writing.record import bag_of
 from lathe_rc.bag.writing.snapshots import Snapshots
 from lathe_rc.bag.writing.writer import FLUSH_PERIOD, Output, offered_qos
 from lathe_rc.cell.block import Block
+from lathe_rc.cell.host_topics import signal_depth
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages import MASTERS

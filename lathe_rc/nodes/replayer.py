@@ -28,9 +28,10 @@ from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.limits import MOST_BEFORE, MOST_SENT
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.storage import Message
+from lathe_rc.cell.beside import REPLAYED_FILES, ReplayerParameters
+from lathe_rc.cell.beside import REPLAYER as KIND
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
-from lathe_rc.cell.replayer import FILES, KIND, ReplayerParameters
 from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
@@ -177,7 +178,7 @@ class Replayer:
         self._node.create_subscription(Member, "/members", heard, latched_qos(256))
         self._node.create_subscription(Progress, "/progress", progressed, latched_qos(256))
         # The recorder puts the scenario's files into its bag as well, so they stay as long as the replayer.
-        self._folder = tempfile.TemporaryDirectory(prefix=FILES)
+        self._folder = tempfile.TemporaryDirectory(prefix=REPLAYED_FILES)
         scenario = provenance.scenario_of(self._source.about, Path(self._folder.name))
         cell = Cell(scenario.nodes)
         announced = []

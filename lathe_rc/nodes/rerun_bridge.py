@@ -22,7 +22,8 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 
-from lathe_rc.cell.rerun_bridge import KIND, RerunBridgeParameters
+from lathe_rc.cell.beside import RERUN_BRIDGE as KIND
+from lathe_rc.cell.beside import RerunBridgeParameters
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes import arguments
 from lathe_rc.nodes.ports import message_class

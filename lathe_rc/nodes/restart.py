@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from lathe_rc.bag.writing.record import signal_depth
 from lathe_rc.cell import state_file
 from lathe_rc.cell.block import Block
+from lathe_rc.cell.host_topics import signal_depth
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.errors import InputError, LatheError

@@ -10,7 +10,7 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from lathe_rc import messages
-from lathe_rc.cell.durations import LATENCY, LATENESS, PERCENT, Durations, Percentiles
+from lathe_rc.cell.latency_histogram import LATENCY, LATENESS, PERCENT, Durations, Percentiles
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes.losses import LossWatch

@@ -7,12 +7,11 @@ from collections.abc import Collection, Sequence
 from functools import partial
 
 from lathe_rc import messages
-from lathe_rc.cell import extremes
-from lathe_rc.cell.block import Pool
-from lathe_rc.cell.framing import Framer
+from lathe_rc.cell.block import Framer, Pool
+from lathe_rc.cell.delay_buffer import DelayBuffer, longest_delays
+from lathe_rc.cell.parameters import explain_overflow
 from lathe_rc.cell.stage import Input, Sparse, Stage, compile_kernels
 from lathe_rc.cell.stages import STAGES
-from lathe_rc.cell.track import Track, longest_delays
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Samples, Signals
@@ -39,7 +38,7 @@ class StageTopics(CellNode):
 
     def configure_part(self) -> None:
         """Build the stage and compile its kernels: the first block then takes no longer than the next."""
-        with extremes.refused({self.get_name(): self.table}):
+        with explain_overflow({self.get_name(): self.table}):
             self.stage = STAGES[self.kind](self.get_name(), self.table)
         compile_kernels(self.stage)
         self.blocks = 0
@@ -61,12 +60,12 @@ class StageTopics(CellNode):
         self._pools = [Pool(port.type) for port in self.stage.outputs]
         self._sparse_topics = {topic: self.topic(topic) for topic in self.stage.sparse_topics}
         self._queues: dict[str, BlockQueue] = {}
-        self._tracks: dict[str, Track] = {}
+        self._tracks: dict[str, DelayBuffer] = {}
         ports = self.ports()
         for topic, port in ports:
             delays = longest_delays(p for other, p in ports if other == topic)
             self._queues[topic] = BlockQueue(topic, port.type, self.table, sorted(delays))
-            self._tracks[topic] = Track(port.type, delays, self.together * self.table.block_size)
+            self._tracks[topic] = DelayBuffer(port.type, delays, self.together * self.table.block_size)
         self._wire()
 
     def ports(self) -> list[tuple[str, Input]]:
@@ -152,7 +151,7 @@ class StageTopics(CellNode):
         return sum(queue.lost for queue in self._queues.values())
 
     @staticmethod
-    def _load(queue: BlockQueue, track: Track, until: int) -> None:
+    def _load(queue: BlockQueue, track: DelayBuffer, until: int) -> None:
         """Move queued blocks into the topic's track until it reaches sample ``until``, as far as they have come."""
         while track.end < until and queue.blocks:
             block = queue.blocks.popleft()

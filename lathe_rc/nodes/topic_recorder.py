@@ -18,8 +18,9 @@ from rclpy.subscription import Subscription
 from lathe_rc import messages
 from lathe_rc.bag.writing.publication_order import Continuity, PublicationOrder, Recorded
 from lathe_rc.bag.writing.writer import FLUSH_PERIOD, BagWriter
+from lathe_rc.cell.beside import TOPIC_RECORDER as KIND
+from lathe_rc.cell.beside import TopicRecorderParameters
 from lathe_rc.cell.recorder import RecorderParameters
-from lathe_rc.cell.topic_recorder import KIND, TopicRecorderParameters
 from lathe_rc.errors import InputError, LossyRunError
 from lathe_rc.nodes import arguments, publisher_info, standalone_node
 from lathe_rc.nodes.ports import message_class

@@ -31,10 +31,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.compiled.struct_view import sized
 from lathe_rc.control.limits import CommandLimits, keep_position, keep_velocity, rest
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
-from lathe_rc.placed import sized
 from lathe_rc.plants.feed_models import realise, settles
 from lathe_rc.plants.friction import LUGRE, NONE, STRIBECK, Friction, FrictionTable, bend, no_friction, slide
 from lathe_rc.plants.linear import discretise

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.arrays import put
+from lathe_rc.compiled.struct_view import sized
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import inlined, kernel
-from lathe_rc.placed import sized
 from lathe_rc.plants.chip import (
     DONE,
     DRAWN_IN,

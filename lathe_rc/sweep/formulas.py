@@ -24,12 +24,12 @@ import numpy as np
 import scipy
 
 from lathe_rc.analysis.pid_tuning import fastest
-from lathe_rc.cell.cures import Loop
-from lathe_rc.cell.cures import lag as drive_lag
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.cutting_process import CuttingProcessParameters
 from lathe_rc.cell.stages.feed_drive import FeedDriveParameters
 from lathe_rc.cell.stages.force_controller import ForceController
+from lathe_rc.cell.stages.learner import Loop
+from lathe_rc.cell.stages.learner import lag as drive_lag
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
 from lathe_rc.cell.wiring import Cell
@@ -82,7 +82,7 @@ def settings(scenario: Scenario, targets: Collection[str], margin: float = MARGI
 
 
 def _learning(cell: Cell, stage: LearningController, free: Collection[str], margin: float) -> dict[str, Found]:
-    responses = [response for response, _ in cell.learned(stage)]
+    responses = [response for response, _ in stage.learned(cell.stages.values())]
     if not responses:
         return {}
     loop = Loop(stage, responses, stage.checked_speeds(*cell.master.speed_range()))

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from lathe_rc import __version__, messages
 from lathe_rc.analysis.form_errors import FormErrors, RunningErrors
 from lathe_rc.analysis.tolerance import judge
-from lathe_rc.cell.batch import Bench, Errors
+from lathe_rc.cell.batch import CellRunner, Errors
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
@@ -198,7 +198,7 @@ def compute(
     values: Mapping[str, Value],
     targets: Sequence[str],
     measures: Sequence[Measure],
-    bench: Bench | None = None,
+    bench: CellRunner | None = None,
 ) -> dict[str, Any]:
     """The row of a cell but for its number and key; whatever is wrong with the cell stands in it.
 
@@ -212,7 +212,7 @@ def compute(
     start = time.perf_counter()
     row: dict[str, Any] = {"status": DONE, "version": revision()}
     row |= {target: values[target] for target in targets if target in values}
-    bench = bench or Bench()
+    bench = bench or CellRunner()
     cell: Cell | None = None
     started = False
     try:

@@ -25,7 +25,7 @@ from distributed.scheduler import KilledWorker
 
 from lathe_rc import allowed_code
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.batch import Bench
+from lathe_rc.cell.batch import CellRunner
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, shown
@@ -116,7 +116,7 @@ def compute(share: Share) -> pa.Table:
     """The rows of some cells; a task of Dask."""
     order = share.order
     allowed_code.taken_from(order.code)
-    base, bench = _scenario(order.name, order.text, order.identity), Bench()
+    base, bench = _scenario(order.name, order.text, order.identity), CellRunner()
     rows = [
         {"cell": job.number, "key": job.key, **row.compute(base, job.values, order.targets, order.measures, bench)}
         for job in share.jobs

@@ -11,8 +11,8 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.bag.reading import stream
 from lathe_rc.bag.reading.source import Source, name_of
+from lathe_rc.cell.beside import RERUN_RATE
 from lathe_rc.cell.block import Block
-from lathe_rc.cell.rerun_bridge import RATE
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import START_NS
 
@@ -83,7 +83,7 @@ def log(recording: "rr.RecordingStream", bag: Path, *, rate: float) -> int:
     return header.samples
 
 
-def write(bag: Path, output: Path, *, rate: float = RATE) -> int:
+def write(bag: Path, output: Path, *, rate: float = RERUN_RATE) -> int:
     """Write a bag's .rrd file: whole, or not at all.
 
     Returns:

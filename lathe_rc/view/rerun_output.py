@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote, urlsplit
 
 from lathe_rc import allowed_code, extras
-from lathe_rc.cell.rerun_bridge import PORT, Kind
+from lathe_rc.cell.beside import RERUN_PORT, RerunOutput
 from lathe_rc.errors import InputError, LatheError
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def end(process: "subprocess.Popen[bytes]") -> None:
     process.wait()
 
 
-def viewer(kind: Kind, port: int = PORT) -> Viewer:
+def viewer(kind: RerunOutput, port: int = RERUN_PORT) -> Viewer:
     """The viewer for ``spawn`` or ``serve``.
 
     Args:
@@ -114,7 +114,7 @@ class Output:
         InputError: a file that cannot be made, a URL that is none, or no display.
     """
 
-    def __init__(self, kind: Kind, *, file: Path, url: str, port: int) -> None:
+    def __init__(self, kind: RerunOutput, *, file: Path, url: str, port: int) -> None:
         self._kind, self._file, self._url = kind, file, url
         self._viewer = viewer(kind, port) if kind in ("spawn", "serve") else None
         self._process: subprocess.Popen[bytes] | None = None

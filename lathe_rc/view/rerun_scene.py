@@ -14,7 +14,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from lathe_rc import event_log, messages
-from lathe_rc.cell.rerun_bridge import RATE
+from lathe_rc.cell.beside import RERUN_RATE
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.event_log import LOGGED
@@ -61,7 +61,7 @@ class Scene:
         step_ns: int,
         *,
         outlook: parts.Outlook | None = None,
-        rate: float = RATE,
+        rate: float = RERUN_RATE,
         live: bool = False,
         silent: Collection[str] = (),
     ) -> None:

@@ -11,23 +11,13 @@ from lathe_rc.bag import provenance
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.snapshots import Snapshots
 from lathe_rc.bag.writing.writer import BagWriter, Both, Output, offered_qos
-from lathe_rc.cell.framing import Framer
-from lathe_rc.cell.parameters import SharedParameters
+from lathe_rc.cell.block import Framer
+from lathe_rc.cell.host_topics import signal_depth
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
-
-_SPARE, _FREE_RUNNING = 32, 2080  # messages
-
-
-def signal_depth(shared: SharedParameters) -> int:
-    """Queue length of signal topics: all blocks in flight and some more; many where nothing holds the spindle back.
-
-    A publisher may be a window ahead of a reader that goes on in the place of a dead one, from two windows before.
-    """
-    return 3 * shared.window + _SPARE if shared.window else _FREE_RUNNING
 
 
 def bag_of(path: Path, table: RecorderParameters, snapshots: Snapshots | None) -> Output:

@@ -1,20 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The common part of all controllers that learn a drive, for the checks before a start."""
+"""The common part of all controllers that learn a drive: checks before a start, and cures for a loop that diverges."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Collection, Iterable, Mapping
-from typing import Annotated, ClassVar
+from types import MappingProxyType
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell.parameters import ObedientParameters, RestartParameters, Value, parameter
-from lathe_rc.cell.stages.drive import BoundedParameters
+from lathe_rc.cell.parameters import ObedientParameters, RestartParameters, Value, parameter, remapped
+from lathe_rc.cell.stage import Stage, WiredCell
+from lathe_rc.cell.stages.drive import BoundedParameters, Drive
 from lathe_rc.cell.stages.obedience import Obedience, Obedient
 from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Takeover
-from lathe_rc.errors import DivergedError
+from lathe_rc.errors import DivergedError, InputError
+
+_SAFE = 0.98  # factor of a cycle that a cure leaves at most
+_BANDS = np.geomspace(60_000.0, 500.0, 32)  # [rad/s] where a flat Q may end
+# Where its stop band begins, over that, and its ripple: the flattest first. One with a longer kernel may not fit into
+# the memory, which holds fewer points a second the slower the spindle turns.
+_SHAPES = ((2.0, 1e-6), (3.0, 1e-6), (2.0, 1e-4), (3.0, 1e-4), (2.0, 1e-3), (2.0, 1e-2))
 
 
 class LearnerParameters(ObedientParameters, BoundedParameters, RestartParameters):
@@ -43,6 +52,7 @@ class Learner(Obedient):
     """
 
     parameters: LearnerParameters
+    learns = True
     factor: ClassVar[str] = "sup|factor of a cycle|"  #: what `worst` tells, in words
     remedy: ClassVar[str] = "change the law"  #: for a loop that diverges where none of its `cures` helps, in words
 
@@ -98,6 +108,99 @@ class Learner(Obedient):
         """
         return None
 
+    # ---- checks before a start ----------------------------------------------------------------------
+
+    def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
+        """See `Stage`: the errors of a cycle come in time, and learning converges."""
+        super().check_cell(cell, cures=cures)
+        low, high = cell.master.speed_range()
+        self._check_delay(cell, high)
+        self._check_convergence(cell, self.checked_speeds(low, high), cures=cures)
+        cell.warnings += self.encoder_warnings(low, high, cell.master.parameters.counts_per_revolution)
+
+    def learned(self, stages: Iterable[Stage]) -> list[tuple[Response, Drive]]:
+        """Return the responses of the drives that it commands, and the drives."""
+        commands = {remapped(self.shared, output.topic) for output in self.outputs}
+        return [
+            (response, drive)
+            for drive in stages
+            if isinstance(drive, Drive)
+            for topic, response in drive.responses().items()
+            if remapped(drive.shared, topic) in commands and any(port.topic == topic for port in drive.inputs)
+        ]
+
+    def _check_delay(self, cell: WiredCell, speed: float) -> None:
+        encoder = cell.master.parameters
+        count = 2 * np.pi / encoder.counts_per_revolution if encoder.counts_per_revolution else 0.0
+        acceleration = cell.master.largest_acceleration()
+        largest = self.largest_delay(speed, acceleration, count, encoder.speed_window * encoder.step)
+        delay = self.parameters.feedback_delay
+        if largest is None:
+            cell.unchecked.append(f"{self.name}: {self.kind} tells no longest feedback_delay")
+        elif delay > largest:
+            least = self.shared.block_size
+            allowed = f"{least} up to {largest}"
+            if largest < least:
+                allowed = f"{largest} or less, with a block_size no longer than that"
+            if largest < 1:
+                allowed = "a longer cycle, a shorter lead, or a spindle that turns slower"
+            raise InputError(
+                f"{self.name}.feedback_delay = {delay} samples: at {speed:.4g} rad/s the cycle leaves "
+                f"{max(largest, 0)}; allowed: {allowed}"
+            )
+
+    def _check_convergence(self, cell: WiredCell, speeds: Collection[float], *, cures: bool) -> None:
+        command = remapped(self.shared, self.outputs[0].topic)
+        unknown = [name for name in cell.unknown if name in cell.reader_names(command)]
+        for name in unknown:
+            cell.leave_open(f"whether {self.name} converges with {name}", name)
+        learned, untold = self.learned(cell.stages.values()), list[str]()
+        loop = Loop(self, [response for response, _ in learned], speeds)
+        for response, drive in learned:
+            self._check_reach(drive)
+            told = [(worst, speed) for speed in dict.fromkeys(speeds) if (worst := self.worst(response, speed))]
+            if broken := next(((worst, speed) for worst, speed in told if math.isnan(worst[0])), None):
+                (_, waves), speed = broken
+                raise InputError(
+                    f"{self.name}: {self.factor} with {drive.name} is not a number at {waves:.4g} waves and "
+                    f"{speed:.4g} rad/s; allowed: finite numbers; see contraction of the law and response of the drive"
+                )
+            if told:
+                (largest, waves), speed = max(told)
+                cell.factors[self.name] = max(largest, cell.factors.get(self.name, 0.0))
+                if largest >= 1.0 and not self.parameters.allow_unstable:
+                    where = f"{waves * speed:.5g} rad/s ({waves:.4g} waves at {speed:.4g} rad/s)"
+                    remedy = " or ".join(loop.cures() if cures else []) or self.remedy
+                    raise InputError(
+                        f"{self.name}: learning diverges with {drive.name}: {self.factor} = {largest:.4g} at {where} "
+                        f"with {self.settings()}; allowed: below 1 ({remedy}; or set allow_unstable)"
+                    )
+            else:
+                untold.append(f"{self.name}: {self.kind} tells no factor of a cycle: nobody knows if it converges")
+        if not learned and not unknown:
+            untold.append(f"{self.name}: no drive tells its response to {command}: nobody knows if it converges")
+        if untold and not (self.parameters.stop_ratio or self.parameters.allow_unstable):
+            raise InputError(
+                f"{untold[0]}; allowed: {self.name}.stop_ratio above 0 (2: twice the error of the first cycle ends "
+                "the run), or allow_unstable"
+            )
+        cell.unchecked += untold
+
+    def _check_reach(self, drive: Drive) -> None:
+        """Refuse bounds with which it could not take over from every position of a drive."""
+        parameters = self.parameters
+        reach = parameters.bounds().reach(parameters.retract_time)
+        for limits in drive.limits().values() if parameters.reaction_delay else ():
+            needed = limits.stroke + max(limits.stroke, abs(parameters.retract_position))
+            if reach < needed:
+                raise InputError(
+                    f"{self.name}.retract_time = {parameters.retract_time:g} s: the bounds allow a way of {reach:.3g} "
+                    f"m in that, and the stroke of {drive.name} needs {needed:.3g} m; allowed: a longer retract_time, "
+                    "or wider bounds"
+                )
+
+    # ---- obedience ----------------------------------------------------------------------------------
+
     def _make_obedience(self, settled: int) -> Obedience | None:
         """The obedience to the supervisor, if any; errors of ``settled`` samples after a takeover are not learned."""
         parameters = self.parameters
@@ -116,3 +219,68 @@ class Learner(Obedient):
             f"sample {index}: the error grows: {rms * 1e6:.4g} µm RMS in a cycle, {ratio:.3g} times {first * 1e6:.4g} "
             f"µm; allowed: stop_ratio = {self.parameters.stop_ratio:g} (a smaller gain, or another law)"
         )
+
+
+def lag(response: Response) -> float:
+    """Lag of a drive at low frequencies [s]."""
+    low = 1.0
+    return float(-np.angle(response(np.array([low])))[0] / low)
+
+
+class Loop(NamedTuple):
+    """A learning controller with the drives that it commands.
+
+    Attributes:
+        stage: the controller.
+        responses: of the drives.
+        speeds: at which the loop is looked at [rad/s].
+    """
+
+    stage: Learner
+    responses: Collection[Response]
+    speeds: Collection[float]
+
+    def factor(self, values: Mapping[str, Value]) -> float:
+        """Largest factor of a cycle with some parameters changed; inf: there is no such controller, or it is silent."""
+        try:
+            stage = type(self.stage)(self.stage.name, self.stage.parameters.model_copy(update=dict(values)))
+        except InputError:  # the memory has no room for it
+            return np.inf
+        told = [stage.worst(response, speed) for response in self.responses for speed in self.speeds]
+        return max((np.inf if worst is None or np.isnan(worst[0]) else worst[0] for worst in told), default=np.inf)
+
+    def first(self, candidates: Iterable[Mapping[str, Value]], allowed: float = _SAFE) -> Mapping[str, Value] | None:
+        """The first parameters with which no factor is above what is allowed; None: there are none."""
+        return next((values for values in candidates if self.factor(values) <= allowed), None)
+
+    def cures(self) -> list[str]:
+        """Parameters to set so that a loop converges that does not."""
+        found: list[Mapping[str, Value]] = []
+        for candidates in self.stage.cures(max(map(lag, self.responses))):
+            cure = self.first(each for each in candidates if not any(each.keys() >= known.keys() for known in found))
+            found += [cure] if cure else []
+        name = self.stage.name
+        return [" and ".join(f"{name}.{key} = {value:g}" for key, value in cure.items()) for cure in found]
+
+    def flat(
+        self,
+        allowed: float,
+        stop: float | None = None,
+        ripple: float | None = None,
+        others: Mapping[str, Value] = MappingProxyType({}),
+    ) -> dict[str, Value] | None:
+        """The widest flat Q, an FIR low-pass, of the first shape with which the loop converges; None: there is none.
+
+        Args:
+            allowed: factor of a cycle.
+            stop: begin of its stop band [rad/s]; None: free.
+            ripple: None: free.
+            others: parameters that are changed as well.
+        """
+        for ratio, each in dict.fromkeys((ratio, ripple or own) for ratio, own in _SHAPES):
+            bands = _BANDS if stop is None else _BANDS[stop > _BANDS]
+            made = ({"q_pass": float(band), "q_stop": stop or float(ratio * band)} for band in bands)
+            shape = {**others, "q_filter": "fir", "q_ripple": each}
+            if found := self.first(({**shape, **band} for band in made), allowed):
+                return dict(found)
+        return None

@@ -13,7 +13,7 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.analysis.learning import LearningLoop, Response
 from lathe_rc.cell.parameters import Value, about
-from lathe_rc.cell.stage import Input, Output, Sparse
+from lathe_rc.cell.stage import Input, Output, Sparse, WiredCell
 from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
 from lathe_rc.cell.stages.learning_step import LOST_AT, Memory, step
@@ -177,6 +177,23 @@ class LearningController(Learner):
             looks_ahead=self.correction.looks_ahead,
             step=parameters.step,
         )
+
+    def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
+        """See `Stage`: an exact preview knows the speed law of the spindle."""
+        master = cell.master
+        if self.parameters.lead_law == "exact_preview":
+            own, true = self.parameters.speed_law(self.name), master.law
+            if true is None:
+                raise InputError(
+                    f"{self.name}.lead_law = exact_preview, but nobody knows the speed of {master.name} in advance; "
+                    "allowed: another lead law"
+                )
+            if not (np.array_equal(own.lines, true.lines) and np.array_equal(own.tachogram, true.tachogram)):
+                raise InputError(
+                    f"{self.name}.lead_law = exact_preview, but it does not know the speed of {master.name}; give "
+                    f"it the same deviation, tachogram and random parameters"
+                )
+        super().check_cell(cell, cures=cures)
 
     # ---- events -------------------------------------------------------------------------------------
 

@@ -9,7 +9,6 @@ import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 
 from lathe_rc import messages, resources
-from lathe_rc.cell.native import Step
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
 from lathe_rc.cell.stages.feed_drive import Axis
@@ -17,6 +16,7 @@ from lathe_rc.cell.stages.obedience import OBEY, Listener, apply, listens, may_l
 from lathe_rc.cell.stages.servo import Servo, ServoParameters, pid_along
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.cell.stages.trajectory import Course, follow
+from lathe_rc.compiled.step import Step
 from lathe_rc.control import periodic
 from lathe_rc.control.periodic import PRESETS, PeriodicController, PeriodicLaw, PeriodicState
 from lathe_rc.control.pid import POSITION, Pid, PidTable

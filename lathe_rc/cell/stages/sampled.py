@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lathe_rc.analysis.learning import Array, Complex
-from lathe_rc.cell.native import Step, step_of
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.stage import Stage
+from lathe_rc.compiled.step import Step, step_of
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import code_of_others
 

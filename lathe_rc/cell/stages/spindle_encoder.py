@@ -8,12 +8,12 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from lathe_rc import messages
-from lathe_rc.cell.native import Step
 from lathe_rc.cell.parameters import about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
+from lathe_rc.compiled.step import Step
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.signals.encoder import Encoder, EncoderTable, encode

@@ -11,8 +11,9 @@ import numpy.typing as npt
 from annotated_types import Ge, Le
 
 from lathe_rc import messages
-from lathe_rc.cell.parameters import NodeParameters, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage, cut
+from lathe_rc.cell.parameters import NodeParameters, parameter, remapped
+from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage, WiredCell, cut
+from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel
@@ -428,3 +429,57 @@ class Supervisor(Stage):
             "limit": limit,
         }
         return Sparse("safety/status", messages.SAFETY_STATUS, index, values)
+
+    # ---- checks before a start ----------------------------------------------------------------------
+
+    def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
+        """See `Stage`: where a retraction can be asked for, the tool gets out of the part."""
+        super().check_cell(cell, cures=cures)
+        if self.parameters.drives:
+            self._check_obedience(cell)
+            self._check_retraction(cell)
+            self._check_clearance(cell)
+
+    def _check_obedience(self, cell: WiredCell) -> None:
+        """A node that moves the first drive obeys."""
+        asks = next((monitor for monitor in self.monitors if monitor.reaction >= Reaction.RETRACT), None)
+        drive, safety = self.parameters.drives[0], remapped(self.shared, "safety")
+        movers = [cell.node_of(remapped(self.shared, f"{drive}/{what}")) for what in ("command", "state")]
+        nodes = [node for node in movers if node]
+        if asks and nodes and not cell.reader_names(safety) & set(nodes):
+            asked = f"monitor {asks.name} asks for {asks.reaction.name.lower()}"
+            raise InputError(
+                f"{self.name}: {asked}, but no node that moves {drive} reads safety; "
+                f"allowed: {nodes[0]}.reaction_delay of a block or more, or a weaker reaction"
+            )
+
+    def _check_retraction(self, cell: WiredCell) -> None:
+        """The tool has to get as far out of the part as is asked for before it is safe."""
+        drive, clear = self.parameters.drives[0], self.parameters.clear_position
+        for topic, name in ((f"{drive}/command", "retract_position"), (f"{drive}/state", "command_stroke")):
+            outlet_topic = remapped(self.shared, topic)
+            node = cell.node_of(outlet_topic)
+            if node is None:
+                continue  # a series drive passes commands on inside
+            source = cell.publisher(outlet_topic, f"whether {node} gets beyond {self.name}.clear_position")
+            if source is None:
+                continue
+            reached = getattr(source.shared, name, None)
+            counts = reached if name == "command_stroke" else getattr(source.shared, "reaction_delay", 0)
+            if counts and reached is not None and reached <= clear:
+                raise InputError(
+                    f"{source.name}.{name} = {reached:g} m, but the tool is out of the part beyond "
+                    f"{self.name}.clear_position = {clear:g} m; allowed: above that, or a smaller clear_position"
+                )
+
+    def _check_clearance(self, cell: WiredCell) -> None:
+        """A drive gets no farther than its stroke."""
+        clear = self.parameters.clear_position
+        node = cell.node_of(remapped(self.shared, f"{self.parameters.drives[0]}/state"))
+        drive = cell.stages.get(node or "")  # what is unknown has been said of the retraction
+        for limits in drive.limits().values() if isinstance(drive, Drive) else ():
+            if limits.stroke <= clear:
+                raise InputError(
+                    f"{self.name}.clear_position = {clear:g} m: the tool is out of the part beyond that, and the "
+                    f"stroke of {node} ends at {limits.stroke:g} m; allowed: less than that"
+                )

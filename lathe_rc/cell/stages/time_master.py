@@ -10,8 +10,11 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from lathe_rc.cell.parameters import NodeParameters, Value, about, parameter
-from lathe_rc.cell.stage import Stage, Trigger
+from lathe_rc.cell.stage import Stage, Trigger, WiredCell
+from lathe_rc.errors import InputError
 from lathe_rc.signals.speed import SpeedLaw
+
+_LEAST_SAMPLES = 4  # of a revolution
 
 
 class TimeMasterParameters(NodeParameters):
@@ -66,6 +69,20 @@ class TimeMaster(Stage):
         super().__init__(name, parameters)
         self.parameters = parameters
         self.samples: int | None = None
+
+    def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
+        """See `Stage`: the spindle must turn, and not too fast for the sampling rate."""
+        super().check_cell(cell, cures=cures)
+        low, high = self.speed_range()
+        if low <= 0.0:
+            raise InputError(
+                f"{self.name}.nominal_rpm and its deviations: speed falls to {low:.4g} rad/s; allowed: above 0"
+            )
+        if (samples := 2.0 * np.pi / (high * self.shared.step)) < _LEAST_SAMPLES:
+            raise InputError(
+                f"{self.name}.nominal_rpm and its deviations: a revolution takes {samples:.3g} samples at "
+                f"{high:.4g} rad/s; allowed: {_LEAST_SAMPLES} or more (turn slower, or raise sample_rate)"
+            )
 
     @abstractmethod
     def sample_at(self, angle: float) -> int:

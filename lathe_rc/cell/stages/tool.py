@@ -9,12 +9,15 @@ from annotated_types import Ge, Le, MinLen
 
 from lathe_rc import messages
 from lathe_rc.arrays import put
-from lathe_rc.cell.parameters import Value, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
-from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, evaluate
+from lathe_rc.cell.parameters import Value, parameter, remapped
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage, WiredCell
+from lathe_rc.cell.stages.drive import Drive, Limits
+from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, ProfileStage, evaluate
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
+from lathe_rc.signals.profile_table import Demand
+from lathe_rc.signals.tip_path import steepest_fall
 
 
 class ToolParameters(FormParameters):
@@ -156,6 +159,32 @@ class Tool(Stage):
         """See `Stage`."""
         return self.form.doubts if self.form else []
 
+    def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
+        """See `Stage`: the first drive carries the profile, the others what it leaves; and the flank must not rub."""
+        super().check_cell(cell, cures=cures)
+        owner = self._form_owner(cell)
+        topic = remapped(self.shared, f"{self.parameters.drives[0]}/state")
+        source = cell.publisher(topic, f"whether {cell.node_of(topic)} can follow the profile of {self.name}")
+        if owner is None or owner.form is None:
+            return
+        if isinstance(source, Drive):
+            speed, acceleration = cell.master.speed_range()[1], cell.master.largest_acceleration()
+            demand = owner.form.profile.demand(speed, acceleration, owner.parameters.feed)
+            for of, limits in source.limits().items():
+                if remapped(source.shared, of) == topic:
+                    _check_demand(owner.name, source.name, demand, limits, speed)
+        if owner.parameters.clearance:
+            _check_flank(owner.name, owner.parameters, owner.form)
+
+    def _form_owner(self, cell: WiredCell) -> "Tool | ProfileStage | None":
+        """The stage that has the tool's desired form."""
+        if self.form is not None:
+            return self
+        source = cell.publisher(
+            remapped(self.shared, "reference"), f"whether a drive can follow what {self.name} reads"
+        )
+        return source if isinstance(source, ProfileStage) else None
+
     @property
     def memory(self) -> Memory:
         """See `Stage`."""
@@ -163,3 +192,28 @@ class Tool(Stage):
         form = self.form.table if self.form else _ELSEWHERE
         begin = 3 if self.form is None else 2 * len(self.form.inputs)
         return Memory(form, begin, len(parameters.drives), parameters.cross_slide, parameters.deflects)
+
+
+def _check_demand(owner: str, drive: str, demand: Demand, limits: Limits, speed: float) -> None:
+    """Refuse a profile that a drive cannot follow at a speed [rad/s]."""
+    for what, asked, allowed, unit in (
+        ("stroke", demand.stroke * 1e6, limits.stroke * 1e6, "µm"),
+        ("velocity", demand.velocity, limits.velocity, "m/s"),
+        ("acceleration", demand.acceleration, limits.acceleration, "m/s^2"),
+    ):
+        if asked > allowed:
+            raise InputError(
+                f"{owner}.profile: {drive} cannot follow it at {speed:.4g} rad/s: {what} "
+                f"{asked:.4g} {unit}; allowed: {allowed:.4g} {unit} (turn slower or change the form)"
+            )
+
+
+def _check_flank(owner: str, parameters: FormParameters, form: Form) -> None:
+    """Refuse a flank that does not leave the surface behind the edge free."""
+    fall = steepest_fall(form.surface, parameters.part_radius, parameters.feed)
+    if fall.clearance >= parameters.clearance:
+        raise InputError(
+            f"{owner}.clearance = {parameters.clearance:g} rad: the tool's flank would rub, since the form falls "
+            f"by {fall.clearance:.4g} rad at {fall.angle:.4g} rad, height {fall.height:g} m; allowed: above that, or a "
+            "flatter form"
+        )

@@ -24,7 +24,7 @@ def longest_delays(ports: Iterable[Input]) -> dict[str, int]:
     return delays
 
 
-class Track:
+class DelayBuffer:
     """Samples of some fields of a topic: the newest ones and, where they are read late, those before them.
 
     Before sample 0 everything is zero. What `extend` and `view` hand out is good until the next block is added.

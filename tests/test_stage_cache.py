@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lathe_rc.cell.parameters import NodeParameters
-from lathe_rc.cell.rewind import Start, UnknownPartError
 from lathe_rc.cell.stage import Output, Stage
+from lathe_rc.cell.stage_cache import Start, UnknownPartError
 from lathe_rc.messages import COMMAND
 
 

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps as functions of addresses: what a program calls without Python, and a stage alone with little of it.
+"""Steps as functions of addresses: a program calls them without Python, and a stage alone with little of it.
 
-For each kind of step a function is written that takes the addresses of its memory and of the arrays of its ports, and
-calls it. It stands in a module of its own, whose compiled code is kept: it depends on the types of the memory and the
-ports, not on their values.
+The function for a kind of step stands in a module of its own, which is written here and whose compiled code is kept:
+it depends on the types of the memory and the ports, not on their values.
 """
 
 import hashlib
@@ -19,16 +18,15 @@ import numpy as np
 import numpy.typing as npt
 from numba.core.errors import NumbaError
 
+from lathe_rc.compiled.struct_view import Integers, Struct, StructView, call
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.extensions import is_ours, source_hash
 from lathe_rc.jit import cache_folder, kernel, read_kept
-from lathe_rc.placed import Placed, Words, call
 
-Integers = npt.NDArray[np.int64]
 Step = Callable[..., tuple[int, int]]
 
 _FIELDS = {np.dtype(np.float64): "floats", np.dtype(np.uint8): "octets"}
-_MODULE = '''"""Written by lathe_rc.cell.native: {step} as a function of addresses.
+_MODULE = '''"""Written by lathe_rc.compiled.step: {step} as a function of addresses.
 
 The memory is {memory}.
 The source is {source}.
@@ -36,7 +34,7 @@ The source is {source}.
 
 import {module}
 from lathe_rc.jit import entry
-from lathe_rc.placed import at, floats, octets, ports, store, word
+from lathe_rc.compiled.struct_view import at, floats, octets, ports, store, word
 
 STEP = {step}
 
@@ -96,7 +94,7 @@ class AddressTable:
         self.places = [*read, *range(1 + self.flags, self.first)]
 
 
-class Native:
+class CompiledStep:
     """A step with its memory as a function of addresses.
 
     Args:
@@ -105,7 +103,9 @@ class Native:
         inputs, outputs: element types of the arrays of all fields of all ports.
 
     Attributes:
-        words: of the memory, see `Words`.
+        name: of the module that it stands in.
+        words: of the memory, see `lathe_rc.compiled.struct_view.Struct`.
+        update: lays the memory out anew, see there.
     """
 
     def __init__(
@@ -115,17 +115,12 @@ class Native:
         inputs: Sequence[np.dtype[Any]],
         outputs: Sequence[np.dtype[Any]],
     ) -> None:
-        self._words = Words(memory)
-        self.words = self._words.words
-        self._entry = _entry(step, self._words.kind, tuple(inputs), tuple(outputs))
-        table = self._entry.table
+        layout = Struct(memory)
+        self.words, self.update = layout.words, layout.update
+        self._entry = _entry(step, layout.kind, tuple(inputs), tuple(outputs))
+        self.name, table = self._entry.name, self._entry.table
         self._places, self._reached, self._fields = table.places, np.zeros(1, np.int64), np.zeros(table.size, np.int64)
         self._fields[0] = table.floats
-
-    @property
-    def name(self) -> str:
-        """Of the module that it stands in."""
-        return self._entry.name
 
     @property
     def address(self) -> int:
@@ -135,10 +130,6 @@ class Native:
             InputError: it cannot be compiled.
         """
         return self._entry.address
-
-    def update(self, memory: tuple[Any, ...]) -> None:
-        """See `Words`."""
-        self._words.update(memory)
 
     def __call__(self, first: int, start: int, fields: Sequence[npt.NDArray[Any]], samples: int) -> tuple[int, int]:
         """Call the step for the arrays of all fields, shape (samples,)."""
@@ -174,10 +165,10 @@ def _call(
 
 
 class Entry:
-    """The function of addresses for a kind of step, memory and ports; see `Native`."""
+    """The function of addresses for a kind of step, memory and ports; see `CompiledStep`."""
 
     def __init__(
-        self, step: Step, memory: Placed, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]
+        self, step: Step, memory: StructView, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]
     ) -> None:
         self.table = AddressTable(inputs, outputs)
         self._memory, self._text = memory, _text(step, memory, self.table, outputs)
@@ -185,7 +176,7 @@ class Entry:
 
     @cached_property
     def address(self) -> int:
-        """See `Native`."""
+        """See `CompiledStep`."""
         try:
             return int(_module(self.name, self._text, self._memory).enter.address)
         except NumbaError as error:
@@ -195,7 +186,7 @@ class Entry:
 _entry = cache(Entry)  # made once for all that are alike
 
 
-def _text(step: Step, memory: Placed, table: AddressTable, outputs: Sequence[np.dtype[Any]]) -> str:
+def _text(step: Step, memory: StructView, table: AddressTable, outputs: Sequence[np.dtype[Any]]) -> str:
     """The text of the module."""
 
     def arrays(begin: int, kinds: Iterable[np.dtype[Any]]) -> str:
@@ -237,7 +228,7 @@ def is_kept(name: str) -> bool:
 
 
 @cache
-def _module(name: str, text: str, memory: Placed) -> ModuleType:
+def _module(name: str, text: str, memory: StructView) -> ModuleType:
     """The module of a text, in no file: only what is compiled of it is kept."""
     module = ModuleType(f"lathe_rc_steps.{name}")
     vars(module)["MEMORY"] = memory

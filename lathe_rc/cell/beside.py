@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the nodes that are no members of a cell: they compute nothing, and no member waits for them."""
+
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Gt, Le
+
+from lathe_rc.cell.parameters import Table, parameter
+
+REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER = "replayer", "rerun_bridge", "topic_recorder"  #: kinds of node
+REPLAYED_FILES = "lathe-replay-"  #: begins the name of the temporary folder with the files of a replayed bag
+RERUN_RATE = 2000.0  #: points of a curve in a second
+RERUN_PORT = 9090  #: of the web page
+
+RerunOutput = Literal["spawn", "serve", "connect", "save"]
+
+
+class ReplayerParameters(Table):
+    """The messages to send again, and their pace."""
+
+    bag: str = parameter("", "folder or file of the bag", path=True)
+    rate: Annotated[float, Ge(0)] = parameter(1.0, "pace against the bag's time; 0: as fast as the readers follow")
+    loop: bool = parameter(default=False, doc="begin again at the end")
+    start: Annotated[float, Ge(0)] = parameter(0.0, "where to begin, counted from the bag's first message", "s")
+    end: Annotated[float, Ge(0)] = parameter(0.0, "where to end, counted from the bag's first message; 0: its end", "s")
+    topics: list[str] = parameter([], "fully qualified; none: all but /clock")
+    wait: Annotated[int, Ge(0)] = parameter(0, "readers that each topic must have before the first message is sent")
+    as_cell: bool = parameter(
+        default=False,
+        doc="send each topic from a node of its own name, as members of the cell, and wait for a recorder",
+    )
+
+
+class RerunBridgeParameters(Table):
+    """The signals to show live in Rerun, and the place for them."""
+
+    output: RerunOutput = parameter("spawn", "a window, a page for the browser, a viewer that runs already, or files")
+    file: str = parameter(
+        "live.rrd", "to save to; must not exist. Further runs go to files with a number in their names", path=True
+    )
+    url: str = parameter("rerun+http://127.0.0.1:9876/proxy", "of the viewer to connect to")
+    port: Annotated[int, Ge(1), Le(65535)] = parameter(RERUN_PORT, "of the web page")
+    rate: Annotated[float, Ge(1)] = parameter(
+        RERUN_RATE, "points of a curve, at most: smallest and largest values", "1/s"
+    )
+    once: bool = parameter(default=False, doc="end when the first run is over")
+
+
+class TopicRecorderParameters(Table):
+    """The topics to record of any ROS system, and the clock for them."""
+
+    bag: str = parameter("", "folder of the bag; must not exist", path=True)
+    topics: list[str] = parameter([], "fully qualified; none: all but hidden ones, /rosout and /parameter_events")
+    all: bool = parameter(default=False, doc="hidden topics, /rosout and /parameter_events as well")
+    sim_time: bool = parameter(
+        default=False, doc="log times are those that /clock told last before; otherwise the wall time of publication"
+    )
+    once: bool = parameter(default=False, doc="end when all publishers are gone")
+    hold: Annotated[float, Gt(0), Le(60)] = parameter(
+        0.5, "how much later than a message one that was published before it may come", "s"
+    )
+
+
+#: tables by kind of node
+BESIDE: dict[str, type[Table]] = {
+    REPLAYER: ReplayerParameters,
+    RERUN_BRIDGE: RerunBridgeParameters,
+    TOPIC_RECORDER: TopicRecorderParameters,
+}

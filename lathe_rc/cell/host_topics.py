@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Topics of a cell in ROS: those outside the signals, and the queue depth of the signals'."""
+
+from typing import NamedTuple
+
+from lathe_rc.cell.parameters import SharedParameters
+from lathe_rc.cell.recorder import KIND as RECORDER
+from lathe_rc.cell.stages import MASTERS, STAGES
+from lathe_rc.messages import PACKAGE
+
+_SPARE, _FREE_RUNNING = 32, 2080  # messages
+
+
+def signal_depth(shared: SharedParameters) -> int:
+    """Queue length of signal topics: all blocks in flight and some more; many where nothing holds the spindle back.
+
+    A publisher may be a window ahead of a reader that goes on in the place of a dead one, from two windows before.
+    """
+    return 3 * shared.window + _SPARE if shared.window else _FREE_RUNNING
+
+
+class HostTopic(NamedTuple):
+    """A topic outside the signals: it carries wall time, or how the run goes, and enters no digest.
+
+    Attributes:
+        name: relative, or absolute where the whole ROS domain shares it.
+        type: message type.
+        depth: queue length that publishers offer.
+        durability: ``transient local``: late readers get the newest messages, or ``volatile``.
+        publishers: kinds of node that publish it.
+        subscribers: kinds of node that read it.
+        doc: what it is for.
+    """
+
+    name: str
+    type: str
+    depth: int
+    durability: str
+    publishers: tuple[str, ...]
+    subscribers: tuple[str, ...]
+    doc: str
+
+
+MEMBERS = (*STAGES.own, RECORDER)  #: kinds of node that take part in a cell
+_MEMBER, _STATE, _PROGRESS = (f"{PACKAGE}/msg/{name}" for name in ("Member", "CellState", "Progress"))
+_DIAGNOSTICS, _CLOCK = "diagnostic_msgs/msg/DiagnosticArray", "rosgraph_msgs/msg/Clock"
+_LATCHED = "transient local"
+HOST_TOPICS = (
+    HostTopic("members", _MEMBER, 1, _LATCHED, MEMBERS, MEMBERS, "who takes part, and who is ready"),
+    HostTopic("cell_state", _STATE, 1, _LATCHED, MASTERS, MEMBERS, "start, end, safe state and failure of the run"),
+    HostTopic(
+        *("progress", _PROGRESS, 1, _LATCHED, MEMBERS, MASTERS),
+        "how far each member has come: the credit of the window",
+    ),
+    HostTopic(
+        *("/diagnostics", _DIAGNOSTICS, 100, "volatile", MEMBERS, (RECORDER,)),
+        "state and counters of each node, once a second",
+    ),
+    HostTopic("/clock", _CLOCK, 10, "volatile", MASTERS, (), "simulated time of the slowest member"),
+)
