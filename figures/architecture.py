@@ -34,6 +34,7 @@ LAYERS = (
     ),
     Layer("physics, laws", {"plants": "drives, cut, slides, spindle", "control": "learning, PID, decoupling"}),
     Layer("signals", {"signals": "speed, encoder, form"}),
+    Layer("compiled code", {"compiled": "memories and addresses of steps"}),
 )
 #: Arrows within a layer.
 BESIDE = (("drawing", "analysis"), ("plants", "control"))

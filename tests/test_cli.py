@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lathe_rc import harness, loading
+from lathe_rc import extras, harness
 from lathe_rc.cell.scenario import TABLES, load
 from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.stages.time_master import TimeMaster
@@ -327,7 +327,7 @@ def test_commands_are_listed_without_being_imported():
     listed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     *text, modules = listed.splitlines()
     ours = {module for module in modules.split() if module.partition(".")[0] in ("lathe_rc", "numpy", "numba", "rich")}
-    light = {"cli", "command_list", "errors", "extras", "loading", "allowed_code", "public"}
+    light = {"cli", "command_list", "errors", "extras", "allowed_code", "public"}
     assert ours == {"lathe_rc", *(f"lathe_rc.{module}" for module in light)}
     assert not [line for line in text[text.index("Commands:") :] if line.endswith("...")]  # each summary fits
 
@@ -367,5 +367,5 @@ def test_ctrl_c_during_an_import_ends_at_once_and_silently(tmp_path):
     ended = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, check=False)
     assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGINT, b"", b"")
     before = signal.getsignal(signal.SIGINT)
-    loading.load("json")
+    extras.load("json")
     assert signal.getsignal(signal.SIGINT) is before  # after it Ctrl-C is an exception again

@@ -87,7 +87,7 @@ def test_lines_come_in_any_pieces(cuts):
     stream = _Ready(pieces)
     reader, found = LineReader(stream, "line"), []
     while stream.pieces:
-        found += reader.read_bag()
+        found += reader.read()
     assert found == [(n, 2.0 * n) for n in range(20)]
     assert not reader.ended
 
@@ -100,13 +100,13 @@ def test_a_terminal_is_read_raw_and_its_first_line_may_lack_its_beginning():
     ours, theirs = pty.openpty()
     reader = LineReader.open(os.ttyname(theirs), 115200)
     os.close(theirs)
-    assert list(reader.read_bag()) == []
+    assert list(reader.read()) == []
     os.write(ours, b"00,7\n1,2\n3,")
-    assert list(reader.read_bag()) == [(1, 2.0)]
+    assert list(reader.read()) == [(1, 2.0)]
     os.write(ours, b"4\n")
-    assert list(reader.read_bag()) == [(3, 4.0)]
+    assert list(reader.read()) == [(3, 4.0)]
     os.close(ours)
-    assert list(reader.read_bag()) == []
+    assert list(reader.read()) == []
     assert reader.ended
     reader.close()
 
@@ -114,10 +114,10 @@ def test_a_terminal_is_read_raw_and_its_first_line_may_lack_its_beginning():
 def test_a_pipe_has_not_ended_before_somebody_writes_to_it(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     reader = LineReader.open(tmp_path / "pipe", 115200)
-    assert list(reader.read_bag()) == []
+    assert list(reader.read()) == []
     with (tmp_path / "pipe").open("wb") as writer:
         writer.write(b"1,2\n3,4")
-    assert list(reader.read_bag()) == [(1, 2.0), (3, 4.0)]
+    assert list(reader.read()) == [(1, 2.0), (3, 4.0)]
     assert reader.ended
     reader.close()
 
@@ -144,9 +144,9 @@ def test_a_file_says_its_unit_of_time_and_loses_no_nanosecond(tmp_path, text, fo
     path = tmp_path / "counts.csv"
     path.write_text(text)
     reader = CsvReader(path)
-    assert list(reader.read_bag()) == found
+    assert list(reader.read()) == found
     assert reader.ended
-    assert list(reader.read_bag()) == []
+    assert list(reader.read()) == []
 
 
 def test_a_file_with_another_header_or_line_is_refused(tmp_path):

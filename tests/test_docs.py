@@ -49,17 +49,6 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", heading).strip().lower().replace(" ", "-") for heading in found}
 
 
-_LINES = 400  # of a file of the package that needs no reason
-_REASON = re.compile(r"^Longer than 400 lines: \S", re.MULTILINE)
-
-
-def test_a_file_beyond_400_lines_says_why() -> None:
-    texts = {path: path.read_text(encoding="utf-8") for path in (ROOT / "lathe_rc").rglob("*.py")}
-    long = {path: text for path, text in texts.items() if text.count("\n") > _LINES}
-    said = {path: ast.get_docstring(ast.parse(text)) or "" for path, text in long.items()}
-    assert [name(path) for path, docstring in said.items() if not _REASON.search(docstring)] == []
-
-
 class TestReference:
     def test_page_is_what_the_command_prints(self) -> None:
         printed = CliRunner().invoke(cli.main, ["reference"])

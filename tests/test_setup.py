@@ -131,6 +131,7 @@ def test_machine_without_wheels(monkeypatch):
     ],
 )
 def test_help_sets_nothing_up(copy, words, shown):
+    shutil.rmtree(copy / "lathe_rc")
     (copy / "lathe_rc").symlink_to(CHECKOUT / "lathe_rc")
     result = lathe(copy, *words)
     assert (result.returncode, result.stderr) == (0, "")

@@ -172,7 +172,7 @@ def test_result_is_frozen_and_its_loop_is_told(name):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["fork"], "no study 'fork'; allowed: invariance, "),
+        (["fork"], "no study 'fork'; allowed: angle-domain, "),
         (["invarience"], "no study 'invarience'; did you mean invariance?"),
         (["invariance", "--set", "t0_ms"], "--set 't0_ms'; allowed: PARAM=VALUE"),
         (["invariance", "--set", "t0=2"], "invariance.t0: unknown parameter; did you mean t0_ms?"),

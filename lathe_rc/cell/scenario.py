@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenarios: ROS 2 parameter files that describe a whole cell.
-
-Longer than 400 lines: a scenario's way from its text to its tables, and back.
-"""
+"""Scenarios: ROS 2 parameter files that describe a whole cell."""
 
 import hashlib
 import json

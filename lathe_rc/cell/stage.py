@@ -12,9 +12,6 @@ It computes the block that begins at sample ``first``, from its sample ``start``
 (`DONE`) or until Python has to do something (any other reason, see `Stage.serve`), and is called again from there.
 Inputs are the arrays of float64 of all fields of all input ports in their order, flags are those of uint8, or an empty
 one if there are none, and outputs are the arrays of all fields of all output ports.
-
-Longer than 400 lines: ports, messages, triggers and faults of a stage make one contract, which whoever writes a stage
-has to know as a whole.
 """
 
 import re

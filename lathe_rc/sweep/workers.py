@@ -145,14 +145,29 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[distribute
         with client:
             yield client
         return
+    with _safe_path(), _cluster(workers) as cluster, distributed.Client(cluster, set_as_default=False) as client:
+        yield client
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Keep the current folder off the path of Python processes that are started meanwhile."""
+    before = os.environ.get("PYTHONSAFEPATH", "")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        os.environ["PYTHONSAFEPATH"] = before  # empty: as if it were not set
+
+
+def _cluster(workers: int | None) -> distributed.LocalCluster:
     # Ctrl-C is for this process, which ends its workers.
     before = None
     if threading.current_thread() is threading.main_thread():
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        os.environ["PYTHONSAFEPATH"] = "1"  # of the workers: the current folder is not on their path
         with dask.config.set(_SETTINGS):
-            cluster = distributed.LocalCluster(
+            return distributed.LocalCluster(
                 n_workers=workers,
                 threads_per_worker=1,
                 host="127.0.0.1",  # a process that reaches a scheduler or a worker runs code there
@@ -162,8 +177,6 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[distribute
     finally:
         if before is not None:
             signal.signal(signal.SIGINT, before)
-    with cluster, distributed.Client(cluster, set_as_default=False) as client:
-        yield client
 
 
 def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: int) -> Generator[pa.Table]:
