@@ -338,7 +338,7 @@ def test_a_run_imports_the_stages_that_its_cell_has():
     *_, modules = subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
     begin = "lathe_rc.cell.stages."
     imported = {module.removeprefix(begin) for module in modules.split() if module.startswith(begin)}
-    assert imported >= {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "profile", "tool"}
+    assert imported >= {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "form", "tool"}
     assert not imported & {"compound_controller", "cutting_process", "feed_drive", "loaded_drive", "piezo_actuator"}
 
 
