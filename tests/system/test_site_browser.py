@@ -77,7 +77,7 @@ def site(tmp_path_factory):
         server.shutdown()
 
 
-@pytest.mark.parametrize("page", ["", "learning/", "robust/", "decoupling/", "studies/", "api/harness/"])
+@pytest.mark.parametrize("page", ["", "learning/", "robust/", "force_position/", "studies/", "api/harness/"])
 def test_a_page_is_quiet_and_asks_nobody(site, tmp_path, page):
     visit = Visit(f"{site[1]}/{page}", tmp_path, OFFLINE)
     assert visit.console == []
@@ -87,9 +87,9 @@ def test_a_page_is_quiet_and_asks_nobody(site, tmp_path, page):
 def test_the_check_would_see_a_stranger_and_a_complaint(site, tmp_path):
     folder, address = site
     evil = '<img src="http://tracker.invalid/x.png"><script>console.error("complaint")</script></body>'
-    text = (folder / "drive" / "index.html").read_text(encoding="utf-8")
-    (folder / "drive" / "bad.html").write_text(text.replace("</body>", evil), encoding="utf-8")
-    visit = Visit(f"{address}/drive/bad.html", tmp_path, OFFLINE)
+    text = (folder / "drives" / "index.html").read_text(encoding="utf-8")
+    (folder / "drives" / "bad.html").write_text(text.replace("</body>", evil), encoding="utf-8")
+    visit = Visit(f"{address}/drives/bad.html", tmp_path, OFFLINE)
     assert visit.requests == ["http://tracker.invalid/x.png"]
     assert any("complaint" in line for line in visit.console)
 
@@ -104,16 +104,16 @@ def test_search_finds_a_word_in_pages_and_docstrings(site, tmp_path):
             places = Quiet.told.get(timeout=120).split(",")
         finally:
             browser.kill()
-    assert "/predistortion/" in places
+    assert "/force_position/" in places
     assert "/api/control/" in places
 
 
 @pytest.mark.parametrize("width", [1280, 420])
 def test_equations_and_diagrams_are_rendered_and_nothing_is_wider_than_the_page(site, tmp_path, width):
     folder, address = site
-    text = (folder / "loaded" / "index.html").read_text(encoding="utf-8")
-    (folder / "loaded" / "told.html").write_text(text.replace("</body>", _TELL), encoding="utf-8")
-    visit = Visit(f"{address}/loaded/told.html", tmp_path, OFFLINE, f"--window-size={width},900")
+    text = (folder / "drives" / "index.html").read_text(encoding="utf-8")
+    (folder / "drives" / "told.html").write_text(text.replace("</body>", _TELL), encoding="utf-8")
+    visit = Visit(f"{address}/drives/told.html", tmp_path, OFFLINE, f"--window-size={width},900")
     told = re.search(r"<title>fonts true display (\d+) diagram (\d+) left 0 beyond 0</title>", visit.document)
     assert told, re.search(r"<title>.*</title>", visit.document)[0]
     assert 30 < int(told[1]) < 300
