@@ -73,7 +73,9 @@ def test_sdists_hold_what_is_built_and_no_tests_and_caches(dist):
         with tarfile.open(path) as archive:
             names = {member.name.partition("/")[2] for member in archive if member.isfile()}
         assert needed <= names
-        assert [name for name in names if name.startswith(("tests/", ".")) or "cache" in name] == []
+        assert [
+            name for name in names if name.startswith(("tests/", ".")) or "cache/" in name or name.endswith(".pyc")
+        ] == []
 
 
 def environment(dist: Path, place: Path, wanted: str) -> "Installed":
