@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line of a node's executable: what ROS does not answer or refuse; this module imports no ROS."""
 
-import contextlib
 import json
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
@@ -112,11 +110,7 @@ def exit_with(work: Callable[[], int]) -> NoReturn:
     except LatheError as error:
         print(f"lathe: {error}", file=sys.stderr)
         code = error.exit_code
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):
-            stream.flush()
-    # Not sys.exit: destructors of Fast DDS may wait for ever while the process and others end.
-    os._exit(code)
+    sys.exit(code)
 
 
 def rules(words: Sequence[str]) -> Iterator[Rule]:

@@ -116,7 +116,7 @@ def test_equations_and_diagrams_are_rendered_and_nothing_is_wider_than_the_page(
     visit = Visit(f"{address}/drives/told.html", tmp_path, OFFLINE, f"--window-size={width},900")
     told = re.search(r"<title>fonts true display (\d+) diagram (\d+) left 0 beyond 0</title>", visit.document)
     assert told, re.search(r"<title>.*</title>", visit.document)[0]
-    assert 30 < int(told[1]) < 300
+    assert 20 < int(told[1]) < 300
     assert 60 < int(told[2]) < 1000
     assert visit.console == []
 
