@@ -166,27 +166,19 @@ def _tune(name: str) -> None:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> NoReturn:
-    """Run nodes in this process until they are done, fail or are told to stop, and end the process.
-
-    Its exit code is 0, or that of the first node that has failed, or whose cell went to its safe state.
+def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
+    """Run nodes in this process until they are done, fail or are told to stop.
 
     Args:
         members: name and kind of each node.
         args: command line of ROS, from ``--ros-args`` on.
 
+    Returns:
+        The exit code: 0, or that of the first node that has failed, or whose cell went to its safe state.
+
     Raises:
         InputError: a parameter file lies in a bag, and names code that is not allowed or files elsewhere.
     """
-    code = _exit_code(members, args)
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):
-            stream.flush()
-    # Not sys.exit: destructors of Fast DDS may wait for ever while this process and others end.
-    os._exit(code)
-
-
-def _exit_code(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
     for file in arguments.parameter_files(args):
         if allowed_code.bag_around(file.parent) is not None:
             scenarios.load(file)  # it is data, and refused if it names code or files elsewhere
