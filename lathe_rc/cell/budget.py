@@ -186,7 +186,7 @@ def _model(scenario: Scenario) -> dict[str, Cause]:
 def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
     """The part that Q forgets: off, each Q is 1 as far as its channel converges with it."""
     off: dict[str, Value] = {}
-    low, high = cell.master.speed_range()
+    low, high = cell.speed_range
     for stage in cell.stages.values():
         if isinstance(stage, LearningController):
             responses = [response for response, _ in stage.learned(cell.stages.values())]

@@ -124,6 +124,10 @@ class WiredCell(Protocol):
     def master(self) -> Any:
         """Time master, see `lathe_rc.cell.stages.time_master.TimeMaster`."""
 
+    @property
+    def speed_range(self) -> tuple[float, float]:
+        """Lowest and highest speed of its spindle in the run [rad/s]."""
+
     def node_of(self, topic: str) -> str | None:
         """Name of the member that publishes a topic of blocks; None: there is none."""
 

@@ -219,6 +219,11 @@ class Cell:
             raise InputError(f"{len(found)} time masters in the scenario; allowed: 1, a {' or '.join(MASTERS)}")
         return found[0]
 
+    @cached_property
+    def speed_range(self) -> tuple[float, float]:
+        """Lowest and highest speed of the spindle in the run [rad/s]; looked for once, among many samples."""
+        return self.master.speed_range()
+
     @property
     def samples(self) -> int:
         """Length of a run.

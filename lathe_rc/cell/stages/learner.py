@@ -113,7 +113,7 @@ class Learner(Obedient):
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
         """See `Stage`: the errors of a cycle come in time, and learning converges."""
         super().check_cell(cell, cures=cures)
-        low, high = cell.master.speed_range()
+        low, high = cell.speed_range
         self._check_delay(cell, high)
         self._check_convergence(cell, self.checked_speeds(low, high), cures=cures)
         cell.warnings += self.encoder_warnings(low, high, cell.master.parameters.counts_per_revolution)

@@ -73,7 +73,7 @@ class TimeMaster(Stage):
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
         """See `Stage`: the spindle must turn, and not too fast for the sampling rate."""
         super().check_cell(cell, cures=cures)
-        low, high = self.speed_range()
+        low, high = cell.speed_range
         if low <= 0.0:
             raise InputError(
                 f"{self.name}.nominal_rpm and its deviations: speed falls to {low:.4g} rad/s; allowed: above 0"

@@ -168,7 +168,7 @@ class Tool(Stage):
         if owner is None or owner.form is None:
             return
         if isinstance(source, Drive):
-            speed, acceleration = cell.master.speed_range()[1], cell.master.largest_acceleration()
+            speed, acceleration = cell.speed_range[1], cell.master.largest_acceleration()
             demand = owner.form.profile.demand(speed, acceleration, owner.parameters.feed)
             for of, limits in source.limits().items():
                 if remapped(source.shared, of) == topic:
