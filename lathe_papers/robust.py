@@ -299,11 +299,15 @@ def model(frequency: float = 1.0, damping: float = 1.0, delay: float = 1.0) -> V
 
 
 def _cell(
-    bases: Mapping[tuple[str, bool], Scenario], condition: str, law: str, drive: tuple[float, float, float, float]
+    bases: Mapping[tuple[str, bool], Scenario],
+    condition: str,
+    law: str,
+    drive: tuple[float, float, float, float],
+    seed: int = 0,
 ) -> Scenario:
     frequency, damping, _, delay = drive
     told = model(frequency, damping, delay) if law == _KNOWS else model()
-    return bases[law, condition == _SLOWED].varied({**CONDITIONS[condition], **machine(*drive), **told})
+    return bases[law, condition == _SLOWED].varied({**CONDITIONS[condition], **machine(*drive), **told, "seed": seed})
 
 
 def _margin(scenario: Scenario) -> float:
@@ -336,9 +340,7 @@ def run(parameters: RobustParameters, track: Track = untracked) -> RobustResult:
         for slowed, spindle in ((False, {}), (True, _SPINDLE))
     }
     drives = drives_near(count)
-    made = [
-        _cell(bases, *names).varied({"seed": seed}) for *names, seed in product(conditions, LAWS, drives, range(seeds))
-    ]
+    made = [_cell(bases, *names) for names in product(conditions, LAWS, drives, range(seeds))]
     shape = len(conditions), len(LAWS), len(drives), seeds
     largest, rms, settled, effort = np.full((4, *shape), np.nan)
     curves = np.full((*shape, revolutions), np.nan)
