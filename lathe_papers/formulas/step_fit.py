@@ -19,6 +19,7 @@ import numpy.typing as npt
 import scipy
 
 from lathe_papers.formulas.responses import second_order
+from lathe_rc.analysis.reduced_order import refuse_unusable
 from lathe_rc.errors import InputError
 from lathe_rc.signals.table import read_table
 
@@ -43,10 +44,7 @@ class StepResponse:
 
     def __post_init__(self) -> None:
         time, response = self.time, self.response
-        if time.size != response.size or time.size < 8:
-            raise InputError(f"step response: {time.size} times, {response.size} values; allowed: 8 or more of each")
-        if not (np.all(np.isfinite(time)) and np.all(np.isfinite(response))):
-            raise InputError("step response: not all numbers are finite; remove those that are not")
+        refuse_unusable("step response", time, response, 8)
         falling = np.flatnonzero(np.diff(time) <= 0.0)
         if falling.size:
             a, b = time[falling[0]], time[falling[0] + 1]

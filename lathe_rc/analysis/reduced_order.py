@@ -32,6 +32,24 @@ _MOST = 60  # steps of a search; the best of several counts
 _LARGEST_LAG = 100.0  # of the inverse, over the least one
 
 
+def refuse_unusable(what: str, time: Array, response: Array, least: int) -> None:
+    """Refuse a measured response that is too short, or not finite.
+
+    Args:
+        what: it is, in words.
+        time: [s], shape (n,).
+        response: shape (n,).
+        least: smallest n.
+
+    Raises:
+        InputError: it is one of these.
+    """
+    if time.size != response.size or time.size < least:
+        raise InputError(f"{what}: {time.size} times, {response.size} values; allowed: {least} or more of each")
+    if not (np.all(np.isfinite(time)) and np.all(np.isfinite(response))):
+        raise InputError(f"{what}: not all numbers are finite; remove those that are not")
+
+
 @dataclass(frozen=True)
 class ChannelStep:
     """A measured response to a step of 1 at time 0.
@@ -49,10 +67,7 @@ class ChannelStep:
 
     def __post_init__(self) -> None:
         time, response = self.time, self.response
-        if time.size != response.size or time.size < 16:
-            raise InputError(f"channel: {time.size} times, {response.size} values; allowed: 16 or more of each")
-        if not (np.all(np.isfinite(time)) and np.all(np.isfinite(response))):
-            raise InputError("channel: not all numbers are finite; remove those that are not")
+        refuse_unusable("channel", time, response, 16)
         steps = np.diff(time)
         if time[0] != 0.0 or steps[0] <= 0.0 or np.abs(steps - steps[0]).max() > 1e-3 * steps[0]:
             raise InputError(
