@@ -6,7 +6,7 @@ tests/test_site.py compares the picture with the imports in the code.
 
 from typing import NamedTuple
 
-from place import PICTURES
+from place import PICTURES, drawing
 
 
 class Layer(NamedTuple):
@@ -88,17 +88,7 @@ def picture() -> str:
         (x, y, width), (other, _, _) = found[start], found[end]
         drawn.append(arrow(f"M {x + width:g} {y + HEIGHT / 2:g} H {other - 3:g}"))
     height = TOP + len(LAYERS) * (HEIGHT + GAP)
-    tip = '<marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
-    return "\n".join(
-        [
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {LEFT + WIDTH + RIGHT} {height}">',
-            "<!-- SPDX-License-Identifier: Apache-2.0; drawn by figures/architecture.py -->",
-            f"<style>{STYLE}</style>",
-            f'<defs>{tip}<path d="M 0 0 L 8 4 L 0 8 z" fill="#7f8c92"/></marker></defs>',
-            *drawn,
-            "</svg>\n",
-        ]
-    )
+    return drawing("architecture.py", LEFT + WIDTH + RIGHT, height, STYLE, drawn)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ All colours can be read on a light and on a dark page.
 
 import math
 
-from place import PICTURES
+from place import PICTURES, drawing
 
 WIDTH, HEIGHT = 712, 316
 X, Y = 150, 138  # centre of the part
@@ -91,17 +91,7 @@ def picture() -> str:
         arrow(f"M {edge + 273} 247 V {Y + 30}"),
         caption(edge + 204, 212, "commands", "middle"),
     ]
-    tip = '<marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7"'
-    return "\n".join(
-        [
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}">',
-            "<!-- SPDX-License-Identifier: Apache-2.0; drawn by figures/machine.py -->",
-            f"<style>{STYLE}</style>",
-            f'<defs>{tip} orient="auto-start-reverse"><path d="M 0 0 L 8 4 L 0 8 z" fill="#7f8c92"/></marker></defs>',
-            *drawn,
-            "</svg>\n",
-        ]
-    )
+    return drawing("machine.py", WIDTH, HEIGHT, STYLE, drawn)
 
 
 if __name__ == "__main__":
