@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from cells import SCENARIOS, scenario
+from cells import scenario
 from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
@@ -14,7 +14,6 @@ from lathe_rc import harness
 from lathe_rc.analysis.budget import Decomposition
 from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.cell import budget as budgets
-from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.cli import main
 
@@ -102,8 +101,7 @@ ADDING = [
 
 
 def budget(name, revolutions, *overrides):
-    (path,) = (path for path in SCENARIOS if path.stem == name)
-    return lathe_rc.budget(scenarios.load(path, [f"spindle_encoder.revolutions={revolutions}", *overrides]))
+    return lathe_rc.budget(lathe_rc.load(name, [f"spindle_encoder.revolutions={revolutions}", *overrides]))
 
 
 @pytest.mark.parametrize("given", ADDING, ids=lambda given: f"{given[0]}{len(given) - 2 or ''}")
@@ -156,12 +154,8 @@ def test_the_part_of_q_is_the_steady_error_of_the_formula():
 def test_the_part_of_the_lead_is_the_slope_times_the_angle_that_it_misses():
     """A constant lead angle misses φ(t+T0) - φ(t) - T0·Ω0 of the oval a·sin 2φ, at a frozen memory."""
     lead_time, oval, frequency = 2e-3, 225e-6, 10.7
-    given = {
-        "lead_law": "constant_angle",
-        "lead_time": lead_time,
-        "q_time": 130e-6,
-        "events": ["revolution 15: freeze"],
-    }
+    law = {"lead_law": "constant_angle", "lead_time": lead_time, "q_time": 130e-6}
+    given = {**law, "events": ["revolution 15: freeze"]}
     swing = {"deviation_amplitude": [0.05], "deviation_frequency": [frequency], "deviation_start": 15 * 0.06}
     cell = scenario(spindle_encoder={"revolutions": 40.0, **swing}, learning_controller=given)
     parts = {part.name: part.rms for part in lathe_rc.budget(cell).causes}
@@ -209,18 +203,15 @@ def test_a_q_that_cannot_be_flat_is_left_out_and_said_to_be():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (
-            ("force_turning", "--revolutions", "2"),
-            "no form error to budget: the cell has no encoder and tool; allowed: ",
-        ),
-        (("piston", "--revolutions", "0.5"), "budget of piston: no complete revolution; allowed: "),
-        (("piston", "--revolutions", "1e-9"), "budget of piston: no complete revolution; allowed: "),
-        (("piston", "--revolutions", "11.9996"), "its runs end with another revolution each"),
-        (("piston", "--set", "tool.fed=1.0"), "tool.fed: unknown parameter; "),
+        ("force_turning --revolutions 2", "no form error to budget: the cell has no encoder and tool; allowed: "),
+        ("piston --revolutions 0.5", "budget of piston: no complete revolution; allowed: "),
+        ("piston --revolutions 1e-9", "budget of piston: no complete revolution; allowed: "),
+        ("piston --revolutions 11.9996", "its runs end with another revolution each"),
+        ("piston --set tool.fed=1.0", "tool.fed: unknown parameter; "),
     ],
 )
 def test_what_has_no_budget_is_refused_in_a_line(arguments, said):
-    refused = CliRunner().invoke(main, ["budget", *arguments])
+    refused = CliRunner().invoke(main, ["budget", *arguments.split()])
     assert refused.exit_code == 2
     assert refused.stderr.startswith("lathe: ")
     assert said in refused.stderr

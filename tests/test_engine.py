@@ -36,9 +36,7 @@ def busy():
 
 @settings(max_examples=15)
 @example(1)
-@example(32)
 @example(63)
-@example(256)
 @given(st.integers(1, 1500))
 def test_block_size_changes_no_digest(busy, block_size):
     assert run({"block_size": block_size}, **BUSY).digest == busy.digest
@@ -102,13 +100,11 @@ def plain():
 @pytest.mark.parametrize(
     ("when", "index"),
     [
-        ("sample 12345", 12345),
         ("sample 12344.5", 12345),
         ("second 0.2", 12800),
         ("second 0.20001", 12801),
         ("revolution 2.0001", 7681),
         ("revolution 2.4999", 9600),
-        ("sample 0", 0),
         ("revolution 0", 0),
     ],
 )

@@ -1,21 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feed, force and position loops in the cell: what their scenarios promise, and the same bits in every host."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from lathe_rc import harness
-from lathe_rc.cell import scenario
+from lathe_rc.cell.scenario import load
+from lathe_rc.control.predistortion import Predistortion, cancelling, proportional
 from lathe_rc.errors import InputError
 
-CONFIG = Path(__file__).parents[1] / "config"
 
-
-def load(name, *overrides):
-    return scenario.load(CONFIG / f"{name}.yaml", overrides)
+def run(name, *overrides):
+    return harness.run(load(name, overrides))
 
 
 def dense(result, topic):
@@ -24,7 +21,7 @@ def dense(result, topic):
 
 @pytest.fixture(scope="module")
 def turning():
-    return harness.run(load("force_turning"))
+    return run("force_turning")
 
 
 def after(result, seconds):
@@ -47,7 +44,7 @@ class TestForce:
         """The force varies less than without control; the paper has a factor of 1.88 for its own allowance."""
         cut = dense(turning, "cut")
         settled = slice(after(turning, 2.0), None)
-        free = harness.run(load("force_turning", "cutting_process.moved_by=['cross']", *held_open()))
+        free = run("force_turning", *HELD_OPEN)
         disturbed = dense(free, "cut")["force"][settled]
         assert np.std(cut["force"][settled]) < 0.6 * np.std(disturbed - drift(disturbed))
 
@@ -55,13 +52,13 @@ class TestForce:
         """A step to 150 N overshoots by more than 8 %, 300 N/s by less than 2 %."""
         quiet = ("cutting_process.allowance_rms=0.0", "cutting_process.run_out_amplitude=[0.0]")
         quiet += ("spindle_encoder.revolutions=50.0", "cutting_process.wear_per_second=0.0")
-        smooth = harness.run(load("force_turning", *quiet))
-        step = harness.run(load("force_turning", *quiet, "force_controller.set_point_ramp=0.0"))
+        smooth = run("force_turning", *quiet)
+        step = run("force_turning", *quiet, "force_controller.set_point_ramp=0.0")
         assert dense(smooth, "cut")["force"].max() < 1.02 * 150.0
         assert dense(step, "cut")["force"].max() > 1.08 * 150.0
 
     def test_dies_away_in_the_gap_as_its_lag_says(self):
-        result = harness.run(load("interrupted_cut", "spindle_encoder.revolutions=60.0"))
+        result = run("interrupted_cut", "spindle_encoder.revolutions=60.0")
         cut, angle = dense(result, "cut"), dense(result, "encoder")["angle_true"]
         turn, place = np.divmod(angle, 2 * np.pi)
         gap = np.flatnonzero((turn == 50) & (place > 3.0) & (place < 3.25))
@@ -71,15 +68,15 @@ class TestForce:
         assert np.all(cut["depth_of_cut"][(turn == 50) & (place < 3.0)] > 0.0)
 
 
-def held_open():
-    """The cut at the feed of the paper, with nothing controlled."""
-    cross = ("longitudinal.axis=cross", "force_controller.remap=['longitudinal/command:=cross/command']")
-    return (
-        *cross,
-        "force_controller.set_point=[0.0]",
-        "force_controller.integral=0.0",
-        "longitudinal.velocity_gain=1e-12",
-    )
+#: the cut at the feed of the paper, with nothing controlled
+HELD_OPEN = (
+    "cutting_process.moved_by=['cross']",
+    "longitudinal.axis=cross",
+    "force_controller.remap=['longitudinal/command:=cross/command']",
+    "force_controller.set_point=[0.0]",
+    "force_controller.integral=0.0",
+    "longitudinal.velocity_gain=1e-12",
+)
 
 
 def drift(force):
@@ -90,20 +87,18 @@ def drift(force):
 
 class TestApproach:
     def test_comes_from_one_side_and_stays(self):
-        result = harness.run(load("approach"))
+        result = run("approach")
         slide = dense(result, "cross/state")
         assert np.all(np.diff(slide["position"]) >= -1e-15)
         assert_allclose(slide["position"][-1], 5e-3, atol=1e-9)
         assert slide["position"].max() <= 5e-3 + 1e-9
 
     def test_motor_feedback_leaves_half_the_gap(self):
-        result = harness.run(load("approach", "feed_drive.feedback=motor"))
+        result = run("approach", "feed_drive.feedback=motor")
         assert_allclose(5e-3 - dense(result, "cross/state")["position"][-1], 10e-6, atol=1e-9)
 
     def test_link_of_the_paper_swings_between_the_samples(self):
-        result = harness.run(
-            load("approach", "position_controller.link=paper", "position_controller.feedback_delay=64")
-        )
+        result = run("approach", "position_controller.link=paper", "position_controller.feedback_delay=64")
         assert dense(result, "cross/state")["position"].max() > 1.2 * 5e-3
 
 
@@ -111,7 +106,7 @@ class TestPeriodicLaw:
     @pytest.fixture(scope="class")
     @classmethod
     def status(cls):
-        return harness.run(load("periodic")).recording.sparse["/cross/periodic"].values
+        return run("periodic").recording.sparse["/cross/periodic"].values
 
     def test_error_falls_as_in_the_paper_in_spite_of_the_delay(self, status):
         assert status["period"] == list(range(1, 9))
@@ -128,15 +123,14 @@ class TestPeriodicLaw:
 
     def test_divisor_and_unit_are_a_slower_law_in_other_numbers(self, status):
         """A tenth of the rate, millimetres for metres: the drive has a thousandth of the gain per millimetre."""
-        scaled = harness.run(
-            load("periodic", "sample_rate=10000", "block_size=40", "position_controller.feedback_delay=40",
-                 "position_controller.divisor=10", "feed_drive.divisor=10", "spindle_encoder.revolutions=50.0")
-        )  # fmt: skip
+        rate = ("sample_rate=10000", "block_size=40", "position_controller.feedback_delay=40")
+        divisors = ("position_controller.divisor=10", "feed_drive.divisor=10")
+        scaled = run("periodic", *rate, *divisors, "spindle_encoder.revolutions=50.0")
         values = scaled.recording.sparse["/cross/periodic"].values
         assert_allclose(values["max_error"], status["max_error"][:2], rtol=1e-2)
 
     def test_status_does_not_depend_on_the_blocks(self, status):
-        one = harness.run(load("periodic", "block_size=1", "spindle_encoder.revolutions=50.0"))
+        one = run("periodic", "block_size=1", "spindle_encoder.revolutions=50.0")
         values = one.recording.sparse["/cross/periodic"].values
         assert values == {name: column[:2] for name, column in status.items()}
 
@@ -147,13 +141,7 @@ class TestFullCell:
     @pytest.fixture(scope="class")
     @classmethod
     def offline(cls):
-        return harness.run(load("full_cell", *cls.SHORT))
-
-    @pytest.fixture(scope="class")
-    @classmethod
-    def longer(cls):
-        """Long enough for a recorder beside the spindle to complete a block while the spindle makes another."""
-        return harness.run(load("full_cell", "spindle_encoder.revolutions=40.0"))
+        return run("full_cell", *cls.SHORT)
 
     def test_grouped_processes_give_its_digests(self, offline):
         """In the processes that the scenario names."""
@@ -162,17 +150,19 @@ class TestFullCell:
         assert grouped.digest == offline.digest
 
     @pytest.mark.system
-    def test_recorder_and_loops_in_processes_of_their_own_give_its_digests(self, longer):
+    def test_recorder_and_loops_in_processes_of_their_own_give_its_digests(self):
+        """In a run in which a recorder beside the spindle completes a block while the spindle makes another."""
+        longer = run("full_cell", "spindle_encoder.revolutions=40.0")
         loops = ["cutting_process", "longitudinal", "force_controller"]
         inside = [name for name in longer.scenario.nodes if name not in ("recorder", *loops)]
         groups = [inside, loops, ["recorder"]]
         assert harness.run(longer.scenario, mode="processes", groups=groups).digest == longer.digest
 
     def test_blocks_change_no_bit(self, offline):
-        assert harness.run(load("full_cell", *self.SHORT, "block_size=17")).digest == offline.digest
+        assert run("full_cell", *self.SHORT, "block_size=17").digest == offline.digest
 
     def test_form_force_and_edge_are_held_together(self):
-        result = harness.run(load("full_cell", "spindle_encoder.revolutions=100.0"))
+        result = run("full_cell", "spindle_encoder.revolutions=100.0")
         settled = slice(after(result, 3.0), None)
         assert result.errors.rms[-1] < 1e-6
         assert_allclose(dense(result, "cut")["force"][settled].mean(), 150.0, atol=1.0)
@@ -181,109 +171,76 @@ class TestFullCell:
         assert deflection.mean() > 50e-6
         assert np.abs(dense(result, "cross/state")["position"][settled] - deflection).max() < 1e-6
 
-    def test_a_block_longer_than_the_delay_is_refused_with_the_reason(self):
-        with pytest.raises(
-            InputError, match="is delayed by 64 samples, block_size = 128; allowed: a block no longer than"
-        ):
-            harness.run(load("full_cell", "block_size=128"))
-
 
 def test_slow_controllers_compute_at_multiples_of_their_divisor():
-    result = harness.run(
-        load("force_turning", "force_controller.divisor=96", "force_controller.feedback_delay=70", "block_size=50",
-             "spindle_encoder.revolutions=3.0")
-    )  # fmt: skip
-    command = dense(result, "longitudinal/command")["command"]
+    slow = ("force_controller.divisor=96", "force_controller.feedback_delay=70", "block_size=50")
+    command = dense(run("force_turning", *slow, "spindle_encoder.revolutions=3.0"), "longitudinal/command")["command"]
     changes = np.flatnonzero(np.diff(command)) + 1
     assert changes.size > 10
     assert np.all(changes % 96 == 0)
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("name", "changes", "told"),
     [
-        (["position_controller.trajectory=csv"], "trajectory_file is empty"),
-        (["position_controller.set_point=[1.0, 2.0]"], "set_point, set_point_time: 2 values and 1 times"),
+        ("approach", {"trajectory": "csv"}, "trajectory_file is empty"),
+        ("approach", {"set_point": [1.0, 2.0]}, "set_point, set_point_time: 2 values and 1 times"),
+        ("approach", {"set_point_time": [1.0, 1.0], "set_point": [1.0, 2.0]}, "each later than"),
+        ("approach", {"feed_drive.model": "dc_screw", "feed_drive.zero": 0.1}, "feed drive"),
+        ("approach", {"law": "periodic_hyperstable", "period": 0.0001}, "period"),
+        ("approach", {"predistortion_file": "/nowhere.csv"}, "/nowhere.csv"),
+        ("approach", {"link": "paper", "link_gain": 20.0}, "feedback_delay, link: "),
+        ("force_turning", {"gap_start": [1.0]}, "gap_start, gap_width: 1 and 0"),
+        ("force_turning", {"hard_spot_start": [1.0]}, "hard_spot_"),
+        ("force_turning", {"moved_by": ["longitudinal", "longitudinal"]}, "each once"),
+        ("force_turning", {"allowance_rate": 1e-6}, "allowance_rms and allowance_rate"),
+        ("force_turning", {"run_out_amplitude": []}, "run-out"),
         (
-            ["position_controller.set_point_time=[1.0, 1.0]", "position_controller.set_point=[1.0, 2.0]"],
-            "each later than",
+            "full_cell",
+            {"block_size": 128},
+            "delayed by 64 samples, block_size = 128; allowed: a block no longer",
         ),
-        (["feed_drive.model=dc_screw", "feed_drive.zero=0.1"], "feed drive"),
-        (["position_controller.link_gain=-1.0"], "position_controller.link_gain = -1.0; allowed:"),
-        (["position_controller.law=periodic_hyperstable", "position_controller.period=0.0001"], "period"),
-        (["position_controller.predistortion_file=/nowhere.csv"], "/nowhere.csv"),
-        (["position_controller.link=paper", "position_controller.link_gain=20.0"], "feedback_delay, link: "),
     ],
 )
-def test_bad_servos_are_refused_in_one_line(changes, told):
+def test_bad_servos_cuts_and_blocks_are_refused_in_one_line(name, changes, told):
+    node = {"approach": "position_controller.", "force_turning": "cutting_process."}.get(name, "")
+    values = {key if "." in key else f"{node}{key}": value for key, value in changes.items()}
     with pytest.raises(InputError) as refused:
-        harness.run(load("approach", *changes))
+        harness.run(load(name).varied(values))
     assert told in str(refused.value)
     assert len(str(refused.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize(
-    ("changes", "told"),
-    [
-        (["cutting_process.gap_start=[1.0]"], "gap_start, gap_width: 1 and 0"),
-        (["cutting_process.hard_spot_start=[1.0]"], "hard_spot_"),
-        (["cutting_process.moved_by=['longitudinal', 'longitudinal']"], "each once"),
-        (["cutting_process.allowance_rate=1e-6"], "allowance_rms and allowance_rate"),
-        (["cutting_process.run_out_amplitude=[]"], "run-out"),
-    ],
-)
-def test_bad_cuts_are_refused_in_one_line(changes, told):
-    with pytest.raises(InputError) as refused:
-        harness.run(load("force_turning", *changes))
-    assert told in str(refused.value)
-    assert len(str(refused.value).splitlines()) == 1
-
-
-def test_predistorted_shaft_comes_out_straight(tmp_path):
-    """A thin shaft comes out straight where the position loop follows the path that cancels its deflection."""
-    from lathe_rc.control.predistortion import Predistortion, cancelling, proportional
-
-    straight = ["cutting_process.moved_by=['cross', 'longitudinal']", "cutting_process.shaft=centres", *SHAFT]
-    loaded = scenario.load(write_shaft(tmp_path), straight)
-    bent = harness.run(loaded)
-    shaft = loaded.nodes["cutting_process"].flexible()
-    heights = np.linspace(0.0, shaft.length, 101)
-    stiffness = loaded.nodes["cutting_process"].kc1 * 1e-3 * (71e-6 / 1e-3) ** 0.75
-    path = cancelling(shaft.compliance(heights), proportional(stiffness), 0.643e-3)
-    Predistortion(heights, path).save(tmp_path / "path.csv")
-    followed = harness.run(
-        scenario.load(
-            tmp_path / "shaft.yaml", [*straight, f"position_controller.predistortion_file={tmp_path}/path.csv"]
-        )
-    )
-    first, second = (edge(result) for result in (bent, followed))
-    assert np.ptp(first) > 20e-6
-    assert np.ptp(second) < 0.1 * np.ptp(first)
-
-
-SHAFT = ("cutting_process.shaft_length=0.04", "cutting_process.shaft_diameter=3e-3", "cutting_process.depth=0.643e-3")
-
-
-def edge(result):
-    """Position of the edge out of the part once the cut is steady [m]."""
-    settled = slice(after(result, 1.0), None)
-    return dense(result, "cut")["deflection"][settled] - dense(result, "cross/state")["position"][settled]
-
-
-def write_shaft(folder):
-    """A cell that turns a shaft with a steady feed."""
-    path = folder / "shaft.yaml"
-    path.write_text(
-        """
+SHAFT = """
 /**: {ros__parameters: {nominal_rpm: 3000.0}}
 /spindle_encoder: {ros__parameters: {revolutions: 540.0}}
 /position_controller: {ros__parameters: {trajectory: steps}}
 /cross: {ros__parameters: {stage: feed_drive, axis: cross}}
 /feeder: {ros__parameters: {stage: position_controller, axis: longitudinal, trajectory: csv, trajectory_file: feed.csv}}
 /longitudinal: {ros__parameters: {stage: feed_drive, axis: longitudinal, velocity_gain: 12.4e-3}}
-/cutting_process: {ros__parameters: {lag: 0.0}}
-""",
-        encoding="utf-8",
-    )
-    (folder / "feed.csv").write_text("time_s,position_um\n0,0\n10.8,38340\n", encoding="utf-8")
-    return path
+/cutting_process: {ros__parameters: {
+  lag: 0.0, shaft: centres, shaft_length: 0.04, shaft_diameter: 3e-3, depth: 0.643e-3}}
+"""
+
+
+def test_predistorted_shaft_comes_out_straight(tmp_path):
+    """A thin shaft comes out straight where the position loop follows the path that cancels its deflection."""
+    (tmp_path / "shaft.yaml").write_text(SHAFT, encoding="utf-8")
+    (tmp_path / "feed.csv").write_text("time_s,position_um\n0,0\n10.8,38340\n", encoding="utf-8")
+    loaded = load(tmp_path / "shaft.yaml")
+    table = loaded.nodes["cutting_process"]
+    shaft = table.flexible()
+    heights = np.linspace(0.0, shaft.length, 101)
+    stiffness = table.kc1 * 1e-3 * (71e-6 / 1e-3) ** 0.75
+    path = cancelling(shaft.compliance(heights), proportional(stiffness), table.depth)
+    Predistortion(heights, path).save(tmp_path / "path.csv")
+    followed = loaded.varied({"position_controller.predistortion_file": str(tmp_path / "path.csv")})
+    first, second = (np.ptp(edge(harness.run(each))) for each in (loaded, followed))
+    assert first > 20e-6
+    assert second < 0.1 * first
+
+
+def edge(result):
+    """Position of the edge out of the part once the cut is steady [m]."""
+    settled = slice(after(result, 1.0), None)
+    return dense(result, "cut")["deflection"][settled] - dense(result, "cross/state")["position"][settled]

@@ -15,7 +15,6 @@ from lathe_rc.cell.stage import NEVER, Input, Output, Sparse, Stage
 from lathe_rc.cell.stages.form import FormTable
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.compiled.step import CompiledStep
-from lathe_rc.compiled.struct_view import ports
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import COMMAND, ENCODER
@@ -87,10 +86,9 @@ def test_a_stage_in_python_is_asked_for_each_chunk_and_what_it_says_is_kept():
     cell, tapes = program(stage)
     cell.run(450)
     cell.run(1000)
-    assert stage.blocks == [(k, 100) for k in range(0, 400, 100)] + [(400, 50)] + [
-        (k, 100) for k in range(450, 950, 100)
-    ] + [(950, 50)]
-    assert [message.index for message in cell.said(1, NEVER)] == [first for first, _ in stage.blocks]
+    firsts = [*range(0, 450, 100), *range(450, 1000, 100)]
+    assert stage.blocks == [(first, 50 if first in (400, 950) else 100) for first in firsts]
+    assert [message.index for message in cell.said(1, NEVER)] == firsts
     assert cell.said(1, NEVER) == []
     angle = tapes.view("encoder", 0, 1000)["angle"]
     assert angle[-1] > 0.0
@@ -150,20 +148,6 @@ def test_a_stage_that_has_its_own_process_does_not_inherit_a_step():
 
     assert Other.step is None
     assert SpindleEncoder.step is not None
-
-
-@kernel
-def some_of(table, count, samples):
-    found = ports(table, count, samples)
-    return len(found), found[0][0], found[count - 1][samples - 1], found[-1][samples - 1]
-
-
-@pytest.mark.parametrize("count", [1, 3])
-def test_a_kernel_takes_any_number_of_arrays_by_number(count):
-    arrays = [np.arange(4.0) + 10.0 * place for place in range(count)]
-    table = np.array([array.ctypes.data for array in arrays])
-    assert some_of(table.ctypes.data, count, 4) == (count, 0.0, arrays[-1][-1], arrays[-1][-1])
-    assert len(some_of.signatures) == 1, "compiled once for all"
 
 
 class Doubled(NamedTuple):

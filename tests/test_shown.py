@@ -47,20 +47,11 @@ def test_what_has_no_revolution_says_so():
     short = run(spindle_encoder={"revolutions": 0.5})
     assert repr(short) == "<Result of test: offline, 0 revolutions, no bag>"
     assert "<img" not in short._repr_html_()
-    alone = spindle_alone()
+    alone = harness.run(Scenario("spindle", {"spindle_encoder": scenario().nodes["spindle_encoder"]}))
     assert "0 revolutions" in repr(alone.recording)
-    with pytest.raises(
-        InputError, match=r"^nothing to draw: the recording has no complete revolution; let it run longer"
-    ):
-        short.plot()
-    with pytest.raises(InputError, match=r"^nothing to draw: the recording has no tool; record both"):
-        alone.plot()
-
-
-def spindle_alone():
-    """A run without a tool."""
-    whole = scenario()
-    return harness.run(Scenario("spindle", {"spindle_encoder": whole.nodes["spindle_encoder"]}))
+    for made, why in ((short, "no complete revolution; let it run longer"), (alone, "no tool; record both")):
+        with pytest.raises(InputError, match=f"^nothing to draw: the recording has {why}"):
+            made.plot()
 
 
 def test_a_recording_lists_its_topics_with_units(result):
@@ -84,17 +75,13 @@ def test_a_scenario_is_a_line_and_a_table_of_what_is_set(path):
 
 
 def test_a_scenario_shows_what_is_set_and_only_that():
-    told = {row[0]: row for row in rows(scenario(edge={"stage": "tool", "feed": 1e-4})._repr_html_())}
-    assert told["edge"] == ["edge", "tool", "feed = 0.0001 m/rev"]
-    assert told["tool"] == ["tool", "", ""]
-    assert told["all nodes"] == ["all nodes", "", "run_id = test"]
-
-
-def test_names_that_look_like_html_are_shown_as_they_are():
-    strange = Scenario("<b>&", scenario(edge={"stage": "tool", "remap": ["tool:=a<b>"]}).nodes)
-    head, *nodes = rows(strange._repr_html_())
+    """Names that look like HTML too."""
+    made = scenario(edge={"stage": "tool", "feed": 1e-4}, other={"stage": "tool", "remap": ["tool:=a<b>"]})
+    head, *told = rows(Scenario("<b>&", made.nodes)._repr_html_())
     assert head[0] == "<b>&"
-    assert nodes[-1][2] == "remap = ['tool:=a<b>']"
+    assert ["all nodes", "", "run_id = test"] in told
+    assert ["tool", "", ""] in told
+    assert told[-2:] == [["edge", "tool", "feed = 0.0001 m/rev"], ["other", "tool", "remap = ['tool:=a<b>']"]]
 
 
 class TestPlot:
@@ -110,11 +97,10 @@ class TestPlot:
         assert max(last.get_ydata()) == pytest.approx(result.errors.largest[-1] * 1e6)
         assert len(form.get_lines()) == 2
 
-    def test_of_a_bag_is_that_of_its_run(self, result):
-        assert reader.read_bag(result.bag).plot("test")._repr_png_() == result.plot()._repr_png_()
-
-    def test_is_shown_by_a_notebook_without_pyplot(self, result):
-        assert result.plot()._repr_png_().startswith(b"\x89PNG")
+    def test_of_a_bag_is_that_of_its_run_and_shown_by_a_notebook_without_pyplot(self, result):
+        png = result.plot()._repr_png_()
+        assert png.startswith(b"\x89PNG")
+        assert reader.read_bag(result.bag).plot("test")._repr_png_() == png
 
     def test_of_a_snapshot_counts_the_revolutions_of_the_run(self, tmp_path):
         recorder = {"mode": "both", "pre": 0.03, "post": 0.15, "triggers": ["*: freeze"]}
