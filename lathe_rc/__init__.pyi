@@ -17,8 +17,8 @@ from lathe_rc.cell.stage import Input as Input
 from lathe_rc.cell.stage import Output as Output
 from lathe_rc.cell.stage import Stage as Stage
 from lathe_rc.cell.stages.law import Law as Law
-from lathe_rc.cell.stages.law import LawParameters as LawParameters
 from lathe_rc.cell.stages.law import Now as Now
+from lathe_rc.cell.stages.learner import LawParameters as LawParameters
 from lathe_rc.cell.stages.plant import Plant as Plant
 from lathe_rc.cell.stages.plant import PlantParameters as PlantParameters
 from lathe_rc.errors import InputError as InputError

@@ -177,7 +177,7 @@ class Errors:
         self._errors = RunningErrors()
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Take a piece of the run, as a sink of the engine."""
         if self._encoder and self._tool:
             self._errors.add(dense[self._encoder]["angle_true"], dense[self._tool]["error"])
 

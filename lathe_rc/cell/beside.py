@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le
 
-from lathe_rc.cell.parameters import Table, parameter
+from lathe_rc.cell.parameters import NonNegative, Table, parameter
 
 REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER = "replayer", "rerun_bridge", "topic_recorder"  #: kinds of node
 REPLAYED_FILES = "lathe-replay-"  #: begins the name of the temporary folder with the files of a replayed bag
@@ -19,10 +19,10 @@ class ReplayerParameters(Table):
     """The messages to send again, and their pace."""
 
     bag: str = parameter("", "folder or file of the bag", path=True)
-    rate: Annotated[float, Ge(0)] = parameter(1.0, "pace against the bag's time; 0: as fast as the readers follow")
+    rate: NonNegative = parameter(1.0, "pace against the bag's time; 0: as fast as the readers follow")
     loop: bool = parameter(default=False, doc="begin again at the end")
-    start: Annotated[float, Ge(0)] = parameter(0.0, "where to begin, counted from the bag's first message", "s")
-    end: Annotated[float, Ge(0)] = parameter(0.0, "where to end, counted from the bag's first message; 0: its end", "s")
+    start: NonNegative = parameter(0.0, "where to begin, counted from the bag's first message", "s")
+    end: NonNegative = parameter(0.0, "where to end, counted from the bag's first message; 0: its end", "s")
     topics: list[str] = parameter([], "fully qualified; none: all but /clock")
     wait: Annotated[int, Ge(0)] = parameter(0, "readers that each topic must have before the first message is sent")
     as_cell: bool = parameter(

@@ -102,7 +102,7 @@ class _Keep:
         self._kept = {name: np.empty(samples) for name in self._fields}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Take a piece of the run, as a sink of the engine."""
         for name, (topic, of) in self._fields.items():
             self._kept[name][first : first + samples] = dense[topic][of]
 

@@ -79,7 +79,7 @@ class Collector:
         self._sparse: dict[str, list[Sparse]] = {topic: [] for topic in self._sources if topic in cell.sparse}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Take a piece of the run, as a sink of the engine."""
         for topic, whole in self._dense.items():
             for name, array in dense[topic].items():
                 whole[name][first : first + samples] = array

@@ -22,6 +22,9 @@ from lathe_rc.extensions import Named
 from lathe_rc.messages import MAX_BLOCK
 from lathe_rc.names import instead
 
+NonNegative = Annotated[float, Ge(0)]  #: most quantities, and those that 0 switches off
+Positive = Annotated[float, Gt(0)]  #: what something is divided by
+
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
 
 T = TypeVar("T", bound="Table")
@@ -288,8 +291,7 @@ class NodeParameters(SharedParameters):
         "what breaks and when, as 'revolution 20 to 25: coarse/state.measured_position stuck'; without 'to' it stays",
     )
     volatile_inputs: list[str] = parameter(
-        [],
-        "input topics whose publisher keeps no messages for those who come late (a device with default QoS)",
+        [], "input topics whose publisher keeps no messages for those who come late (a device with default QoS)"
     )
     autostart: bool = parameter(default=True, doc="configure and activate by itself")
 

@@ -14,7 +14,6 @@ Inputs are the arrays of float64 of all fields of all input ports in their order
 one if there are none, and outputs are the arrays of all fields of all output ports.
 """
 
-import re
 from abc import ABC
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -24,6 +23,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from lathe_rc import messages
+from lathe_rc.cell import events
 from lathe_rc.cell.parameters import NodeParameters, about, remapped
 from lathe_rc.compiled.step import CompiledStep, Step, is_compiled
 from lathe_rc.compiled.struct_view import explain_unfit
@@ -81,34 +81,13 @@ class Sparse:
     values: dict[str, Any] = field(compare=False)
 
 
-@dataclass(frozen=True)
-class Trigger:
-    """When an event takes effect."""
-
-    kind: str  # revolution, second or sample
-    value: float
-    action: str
-    parameter: str  # that lists it: events or faults
-    ends: bool = False  # a fault that has begun
-
-    @property
-    def text(self) -> str:
-        """How it is written."""
-        return f"{self.kind} {self.value:g}: {self.action}"
-
-
 Fields = tuple[Samples, ...]  #: arrays of a step, each of shape (n,)
 Reached = tuple[int, int]  #: sample of the block that a step has reached, and why it has stopped
 DONE, PYTHON = 0, -1  #: why a step, or a program of steps, has stopped
 NEVER = np.iinfo(np.int64).max  #: no sample at all
 
 _NOTHING = np.empty(0)
-_MOST_SAMPLES = 2**53  # that a double counts
-
-_EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)(?:\s+to\s+([0-9.eE+-]+))?\s*:\s*(\S.*?)\s*")
-_FAULT, _REPAIR = "fault", "repair"  # verbs of the events that all stages know: fault FAULT, repair FAULT or TARGET
-SAFE = "safe"  #: and of the one that only a host may ask for: members of the cell are lost
-NOTHING_TO_REPAIR = "nothing to repair"  #: event of a repair of what is not broken
+_NO_FLAGS = np.empty(0, np.uint8)  # stands for the flags of a step without any, so that it may have the same code
 
 
 class WiredCell(Protocol):
@@ -203,8 +182,7 @@ class Stage(ABC):
         self.sparse_topics: dict[str, str] = {}
         self.unheard: Collection[str] = ()
         self.foreign: dict[str, str] = {}
-        self._triggers = [self._trigger("events", text) for text in parameters.events]
-        self._triggers += [trigger for text in parameters.faults for trigger in self._break_down(text)]
+        self._triggers = events.triggers(name, parameters)
         self._injection: Injection | None = None
         self.own_inputs, self.tells = 0, False
         self._native: CompiledStep | None = None
@@ -274,36 +252,6 @@ class Stage(ABC):
         """Whether there are events for it."""
         return bool(self.actions) or self.shared.allow_faults
 
-    def _trigger(self, what: str, text: str, *, ends: bool = False) -> Trigger:
-        match = _EVENT.fullmatch(text)
-        try:
-            trigger = Trigger(match[1], float(match[2]), match[4], what, ends) if match and not match[3] else None
-        except ValueError:
-            trigger = None
-        per_unit = self.shared.sample_rate if trigger and trigger.kind == "second" else 1
-        if trigger is None or not 0 <= trigger.value * per_unit < _MOST_SAMPLES:
-            raise InputError(
-                f"{self.name}.{what} = {text!r}; allowed: 'revolution R: ACTION', 'second T: ACTION' or "
-                f"'sample N: ACTION', before sample {_MOST_SAMPLES}"
-            )
-        return trigger
-
-    def _break_down(self, text: str) -> list[Trigger]:
-        """Begin and, if it has one, end of a fault."""
-        match = _EVENT.fullmatch(text)
-        if match is None:
-            raise InputError(
-                f"{self.name}.faults = {text!r}; allowed: 'revolution R to S: FAULT', 'second ...', 'sample ...'; "
-                "without 'to' it stays"
-            )
-        begin = self._trigger("faults", f"{match[1]} {match[2]}: {_FAULT} {match[4]}")
-        if not match[3]:
-            return [begin]
-        end = self._trigger("faults", f"{match[1]} {match[3]}: {_REPAIR} {match[4]}", ends=True)
-        if end.value <= begin.value:
-            raise InputError(f"{self.name}.faults = {text!r} ends before it begins; allowed: an end after {match[2]}")
-        return [begin, end]
-
     def check_action(self, action: str) -> None:
         """Refuse an event that cannot be carried out.
 
@@ -311,13 +259,13 @@ class Stage(ABC):
             InputError: the stage does not know it, or lacks what it needs.
         """
         verb, _, rest = action.partition(" ")
-        if verb == _FAULT:
+        if verb == events.FAULT:
             self._check_fault(faults.parse(rest, self.name))
             return
-        if verb == _REPAIR:
+        if verb == events.REPAIR:
             self._check_allowed(action)
             if " " in rest:
-                self._check_fault(faults.parse(rest, self.name, what=_REPAIR))
+                self._check_fault(faults.parse(rest, self.name, what=events.REPAIR))
             else:
                 assert self._injection is not None, "there is one if faults are allowed"
                 self._injection.check_target(rest)
@@ -346,7 +294,7 @@ class Stage(ABC):
 
     def replay(self, action: str, index: int) -> None:
         """Let an event of a recording take effect again, at its sample; what comes about by itself will do so."""
-        if action.partition(":")[0] not in (*self.announces, NOTHING_TO_REPAIR):
+        if action.partition(":")[0] not in (*self.announces, events.NOTHING_TO_REPAIR):
             self.schedule(action, index)
 
     @property
@@ -357,7 +305,7 @@ class Stage(ABC):
 
     def lose(self, index: int) -> None:
         """Go to its safe state at sample ``index``, which the host has not issued yet: members of the cell are lost."""
-        self._scheduled.append((index, SAFE))
+        self._scheduled.append((index, events.SAFE))
 
     def _scheduled_actions(self, action: str) -> bool:
         """Whether the scenario lists an event with this action."""
@@ -378,24 +326,19 @@ class Stage(ABC):
             return 0, 0.0
         if not self._triggers and not self._scheduled:
             return NEVER, np.inf
-        samples = [self._sample_of(trigger) for trigger in self._triggers if trigger.kind != "revolution"]
+        samples = [
+            trigger.sample(self.shared.sample_rate) for trigger in self._triggers if trigger.kind != "revolution"
+        ]
         turns = [trigger.value * 2 * np.pi for trigger in self._triggers if trigger.kind == "revolution"]
         samples += [index for index, _ in self._scheduled]
         return min(samples, default=NEVER), min(turns, default=np.inf)
-
-    def _sample_of(self, trigger: Trigger) -> int:
-        """When an event is due that does not depend on the angle."""
-        if trigger.kind == "sample":
-            return int(np.ceil(trigger.value))
-        # The factor keeps 0.1 s · 64000 from becoming sample 6401.
-        return int(np.ceil(trigger.value * self.shared.sample_rate * (1 - 1e-12)))
 
     def _due(self, first: int, samples: int, inputs: Sequence[Signals]) -> list[tuple[int, str]]:
         """Take the events that fall into a block, by sample index; equal indices keep the order of scheduling."""
         waiting = []
         for trigger in self._triggers:
             if trigger.kind != "revolution":
-                index = self._sample_of(trigger)
+                index = trigger.sample(self.shared.sample_rate)
             else:
                 place = self.angle_input
                 assert place is not None, "declare() refuses revolutions without an angle"
@@ -493,21 +436,21 @@ class Stage(ABC):
     def act(self, action: str, index: int) -> None:
         """Carry out an event at sample ``index``, the next one."""
         verb, _, rest = action.partition(" ")
-        if verb == SAFE:
+        if verb == events.SAFE:
             self.go_safe()
-        elif verb == _FAULT:
+        elif verb == events.FAULT:
             fault = faults.parse(rest, self.name)
             if faults.KINDS[fault.kind].what in self.devices:
                 self.damage(fault)
             else:
                 assert self._injection is not None, "the fault has been checked"
                 self._injection.begin(fault, index)
-        elif verb == _REPAIR:
+        elif verb == events.REPAIR:
             assert self._injection is not None, "the event has been checked"
             target, one = rest.partition(" ")[0], faults.parse(rest, self.name) if " " in rest else None
             mended = self.mend(one) if target in self.devices else self._injection.end(target, index, one)
             if not mended:
-                self._remarks.append(f"{NOTHING_TO_REPAIR}: {target}")
+                self._remarks.append(f"{events.NOTHING_TO_REPAIR}: {target}")
         else:
             self.perform(action)
 
@@ -536,20 +479,13 @@ class Stage(ABC):
         start = -first % period
         if start >= samples:
             return []
-
         # Copies: the block's own arrays are used again.
-        position = signals[joint.position][start::period].copy()
-        velocity = signals[joint.velocity][start::period].copy() if joint.velocity else None
-        effort = signals[joint.effort][start::period].copy() if joint.effort else None
+        given = {what: signals[name][start::period].copy() for what, name in joint._asdict().items() if name}
         topic, found = f"{self.name}/joint_states", []
-        for k in range(position.size):
-            values = {
-                "name": [self.name],
-                "position": position[k : k + 1],
-                "velocity": _NOTHING if velocity is None else velocity[k : k + 1],
-                "effort": _NOTHING if effort is None else effort[k : k + 1],
-            }
-            found.append(Sparse(topic, messages.JOINTS, first + start + k * period, values))
+        for k in range(given["position"].size):
+            told = {what: given[what][k : k + 1] if what in given else _NOTHING for what in joint._fields}
+            index = first + start + k * period
+            found.append(Sparse(topic, messages.JOINTS, index, {"name": [self.name], **told}))
         return found
 
     def perform(self, action: str) -> None:
@@ -581,7 +517,7 @@ class Stage(ABC):
         if self.is_compiled:
             return self.native()(first, start, fields, samples)
         inputs = sum(len(port.fields) for port in self.inputs[: self.own_inputs])
-        flags = tuple(field for field in fields[:inputs] if field.dtype != np.float64)
+        flags = tuple(field for field in fields[:inputs] if field.dtype != np.float64) or (_NO_FLAGS,)
         floats = tuple(field for field in fields[:inputs] if field.dtype == np.float64)
         return self.step(self.memory, first, start, floats, flags, tuple(fields[inputs:]))
 
@@ -658,7 +594,7 @@ class Stage(ABC):
 
 
 class _Named(AbstractContextManager[None]):
-    """See `Stage.named`; a generator takes three times as long, some 70 times a run."""
+    """Lets errors name the node; a generator takes three times as long, some 70 times a run."""
 
     def __init__(self, node: str) -> None:
         self._node = node

@@ -176,7 +176,7 @@ class Entry:
 
     @cached_property
     def address(self) -> int:
-        """See `CompiledStep`."""
+        """Address of the function, which is compiled if it never was."""
         try:
             return int(_module(self.name, self._text, self._memory).enter.address)
         except NumbaError as error:

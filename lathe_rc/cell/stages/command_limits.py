@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limits of what a drive is commanded, and what is said of samples that are clipped."""
 
-from typing import Annotated
-
 import numpy as np
-from annotated_types import Ge
+import numpy.typing as npt
 
 from lathe_rc import messages
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, parameter
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.control.limits import CommandLimits, LimiterTable, limit, limiter
 from lathe_rc.jit import kernel
@@ -21,64 +19,15 @@ _QUIET = 10e-3  # [s] without a clipped sample until a command is free again
 class LimitedParameters(NodeParameters):
     """Limits of the command on its way to the drive."""
 
-    command_stroke: Annotated[float, Ge(0)] = parameter(
-        0.0, "the command is kept within this to each side; 0: none", "m"
-    )
-    command_velocity: Annotated[float, Ge(0)] = parameter(0.0, "and within this velocity; 0: none", "m/s")
-    command_acceleration: Annotated[float, Ge(0)] = parameter(0.0, "and within this acceleration; 0: none", "m/s^2")
-    command_jerk: Annotated[float, Ge(0)] = parameter(0.0, "and within this jerk; 0: none", "m/s^3")
+    command_stroke: NonNegative = parameter(0.0, "the command is kept within this to each side; 0: none", "m")
+    command_velocity: NonNegative = parameter(0.0, "and within this velocity; 0: none", "m/s")
+    command_acceleration: NonNegative = parameter(0.0, "and within this acceleration; 0: none", "m/s^2")
+    command_jerk: NonNegative = parameter(0.0, "and within this jerk; 0: none", "m/s^3")
 
     def command_limits(self) -> CommandLimits:
         """The limits that are set."""
         given = (self.command_stroke, self.command_velocity, self.command_acceleration, self.command_jerk)
         return CommandLimits(*(limit or np.inf for limit in given))
-
-
-class LimitedCommand:
-    """Keeps a command within its limits, and says with which sample that begins and ends.
-
-    Args:
-        node: whose command it is.
-        parameters: its table.
-        which: of its commands; empty if it has one.
-
-    Attributes:
-        on: whether there is a limit.
-        table: for `limited`.
-    """
-
-    def __init__(self, node: str, parameters: LimitedParameters, which: str = "") -> None:
-        limits = parameters.command_limits()
-        self.on = limits.any
-        self.table = limiter(limits, parameters.step, messages.MAX_BLOCK if self.on else 1)
-        self._clipping = Clipping(node, parameters, which)
-
-    def tell(self, first: int, end: int) -> list[Sparse]:
-        """The events of the samples from ``first`` on and before ``end``, which were limited last."""
-        if not self.on:
-            return []
-        return self._clipping.told(first, remembered(self.table.clipped, first, end))
-
-    def finish(self, index: int) -> list[Sparse]:
-        """See `Clipping.finish`."""
-        return self._clipping.finish(index)
-
-
-@kernel
-def limited(limits: LimiterTable, first: int, command: Samples) -> Samples:
-    """The drive's input [m], shape (n,), of samples ``first`` on; see `LimitedCommand`."""
-    if limits.clipped.size == 1:
-        return command
-    given = np.empty_like(command)
-    limit(limits, first, command, given)
-    return given
-
-
-def remembered(flags: Samples, first: int, end: int) -> Samples:
-    """Flags of the samples from ``first`` on and before ``end``, where that of sample n stands at n modulo the size."""
-    begin = first & (flags.size - 1)
-    found = flags[begin : begin + end - first]
-    return found if found.size == end - first else np.concatenate((found, flags[: end - first - found.size]))
 
 
 class Clipping:
@@ -88,10 +37,11 @@ class Clipping:
         node: whose command it is.
         parameters: its table.
         which: of its commands; empty if it has one.
+        flags: whether sample n was clipped, at n modulo their number, a power of two; one alone: there is no limit.
     """
 
-    def __init__(self, node: str, parameters: NodeParameters, which: str = "") -> None:
-        self._topic = f"{node}/events"
+    def __init__(self, node: str, parameters: NodeParameters, which: str, flags: npt.NDArray[np.uint8]) -> None:
+        self._topic, self._flags = f"{node}/events", flags
         self._which = f" {which}" if which else ""
         self._begins = f"{LIMITED}:{self._which}" if which else LIMITED
         self._quiet = round(_QUIET * parameters.sample_rate)
@@ -99,10 +49,16 @@ class Clipping:
         # Clipped samples so far, and when it was last free; samples until it is free again.
         self._clipped, self._before, self._left = 0, 0, 0
 
-    def told(self, first: int, clipped: Samples) -> list[Sparse]:
-        """The events of samples ``first`` on, of which some are ``clipped``, shape (n,)."""
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """The events of the samples from ``first`` on and before ``end``, which were computed last."""
         found: list[Sparse] = []
-        start = 0
+        if self._flags.size == 1:
+            return found
+        # A ring: samples at its end and at its begin may belong together.
+        begin, start = first & (self._flags.size - 1), 0
+        clipped = self._flags[begin : begin + end - first]
+        if clipped.size < end - first:
+            clipped = np.concatenate((clipped, self._flags[: end - first - clipped.size]))
         if not self._left and self._clipped == self._before and not clipped.any():
             return found
         while start < clipped.size:
@@ -150,3 +106,33 @@ class Clipping:
             else:
                 place = samples
         return found
+
+
+class LimitedCommand(Clipping):
+    """Keeps a command within its limits, and says with which sample that begins and ends.
+
+    Args:
+        node: whose command it is.
+        parameters: its table.
+        which: of its commands; empty if it has one.
+
+    Attributes:
+        on: whether there is a limit.
+        table: for `limited`.
+    """
+
+    def __init__(self, node: str, parameters: LimitedParameters, which: str = "") -> None:
+        limits = parameters.command_limits()
+        self.on = limits.any
+        self.table = limiter(limits, parameters.step, messages.MAX_BLOCK if self.on else 1)
+        super().__init__(node, parameters, which, self.table.clipped)
+
+
+@kernel
+def limited(limits: LimiterTable, first: int, command: Samples) -> Samples:
+    """The drive's input [m], shape (n,), of samples ``first`` on; see `LimitedCommand`."""
+    if limits.clipped.size == 1:
+        return command
+    given = np.empty_like(command)
+    limit(limits, first, command, given)
+    return given

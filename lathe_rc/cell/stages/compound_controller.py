@@ -7,13 +7,12 @@ the following error. The settings are ours, tuned on the conditions of ``lathe s
 """
 
 from collections.abc import Callable
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt
 
 from lathe_rc.analysis.learning import Array, Complex, Response
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import NonNegative, Positive, parameter
 from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, ForwardTable, fed_forward
 from lathe_rc.cell.stages.law import Now
 from lathe_rc.jit import kernel
@@ -22,10 +21,10 @@ from lathe_rc.jit import kernel
 class CompoundControllerParameters(FormLawParameters):
     """Input feed-forward and dynamic compensation from the model, and a PID on the measured error."""
 
-    proportional: Annotated[float, Ge(0)] = parameter(0.5, "of the PID, Kp")
-    integral: Annotated[float, Ge(0)] = parameter(700.0, "of the PID, Ki", "1/s")
-    derivative: Annotated[float, Ge(0)] = parameter(1.3e-3, "of the PID, Kd", "s")
-    derivative_bandwidth: Annotated[float, Gt(0)] = parameter(1600.0, "of its low-pass", "rad/s")
+    proportional: NonNegative = parameter(0.5, "of the PID, Kp")
+    integral: NonNegative = parameter(700.0, "of the PID, Ki", "1/s")
+    derivative: NonNegative = parameter(1.3e-3, "of the PID, Kd", "s")
+    derivative_bandwidth: Positive = parameter(1600.0, "of its low-pass", "rad/s")
 
 
 class Memory(NamedTuple):
@@ -48,7 +47,7 @@ class Memory(NamedTuple):
 
 @kernel
 def sample(memory: Memory, now: Now) -> float:
-    """See `Law`."""
+    """Command of the law at one sample [m]."""
     state, late = memory.state, memory.forward.late
     command = fed_forward(memory.forward, now.angle)
     if now.sample < late:
@@ -63,7 +62,7 @@ def sample(memory: Memory, now: Now) -> float:
 
 
 class CompoundController(FormLaw):
-    """See the module.
+    """Law that feeds the form forward, with a PID on the error.
 
     Attributes:
         parameters: its table.
@@ -75,7 +74,7 @@ class CompoundController(FormLaw):
     sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
 
     def start(self) -> Memory:
-        """See `Law`."""
+        """Return the memory before the first sample."""
         parameters = self.parameters
         step = parameters.step
         return Memory(

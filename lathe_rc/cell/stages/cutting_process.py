@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt, Le, Lt
+from annotated_types import Ge, Le, Lt
 
 from lathe_rc import messages
 from lathe_rc.analysis.shaft import STEEL_MODULUS, Shaft, Support
 from lathe_rc.arrays import put, put_scaled, subtract
-from lathe_rc.cell.parameters import NodeParameters, about, parameter
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.errors import InputError
@@ -44,40 +44,36 @@ class CuttingProcessParameters(NodeParameters):
         "form",
         "what the tool drives meet: a round blank, or the form left by the pass before, so that the chip is even",
     )
-    depth: Annotated[float, Ge(0)] = parameter(0.0, "depth of cut with everything at 0 and an allowance of 0", "m")
-    feed: Annotated[float, Ge(0)] = parameter(71e-6, "feed, unless the longitudinal slide makes it", "m/rev")
-    kc1: Annotated[float, Gt(0)] = parameter(1.7e9, "specific force at a feed of 1 mm; steel", "Pa")
+    depth: NonNegative = parameter(0.0, "depth of cut with everything at 0 and an allowance of 0", "m")
+    feed: NonNegative = parameter(71e-6, "feed, unless the longitudinal slide makes it", "m/rev")
+    kc1: Positive = parameter(1.7e9, "specific force at a feed of 1 mm; steel", "Pa")
     mc: Annotated[float, Ge(0), Lt(1)] = parameter(0.25, "exponent of its fall with the feed")
-    wear_factor: Annotated[float, Ge(0)] = parameter(0.0, "relative rise of the force with the wear VB", "1/m")
-    wear: Annotated[float, Ge(0)] = parameter(0.0, "wear VB at sample 0", "m")
-    wear_per_metre: Annotated[float, Ge(0)] = parameter(0.0, "its growth with the cutting path", "1")
-    wear_per_second: Annotated[float, Ge(0)] = parameter(0.0, "its growth with the time in the cut", "m/s")
-    flank_pressure: Annotated[float, Ge(0)] = parameter(
+    wear_factor: NonNegative = parameter(0.0, "relative rise of the force with the wear VB", "1/m")
+    wear: NonNegative = parameter(0.0, "wear VB at sample 0", "m")
+    wear_per_metre: NonNegative = parameter(0.0, "its growth with the cutting path", "1")
+    wear_per_second: NonNegative = parameter(0.0, "its growth with the time in the cut", "m/s")
+    flank_pressure: NonNegative = parameter(
         0.0, "process damping: force by the volume that the flank presses in; 4e13 for steel; 0: none", "N/m^3"
     )
-    flank_width: Annotated[float, Gt(0)] = parameter(0.2e-3, "process damping: width of the flank along the edge", "m")
-    flank_land: Annotated[float, Ge(0)] = parameter(
-        0.05e-3, "process damping: land of a new edge, to which the wear VB adds", "m"
-    )
-    lag: Annotated[float, Ge(0)] = parameter(0.075, "time constant of the force; 0: none", "s")
-    allowance_rms: Annotated[float, Ge(0)] = parameter(
+    flank_width: Positive = parameter(0.2e-3, "process damping: width of the flank along the edge", "m")
+    flank_land: NonNegative = parameter(0.05e-3, "process damping: land of a new edge, to which the wear VB adds", "m")
+    lag: NonNegative = parameter(0.075, "time constant of the force; 0: none", "s")
+    allowance_rms: NonNegative = parameter(
         0.0, "random allowance: RMS; 20.7e-6 is the 4.83 N RMS of paper 004; 0: none", "m"
     )
-    allowance_time: Annotated[float, Gt(0)] = parameter(1.0, "its correlation time", "s")
-    allowance_rate: Annotated[float, Ge(0)] = parameter(
-        0.0, "instead: a walk without bounds, RMS after one second; 0: none", "m"
-    )
+    allowance_time: Positive = parameter(1.0, "its correlation time", "s")
+    allowance_rate: NonNegative = parameter(0.0, "instead: a walk without bounds, RMS after one second; 0: none", "m")
     run_out_order: list[Annotated[int, Ge(1), Le(2000)]] = parameter([], "run-out of the blank: waves a revolution")
     run_out_amplitude: list[float] = parameter([], "their amplitudes", "m")
     run_out_phase: list[float] = parameter([], "their phases at angle 0; empty: all 0", "rad")
-    radius: Annotated[float, Gt(0)] = parameter(0.05, "of the part, for the cutting path", "m")
+    radius: Positive = parameter(0.05, "of the part, for the cutting path", "m")
     gap_start: list[float] = parameter([], "interrupted cut: where places without material begin", "rad")
-    gap_width: list[Annotated[float, Gt(0)]] = parameter([], "their widths", "rad")
+    gap_width: list[Positive] = parameter([], "their widths", "rad")
     hard_spot_start: list[float] = parameter([], "hard spots: where they begin", "rad")
-    hard_spot_width: list[Annotated[float, Gt(0)]] = parameter([], "their widths", "rad")
+    hard_spot_width: list[Positive] = parameter([], "their widths", "rad")
     hard_spot_bottom: list[float] = parameter([], "their lower ends along the part", "m")
     hard_spot_top: list[float] = parameter([], "their upper ends along the part", "m")
-    hard_spot_factor: list[Annotated[float, Ge(0)]] = parameter([], "factor of the force in them")
+    hard_spot_factor: list[NonNegative] = parameter([], "factor of the force in them")
     regeneration: Annotated[float, Ge(0), Le(1)] = parameter(
         0.0, "overlap µ with the surface of the last revolution; 0: off"
     )
@@ -87,14 +83,14 @@ class CuttingProcessParameters(NodeParameters):
     shaft: Literal["none", "centres", "chuck_and_centre", "chuck"] = parameter(
         "none", "none: the compliance of W3 all along; otherwise that of a shaft and what holds it"
     )
-    shaft_length: Annotated[float, Gt(0)] = parameter(0.5, "shaft: length", "m")
-    shaft_diameter: Annotated[float, Gt(0)] = parameter(0.03, "shaft: diameter", "m")
-    shaft_head: Annotated[float, Gt(0)] = parameter(1e8, "shaft: stiffness of the head stock", "N/m")
-    shaft_tail: Annotated[float, Gt(0)] = parameter(5e7, "shaft: stiffness of the tail stock", "N/m")
-    shaft_carriage: Annotated[float, Gt(0)] = parameter(1e8, "shaft: stiffness of the carriage", "N/m")
-    shaft_modulus: Annotated[float, Gt(0)] = parameter(STEEL_MODULUS, "shaft: modulus of elasticity", "Pa")
-    noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the force sensor, RMS; 0: none", "N")
-    resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the force sensor; 0: none", "N")
+    shaft_length: Positive = parameter(0.5, "shaft: length", "m")
+    shaft_diameter: Positive = parameter(0.03, "shaft: diameter", "m")
+    shaft_head: Positive = parameter(1e8, "shaft: stiffness of the head stock", "N/m")
+    shaft_tail: Positive = parameter(5e7, "shaft: stiffness of the tail stock", "N/m")
+    shaft_carriage: Positive = parameter(1e8, "shaft: stiffness of the carriage", "N/m")
+    shaft_modulus: Positive = parameter(STEEL_MODULUS, "shaft: modulus of elasticity", "Pa")
+    noise_rms: NonNegative = parameter(0.0, "white noise of the force sensor, RMS; 0: none", "N")
+    resolution: NonNegative = parameter(0.0, "quantisation step of the force sensor; 0: none", "N")
 
     def allowance(self, node: str, prefix: str = "") -> Allowance:
         """The allowance of a node; ``prefix`` begins the parameters where they are part of a table."""
@@ -200,7 +196,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`; the cross feed is positive into the part."""
+    """Cut through one block; the cross feed is positive into the part."""
     angle, speed = inputs[0], inputs[1]
     force, measured_force, depth_of_cut, feed, allowance, wear, deflection = outputs
     n = angle.size
@@ -247,12 +243,12 @@ class CutStage(Stage):
         self._damages = list[Fault]()
 
     def damage(self, fault: Fault) -> None:
-        """See `Stage`."""
+        """Break the tool, or put a hard spot into the material."""
         self._damages.append(fault)
         self._suffer()
 
     def mend(self, fault: Fault | None) -> bool:
-        """See `Stage`: a longer edge, or a spot less; all of them are a new tool in even material."""
+        """Lengthen the edge, or take a spot away; None: a new tool in even material."""
         mended = self._damages[:] if fault is None else [damage for damage in self._damages if damage == fault][:1]
         for damage in mended:
             self._damages.remove(damage)
@@ -269,7 +265,7 @@ class CutStage(Stage):
         self.cut.damage(shorter=shorter, spots=spots)
 
     def prepare(self, first: int, samples: int) -> None:
-        """See `Stage`."""
+        """Draw allowance and sensor noise for the samples ahead."""
         super().prepare(first, samples)
         self._allowance.draw(samples)
         self._force_sensor.draw(samples)
@@ -277,7 +273,7 @@ class CutStage(Stage):
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """See `Stage`.
+        """End a run whose cut cannot go on.
 
         Raises:
             LatheError: it cannot go on.
@@ -287,7 +283,7 @@ class CutStage(Stage):
 
 
 class CuttingProcessStage(CutStage):
-    """See `lathe_rc.plants.cutting`.
+    """Cutting process under rigid drives; see `lathe_rc.plants.cutting`.
 
     Attributes:
         parameters: its table.
@@ -308,7 +304,7 @@ class CuttingProcessStage(CutStage):
 
     @property
     def memory(self) -> Memory:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         parameters = self.parameters
         places, place = dict.fromkeys(READ, -1), 2
         for name in parameters.moved_by:

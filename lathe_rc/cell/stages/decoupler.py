@@ -3,11 +3,11 @@
 
 from typing import Annotated, Literal, NamedTuple
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
 from lathe_rc import messages
 from lathe_rc.arrays import put
-from lathe_rc.cell.parameters import NodeParameters, about, parameter
+from lathe_rc.cell.parameters import NodeParameters, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Stage
 from lathe_rc.control.decoupler import LAG, LEAK, PRESETS, Channels, Decoupler, compensators, decouple_along
 from lathe_rc.errors import InputError
@@ -38,12 +38,12 @@ class DecouplerParameters(NodeParameters):
     w4_denominator: list[float] = parameter([], "its denominator; empty: that of the preset")
     k1: bool = parameter(default=True, doc="takes the effect of the cross command off the force")
     k2: bool = parameter(default=True, doc="takes the effect of the longitudinal command off the position")
-    inverse_lag: Annotated[float, Gt(0)] = parameter(LAG, "lag for each order that an inverse is missing", "s")
+    inverse_lag: Positive = parameter(LAG, "lag for each order that an inverse is missing", "s")
     leak: Annotated[float, Ge(0), Le(1e6)] = parameter(LEAK, "of the integrators in K1 and K2; 0: none", "rad/s")
 
     @property
     def commanded_topic(self) -> str:
-        """See `NodeParameters`; W1, W3 and W4 are of the cutting process as well, and no drive's alone."""
+        """Topic of the drive that W2 is the model of; W1, W3 and W4 are no drive's alone."""
         return "cross/command"
 
     def channels(self, node: str) -> Channels:
@@ -73,7 +73,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`; set points and errors go on unchanged."""
+    """Decouple the commands of one block; set points and errors go on unchanged."""
     force, position = inputs[0], inputs[3]
     for place in (1, 2, 4, 5):
         put(outputs[place], inputs[place])
@@ -82,7 +82,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class DecouplerStage(Stage):
-    """See `lathe_rc.control.decoupler`.
+    """Decoupler between force and position loop; see `lathe_rc.control.decoupler`.
 
     Attributes:
         parameters: its table.
@@ -113,6 +113,6 @@ class DecouplerStage(Stage):
 
     @property
     def memory(self) -> Memory:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         made = self._decoupler
         return Memory(made.k1, made.state1, made.k2, made.state2)

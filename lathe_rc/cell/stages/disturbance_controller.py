@@ -14,7 +14,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc.analysis.learning import Array, Complex, Response
-from lathe_rc.cell.parameters import Value, about, parameter
+from lathe_rc.cell.parameters import NonNegative, Positive, Value, about, parameter
 from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, feed_forward
 from lathe_rc.cell.stages.law import Now
 from lathe_rc.cell.stages.tables import made_of
@@ -28,22 +28,20 @@ from lathe_rc.jit import kernel
 class DisturbanceControllerParameters(FormLawParameters):
     """Inverse feed-forward of the form, a repetitive memory of the disturbance, a disturbance observer."""
 
-    observer_bandwidth: Annotated[float, Ge(0)] = parameter(
-        4000.0, "bandwidth ωo of the disturbance observer; 0: none", "rad/s"
-    )
+    observer_bandwidth: NonNegative = parameter(4000.0, "bandwidth ωo of the disturbance observer; 0: none", "rad/s")
     learning_gain: Annotated[float, Ge(0), Lt(1)] = parameter(
         0.5, "part of what a revolution brings that the memory takes up in the long run; 0: there is no memory"
     )
     learned_waves: Annotated[float, Gt(0), Le(1000)] = parameter(
         60.0, "waves per revolution at which the filter S of what is learned has fallen to a half"
     )
-    learning_bandwidth: Annotated[float, Gt(0)] = parameter(8000.0, "bandwidth of what is learned", "rad/s")
+    learning_bandwidth: Positive = parameter(8000.0, "bandwidth of what is learned", "rad/s")
     follows_speed: bool = parameter(default=True, doc="learn how the disturbance changes with the speed as well")
     points_per_revolution: Annotated[int, Ge(64), Le(65536)] = parameter(
         512, "points of the memory per revolution, a power of 2"
     )
     identify: bool = parameter(default=True, doc="identify damping and natural frequency of the drive")
-    identification_bandwidth: Annotated[float, Gt(0)] = parameter(
+    identification_bandwidth: Positive = parameter(
         1500.0, "bandwidth of its filters: above the profile's harmonics, below the noise", "rad/s"
     )
     identification_forgetting: Annotated[float, Ge(0), Lt(1)] = parameter(
@@ -84,7 +82,7 @@ class Memory(NamedTuple):
 
 @kernel
 def sample(memory: Memory, now: Now) -> float:
-    """See `Law`."""
+    """Command of the law at one sample [m]."""
     spindle, known = memory.spindle, memory.known
     follow(spindle, now.angle)
     found = 0.0
@@ -99,7 +97,7 @@ def sample(memory: Memory, now: Now) -> float:
 
 
 class DisturbanceController(FormLaw):
-    """See the module.
+    """Law that feeds the form forward, learns the disturbance and observes what is left.
 
     Attributes:
         parameters: its table.
@@ -118,26 +116,26 @@ class DisturbanceController(FormLaw):
         super().__init__(name, parameters)
 
     def start(self) -> Memory:
-        """See `Law`."""
+        """Return the memory before the first sample."""
         parameters = self.parameters
         late = parameters.feedback_delay * parameters.step
         return Memory(self.make_filter(), self.form, parameters.make(self.name), parameters.model_delay, late)
 
     def perform(self, action: str) -> None:
-        """See `Stage`: ``clear`` forgets the memory; what is known of angle and drive stays."""
+        """Carry out an event; ``clear`` forgets the memory, not what is known of angle and drive."""
         if action == "clear":
             forget(self.law.known)
         else:
             super().perform(action)
 
     def settings(self) -> str:
-        """See `Learner`."""
+        """Drive model that decides whether learning converges, in words."""
         parameters = self.parameters
         model = f"{parameters.model_natural_frequency:.4g} rad/s, {parameters.model_damping:.3g}"
         return f"a model of {model}, {parameters.model_delay * 1e3:.3g} ms"
 
     def cures(self, lag: float) -> Iterable[Iterable[Mapping[str, Value]]]:
-        """See `Learner`: fewer waves that are learned, a slower observer, or both where neither helps alone."""
+        """Fewer waves that are learned, a slower observer, or both where neither helps alone."""
         parameters = self.parameters
         waves = [float(f"{parameters.learned_waves * 0.8**k:.2g}") for k in range(9)]
         observers = [float(f"{parameters.observer_bandwidth * 0.6**k:.2g}") for k in range(9)]
@@ -154,7 +152,7 @@ class DisturbanceController(FormLaw):
         return np.asarray(drive(frequency) * (1.0 + a1 * p + a2 * p * p) * np.exp(p * self.parameters.model_delay) - 1)
 
     def contraction(self, drive: Response, waves: Array, speed: float) -> Complex:
-        """See `Law`: of the memory, or |E·L| of the observer where that is more, with the model that is given."""
+        """Factor of the memory, or |E·L| of the observer where that is more, with the given model."""
         parameters, frequency = self.parameters, waves * speed
         error, p = self._model_error(drive, frequency), 1j * frequency
         inside = np.zeros_like(error)
@@ -175,5 +173,5 @@ class DisturbanceController(FormLaw):
         return np.asarray(np.cos(2 * np.pi / points * np.outer(waves, places)) @ taps)
 
     def highest_waves(self, speed: float) -> float:
-        """See `Law`: the Nyquist limit of the memory."""
+        """Nyquist limit of the memory [waves per revolution]."""
         return 0.5 * self.parameters.points_per_revolution

@@ -4,14 +4,11 @@
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
-
-from annotated_types import Gt
 
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell.parameters import NodeParameters, parameter
+from lathe_rc.cell.parameters import NodeParameters, Positive, parameter
 from lathe_rc.cell.stage import Sparse, Stage
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED, LimitedCommand
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedCommand
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, follows, take_over
 from lathe_rc.jit import kernel
@@ -22,9 +19,9 @@ from lathe_rc.signals.noise import Sensor
 class BoundedParameters(NodeParameters):
     """Bounds of a command that is taken over."""
 
-    retract_velocity: Annotated[float, Gt(0)] = parameter(0.1, "largest velocity of a takeover", "m/s")
-    retract_acceleration: Annotated[float, Gt(0)] = parameter(50.0, "its largest acceleration", "m/s^2")
-    retract_jerk: Annotated[float, Gt(0)] = parameter(1e5, "its largest jerk", "m/s^3")
+    retract_velocity: Positive = parameter(0.1, "largest velocity of a takeover", "m/s")
+    retract_acceleration: Positive = parameter(50.0, "its largest acceleration", "m/s^2")
+    retract_jerk: Positive = parameter(1e5, "its largest jerk", "m/s^3")
 
     def bounds(self) -> Bounds:
         """The same for a motion."""
@@ -82,7 +79,8 @@ class Drive(Stage):
     """A stage that moves the tool; a subclass sets what it has of the following."""
 
     announces = (LIMITED, FREE)
-    _limited: Sequence[LimitedCommand] = ()  # its commands
+    _commands: Sequence[LimitedCommand] = ()
+    _clippings: Sequence[Clipping] = ()  # of other quantities that are limited
     _sensors: Sequence[Sensor] = ()
     _limits: Limits | None = None  # of a drive that carries the whole profile
     _retraction: OwnRetraction | None = None  # of one that takes the tool out
@@ -96,20 +94,20 @@ class Drive(Stage):
         return {"coarse/state": self._limits} if self._limits else {}
 
     def go_safe(self) -> None:
-        """See `Stage`; the carriage takes the tool out."""
+        """Retract the carriage, whatever is commanded: members of the cell are lost."""
         if self._retraction:
             self._retraction.begin()
 
     def prepare(self, first: int, samples: int) -> None:
-        """See `Stage`."""
+        """Draw the noise of the sensors for the samples ahead."""
         super().prepare(first, samples)
         for sensor in self._sensors:
             sensor.draw(samples)
 
     def tell(self, first: int, end: int) -> list[Sparse]:
-        """See `Stage`."""
-        return [message for limited in self._limited for message in limited.tell(first, end)]
+        """Return the events of the samples that the step has computed last."""
+        return [message for each in (*self._commands, *self._clippings) for message in each.tell(first, end)]
 
     def finish(self, index: int) -> list[Sparse]:
-        """See `Stage`."""
-        return [message for limited in self._limited for message in limited.finish(index)]
+        """Return the events that are left when the run ends."""
+        return [message for each in (*self._commands, *self._clippings) for message in each.finish(index)]

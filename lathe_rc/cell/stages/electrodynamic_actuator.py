@@ -4,10 +4,10 @@
 from collections.abc import Mapping
 from typing import Annotated
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import Positive, parameter
 from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.cell.stages.command_limits import limited
 from lathe_rc.cell.stages.drive import followed
@@ -22,22 +22,22 @@ from lathe_rc.signals.noise import measure
 class ElectrodynamicActuatorParameters(PlantParameters):
     """The drive closed by its own loops, e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), its limits and its sensor."""
 
-    natural_frequency: Annotated[float, Gt(0)] = parameter(1038.0, "natural frequency ωn", "rad/s")
-    damping: Annotated[float, Gt(0)] = parameter(0.804, "damping ratio ζ", "1")
+    natural_frequency: Positive = parameter(1038.0, "natural frequency ωn", "rad/s")
+    damping: Positive = parameter(0.804, "damping ratio ζ", "1")
     delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "delay τ", "s")
     discretisation: Discretisation = parameter("foh", "foh: exact for a command linear between samples; or tustin")
-    moving_mass: Annotated[float, Gt(0)] = parameter(1.2, "carriage, coil and tool", "kg")
-    force_constant: Annotated[float, Gt(0)] = parameter(30.0, "force of the coil per current", "N/A")
+    moving_mass: Positive = parameter(1.2, "carriage, coil and tool", "kg")
+    force_constant: Positive = parameter(30.0, "force of the coil per current", "N/A")
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """See `NodeParameters`."""
+        """Quantities of the drive that controllers may know, by command topic."""
         known = {"natural_frequency": self.natural_frequency, "damping": self.damping, "delay": self.delay}
         return {"coarse/command": known}
 
 
 @kernel
 def step(memory: PlantMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Move the drive through one block, within its limits."""
     command, (position, velocity, effort, measured_position) = inputs[0], outputs
     given = limited(memory.limits, first, followed(memory.retraction, command))
     advance(memory.plant, given, position, velocity, effort)
@@ -46,7 +46,7 @@ def step(memory: PlantMemory, first: int, start: int, inputs: Fields, flags: Fie
 
 
 class ElectrodynamicActuator(SingleDrive):
-    """See `lathe_rc.plants.electrodynamic`.
+    """Coarse electrodynamic drive in air; see `lathe_rc.plants.electrodynamic`.
 
     Attributes:
         drive: the machine.
@@ -63,9 +63,9 @@ class ElectrodynamicActuator(SingleDrive):
 
     @property
     def machine(self) -> CoarseTable:
-        """See `SingleDrive`."""
+        """Table of the machine, for the step."""
         return self.drive.table
 
     def responses(self) -> Mapping[str, Response]:
-        """See `Drive`."""
+        """Response of the position to the command, by topic."""
         return {"coarse/command": self.drive.plant.response}

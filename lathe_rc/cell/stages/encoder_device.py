@@ -9,7 +9,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc import messages, resources
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import NonNegative, Positive, parameter
 from lathe_rc.cell.stage import Joint, Output, Sparse
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
@@ -44,28 +44,24 @@ class EncoderDeviceParameters(TimeMasterParameters):
     counts_file: str = parameter("", "file: CSV file with time_ns,counts or time_s,counts", path=True)
     counter_range: Annotated[int, Ge(0)] = parameter(0, "the counter begins anew after so many counts; 0: never")
     inverted: bool = parameter(default=False, doc="the counter counts down while the spindle turns forward")
-    max_reverse: Annotated[float, Ge(0)] = parameter(
+    max_reverse: NonNegative = parameter(
         2.0, "counts that the counter may go back by; the angle stands still meanwhile"
     )
-    max_gap: Annotated[float, Gt(0)] = parameter(
-        0.01, "longest time between two readings; a longer one is an error", "s"
-    )
-    max_silence: Annotated[float, Gt(0)] = parameter(
-        1.0, "topic, line: longest wall time without a reading; longer is an error", "s"
-    )
-    max_lag: Annotated[float, Gt(0)] = parameter(
+    max_gap: Positive = parameter(0.01, "longest time between two readings; a longer one is an error", "s")
+    max_silence: Positive = parameter(1.0, "topic, line: longest wall time without a reading; longer is an error", "s")
+    max_lag: Positive = parameter(
         0.5, "topic, line: how far the cell may fall behind the readings; farther is an error", "s"
     )
     max_deviation: Annotated[float, Gt(0), Lt(1)] = parameter(
         0.2, "the checks before the start count on speeds this near to the nominal one; events report others", "1"
     )
-    max_acceleration: Annotated[float, Ge(0)] = parameter(
+    max_acceleration: NonNegative = parameter(
         200.0, "the checks before the start count on no greater acceleration of the spindle", "rad/s^2"
     )
 
 
 class EncoderDevice(TimeMaster):
-    """See `lathe_rc.signals.counts`.
+    """Time master that follows the counts of a real encoder; see `lathe_rc.signals.counts`.
 
     Attributes:
         parameters: its table.
@@ -169,7 +165,7 @@ class EncoderDevice(TimeMaster):
     # ---- for the checks before a start --------------------------------------------------------------
 
     def sample_at(self, angle: float) -> int:
-        """See `TimeMaster`; readings that are still to come tell nothing."""
+        """First sample at which the readings have reached an angle [rad]; later ones say nothing."""
         found = None if self.live else self.counted.reached(angle)
         if found is None:
             where = f"{angle / _TURN:g} revolutions"
@@ -182,18 +178,18 @@ class EncoderDevice(TimeMaster):
         return found
 
     def speed_range(self) -> tuple[float, float]:
-        """See `TimeMaster`."""
+        """Lowest and highest speed in the run [rad/s]."""
         nominal, deviation = self.shared.nominal_speed, self.parameters.max_deviation
         return nominal * (1.0 - deviation), nominal * (1.0 + deviation)
 
     def largest_acceleration(self) -> float:
-        """See `TimeMaster`."""
+        """Upper bound of the magnitude of dΩ/dt in the run [rad/s²]."""
         return self.parameters.max_acceleration
 
     # ---- samples ------------------------------------------------------------------------------------
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
-        """See `Stage`."""
+        """Compute angle and speed of the samples from the readings."""
         out = outputs[0]
         if not out["angle"].size:
             return []

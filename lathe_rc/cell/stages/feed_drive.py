@@ -6,19 +6,19 @@ from itertools import dropwhile
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
 from lathe_rc import messages
 from lathe_rc.arrays import put
-from lathe_rc.cell.parameters import about, parameter
+from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedParameters, remembered
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedParameters
 from lathe_rc.cell.stages.obedience import (
     OBEY,
     OUT_OF_REACH,
     FeedObedientParameters,
+    Listener,
     Obedience,
-    ObedienceTable,
     Obedient,
     apply,
     listens,
@@ -52,67 +52,67 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
     model: Literal["dc_screw", "fourth_order", "sampled"] = parameter(
         "dc_screw", "dc_screw: motor and screw of paper 004; fourth_order: paper 002; sampled: paper 003"
     )
-    velocity_gain: Annotated[float, Gt(0)] = parameter(
+    velocity_gain: Positive = parameter(
         4.38e-3, "dc_screw: speed at the full command, 1; the cross feed of paper 004", "m/s"
     )
-    lags: list[Annotated[float, Gt(0)]] = parameter([], "dc_screw: time constants; empty: 0.045 alone", "s")
-    zero: Annotated[float, Ge(0)] = parameter(
+    lags: list[Positive] = parameter([], "dc_screw: time constants; empty: 0.045 alone", "s")
+    zero: NonNegative = parameter(
         0.0, "dc_screw: time constant of a zero, which makes room for the lag of the cutting process", "s"
     )
-    gain: Annotated[float, Gt(0)] = parameter(19.0, "fourth_order: K")
+    gain: Positive = parameter(19.0, "fourth_order: K")
     a1: float = parameter(21.5, "fourth_order: a1, the coefficient of 1")
     a2: float = parameter(48.0, "fourth_order: a2, of p")
     a3: float = parameter(46.9, "fourth_order: a3, of p²")
     a4: float = parameter(10.2, "fourth_order: a4, of p³")
-    sampled_gain: Annotated[float, Gt(0)] = parameter(6.25, "sampled: K, for a command in m", "1/s")
-    sampled_lag: Annotated[float, Gt(0)] = parameter(0.08, "sampled: T1", "s")
+    sampled_gain: Positive = parameter(6.25, "sampled: K, for a command in m", "1/s")
+    sampled_lag: Positive = parameter(0.08, "sampled: T1", "s")
     divisor: Annotated[int, Ge(1), Le(1_000_000)] = parameter(
         1, "the command is taken at samples that are multiples of it, and held between", "sample"
     )
-    command_limit: Annotated[float, Ge(0)] = parameter(
+    command_limit: NonNegative = parameter(
         1.0, "largest command to each side, in its unit; the full command is 1; 0: none"
     )
-    command_stroke: Annotated[float, Ge(0)] = parameter(
+    command_stroke: NonNegative = parameter(
         0.0, "what is commanded stops the slide within this to each side; 0: none", "m"
     )
-    command_velocity: Annotated[float, Ge(0)] = parameter(
+    command_velocity: NonNegative = parameter(
         0.0, "largest velocity that is commanded: gain times command, or its change for a position; 0: none", "m/s"
     )
-    command_acceleration: Annotated[float, Ge(0)] = parameter(0.0, "largest change of that velocity; 0: none", "m/s^2")
-    command_jerk: Annotated[float, Ge(0)] = parameter(0.0, "largest change of that acceleration; 0: none", "m/s^3")
-    speed_limit: Annotated[float, Ge(0)] = parameter(0.0, "greatest speed of the motor; 0: none", "m/s")
+    command_acceleration: NonNegative = parameter(0.0, "largest change of that velocity; 0: none", "m/s^2")
+    command_jerk: NonNegative = parameter(0.0, "largest change of that acceleration; 0: none", "m/s^3")
+    speed_limit: NonNegative = parameter(0.0, "greatest speed of the motor; 0: none", "m/s")
     disturbance: float = parameter(
         0.0, "amplitude of f(t) = A·sin²(0.04πt s⁻¹), added to the limited command; 0.5 in eq. 18 of paper 002"
     )
-    backlash: Annotated[float, Ge(0)] = parameter(0.0, "gap between motor and slide", "m")
+    backlash: NonNegative = parameter(0.0, "gap between motor and slide", "m")
     friction: Literal["none", "stribeck", "lugre"] = parameter(
         "none", "of the slide; lugre: with presliding; of a dc_screw or sampled drive, at its longest lag"
     )
-    motor_force: Annotated[float, Gt(0)] = parameter(
+    motor_force: Positive = parameter(
         1000.0, "friction: force of the motor on the slide at a command of 1, at rest", "N"
     )
-    friction_coulomb: Annotated[float, Gt(0)] = parameter(200.0, "friction: force in motion, Fc", "N")
-    friction_static: Annotated[float, Gt(0)] = parameter(300.0, "friction: greatest force at rest, Fs", "N")
-    friction_speed: Annotated[float, Gt(0)] = parameter(1e-3, "friction: speed vs at which it has fallen to Fc", "m/s")
-    friction_viscous: Annotated[float, Ge(0)] = parameter(
+    friction_coulomb: Positive = parameter(200.0, "friction: force in motion, Fc", "N")
+    friction_static: Positive = parameter(300.0, "friction: greatest force at rest, Fs", "N")
+    friction_speed: Positive = parameter(1e-3, "friction: speed vs at which it has fallen to Fc", "m/s")
+    friction_viscous: NonNegative = parameter(
         0.0, "friction: growth with the speed Fv, beside what the lags contain", "N*s/m"
     )
-    friction_stiffness: Annotated[float, Gt(0)] = parameter(1e7, "lugre: stiffness of the bristles σ0", "N/m")
-    friction_damping: Annotated[float, Ge(0)] = parameter(1e4, "lugre: their damping σ1", "N*s/m")
+    friction_stiffness: Positive = parameter(1e7, "lugre: stiffness of the bristles σ0", "N/m")
+    friction_damping: NonNegative = parameter(1e4, "lugre: their damping σ1", "N*s/m")
     pitch_slope: float = parameter(0.0, "screw: error of its pitch all along, as a part of the way; 0: none")
     pitch_amplitude: float = parameter(0.0, "screw: amplitude of the error that repeats with the lead; 0: none", "m")
-    pitch_lead: Annotated[float, Gt(0)] = parameter(10e-3, "screw: lead", "m")
+    pitch_lead: Positive = parameter(10e-3, "screw: lead", "m")
     pitch_phase: float = parameter(0.0, "screw: phase of that error at the place 0", "rad")
-    screw_heating: Annotated[float, Ge(0)] = parameter(
+    screw_heating: NonNegative = parameter(
         0.0, "screw: rise of its temperature in the end, by the speed of the nut; 0: none", "K*s/m"
     )
     screw_surroundings: float = parameter(0.0, "screw: rise of its temperature in the end at rest; 0: none", "K")
-    screw_time: Annotated[float, Gt(0)] = parameter(1800.0, "screw: time constant of that", "s")
-    screw_expansion: Annotated[float, Ge(0)] = parameter(11.5e-6, "screw: growth with the temperature; steel", "1/K")
+    screw_time: Positive = parameter(1800.0, "screw: time constant of that", "s")
+    screw_expansion: NonNegative = parameter(11.5e-6, "screw: growth with the temperature; steel", "1/K")
     screw_anchor: float = parameter(0.0, "screw: place of the bearing that it grows from", "m")
     feedback: Feedback = parameter("load", "where the position sensor is: at the motor or at the load")
-    noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
-    resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
+    noise_rms: NonNegative = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
+    resolution: NonNegative = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
 
     def transfer(self) -> TransferFunction:
         """Position over command.
@@ -158,7 +158,7 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
         return screw
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """See `NodeParameters`."""
+        """Quantities of the drive that controllers may know, by command topic."""
         known: dict[str, float | list[float]] = {}
         if self.model == "sampled":
             known |= {"gain": self.sampled_gain, "lag": self.sampled_lag}
@@ -174,7 +174,7 @@ class Memory(NamedTuple):
     Attributes:
         drive: the machine.
         sensor: of its position.
-        obedience: to the supervisor, if it ``listens``; once it is ``safe``, to nobody.
+        who: obeys the supervisor, if it ``listens``; once it is ``safe``, nobody.
         disturbance: amplitude of what adds to the command.
         period: sampling step [s].
         clipped: whether the command was not given as it was commanded, of sample n at n modulo its length.
@@ -183,7 +183,7 @@ class Memory(NamedTuple):
 
     drive: FeedTable
     sensor: SensorTable
-    obedience: ObedienceTable
+    who: Listener
     listens: bool
     safe: bool
     disturbance: float
@@ -194,20 +194,20 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Move the slide through one block, piece by piece between reactions."""
     command, (position, velocity, effort, measured_position) = inputs[0], outputs
     n = command.size
     while start < n:
         stop = n
         if memory.listens:
-            stop = piece(memory.obedience, start, flags[0])
+            stop = piece(memory.who, start, n, flags[0])
             if stop == start:
                 return start, OBEY
         given, samples, now = command[start:stop], stop - start, first + start
         if memory.listens or memory.safe:
             given = memory.room[0, :samples]
             put(given, command[start:stop])
-        apply(memory.obedience, given)
+        apply(memory.who, given)
         load = memory.room[1, : samples if memory.disturbance else 0]
         fill_disturbance(now, memory.period, memory.disturbance, load)
         motor, seen = memory.room[2, :samples], memory.room[3, :samples]
@@ -221,7 +221,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class FeedDriveStage(Obedient):
-    """See `lathe_rc.plants.feed`.
+    """Feed drive of a slide; see `lathe_rc.plants.feed`.
 
     Attributes:
         parameters: its table.
@@ -251,9 +251,9 @@ class FeedDriveStage(Obedient):
                 friction=rubbing,
                 screw=screw,
             )
-        self._clipping = Clipping(name, parameters)
         cuts = limits.any or bool(parameters.command_limit)
         self._clipped = np.zeros(messages.MAX_BLOCK if cuts else 1, np.uint8)
+        self._clipping = Clipping(name, parameters, "", self._clipped)
         self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
         limit = parameters.command_limit
         self._obedience: Obedience = parameters.obedience(name, speed=self.drive.integrates, limit=limit, settled=0)
@@ -270,22 +270,22 @@ class FeedDriveStage(Obedient):
         )
 
     def go_safe(self) -> None:
-        """See `Stage`; the slide stops, and nobody is listened to any more."""
+        """Stop the slide and obey nobody any more: members of the cell are lost."""
         self._safe = True
         self._said = self._obedience.obey(Reaction.STOP, 0)
 
     def finish(self, index: int) -> list[Sparse]:
-        """See `Stage`."""
+        """Return the events that are left when the run ends."""
         return self._clipping.finish(index)
 
     @property
     def memory(self) -> Memory:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         parameters = self.parameters
         return Memory(
             drive=self.drive.whole,
             sensor=self._sensor.table,
-            obedience=self._obedience.table,
+            who=self.listener,
             listens=bool(parameters.reaction_delay) and not self._safe,
             safe=self._safe,
             disturbance=parameters.disturbance,
@@ -295,14 +295,12 @@ class FeedDriveStage(Obedient):
         )
 
     def prepare(self, first: int, samples: int) -> None:
-        """See `Stage`."""
+        """Draw the noise of the sensor for the samples ahead."""
         self._sensor.draw(samples)
 
     def tell(self, first: int, end: int) -> list[Sparse]:
-        """See `Stage`."""
+        """Return the events of the samples that the step has computed last."""
         said, self._said = self._said, []
         for message in said:
             message.index = first
-        if self._clipped.size > 1:
-            said += self._clipping.told(first, remembered(self._clipped, first, end))
-        return said
+        return said + self._clipping.tell(first, end)

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Force controller: holds the main cutting force by the longitudinal feed (paper 004)."""
 
-from typing import Annotated, NamedTuple
-
-from annotated_types import Ge, Gt
+from typing import NamedTuple
 
 from lathe_rc import messages
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import NonNegative, Positive, parameter
 from lathe_rc.cell.stage import Fields, Input, Output, Reached
 from lathe_rc.cell.stages.obedience import Listener, listens
 from lathe_rc.cell.stages.servo import Servo, ServoParameters, pid_along
@@ -20,14 +18,14 @@ class ForceControllerParameters(ServoParameters):
     """Set point, feedback, converters, limits, and the gains of the PID; by default those of paper 004, Fig. 12."""
 
     set_point: list[float] = parameter([], "steps: values, each from its time on; empty: 0", "N")
-    adc_step: Annotated[float, Ge(0)] = parameter(0.0, "step of the converter of the measurement; 0: none", "N")
-    set_point_ramp: Annotated[float, Ge(0)] = parameter(
+    adc_step: NonNegative = parameter(0.0, "step of the converter of the measurement; 0: none", "N")
+    set_point_ramp: NonNegative = parameter(
         0.0, "fastest change of the set point, for a smooth engagement; 0: any", "N/s"
     )
     proportional: float = parameter(FORCE.proportional, "proportional gain P", "1/N")
     integral: float = parameter(FORCE.integral, "integral gain I", "1/(N*s)")
     derivative: float = parameter(FORCE.derivative, "derivative gain D", "s/N")
-    derivative_filter: Annotated[float, Gt(0)] = parameter(FORCE.filter, "N, where the derivative ends", "rad/s")
+    derivative_filter: Positive = parameter(FORCE.filter, "N, where the derivative ends", "rad/s")
 
 
 class Memory(NamedTuple):
@@ -41,7 +39,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Control the force through one block."""
     force, (command, wanted, error) = inputs[1], outputs
     if start == 0:
         follow(memory.course, first, wanted)
@@ -51,7 +49,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class ForceController(Servo):
-    """See `lathe_rc.control.pid`.
+    """PID of the cutting force on the longitudinal feed; see `lathe_rc.control.pid`.
 
     Attributes:
         parameters: its table.
@@ -78,5 +76,5 @@ class ForceController(Servo):
 
     @property
     def memory(self) -> Memory:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         return Memory(self.trajectory.course, self.pid.table, self.pid.state, self.listener)

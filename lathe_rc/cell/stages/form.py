@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt, Le, Lt
+from annotated_types import Ge, Le, Lt
 
 from lathe_rc import messages, resources
 from lathe_rc.arrays import put
-from lathe_rc.cell.parameters import NodeParameters, Value, about, parameter
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, Value, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.errors import InputError
@@ -41,28 +41,24 @@ class FormParameters(NodeParameters):
     )
     harmonic_amplitude: list[float] = parameter([], "harmonics: amplitudes", "m")
     harmonic_phase: list[float] = parameter([], "harmonics: phases at angle 0; empty: all 0", "rad")
-    piston_ovality: Annotated[float, Ge(0)] = parameter(
-        0.5e-3, "piston: difference of the diameters at the ends of the skirt", "m"
-    )
-    piston_ovality_middle: Annotated[float, Ge(0)] = parameter(0.4e-3, "piston: the same at the widest place", "m")
-    piston_barrel: Annotated[float, Ge(0)] = parameter(30e-6, "piston: radius lost towards the ends", "m")
-    piston_length: Annotated[float, Gt(0)] = parameter(0.06, "piston: length of the skirt", "m")
-    piston_widest: Annotated[float, Ge(0)] = parameter(0.02, "piston: widest place from the start", "m")
+    piston_ovality: NonNegative = parameter(0.5e-3, "piston: difference of the diameters at the ends of the skirt", "m")
+    piston_ovality_middle: NonNegative = parameter(0.4e-3, "piston: the same at the widest place", "m")
+    piston_barrel: NonNegative = parameter(30e-6, "piston: radius lost towards the ends", "m")
+    piston_length: Positive = parameter(0.06, "piston: length of the skirt", "m")
+    piston_widest: NonNegative = parameter(0.02, "piston: widest place from the start", "m")
     polygon_sides: Annotated[int, Ge(3), Le(64)] = parameter(3, "polygon: number of sides")
-    polygon_inscribed_radius: Annotated[float, Gt(0)] = parameter(1e-3, "polygon: radius of the inscribed circle", "m")
-    polygon_corner_radius: Annotated[float, Gt(0)] = parameter(0.8e-3, "polygon: radius of the corners", "m")
+    polygon_inscribed_radius: Positive = parameter(1e-3, "polygon: radius of the inscribed circle", "m")
+    polygon_corner_radius: Positive = parameter(0.8e-3, "polygon: radius of the corners", "m")
     height_from: Literal["feed", "slide"] = parameter(
         "feed", "what makes the height along the part: the feed below, or the longitudinal slide"
     )
-    feed: Annotated[float, Ge(0)] = parameter(0.0, "feed: advance along the part", "m/rev")
-    start_height: Annotated[float, Ge(0)] = parameter(0.0, "where along the part the run begins", "m")
+    feed: NonNegative = parameter(0.0, "feed: advance along the part", "m/rev")
+    start_height: NonNegative = parameter(0.0, "where along the part the run begins", "m")
     part_revolutions: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
         0, "feed: after so many revolutions the next part begins at start_height; 0: one endless part", "rev"
     )
-    part_radius: Annotated[float, Gt(0)] = parameter(
-        0.05, "radius that the form deviates from, for tip_radius and clearance", "m"
-    )
-    tip_radius: Annotated[float, Ge(0)] = parameter(
+    part_radius: Positive = parameter(0.05, "radius that the form deviates from, for tip_radius and clearance", "m")
+    tip_radius: NonNegative = parameter(
         0.0, "radius of the tool's tip in the plane across the spindle; 0: a point, which follows the form", "m"
     )
     tip_correction: bool = parameter(
@@ -74,7 +70,7 @@ class FormParameters(NodeParameters):
     )
 
     def known(self) -> Mapping[str, Value]:
-        """See `NodeParameters`."""
+        """Form of the part, for laws that feed it forward."""
         return {name: getattr(self, name) for name in FORM}
 
     def form(self, node: str) -> Profile:
@@ -220,7 +216,7 @@ class Form:
 
 @kernel
 def step(memory: FormTable, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Evaluate desired form and height of one block."""
     reference, expected, height = outputs
     evaluate(memory, inputs, reference, expected, height)
     return height.size, DONE
@@ -248,10 +244,10 @@ class ProfileStage(Stage):
         )
 
     def warnings(self, seconds: float) -> list[str]:
-        """See `Stage`."""
+        """Return the doubts about the form's file, one line each."""
         return self.form.doubts
 
     @property
     def memory(self) -> FormTable:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         return self.form.table

@@ -15,9 +15,10 @@ from typing import Annotated, ClassVar, NamedTuple
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from lathe_rc.cell.parameters import Value, parameter
+from lathe_rc.cell.parameters import Positive, Value, parameter
 from lathe_rc.cell.stages.form import FORM, Form, FormParameters
-from lathe_rc.cell.stages.law import Law, LawParameters
+from lathe_rc.cell.stages.law import Law
+from lathe_rc.cell.stages.learner import LawParameters
 from lathe_rc.control.angle_filter import (
     AngleFilterTable,
     angle_filter,
@@ -47,8 +48,7 @@ class FormLawParameters(LawParameters, FormParameters):
         64, "samples from a measured position or error to when it is visible; at least a block", "sample"
     )
     encoder_counts: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
-        0,
-        "counts of the encoder per revolution; 0: an ideal one; not given in a scenario: those of the spindle",
+        0, "counts of the encoder per revolution; 0: an ideal one; not given in a scenario: those of the spindle"
     )
     expected_deviation: Annotated[float, Gt(0), Le(1)] = parameter(
         0.1, "amplitude of the speed deviations that the angle filter expects, relative to the nominal speed", "1"
@@ -56,19 +56,17 @@ class FormLawParameters(LawParameters, FormParameters):
     expected_frequency: Annotated[float, Gt(0), Le(10_000)] = parameter(
         300.0, "up to which frequency it expects them", "rad/s"
     )
-    model_natural_frequency: Annotated[float, Gt(0)] = parameter(
-        1038.0, "drive model: ωn", "rad/s", drive="natural_frequency"
-    )
-    model_damping: Annotated[float, Gt(0)] = parameter(0.804, "drive model: ζ", drive="damping")
+    model_natural_frequency: Positive = parameter(1038.0, "drive model: ωn", "rad/s", drive="natural_frequency")
+    model_damping: Positive = parameter(0.804, "drive model: ζ", drive="damping")
     model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s", drive="delay")
 
     def known(self) -> Mapping[str, Value]:
-        """See `NodeParameters`: the form is the tool's."""
+        """Nothing: the form is the tool's, and the law asks for it."""
         return {}
 
     @property
     def commanded_topic(self) -> str:
-        """See `NodeParameters`."""
+        """Topic of the drive that the model is of, before remapping."""
         return "coarse/command"
 
     @property
@@ -132,7 +130,7 @@ class FormLaw(Law):
         )
 
     def encoder_warnings(self, low: float, high: float, counts: int) -> list[str]:
-        """See `Learner`: counts per sample near a ratio of small numbers."""
+        """Return a doubt about counts per sample near a ratio of small numbers."""
         rate = self.parameters.sample_rate
         spindle = self._filter(1.0 / rate, counts)
         ratio = followed_ratio(spindle, low, high, _BAD)
@@ -164,7 +162,7 @@ class FormLaw(Law):
         )
 
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
-        """See `Learner`: half a revolution, since what is late must not meet what is learned."""
+        """Half a revolution [sample], since what is late must not meet what is learned."""
         return int(np.pi / (speed * self.parameters.step))
 
 

@@ -3,17 +3,15 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from annotated_types import Ge
 
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Array, Complex, Response, supremum
-from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
-from lathe_rc.cell.stages.learner import Learner, LearnerParameters
+from lathe_rc.cell.stages.learner import LawParameters, Learner
 from lathe_rc.cell.stages.obedience import OBEY, OUT_OF_REACH, Listener, apply, listens, may_learn, piece
 from lathe_rc.cell.stages.sampled import Sampled, checked
 from lathe_rc.errors import InputError
@@ -23,16 +21,6 @@ from lathe_rc.messages import Samples, Signals
 
 _TURN = 2.0 * np.pi
 _DIVERGED = 1  # why a step stops
-
-
-class LawParameters(LearnerParameters):
-    """Parameters that every law has."""
-
-    stop_ratio: Annotated[float, Ge(0)] = parameter(
-        2.0,
-        "a revolution whose RMS error is more than so many times that of the form, or of the first revolution, ends "
-        "the run; 0: none does",
-    )
 
 
 class Now(NamedTuple):
@@ -123,19 +111,17 @@ class LawMemory(NamedTuple):
 
 
 def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
-    """See `Sampled`."""
+    """Make the step of a law from its formula for one sample."""
 
     def step(memory: LawMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-        """See `lathe_rc.cell.stage`."""
+        """Compute the command of one block, piece by piece between reactions."""
         angle, speed, error_angle, error, form = inputs[0], inputs[1], inputs[2], inputs[3], inputs[4]
         position, command, who = inputs[-1], outputs[0], memory.who
         while start < command.size:
-            stop, learning = command.size, memory.learns[0] != 0
-            if who.listens:
-                stop = piece(who.obedience, start, flags[0])
-                if stop == start:
-                    return start, OBEY
-                learning = learning and may_learn(who.obedience)
+            stop = piece(who, start, command.size, flags[0])
+            if stop == start:
+                return start, OBEY
+            learning = memory.learns[0] != 0 and (not who.listens or may_learn(who))
             for k in range(start, stop):
                 n = first + k
                 if n >= memory.delay and _grows(memory.guard, error_angle[k], error[k], form[k]):
@@ -143,8 +129,7 @@ def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
                 sensed = position[k] if memory.senses else 0.0
                 now = Now(n, n * memory.period, angle[k], speed[k], error[k], error_angle[k], learning, sensed)
                 command[k] = sample(memory.law, now)
-            if who.listens:
-                apply(who.obedience, command[start:stop])
+            apply(who, command[start:stop])
             start = stop
         return command.size, DONE
 
@@ -234,7 +219,7 @@ class Law(Sampled, Learner):
         return float(np.pi / (self.parameters.step * speed))
 
     def worst(self, drive: Response, speed: float) -> tuple[float, float] | None:
-        """See `Learner`."""
+        """Largest magnitude of `contraction`, and the waves per revolution where it is."""
         with code_of_others(f"{self.name}: contraction"):
             if self.contraction(drive, np.zeros(1), speed) is None:
                 return None
@@ -247,7 +232,7 @@ class Law(Sampled, Learner):
         return checked(f"{self.name}: contraction", lambda: self.contraction(drive, waves, speed), waves)
 
     def perform(self, action: str) -> None:
-        """See `Stage`."""
+        """Clear the memory, or let the law learn or not."""
         if action == "clear":
             self.law = self.start()
         else:
@@ -255,14 +240,14 @@ class Law(Sampled, Learner):
 
     @property
     def memory(self) -> LawMemory:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         delay, period = self.parameters.feedback_delay, self.parameters.step
         return LawMemory(self.law, self._guard, self.listener, delay, period, self.senses, self._learns)
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """See `Stage`.
+        """Obey the supervisor, or end a run that diverges.
 
         Raises:
             LatheError: the loop diverges.

@@ -8,10 +8,18 @@ from types import MappingProxyType
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell.parameters import ObedientParameters, RestartParameters, Value, parameter, remapped
+from lathe_rc.cell.parameters import (
+    NonNegative,
+    ObedientParameters,
+    Positive,
+    RestartParameters,
+    Value,
+    parameter,
+    remapped,
+)
 from lathe_rc.cell.stage import Stage, WiredCell
 from lathe_rc.cell.stages.drive import BoundedParameters, Drive
 from lathe_rc.cell.stages.obedience import Obedience, Obedient
@@ -26,20 +34,20 @@ _BANDS = np.geomspace(60_000.0, 500.0, 32)  # [rad/s] where a flat Q may end
 _SHAPES = ((2.0, 1e-6), (3.0, 1e-6), (2.0, 1e-4), (3.0, 1e-4), (2.0, 1e-3), (2.0, 1e-2))
 
 
-class LearnerParameters(ObedientParameters, BoundedParameters, RestartParameters):
-    """Of a controller that learns a drive."""
+class LawParameters(ObedientParameters, BoundedParameters, RestartParameters):
+    """Parameters that every law has."""
 
     feedback_delay: Annotated[int, Ge(1), Le(2**24)] = parameter(
-        2048,
-        "samples from an error to when it is visible; at least a block, at most what the cycle leaves",
-        "sample",
+        2048, "samples from an error to when it is visible; at least a block, at most what the cycle leaves", "sample"
     )
     allow_unstable: bool = parameter(default=False, doc="start although the factor of a cycle is not below 1")
-    stop_ratio: Annotated[float, Ge(0)] = parameter(
-        0.0, "a cycle whose RMS error is more than so many times that of the first ends the run; 0: none does"
+    stop_ratio: NonNegative = parameter(
+        2.0,
+        "a revolution whose RMS error is more than so many times that of the form, or of the first revolution, ends "
+        "the run; 0: none does",
     )
     retract_position: float = parameter(0.0, "command when retracted", "m")
-    retract_time: Annotated[float, Gt(0)] = parameter(
+    retract_time: Positive = parameter(
         1.0, "longest takeover: a command that is farther away begins where the way takes so long", "s"
     )
 
@@ -51,7 +59,7 @@ class Learner(Obedient):
         parameters: its table.
     """
 
-    parameters: LearnerParameters
+    parameters: LawParameters
     learns = True
     factor: ClassVar[str] = "sup|factor of a cycle|"  #: what `worst` tells, in words
     remedy: ClassVar[str] = "change the law"  #: for a loop that diverges where none of its `cures` helps, in words
@@ -111,7 +119,7 @@ class Learner(Obedient):
     # ---- checks before a start ----------------------------------------------------------------------
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
-        """See `Stage`: the errors of a cycle come in time, and learning converges."""
+        """Refuse a feedback that comes too late for the cycle, and learning that does not converge."""
         super().check_cell(cell, cures=cures)
         low, high = cell.speed_range
         self._check_delay(cell, high)

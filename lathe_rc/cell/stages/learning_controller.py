@@ -38,7 +38,7 @@ _LEADS = (1.0, 0.9, 1.1, 0.8, 1.2, 0.7, 1.3, 1.5, 1.75, 2.0, 2.25, 2.5)
 
 
 class LearningController(Learner):
-    """See `lathe_rc.control.repetitive`.
+    """Repetitive controller of one drive; see `lathe_rc.control.repetitive`.
 
     Attributes:
         parameters: its table.
@@ -131,17 +131,17 @@ class LearningController(Learner):
         )
 
     def worst(self, drive: Response, speed: float) -> tuple[float, float]:
-        """See `Learner`: sup|Q - γZ|."""
+        """Return sup|Q - γZ|, and the waves per revolution where it is."""
         return self.loop(drive).worst(speed)
 
     def checked_speeds(self, low: float, high: float) -> Collection[float]:
-        """See `Learner`."""
+        """Speeds at which convergence is checked [rad/s]; a memory over time knows one alone."""
         if self.parameters.law == "time_periodic":
             return {self.parameters.nominal_speed}
         return super().checked_speeds(low, high)
 
     def settings(self) -> str:
-        """See `Learner`."""
+        """Lead and Q, which decide whether learning converges, in words."""
         parameters = self.parameters
         q = f"q_time = {parameters.q_time * 1e6:.4g} µs"
         if parameters.q_filter == "fir":
@@ -149,7 +149,7 @@ class LearningController(Learner):
         return f"lead_time = {parameters.lead_time * 1e3:.4g} ms, {q}"
 
     def cures(self, lag: float) -> Iterable[Iterable[Mapping[str, Value]]]:
-        """See `Learner`: a lead near what the correction leaves of the lag, or a Q that forgets more."""
+        """A lead near what the correction leaves of the lag, or a Q that forgets more."""
         parameters = self.parameters
         if parameters.correction.startswith("second_order_inverse"):
             lag -= self.correction.inverse[0]
@@ -162,7 +162,7 @@ class LearningController(Learner):
         yield ({name: float(f"{value * by**k:.2g}") for name, value, by in q} for k in range(1, _QS))
 
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
-        """See `Learner`."""
+        """Longest feedback delay [sample] that cycle and lead leave."""
         parameters = self.parameters
         if parameters.law == "time_periodic":
             speed, acceleration, count = parameters.nominal_speed, 0.0, 0.0
@@ -179,7 +179,7 @@ class LearningController(Learner):
         )
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
-        """See `Stage`: an exact preview knows the speed law of the spindle."""
+        """Refuse an exact preview that does not know the speed law of the spindle, and what `Learner` does."""
         master = cell.master
         if self.parameters.lead_law == "exact_preview":
             own, true = self.parameters.speed_law(self.name), master.law
@@ -198,13 +198,13 @@ class LearningController(Learner):
     # ---- events -------------------------------------------------------------------------------------
 
     def check_action(self, action: str) -> None:
-        """See `Stage`."""
+        """Refuse an event that the controller does not know, or that lacks its file."""
         super().check_action(action)
         if action in _FILE_ACTIONS and not self.parameters.memory_file:
             raise InputError(f"{self.name}.memory_file is empty; name the file for the event {action!r}")
 
     def schedule(self, action: str, index: int) -> None:
-        """See `Stage`; a memory that cannot be loaded is refused now."""
+        """Schedule an event; a memory that cannot be loaded is refused now, not in mid-run."""
         self.check_action(action)
         if action == "load":
             self._read_memory()
@@ -217,7 +217,7 @@ class LearningController(Learner):
             return memory_file.load(path, parameters.cycle_points, parameters.points_per_revolution)
 
     def perform(self, action: str) -> None:
-        """See `Stage`."""
+        """Carry out an event; the samples from now on feel it."""
         controller = self._controller
         if action == "clear":
             controller.clear()
@@ -235,7 +235,7 @@ class LearningController(Learner):
 
     @property
     def memory(self) -> Memory:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         parameters = self.parameters
         return Memory(
             control=self._controller.table,
@@ -256,7 +256,7 @@ class LearningController(Learner):
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """See `Stage`.
+        """Smooth the memory, end a cycle, or obey the supervisor.
 
         Raises:
             AngleLostError: the memory cannot be read at the angle that was measured.
@@ -280,7 +280,7 @@ class LearningController(Learner):
         return sparse
 
     def tell(self, first: int, end: int) -> list[Sparse]:
-        """See `Stage`."""
+        """Return the cycles that have ended, and the loss of the angle."""
         sparse: list[Sparse] = []
         if not self._asks:
             sparse += [message for cycle in self._controller.ended() for message in self._end_cycle(cycle)]

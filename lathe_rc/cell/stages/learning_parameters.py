@@ -8,8 +8,8 @@ from typing import Annotated, Literal, cast
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from lathe_rc.cell.parameters import about, parameter
-from lathe_rc.cell.stages.learner import LearnerParameters
+from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
+from lathe_rc.cell.stages.learner import LawParameters
 from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.lead import LeadLaw, Preview
@@ -34,12 +34,15 @@ def _own_q(make: Callable[..., QFilter], *numbers: float) -> QFilter:
     return make(*numbers)
 
 
-class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
+class LearningControllerParameters(SpeedLawParameters, LawParameters):
     """Law, lead, Q and correction of a channel, and the drive model that its stability margin is computed from.
 
     The speed deviations are what ``exact_preview`` knows in advance; no other law uses them.
     """
 
+    stop_ratio: NonNegative = parameter(
+        0.0, "a cycle whose RMS error is more than so many times that of the first ends the run; 0: none does"
+    )
     law: Literal["angle_domain", "time_periodic"] = parameter(
         "angle_domain", "memory over the spindle angle (paper 000, Fig. 1b) or over time (Fig. 1a)"
     )
@@ -68,19 +71,18 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
     q_time: Annotated[float, Ge(0), Le(1)] = parameter(
         67.0e-6, "width of Q at nominal speed: Q = 1 - (ω·q_time)² for low ω; fixed in angle; not of fir", "s"
     )
-    q_pass: Annotated[float, Gt(0)] = parameter(4000.0, "fir: end of the pass band at nominal speed", "rad/s")
-    q_stop: Annotated[float, Gt(0)] = parameter(10000.0, "fir: begin of the stop band at nominal speed", "rad/s")
+    q_pass: Positive = parameter(4000.0, "fir: end of the pass band at nominal speed", "rad/s")
+    q_stop: Positive = parameter(10000.0, "fir: begin of the stop band at nominal speed", "rad/s")
     q_ripple: Annotated[float, Gt(1e-8), Lt(0.5)] = parameter(1e-4, "fir: ripple in both bands")
     learning_gain: Annotated[float, Gt(0), Le(2)] = parameter(1.0, "γ; 1 in the papers")
     soft_start: Annotated[float, Ge(0), Le(1024)] = parameter(
         0.0, "the gain rises from 0 over so many revolutions when learning begins; 0: at once", "rev"
     )
-    join_below: Annotated[float, Ge(0)] = parameter(
+    join_below: NonNegative = parameter(
         0.0, "the channel learns from the first cycle on whose largest error is within this; 0: at once", "m"
     )
     finer: list[str] = parameter(
-        [],
-        "drives after this channel: their motion is added to the tool's error, so that it learns its own error",
+        [], "drives after this channel: their motion is added to the tool's error, so that it learns its own error"
     )
     points_per_revolution: Annotated[int, Ge(64), Le(65536)] = parameter(1024, "points of the memory per revolution")
     cycle_revolutions: Annotated[int, Ge(1), Le(1024)] = parameter(
@@ -94,21 +96,19 @@ class LearningControllerParameters(SpeedLawParameters, LearnerParameters):
         default=False, doc="publish the stability margin sample by sample as well, on coarse/margin, for a supervisor"
     )
     identify: bool = parameter(default=True, doc="identify the drive from its command and measured position")
-    identification_bandwidth: Annotated[float, Gt(0)] = parameter(
+    identification_bandwidth: Positive = parameter(
         1000.0, "bandwidth of its filters: above the profile's harmonics, below the noise", "rad/s"
     )
     identification_forgetting: Annotated[float, Ge(0), Lt(1)] = parameter(
         0.5, "weight that a cycle's measurements keep after the next"
     )
-    model_natural_frequency: Annotated[float, Gt(0)] = parameter(
-        1038.0, "drive model: ωn", "rad/s", drive="natural_frequency"
-    )
-    model_damping: Annotated[float, Gt(0)] = parameter(0.804, "drive model: ζ", drive="damping")
+    model_natural_frequency: Positive = parameter(1038.0, "drive model: ωn", "rad/s", drive="natural_frequency")
+    model_damping: Positive = parameter(0.804, "drive model: ζ", drive="damping")
     model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s", drive="delay")
 
     @property
     def commanded_topic(self) -> str:
-        """See `NodeParameters`."""
+        """Topic of the drive that the model is of, before remapping."""
         return "coarse/command"
 
     @property

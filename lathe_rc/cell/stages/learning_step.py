@@ -72,7 +72,7 @@ def _begin(memory: Memory, first: int, start: int, stop: int, inputs: Fields) ->
     """Look ahead along a piece of a block, and take its errors."""
     control, samples = memory.control, stop - start
     speed, error = inputs[1][start:stop], inputs[3][start:stop]
-    if memory.by_time or (memory.falls_back and obeyed(memory.who.obedience) >= Reaction.FALL_BACK.value):
+    if memory.by_time or (memory.falls_back and obeyed(memory.who) >= Reaction.FALL_BACK.value):
         speed = np.full(samples, memory.nominal)
     if memory.finer:
         error = error.copy()
@@ -95,17 +95,16 @@ def _lose(memory: Memory, start: int, stop: int, command: Samples) -> None:
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Compute the command of one block, from the memory over the angle."""
     control, state, who, command = memory.control, memory.state, memory.who, outputs[0]
     n = command.size
     while start < n or state[_INSIDE]:
         if not state[_INSIDE]:
-            stop = n
+            stop = piece(who, start, n, flags[0])
+            if stop == start:
+                return start, OBEY
             if who.listens:
-                stop = piece(who.obedience, start, flags[0])
-                if stop == start:
-                    return start, OBEY
-                control.whole[angle_memory.LEARNS] = may_learn(who.obedience)
+                control.whole[angle_memory.LEARNS] = may_learn(who)
             state[_INSIDE], state[_BEGIN], state[_END] = 1, start, stop
             if not state[_LOST]:
                 _begin(memory, first, start, stop, inputs)
@@ -128,8 +127,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
             outputs[published][start:reached] = memory.margin[0]
         if reason != DONE:
             return reached, reason
-        if who.listens:
-            apply(who.obedience, command[begin:stop])
+        apply(who, command[begin:stop])
         state[_INSIDE] = 0
         start = stop
     return n, DONE

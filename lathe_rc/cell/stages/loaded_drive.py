@@ -9,16 +9,15 @@ from annotated_types import Ge, Gt, Le
 from pydantic import create_model
 
 from lathe_rc import messages
-from lathe_rc.analysis.learning import Response
 from lathe_rc.arrays import put, put_scaled
-from lathe_rc.cell.parameters import about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
-from lathe_rc.cell.stages.command_limits import Clipping, LimitedCommand, limited, remembered
+from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
+from lathe_rc.cell.stages.command_limits import Clipping, limited
 from lathe_rc.cell.stages.cutting_process import READ, TURNS, CutStage, CuttingProcessParameters
-from lathe_rc.cell.stages.drive import Drive, Limits, OwnRetraction, followed
+from lathe_rc.cell.stages.drive import followed
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
-from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters, SetPoint, sum_up
-from lathe_rc.cell.stages.series_drive import COARSE, FINE, piezo_on_carriage, tool_drive
+from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters, sum_up
+from lathe_rc.cell.stages.series_drive import FINE, CoupledDrive, piezo_on_carriage, tool_drive
 from lathe_rc.cell.stages.tables import ComposedParameters, made_of, prefixed
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import CommandLimits, LimiterTable, limiter
@@ -29,7 +28,7 @@ from lathe_rc.plants.chip import CutTable
 from lathe_rc.plants.coil import Coil
 from lathe_rc.plants.tool_motion import MotionTable, advance_loaded, failure
 from lathe_rc.signals.allowance import AllowanceTable, allow
-from lathe_rc.signals.noise import Sensor, SensorTable, measure
+from lathe_rc.signals.noise import SensorTable, measure
 
 _CUT = "cut_"  # begins the parameters of the cut
 _COIL = "coil"  # whose limits are told
@@ -45,15 +44,15 @@ class LoadedCoarseParameters(ElectrodynamicActuatorParameters):
         "ideal",
         "ideal: the force of the position loop is there at once; current: a coil with its current loop makes it",
     )
-    resistance: Annotated[float, Gt(0)] = parameter(2.0, "loop current: of the coil", "ohm")
-    inductance: Annotated[float, Gt(0)] = parameter(2e-3, "loop current: of the coil", "H")
-    bandwidth: Annotated[float, Gt(0)] = parameter(12e3, "loop current: bandwidth of the current loop", "rad/s")
+    resistance: Positive = parameter(2.0, "loop current: of the coil", "ohm")
+    inductance: Positive = parameter(2e-3, "loop current: of the coil", "H")
+    bandwidth: Positive = parameter(12e3, "loop current: bandwidth of the current loop", "rad/s")
     back_emf: bool = parameter(
         default=True, doc="loop current: the motion induces a voltage, force_constant · velocity"
     )
-    current_limit: Annotated[float, Ge(0)] = parameter(0.0, "loop current: largest set point; 0: any", "A")
-    voltage_limit: Annotated[float, Ge(0)] = parameter(0.0, "loop current: of the amplifier; 0: any", "V")
-    slew_rate: Annotated[float, Ge(0)] = parameter(0.0, "loop current: the set point changes no faster; 0: any", "A/s")
+    current_limit: NonNegative = parameter(0.0, "loop current: largest set point; 0: any", "A")
+    voltage_limit: NonNegative = parameter(0.0, "loop current: of the amplifier; 0: any", "V")
+    slew_rate: NonNegative = parameter(0.0, "loop current: the set point changes no faster; 0: any", "A/s")
 
     def coil(self, node: str) -> Coil | None:
         """The current loop, if there is one.
@@ -73,7 +72,7 @@ class LoadedCoarseParameters(ElectrodynamicActuatorParameters):
 class LoadedFineParameters(PiezoActuatorParameters):
     """The piezo drive with its preload."""
 
-    preload: Annotated[float, Ge(0)] = parameter(
+    preload: NonNegative = parameter(
         0.0, "of the stack: a larger tension tears it off and ends the run; 0: it holds any", "N"
     )
 
@@ -105,7 +104,7 @@ class LoadedParameters(ComposedParameters):
         return self.part(_CUT, CuttingProcessParameters)
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """See `NodeParameters`; without force and current loop."""
+        """Quantities of each drive by itself, without force and current loop."""
         return self.coarse.drive_models()
 
 
@@ -122,7 +121,7 @@ class LoadedSeriesParameters(LoadedParameters):
         return self.part(FINE, LoadedFineParameters)
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """See `NodeParameters`; each drive by itself, without force and current loop."""
+        """Quantities of each drive by itself, without force and current loop."""
         return {**self.coarse.drive_models(), **self.fine.drive_models()}
 
 
@@ -151,7 +150,7 @@ LoadedSeriesDriveParameters = create_model(
     **{
         **_OF_COARSE_AND_CUT,
         **prefixed(FINE, LoadedFineParameters),
-        "coarse_moving_mass": (Annotated[float, Gt(0)], parameter(1.2, "carriage and coil, without the tool", "kg")),
+        "coarse_moving_mass": (Positive, parameter(1.2, "carriage and coil, without the tool", "kg")),
     },
 )
 
@@ -227,7 +226,7 @@ def _advance(
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Move the coarse drive through one block, under the cutting force."""
     n, room = inputs[0].size, memory.room
     motion = (outputs[0], outputs[1], outputs[2], outputs[3], room[5, :n], room[6, :n], room[7, :n])
     return _advance(memory, first, inputs, motion, room[8, :n], outputs[4:])
@@ -235,16 +234,15 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 @kernel
 def step_series(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Move both drives through one block, under the cutting force."""
     return _advance(memory, first, inputs, outputs[:7], outputs[7], outputs[8:])
 
 
-class LoadedDriveStage(CutStage, Drive):
-    """See `lathe_rc.plants.tool_drive`.
+class LoadedDriveStage(CutStage, CoupledDrive):
+    """Electrodynamic drive that feels the cutting force; see `lathe_rc.plants.tool_drive`.
 
     Attributes:
         parameters: its table.
-        drive: the machine.
     """
 
     kind = "loaded_drive"
@@ -252,22 +250,17 @@ class LoadedDriveStage(CutStage, Drive):
     failure = staticmethod(failure)
     rooms = 9
     step = staticmethod(step)
-    _retraction: OwnRetraction
 
     def __init__(self, name: str, parameters: LoadedParameters) -> None:
         super().__init__(name, parameters, parameters.cut, _CUT)
         self.parameters, self._cut = parameters, parameters.cut
-        coarse, fine = parameters.coarse, None
+        coarse, fine, piezo = parameters.coarse, None, None
         coil = coarse.coil(name)
-        piezo = self._set_point = None
-        self._limited = [
-            LimitedCommand(name, coarse, "coarse" if isinstance(parameters, LoadedSeriesParameters) else "")
-        ]
         if isinstance(parameters, LoadedSeriesParameters):
             fine = parameters.fine
-            self._set_point = SetPoint(name, fine, inside=(COARSE,), prefix=FINE)
-            self._limited.append(LimitedCommand(name, fine, "fine"))
-            piezo = piezo_on_carriage(name, fine, parameters.mass_ratio, fine.preload or np.inf)
+        self._equip(coarse, fine)
+        if isinstance(parameters, LoadedSeriesParameters):
+            piezo = piezo_on_carriage(name, parameters.fine, parameters.mass_ratio, parameters.fine.preload or np.inf)
         with about(name, "coarse_bandwidth" if coil else "mass_ratio", "sample_rate"):
             self.drive = tool_drive(
                 coarse,
@@ -277,14 +270,8 @@ class LoadedDriveStage(CutStage, Drive):
                 piezo=piezo,
                 kept=messages.MAX_BLOCK if coil else 1,
             )
-        self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
-        self._retraction = OwnRetraction(coarse, coarse.stroke)
-        self._clipping = Clipping(name, parameters, _COIL) if coil else None
-        # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
-        self._sensors = [
-            Sensor(coarse.noise_rms, 0.0, parameters.seed, f"{name}/coarse"),
-            Sensor(fine.noise_rms if fine else 0.0, fine.resolution if fine else 0.0, parameters.seed, f"{name}/fine"),
-        ]
+        if coil:
+            self._clippings = [Clipping(name, parameters, _COIL, self.drive.table.coil.limited)]
         inputs = [TURNS, _REFERENCE, Input("coarse/command", messages.COMMAND, ("position",))]
         inputs += self._set_point.inputs if self._set_point else []
         self._slides, place = dict.fromkeys(("cross", "longitudinal"), -1), sum(len(port.fields) for port in inputs)
@@ -295,23 +282,16 @@ class LoadedDriveStage(CutStage, Drive):
         if fine:
             outputs.append(Output("fine/state", messages.STATE))
         outputs.append(Output("cut", messages.CUT))
-        self.declare(inputs=inputs, outputs=outputs, tells=bool(coil) or any(limited.on for limited in self._limited))
-
-    def responses(self) -> Mapping[str, Response]:
-        """See `Drive`; in air, and as long as nothing is limited."""
-        found: dict[str, Response] = {"coarse/command": self.drive.coarse_response}
-        if self._set_point:
-            found["fine/command"] = self.drive.fine_response
-        return found
+        self.declare(inputs=inputs, outputs=outputs, tells=bool(coil) or any(command.on for command in self._commands))
 
     @property
     def memory(self) -> Memory:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         cut = self._cut
         return Memory(
             retraction=self._retraction.table,
-            limits=self._limited[0].table,
-            limits_fine=self._limited[1].table if self._set_point else _NO_LIMITS,
+            limits=self._commands[0].table,
+            limits_fine=self._commands[1].table if self._set_point else _NO_LIMITS,
             signs=self._set_point.signs if self._set_point else np.empty(0),
             drive=self.drive.table,
             cut=self.cut.table,
@@ -324,17 +304,6 @@ class LoadedDriveStage(CutStage, Drive):
             feed=cut.feed / (2.0 * np.pi),
             room=self.room,
         )
-
-    def tell(self, first: int, end: int) -> list[Sparse]:
-        """See `Stage`."""
-        found = super().tell(first, end)
-        if self._clipping:
-            found += self._clipping.told(first, remembered(self.drive.table.coil.limited, first, end))
-        return found
-
-    def finish(self, index: int) -> list[Sparse]:
-        """See `Stage`."""
-        return super().finish(index) + (self._clipping.finish(index) if self._clipping else [])
 
 
 class LoadedSeriesDrive(LoadedDriveStage):

@@ -8,9 +8,9 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc import messages
-from lathe_rc.cell.parameters import about, parameter
+from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Reached, Sparse
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, remembered
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderParameters
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.jit import kernel
@@ -25,18 +25,18 @@ _MOST_LAG = 0.9 * 2.0 * np.pi  # [rad] by which a run is longer than its law nee
 class LoadedSpindleParameters(SpindleEncoderParameters):
     """A speed law, and what the torque of the cut makes of it; a run is longer than the law by what that delays it."""
 
-    inertia: Annotated[float, Gt(0)] = parameter(0.03, "of spindle, chuck and part", "kg*m^2")
-    motor_inertia: Annotated[float, Gt(0)] = parameter(0.01, "of the motor, referred to the spindle", "kg*m^2")
-    belt_stiffness: Annotated[float, Ge(0)] = parameter(0.0, "referred to the spindle; 0: rigid", "N*m/rad")
-    belt_damping: Annotated[float, Ge(0)] = parameter(0.0, "referred to the spindle", "N*m*s/rad")
-    torque_limit: Annotated[float, Ge(0)] = parameter(0.0, "of the motor, referred to the spindle; 0: none", "N*m")
-    speed_bandwidth: Annotated[float, Gt(0)] = parameter(30.0, "speed loop: gain over both inertias", "rad/s")
-    speed_integral_time: Annotated[float, Gt(0)] = parameter(0.1, "speed loop: integral time", "s")
-    part_radius: Annotated[float, Ge(0)] = parameter(0.05, "at which the main cutting force acts", "m")
+    inertia: Positive = parameter(0.03, "of spindle, chuck and part", "kg*m^2")
+    motor_inertia: Positive = parameter(0.01, "of the motor, referred to the spindle", "kg*m^2")
+    belt_stiffness: NonNegative = parameter(0.0, "referred to the spindle; 0: rigid", "N*m/rad")
+    belt_damping: NonNegative = parameter(0.0, "referred to the spindle", "N*m*s/rad")
+    torque_limit: NonNegative = parameter(0.0, "of the motor, referred to the spindle; 0: none", "N*m")
+    speed_bandwidth: Positive = parameter(30.0, "speed loop: gain over both inertias", "rad/s")
+    speed_integral_time: Positive = parameter(0.1, "speed loop: integral time", "s")
+    part_radius: NonNegative = parameter(0.05, "at which the main cutting force acts", "m")
     load_delay: Annotated[int, Ge(1), Le(2**31 - 1)] = parameter(
         64, "delay of the feedback edge from the cut, at least a block: so late the spindle feels the force", "sample"
     )
-    largest_load: Annotated[float, Gt(0)] = parameter(50.0, "a larger torque of the cut ends the run", "N*m")
+    largest_load: Positive = parameter(50.0, "a larger torque of the cut ends the run", "N*m")
     largest_deviation: Annotated[float, Gt(0), Lt(1)] = parameter(
         0.1, "a larger change of the speed by the load, relative to the nominal one, ends the run"
     )
@@ -76,7 +76,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Turn the spindle through one block, under the torque of the cut, and read its encoder."""
     angle_true, speed_true = outputs[3], outputs[4]
     follow_law(memory.encoder, first, angle_true, speed_true)
     reached, reason = turn(memory.spindle, first, inputs[0], angle_true, speed_true, memory.room[0])
@@ -87,7 +87,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class LoadedSpindleStage(SpindleEncoder):
-    """See `lathe_rc.plants.spindle`.
+    """Spindle with motor, belt and speed loop, which the cut slows; see `lathe_rc.plants.spindle`.
 
     Attributes:
         spindle: the machine.
@@ -106,35 +106,35 @@ class LoadedSpindleStage(SpindleEncoder):
         self._push = 2.0 * parameters.largest_load / parameters.inertia  # load and motor may push the same way
         super().__init__(name, parameters)
         self.law = None  # nobody knows in advance what the load will make of it
-        self._clipping = Clipping(name, parameters, _TORQUE)
+        self._clipping = Clipping(name, parameters, _TORQUE, self.spindle.table.limited)
 
     def _loads(self) -> Sequence[Input]:
-        """See `SpindleEncoder`."""
+        """The force of the cut, of some samples ago."""
         return [Input("cut", messages.CUT, ("force",), self._delay)]
 
     def _lag(self) -> float:
-        """See `SpindleEncoder`: what the integral of the speed loop needs for the largest load; less than a turn."""
+        """Angle that the integral of the speed loop needs for the largest load [rad]; less than a turn."""
         table = self.spindle.table
         return min(table.largest_load / table.integral, _MOST_LAG) if table.radius else 0.0
 
     def speed_range(self) -> tuple[float, float]:
-        """See `TimeMaster`."""
+        """Lowest and highest speed in the run [rad/s]."""
         low, high = super().speed_range()
         return low - self._largest, high + self._largest
 
     def largest_acceleration(self) -> float:
-        """See `TimeMaster`."""
+        """Upper bound of the magnitude of dΩ/dt in the run [rad/s²]."""
         return super().largest_acceleration() + self._push
 
     @property
     def memory(self) -> tuple[Any, ...]:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         return Memory(self._encoder.table, self.spindle.table, self.room)
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """See `Stage`.
+        """End a run whose spindle cannot go on.
 
         Raises:
             LatheError: the load is larger than allowed, or what it does.
@@ -143,9 +143,9 @@ class LoadedSpindleStage(SpindleEncoder):
         raise failure(reason, self.spindle.table, angle, force)
 
     def tell(self, first: int, end: int) -> list[Sparse]:
-        """See `Stage`."""
-        return self._clipping.told(first, remembered(self.spindle.table.limited, first, end))
+        """Return the events of the samples that the step has computed last."""
+        return self._clipping.tell(first, end)
 
     def finish(self, index: int) -> list[Sparse]:
-        """See `Stage`."""
+        """Return the events that are left when the run ends."""
         return self._clipping.finish(index)

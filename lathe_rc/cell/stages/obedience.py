@@ -3,14 +3,13 @@
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from annotated_types import Gt
 
 from lathe_rc import messages
-from lathe_rc.cell.parameters import ObedientParameters, parameter
+from lathe_rc.cell.parameters import ObedientParameters, Positive, parameter
 from lathe_rc.cell.stage import Input, Sparse, Stage
 from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, take_over
@@ -32,12 +31,12 @@ def listens(parameters: ObedientParameters) -> list[Input]:
 class FeedObedientParameters(ObedientParameters):
     """Of a node of the feed that obeys the supervisor."""
 
-    stop_rate: Annotated[float, Gt(0)] = parameter(
+    stop_rate: Positive = parameter(
         10.0, "largest rate of the command while it is brought to rest, and of what is left of that when given back",
         "1/s",
     )  # fmt: skip
-    stop_rate_change: Annotated[float, Gt(0)] = parameter(1000.0, "largest change of that rate", "1/s^2")
-    stop_time: Annotated[float, Gt(0)] = parameter(
+    stop_rate_change: Positive = parameter(1000.0, "largest change of that rate", "1/s^2")
+    stop_time: Positive = parameter(
         1.0, "longest duration: a command that is farther away begins where the way takes so long", "s"
     )
 
@@ -88,38 +87,53 @@ class ObedienceTable(NamedTuple):
     takeover: TakeoverTable
 
 
+class Listener(NamedTuple):
+    """The obedience of a node, if it has any, for kernels.
+
+    Attributes:
+        obedience: to the supervisor, if it ``listens``.
+        listens: see above.
+    """
+
+    obedience: ObedienceTable
+    listens: bool
+
+
 @kernel
-def piece(obedience: ObedienceTable, start: int, reaction: Samples) -> int:
-    """Where the piece of a block ends that begins with sample ``start`` and in which nothing changes.
+def piece(who: Listener, start: int, end: int, reaction: Samples) -> int:
+    """Where the piece of a block ends that begins with sample ``start`` and in which nothing changes; ``end`` at most.
 
     It is ``start`` itself where another reaction has to be obeyed first (`OBEY`).
     """
-    obeyed, stop = obedience.whole[_REACTION], start
-    while stop < reaction.size and reaction[stop] == obeyed:
+    if not who.listens:
+        return end
+    obeyed, stop = who.obedience.whole[_REACTION], start
+    while stop < end and reaction[stop] == obeyed:
         stop += 1
-    forbidden = obedience.forbidden[0]
+    forbidden = who.obedience.forbidden[0]
     if 0.0 < forbidden < stop - start:
         stop = start + int(forbidden)
     return stop
 
 
 @kernel
-def may_learn(obedience: ObedienceTable) -> bool:
-    """Whether there is learning in the next piece."""
-    return bool(obedience.whole[_WANTS] and obedience.forbidden[0] == 0.0)
+def may_learn(who: Listener) -> bool:
+    """Whether a node that listens may learn in the next piece."""
+    return bool(who.obedience.whole[_WANTS] and who.obedience.forbidden[0] == 0.0)
 
 
 @kernel
-def obeyed(obedience: ObedienceTable) -> int:
-    """The reaction."""
-    return int(obedience.whole[_REACTION])
+def obeyed(who: Listener) -> int:
+    """The reaction that is in force."""
+    return int(who.obedience.whole[_REACTION])
 
 
 @kernel
-def apply(obedience: ObedienceTable, command: Samples) -> None:
+def apply(who: Listener, command: Samples) -> None:
     """Make of what the controller wants in a piece what the drive gets; in place, in its unit."""
-    take_over(obedience.takeover, command)
-    obedience.forbidden[0] = max(obedience.forbidden[0] - command.size, 0.0)
+    if who.listens:
+        take_over(who.obedience.takeover, command)
+        who.obedience.forbidden[0] = max(who.obedience.forbidden[0] - command.size, 0.0)
 
 
 NOBODY = ObedienceTable(
@@ -176,18 +190,6 @@ class Obedience:
         return [Sparse(f"{self._name}/events", messages.EVENT, index, {"action": f"{OUT_OF_REACH}: by {skipped:g}"})]
 
 
-class Listener(NamedTuple):
-    """The obedience of a node, if it has any, for kernels.
-
-    Attributes:
-        obedience: to the supervisor, if it ``listens``.
-        listens: see above.
-    """
-
-    obedience: ObedienceTable
-    listens: bool
-
-
 class Obedient(Stage):
     """A stage that obeys the supervisor, whose reactions are its last input; a subclass sets its obedience, if any."""
 
@@ -202,7 +204,7 @@ class Obedient(Stage):
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """See `Stage`: obey, where the step has stopped for that (`OBEY`)."""
+        """Obey a new reaction, where the step has stopped for that (`OBEY`)."""
         if reason != OBEY or self._obedience is None:
             return []
         return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)

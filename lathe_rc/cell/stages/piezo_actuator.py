@@ -7,11 +7,11 @@ from functools import lru_cache
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell.parameters import NodeParameters, about, parameter
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
 from lathe_rc.cell.stages.command_limits import LimitedCommand, LimitedParameters, limited
 from lathe_rc.cell.stages.drive import Drive
@@ -104,48 +104,46 @@ _Named = Callable[..., AbstractContextManager[None]]
 class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
     """Set point, resonance 1/(1 + 2ζp/ωn + p²/ωn²), amplifier, hysteresis and its linearisation, creep, sensor."""
 
-    natural_frequency: Annotated[float, Gt(0)] = parameter(14600.0, "natural frequency ωn", "rad/s")
-    damping: Annotated[float, Gt(0)] = parameter(0.299, "damping ratio ζ; 0.02 for a bare actuator", "1")
+    natural_frequency: Positive = parameter(14600.0, "natural frequency ωn", "rad/s")
+    damping: Positive = parameter(0.299, "damping ratio ζ; 0.02 for a bare actuator", "1")
     amplifier_lag: Annotated[float, Ge(0), Le(0.1)] = parameter(
         0.0, "time constant of the amplifier; 0: none; 40e-6 for a bare actuator", "s"
     )
-    slew_rate: Annotated[float, Ge(0)] = parameter(
+    slew_rate: NonNegative = parameter(
         0.0, "the amplifier changes its voltage no faster: its current over the capacity of the ceramics; 0: any", "V/s"
     )
     discretisation: Discretisation = parameter("foh", "foh: exact for a command linear between samples; or tustin")
-    stroke: Annotated[float, Gt(0)] = parameter(15e-6, "displacement at plus and minus full voltage", "m")
-    full_voltage: Annotated[float, Gt(0)] = parameter(100.0, "voltage from the middle at the full stroke", "V")
+    stroke: Positive = parameter(15e-6, "displacement at plus and minus full voltage", "m")
+    full_voltage: Positive = parameter(100.0, "voltage from the middle at the full stroke", "V")
     hysteresis: Literal["none", "prandtl_ishlinskii", "bouc_wen"] = parameter(
         "prandtl_ishlinskii", "hysteresis of the ceramics, relative to the stroke"
     )
-    play_thresholds: list[Annotated[float, Gt(0)]] = parameter(
+    play_thresholds: list[Positive] = parameter(
         [], "prandtl_ishlinskii: increasing thresholds of the plays; empty: ten, i/11"
     )
     play_weights: list[float] = parameter([], "prandtl_ishlinskii: their weights; empty: ten of 0.04767")
-    play_proportional: Annotated[float, Gt(0)] = parameter(0.7617, "prandtl_ishlinskii: weight p0 of no play")
-    bouc_wen_a: Annotated[float, Gt(0)] = parameter(0.33, "bouc_wen: A")
+    play_proportional: Positive = parameter(0.7617, "prandtl_ishlinskii: weight p0 of no play")
+    bouc_wen_a: Positive = parameter(0.33, "bouc_wen: A")
     bouc_wen_beta: float = parameter(0.7, "bouc_wen: β")
     bouc_wen_gamma: float = parameter(0.3, "bouc_wen: γ")
     linearisation: Literal["none", "inverse"] = parameter("inverse", "inverse: the hysteresis is undone beforehand")
-    identified_scale: Annotated[float, Gt(0)] = parameter(
+    identified_scale: Positive = parameter(
         1.0, "error of its identification: factor on the weights of the plays, or on A; 0.85 is 15 % low"
     )
     identified_weights: list[float] = parameter(
         [], "weights of the plays that an identification found (docs/drives.md); empty: those of the drive"
     )
-    identified_thresholds: list[Annotated[float, Gt(0)]] = parameter(
+    identified_thresholds: list[Positive] = parameter(
         [], "thresholds that belong to identified_weights; empty: those of the drive"
     )
-    identified_proportional: Annotated[float, Ge(0)] = parameter(
-        0.0, "p0 that belongs to identified_weights; 0: that of the drive"
-    )
+    identified_proportional: NonNegative = parameter(0.0, "p0 that belongs to identified_weights; 0: that of the drive")
     creep_per_decade: Annotated[float, Ge(0), Le(1)] = parameter(
         0.0, "creep in each decade of time relative to the displacement; 0: none"
     )
-    creep_shortest: Annotated[float, Gt(0)] = parameter(0.1, "shortest time constant of the creep", "s")
+    creep_shortest: Positive = parameter(0.1, "shortest time constant of the creep", "s")
     creep_decades: Annotated[int, Ge(1), Le(12)] = parameter(3, "time constants of the creep, a decade apart")
-    noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
-    resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
+    noise_rms: NonNegative = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
+    resolution: NonNegative = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
 
     def _hysteresis(self, named: _Named) -> PrandtlIshlinskii | BoucWen | None:
         if self.hysteresis == "none":
@@ -173,7 +171,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
             )
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """See `NodeParameters`; the amplifier's lag is left out."""
+        """Quantities of the drive that controllers may know; the amplifier's lag is left out."""
         known = {"natural_frequency": self.natural_frequency, "damping": self.damping, "delay": 0.0}
         return {"fine/command": known}
 
@@ -223,7 +221,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Move the piezo through one block, within its limits."""
     position, velocity, effort, measured_position = outputs
     set_point = sum_up(memory.signs, inputs, 0, position.size)
     advance_fine(memory.drive, limited(memory.limits, first, set_point), position, velocity, effort)
@@ -232,7 +230,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class PiezoActuator(Drive):
-    """See `lathe_rc.plants.piezo`.
+    """Fine piezo drive; see `lathe_rc.plants.piezo`.
 
     Attributes:
         parameters: its table.
@@ -249,19 +247,19 @@ class PiezoActuator(Drive):
         self.parameters = parameters
         self.drive = made_of(PiezoDrive, parameters, stack=parameters.stack(name), method=parameters.discretisation)
         self.set_point = SetPoint(name, parameters)
-        self._limited = [LimitedCommand(name, parameters)]
+        self._commands = [LimitedCommand(name, parameters)]
         self._sensors = [Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)]
         self.declare(
             inputs=self.set_point.inputs,
             outputs=[Output("fine/state", messages.STATE, Joint("position", "velocity", "effort"))],
-            tells=self._limited[0].on,
+            tells=self._commands[0].on,
         )
 
     def responses(self) -> Mapping[str, Response]:
-        """See `Drive`."""
+        """Response of the position to the command, by topic."""
         return {"fine/command": self.drive.linear.response}
 
     @property
     def memory(self) -> Memory:
-        """See `Stage`."""
-        return Memory(self.set_point.signs, self._limited[0].table, self.drive.table, self._sensors[0].table)
+        """Memory of the step, as it is now."""
+        return Memory(self.set_point.signs, self._commands[0].table, self.drive.table, self._sensors[0].table)

@@ -3,14 +3,13 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt
 
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Array, Complex, Response
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import NonNegative, Positive, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
 from lathe_rc.cell.stages.command_limits import LimitedCommand, LimitedParameters, limited
 from lathe_rc.cell.stages.drive import Drive, Limits, OwnRetraction, RetractionParameters, followed
@@ -26,11 +25,11 @@ _NO_FREQUENCY = np.zeros(1)  # [rad/s]
 class PlantParameters(LimitedParameters, RetractionParameters):
     """Limits and sensor of a drive that moves the tool alone."""
 
-    stroke: Annotated[float, Gt(0)] = parameter(1e-3, "end stops at plus and minus this displacement", "m")
-    max_velocity: Annotated[float, Gt(0)] = parameter(1.0, "a profile that asks for more is refused", "m/s")
-    max_acceleration: Annotated[float, Gt(0)] = parameter(200.0, "a profile that asks for more is refused", "m/s^2")
-    noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
-    resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
+    stroke: Positive = parameter(1e-3, "end stops at plus and minus this displacement", "m")
+    max_velocity: Positive = parameter(1.0, "a profile that asks for more is refused", "m/s")
+    max_acceleration: Positive = parameter(200.0, "a profile that asks for more is refused", "m/s^2")
+    noise_rms: NonNegative = parameter(0.0, "white noise of the position sensor, RMS; 0: none", "m")
+    resolution: NonNegative = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
 
 
 class PlantMemory(NamedTuple):
@@ -63,12 +62,12 @@ class SingleDrive(Drive):
         super().__init__(name, parameters)
         self._retraction = OwnRetraction(parameters, parameters.stroke)
         self._limits = Limits(parameters.stroke, parameters.max_velocity, parameters.max_acceleration)
-        self._limited = [LimitedCommand(name, parameters)]
+        self._commands = [LimitedCommand(name, parameters)]
         self._sensors = [Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)]
         self.declare(
             inputs=[Input("coarse/command", messages.COMMAND, ("position",))],
             outputs=[Output("coarse/state", messages.STATE, Joint("position", "velocity", "effort"))],
-            tells=self._limited[0].on,
+            tells=self._commands[0].on,
         )
 
     @property
@@ -78,18 +77,18 @@ class SingleDrive(Drive):
 
     @property
     def memory(self) -> PlantMemory:
-        """See `Stage`."""
-        return PlantMemory(self._retraction.table, self._limited[0].table, self.machine, self._sensors[0].table)
+        """Memory of the step, as it is now."""
+        return PlantMemory(self._retraction.table, self._commands[0].table, self.machine, self._sensors[0].table)
 
 
 Moved = tuple[float, float, float]  #: position [m], velocity [m/s], and effort [N or V] of a drive
 
 
 def _loop(sample: Callable[[Any, float], Moved]) -> Callable[..., Reached]:
-    """See `Sampled`."""
+    """Make the step of a drive from its equation for one sample."""
 
     def step(memory: PlantMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-        """See `lathe_rc.cell.stage`."""
+        """Move the drive through one block, within its limits."""
         command, (position, velocity, effort, measured_position) = inputs[0], outputs
         given = limited(memory.limits, first, followed(memory.retraction, command))
         for k in range(given.size):
@@ -151,11 +150,11 @@ class Plant(Sampled, SingleDrive):
 
     @property
     def machine(self) -> Any:
-        """See `SingleDrive`."""
+        """Table of the machine, for the step."""
         return self.plant
 
     def responses(self) -> Mapping[str, Response]:
-        """See `Drive`."""
+        """Response of the position to the command, by topic."""
         with code_of_others(f"{self.name}: response"):
             if self.response(_NO_FREQUENCY) is None:
                 return {}

@@ -6,10 +6,10 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from annotated_types import Ge, Gt, Le
+from annotated_types import Gt, Le
 
 from lathe_rc import messages, resources
-from lathe_rc.cell.parameters import about, parameter
+from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
 from lathe_rc.cell.stages.feed_drive import Axis
 from lathe_rc.cell.stages.obedience import OBEY, Listener, apply, listens, may_learn, piece
@@ -45,25 +45,25 @@ class PositionControllerParameters(ServoParameters):
     proportional: float = parameter(POSITION.proportional, "pid: proportional gain P", "1/m")
     integral: float = parameter(POSITION.integral, "pid: integral gain I", "1/(m*s)")
     derivative: float = parameter(POSITION.derivative, "pid: derivative gain D", "s/m")
-    derivative_filter: Annotated[float, Gt(0)] = parameter(POSITION.filter, "pid: N, where D ends", "rad/s")
+    derivative_filter: Positive = parameter(POSITION.filter, "pid: N, where D ends", "rad/s")
     link: Literal["ripple_free", "paper"] = parameter(
         "ripple_free", "sampled_link: ripple_free, or the paper's, which rings between the samples"
     )
-    link_gain: Annotated[float, Gt(0)] = parameter(6.25, "sampled_link: K of the drive", "1/s", drive="gain")
-    link_lag: Annotated[float, Gt(0)] = parameter(0.08, "sampled_link: T1 of the drive", "s", drive="lag")
+    link_gain: Positive = parameter(6.25, "sampled_link: K of the drive", "1/s", drive="gain")
+    link_lag: Positive = parameter(0.08, "sampled_link: T1 of the drive", "s", drive="lag")
     link_knows_delay: bool = parameter(
         default=True, doc="sampled_link: the ripple-free link is made for the feedback delay"
     )
     periodic_gains: Literal["published", "quantised"] = parameter(
         "published", "periodic_hyperstable: gains of eqs 20 and 21, or those that survive a quantised measurement"
     )
-    periodic_unit: Annotated[float, Gt(0)] = parameter(
+    periodic_unit: Positive = parameter(
         1.0, "periodic_hyperstable: displacement that the law takes for 1; it has numbers without a unit", "m"
     )
     period: Annotated[float, Gt(0), Le(3600)] = parameter(
         PERIOD, "periodic_hyperstable: of set point and disturbance", "s"
     )
-    memory_filter: Annotated[float, Ge(0)] = parameter(
+    memory_filter: NonNegative = parameter(
         0.1,
         "periodic_hyperstable: standard deviation of the zero-phase filter on the memory; 0: none, as published",
         "s",
@@ -72,7 +72,7 @@ class PositionControllerParameters(ServoParameters):
 
     @property
     def commanded_topic(self) -> str:
-        """See `NodeParameters`."""
+        """Topic of the drive that the model is of, before remapping."""
         return f"{self.axis}/command"
 
 
@@ -156,7 +156,7 @@ def _look(wanted: Wanted, first: int, start: int, inputs: Fields, set_point: Sam
 
 @kernel
 def pid_step(memory: PidMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Control the position through one block by the PID."""
     command, set_point, error = outputs
     position = _look(memory.wanted, first, start, inputs, set_point, error)
     return pid_along(memory.pid, memory.state, memory.wanted.who, first, start, flags[0], set_point, position, command)
@@ -168,14 +168,11 @@ def link_step(memory: LinkMemory, first: int, start: int, inputs: Fields, flags:
     command, set_point, error = outputs
     position, who = _look(memory.wanted, first, start, inputs, set_point, error), memory.wanted.who
     while start < command.size:
-        stop = command.size
-        if who.listens:
-            stop = piece(who.obedience, start, flags[0])
-            if stop == start:
-                return start, OBEY
+        stop = piece(who, start, command.size, flags[0])
+        if stop == start:
+            return start, OBEY
         correct_along(memory.link, first + start, set_point[start:stop], position[start:stop], command[start:stop])
-        if who.listens:
-            apply(who.obedience, command[start:stop])
+        apply(who, command[start:stop])
         start = stop
     return start, DONE
 
@@ -213,15 +210,13 @@ def periodic_step(
     command, set_point, error = outputs
     position, who = _look(memory.wanted, first, start, inputs, set_point, error), memory.wanted.who
     while start < command.size:
-        stop = command.size
+        stop = piece(who, start, command.size, flags[0])
+        if stop == start:
+            return start, OBEY
         if who.listens:
-            stop = piece(who.obedience, start, flags[0])
-            if stop == start:
-                return start, OBEY
-            periodic.freeze(memory.state, not may_learn(who.obedience))
+            periodic.freeze(memory.state, not may_learn(who))
         reached = _repeat(memory, first, start, stop, set_point, position, error, command)
-        if who.listens:
-            apply(who.obedience, command[start:reached])
+        apply(who, command[start:reached])
         start = reached
         if memory.logged[0] == memory.log.shape[0]:
             return start, _TOLD
@@ -229,7 +224,7 @@ def periodic_step(
 
 
 class PositionController(Servo):
-    """See `lathe_rc.control.pid`, `lathe_rc.control.sampled_link` and `lathe_rc.control.periodic`.
+    """Position loop of a slide: `lathe_rc.control.pid`, `sampled_link` or `periodic`.
 
     Attributes:
         parameters: its table.
@@ -283,13 +278,13 @@ class PositionController(Servo):
 
     @property
     def step(self) -> Step:  # type: ignore[override]
-        """See `Stage`."""
+        """Step of the law that the table names."""
         steps: dict[str, Step] = {"pid": pid_step, "sampled_link": link_step, "periodic_hyperstable": periodic_step}
         return steps[self.parameters.law]
 
     @property
     def memory(self) -> PidMemory | LinkMemory | PeriodicMemory:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         path = self._path.table if self._path else _NO_PATH
         edge = 2 if self.parameters.measures == "edge" else 0
         height = (3 if edge else 2) if self._path else 0
@@ -304,7 +299,7 @@ class PositionController(Servo):
         )  # fmt: skip
 
     def tell(self, first: int, end: int) -> list[Sparse]:
-        """See `Stage`: what the periodic law achieved where a period has ended."""
+        """Return what the periodic law achieved, where a period has ended."""
         rows = self._log[: self._logged[0]].tolist()
         self._logged[0] = 0
         return [self._status(int(index), *row) for index, *row in rows]

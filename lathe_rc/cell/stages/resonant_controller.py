@@ -15,10 +15,10 @@ from collections.abc import Callable
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
 from lathe_rc.analysis.learning import Array, Complex, Response
-from lathe_rc.cell.parameters import parameter
+from lathe_rc.cell.parameters import Positive, parameter
 from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, ForwardTable, fed_forward
 from lathe_rc.cell.stages.law import Now
 from lathe_rc.control.angle_filter import at
@@ -29,7 +29,7 @@ class ResonantControllerParameters(FormLawParameters):
     """The orders that are cancelled and how fast."""
 
     highest_order: Annotated[int, Ge(0), Le(64)] = parameter(24, "K: waves per revolution that are cancelled at most")
-    rate: Annotated[float, Gt(0)] = parameter(8.0, "g: how fast an order is taken up", "1/s")
+    rate: Positive = parameter(8.0, "g: how fast an order is taken up", "1/s")
 
 
 class Memory(NamedTuple):
@@ -50,7 +50,7 @@ class Memory(NamedTuple):
 
 @kernel
 def sample(memory: Memory, now: Now) -> float:
-    """See `Law`."""
+    """Command of the law at one sample [m]."""
     forward, amplitudes = memory.forward, memory.amplitudes
     command = fed_forward(forward, now.angle)
     spindle, a1, a2 = forward.spindle, forward.a1, forward.a2
@@ -75,7 +75,7 @@ def sample(memory: Memory, now: Now) -> float:
 
 
 class ResonantController(FormLaw):
-    """See the module.
+    """Law that cancels the harmonics of the error, order by order.
 
     Attributes:
         parameters: its table.
@@ -87,7 +87,7 @@ class ResonantController(FormLaw):
     sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
 
     def start(self) -> Memory:
-        """See `Law`."""
+        """Return the memory before the first sample."""
         parameters = self.parameters
         return Memory(
             self.make_forward(),

@@ -5,12 +5,12 @@ from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 from pydantic import create_model
 
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell.parameters import about, parameter
+from lathe_rc.cell.parameters import Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
 from lathe_rc.cell.stages.command_limits import LimitedCommand, limited
 from lathe_rc.cell.stages.drive import Drive, Limits, OwnRetraction, followed
@@ -45,7 +45,7 @@ class SeriesParameters(ComposedParameters):
         return self.part(FINE, PiezoActuatorParameters)
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """See `NodeParameters`; each drive by itself, without what one does to the other."""
+        """Quantities of each drive by itself, without what one does to the other."""
         return {**self.coarse.drive_models(), **self.fine.drive_models()}
 
 
@@ -57,7 +57,7 @@ SeriesDriveParameters = create_model(
     **{
         **prefixed("coarse_", ElectrodynamicActuatorParameters),
         **prefixed(FINE, PiezoActuatorParameters),
-        "coarse_moving_mass": (Annotated[float, Gt(0)], parameter(1.2, "carriage and coil, without the tool", "kg")),
+        "coarse_moving_mass": (Positive, parameter(1.2, "carriage and coil, without the tool", "kg")),
     },
 )
 
@@ -76,7 +76,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Move carriage and piezo through one block."""
     command = inputs[0]
     noise = np.empty(command.size)
     measure(memory.noise, np.zeros(command.size), noise)
@@ -105,18 +105,47 @@ def tool_drive(coarse: ElectrodynamicActuatorParameters, shared: ComposedParamet
     return made_of(ToolDrive, coarse, method=shared.discretisation, **beside)
 
 
-class SeriesDriveStage(Drive):
-    """See `lathe_rc.plants.tool_drive`.
+class CoupledDrive(Drive):
+    """The coarse drive, and maybe the piezo drive with the tool on its carriage, as one machine.
+
+    Attributes:
+        drive: the machine.
+    """
+
+    drive: ToolDrive
+    _retraction: OwnRetraction
+    _set_point: SetPoint | None = None  # of the piezo drive
+
+    def _equip(self, coarse: ElectrodynamicActuatorParameters, fine: PiezoActuatorParameters | None) -> None:
+        """Set limits, retraction, commands and sensors from the tables of the drives."""
+        name, seed = self.name, self.shared.seed
+        self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
+        self._retraction = OwnRetraction(coarse, coarse.stroke)
+        self._commands = [LimitedCommand(name, coarse, "coarse" if fine else "")]
+        # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
+        self._sensors = [Sensor(coarse.noise_rms, 0.0, seed, f"{name}/coarse"), Sensor(0.0, 0.0, seed, f"{name}/fine")]
+        if fine:
+            self._set_point = SetPoint(name, fine, inside=(COARSE,), prefix=FINE)
+            self._commands.append(LimitedCommand(name, fine, "fine"))
+            self._sensors[1] = Sensor(fine.noise_rms, fine.resolution, seed, f"{name}/fine")
+
+    def responses(self) -> Mapping[str, Response]:
+        """Responses of the motions to the commands, in air, and as long as nothing is limited."""
+        coarse = {"coarse/command": self.drive.coarse_response}
+        return {**coarse, "fine/command": self.drive.fine_response} if self._set_point else coarse
+
+
+class SeriesDriveStage(CoupledDrive):
+    """Piezo and tool on the coarse carriage, in air; see `lathe_rc.plants.tool_drive`.
 
     Attributes:
         parameters: its table.
-        drive: the machine.
     """
 
     kind = "series_drive"
     Parameters = SeriesDriveParameters
-    _retraction: OwnRetraction
     step = staticmethod(step)
+    _set_point: SetPoint
 
     def __init__(self, name: str, parameters: SeriesParameters) -> None:
         super().__init__(name, parameters)
@@ -125,31 +154,19 @@ class SeriesDriveStage(Drive):
         piezo = piezo_on_carriage(name, fine, parameters.mass_ratio)
         with about(name, "mass_ratio", "sample_rate"):
             self.drive = tool_drive(coarse, parameters, piezo=piezo)
-        self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
-        self._retraction = OwnRetraction(coarse, coarse.stroke)
-        self._limited = [LimitedCommand(name, coarse, "coarse"), LimitedCommand(name, fine, "fine")]
-        self._set_point = SetPoint(name, fine, inside=(COARSE,), prefix=FINE)
-        # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
-        self._sensors = [
-            Sensor(coarse.noise_rms, 0.0, parameters.seed, f"{name}/coarse"),
-            Sensor(fine.noise_rms, fine.resolution, parameters.seed, f"{name}/fine"),
-        ]
+        self._equip(coarse, fine)
         self.declare(
             inputs=[Input("coarse/command", messages.COMMAND, ("position",)), *self._set_point.inputs],
             outputs=[
                 Output("coarse/state", messages.STATE, Joint("position", "velocity", "effort")),
                 Output("fine/state", messages.STATE),
             ],
-            tells=any(limited.on for limited in self._limited),
+            tells=any(command.on for command in self._commands),
         )
-
-    def responses(self) -> Mapping[str, Response]:
-        """See `Drive`."""
-        return {"coarse/command": self.drive.coarse_response, "fine/command": self.drive.fine_response}
 
     @property
     def memory(self) -> Memory:
-        """See `Stage`."""
-        limits, limits_fine = (limited.table for limited in self._limited)
+        """Memory of the step, as it is now."""
+        limits, limits_fine = (command.table for command in self._commands)
         sensors = (sensor.table for sensor in self._sensors)
         return Memory(self._retraction.table, limits, limits_fine, self._set_point.signs, self.drive.table, *sensors)

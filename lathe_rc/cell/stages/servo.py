@@ -3,9 +3,9 @@
 
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
-from lathe_rc.cell.parameters import about, parameter
+from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
 from lathe_rc.cell.stage import DONE
 from lathe_rc.cell.stages.obedience import (
     OBEY,
@@ -35,16 +35,14 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
     divisor: Annotated[int, Ge(1), Le(1_000_000)] = parameter(
         1, "computes at samples that are multiples of it, and holds the command between", "sample"
     )
-    command_limit: Annotated[float, Gt(0)] = parameter(
-        1.0, "largest command to each side, in its unit; the full command is 1"
-    )
-    adc_step: Annotated[float, Ge(0)] = parameter(0.0, "step of the converter of the measurement; 0: none", "m")
-    dac_step: Annotated[float, Ge(0)] = parameter(0.0, "step of the converter of the command; 0: none")
-    set_point_ramp: Annotated[float, Ge(0)] = parameter(
+    command_limit: Positive = parameter(1.0, "largest command to each side, in its unit; the full command is 1")
+    adc_step: NonNegative = parameter(0.0, "step of the converter of the measurement; 0: none", "m")
+    dac_step: NonNegative = parameter(0.0, "step of the converter of the command; 0: none")
+    set_point_ramp: NonNegative = parameter(
         0.0, "pid: fastest change of the set point, for a smooth engagement; 0: any", "m/s"
     )
 
-    set_point_smoothing: Annotated[float, Ge(0)] = parameter(
+    set_point_smoothing: NonNegative = parameter(
         0.0, "pid: time constant with which the set point is approached; 0: at once", "s"
     )
 
@@ -88,11 +86,11 @@ class Servo(Obedient):
         self._obedience = parameters.obeys(name)
 
     def warnings(self, seconds: float) -> list[str]:
-        """See `Stage`."""
+        """Return the doubt about a trajectory that does not meet the run."""
         return [f"{self.name}.{doubt}" for doubt in self.trajectory.doubts(seconds)]
 
     def prepare(self, first: int, samples: int) -> None:
-        """See `Stage`."""
+        """Compute the set point of the samples ahead."""
         self.trajectory.prepare(first, samples)
 
 
@@ -110,14 +108,12 @@ def pid_along(
 ) -> tuple[int, int]:
     """Step a PID through a block from its sample ``start`` on, see `lathe_rc.cell.stage`; arrays of shape (n,)."""
     while start < command.size:
-        stop = command.size
+        stop = piece(who, start, command.size, reaction)
+        if stop == start:
+            return start, OBEY
         if who.listens:
-            stop = piece(who.obedience, start, reaction)
-            if stop == start:
-                return start, OBEY
-            enable_integrator(state, may_learn(who.obedience), obeyed(who.obedience) >= Reaction.HOLD.value)
+            enable_integrator(state, may_learn(who), obeyed(who) >= Reaction.HOLD.value)
         control_along(pid, state, first + start, wanted[start:stop], measured[start:stop], command[start:stop])
-        if who.listens:
-            apply(who.obedience, command[start:stop])
+        apply(who, command[start:stop])
         start = stop
     return start, DONE

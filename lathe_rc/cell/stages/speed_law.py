@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
 from lathe_rc import resources
-from lathe_rc.cell.parameters import NodeParameters, about, parameter
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, about, parameter
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
@@ -27,10 +27,10 @@ class SpeedLawParameters(NodeParameters):
     deviation_amplitude: list[float] = parameter(
         [], "harmonic speed deviations: amplitudes relative to the nominal speed", "1"
     )
-    deviation_frequency: list[Annotated[float, Gt(0)]] = parameter([], "their frequencies", "rad/s")
+    deviation_frequency: list[Positive] = parameter([], "their frequencies", "rad/s")
     deviation_phase: list[float] = parameter([], "their phases at their start; empty: all 0", "rad")
-    deviation_start: Annotated[float, Ge(0)] = parameter(0.0, "when the harmonic deviations begin", "s")
-    tachogram_time: list[Annotated[float, Ge(0)]] = parameter([], "breakpoints of a piecewise-linear tachogram", "s")
+    deviation_start: NonNegative = parameter(0.0, "when the harmonic deviations begin", "s")
+    tachogram_time: list[NonNegative] = parameter([], "breakpoints of a piecewise-linear tachogram", "s")
     tachogram_deviation: list[float] = parameter(
         [], "deviation there relative to the nominal speed, held before the first and after the last", "1"
     )
@@ -39,16 +39,16 @@ class SpeedLawParameters(NodeParameters):
         "CSV file with time_s,rpm instead of both, from its first row on: the speed itself, other deviations add to it",
         path=True,
     )
-    random_rms: Annotated[float, Ge(0)] = parameter(0.0, "random deviation: RMS relative to the nominal speed", "1")
-    random_low: Annotated[float, Gt(0)] = parameter(1.0, "lower end of its band", "rad/s")
-    random_high: Annotated[float, Gt(0)] = parameter(60.0, "upper end of its band", "rad/s")
+    random_rms: NonNegative = parameter(0.0, "random deviation: RMS relative to the nominal speed", "1")
+    random_low: Positive = parameter(1.0, "lower end of its band", "rad/s")
+    random_high: Positive = parameter(60.0, "upper end of its band", "rad/s")
     random_lines: Annotated[int, Ge(1), Le(1024)] = parameter(16, "spectral lines that it is made of")
     deviation_law: Annotated[str, Named(SPEED_LAWS, ("",))] = parameter(
         "", "a law of others in place of the tachogram, which is made of it; empty: none"
     )
     deviation_values: list[float] = parameter([], "numbers that it is made of, in the order of its constructor")
-    deviation_law_step: Annotated[float, Gt(0)] = parameter(1e-3, "step of its tachogram", "s")
-    deviation_law_end: Annotated[float, Gt(0)] = parameter(
+    deviation_law_step: Positive = parameter(1e-3, "step of its tachogram", "s")
+    deviation_law_end: Positive = parameter(
         60.0, "end of its tachogram, not before the end of the run; an endless one goes on with the last deviation", "s"
     )
 

@@ -51,13 +51,13 @@ class SpindleEncoderParameters(TimeMasterParameters, SpeedLawParameters):
 
 @kernel
 def step(memory: EncoderTable, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Turn the spindle through one block, and read its encoder."""
     encode(memory, first, outputs)
     return outputs[0].size, DONE
 
 
 class SpindleEncoder(TimeMaster):
-    """See `lathe_rc.signals.speed` and `lathe_rc.signals.encoder`.
+    """Spindle that follows a speed law, with its encoder; see `lathe_rc.signals.encoder`.
 
     Attributes:
         parameters: its table.
@@ -102,7 +102,7 @@ class SpindleEncoder(TimeMaster):
             )
 
     def warnings(self, seconds: float) -> list[str]:
-        """See `Stage`: a tachogram that does not meet the run."""
+        """Return the doubt about a tachogram that does not meet the run."""
         time, deviation, _ = self._law.tachogram
         rpm, doubt = self.parameters.nominal_rpm * (1.0 + deviation), ""
         if self.parameters.tachogram_file and time[-1] < (1.0 - _SHORT) * seconds:
@@ -119,18 +119,18 @@ class SpindleEncoder(TimeMaster):
         return [f"{self.name}.{doubt}"] if doubt else []
 
     def sample_at(self, angle: float) -> int:
-        """See `TimeMaster`."""
+        """First sample at which the law has reached an angle [rad]."""
         return self._law.samples_until(angle, self.parameters.step)
 
     def speed_range(self) -> tuple[float, float]:
-        """See `TimeMaster`."""
+        """Lowest and highest speed in the run [rad/s]."""
         return self._law.speed_range(np.inf if self.samples is None else self.samples * self.shared.step)
 
     def largest_acceleration(self) -> float:
-        """See `TimeMaster`."""
+        """Upper bound of the magnitude of dΩ/dt in the run [rad/s²]."""
         return self._law.largest_acceleration()
 
     @property
     def memory(self) -> tuple[Any, ...]:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         return self._encoder.table

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from annotated_types import Ge, Le
 
 from lathe_rc import messages
-from lathe_rc.cell.parameters import NodeParameters, parameter, remapped
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, parameter, remapped
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage, WiredCell, cut
 from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.errors import InputError
@@ -50,59 +50,53 @@ class SupervisorParameters(NodeParameters):
     )
     slides: list[Literal["cross", "longitudinal"]] = parameter([], "slides that are watched")
 
-    speed_limit: Annotated[float, Ge(0)] = parameter(
-        0.0, "encoder: measured speed, deviation from the nominal", "rad/s"
-    )
+    speed_limit: NonNegative = parameter(0.0, "encoder: measured speed, deviation from the nominal", "rad/s")
     speed_reaction: Asked = parameter("stop", "what is asked for then")
-    acceleration_limit: Annotated[float, Ge(0)] = parameter(0.0, "encoder: change of the measured speed", "rad/s^2")
+    acceleration_limit: NonNegative = parameter(0.0, "encoder: change of the measured speed", "rad/s^2")
     acceleration_window: Annotated[int, Ge(1), Le(65536)] = parameter(640, "over so many samples", "sample")
     acceleration_reaction: Asked = parameter("stop", "what is asked for then")
     index_limit: Annotated[float, Ge(0), Le(3)] = parameter(
         0.0, "encoder: measured angle from index pulse to index pulse, deviation from a revolution", "rad"
     )
     index_reaction: Asked = parameter("retract", "what is asked for then")
-    following_limit: list[Annotated[float, Ge(0)]] = parameter(
+    following_limit: list[NonNegative] = parameter(
         [], "drives: command - measured position, the drive's own lag included; one for each, or none", "m"
     )
-    following_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
+    following_time: NonNegative = parameter(1e-3, "for so long", "s")
     following_reaction: Asked = parameter("retract", "what is asked for then")
-    stroke_limit: list[Annotated[float, Ge(0)]] = parameter(
+    stroke_limit: list[NonNegative] = parameter(
         [], "drives: measured position to each side; one for each, or none", "m"
     )
     stroke_reaction: Asked = parameter("retract", "what is asked for then")
-    effort_limit: list[Annotated[float, Ge(0)]] = parameter(
+    effort_limit: list[NonNegative] = parameter(
         [], "drives: current or voltage at which one is taken to be saturated; one for each, or none", "A or V"
     )
-    effort_time: Annotated[float, Ge(0)] = parameter(5e-3, "for so long", "s")
+    effort_time: NonNegative = parameter(5e-3, "for so long", "s")
     effort_reaction: Asked = parameter("freeze", "what is asked for then")
-    error_limit: Annotated[float, Ge(0)] = parameter(0.0, "tool: measured error", "m")
-    error_after: Annotated[float, Ge(0)] = parameter(
+    error_limit: NonNegative = parameter(0.0, "tool: measured error", "m")
+    error_after: NonNegative = parameter(
         10.0, "after so many from the start or a reset: they are there to learn", "rev"
     )
     error_reaction: Asked = parameter("retract", "what is asked for then")
-    growth_limit: Annotated[float, Ge(0)] = parameter(
-        0.0, "tool: RMS error of a revolution over that of the one before"
-    )
+    growth_limit: NonNegative = parameter(0.0, "tool: RMS error of a revolution over that of the one before")
     growth_cycles: Annotated[int, Ge(1), Le(1000)] = parameter(3, "so many times in a row", "rev")
-    growth_floor: Annotated[float, Ge(0)] = parameter(1e-6, "RMS error that does not count", "m")
+    growth_floor: NonNegative = parameter(1e-6, "RMS error that does not count", "m")
     growth_reaction: Asked = parameter("freeze", "what is asked for then")
-    margin_limit: list[Annotated[float, Ge(0)]] = parameter(
+    margin_limit: list[NonNegative] = parameter(
         [],
         "drives: smallest stability margin of the channel that commands one, which has publish_margin; one for each, "
         "or none",
     )
-    margin_after: Annotated[float, Ge(0)] = parameter(
+    margin_after: NonNegative = parameter(
         10.0, "after so many from the start or a reset: the drive has to be identified", "rev"
     )
     margin_reaction: Asked = parameter("freeze", "what is asked for then")
-    force_limit: Annotated[float, Ge(0)] = parameter(0.0, "cut: measured force", "N")
-    force_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
-    force_low: Annotated[float, Ge(0)] = parameter(0.0, "cut: measured force below this is lost", "N")
-    force_after: Annotated[float, Ge(0)] = parameter(10.0, "after so many from the start or a reset", "rev")
+    force_limit: NonNegative = parameter(0.0, "cut: measured force", "N")
+    force_time: NonNegative = parameter(1e-3, "for so long", "s")
+    force_low: NonNegative = parameter(0.0, "cut: measured force below this is lost", "N")
+    force_after: NonNegative = parameter(10.0, "after so many from the start or a reset", "rev")
     force_reaction: Asked = parameter("retract", "what is asked for beyond either")
-    slide_limit: list[Annotated[float, Ge(0)]] = parameter(
-        [], "slides: measured position to each side; one for each, or none", "m"
-    )
+    slide_limit: list[NonNegative] = parameter([], "slides: measured position to each side; one for each, or none", "m")
     slide_reaction: Asked = parameter("hold", "what is asked for then")
     monitors: list[Annotated[str, Named(MONITORS)]] = parameter([], "monitors of others")
     monitor_signals: list[str] = parameter(
@@ -114,10 +108,10 @@ class SupervisorParameters(NodeParameters):
     monitor_limits: list[float] = parameter([], "threshold of each, in the unit of what it finds")
     monitor_reactions: list[Asked] = parameter([], "what each of them asks for")
 
-    clear_position: Annotated[float, Ge(0)] = parameter(
+    clear_position: NonNegative = parameter(
         0.25e-3, "the tool is out of the part where the first drive's measured position is beyond this", "m"
     )
-    clear_time: Annotated[float, Ge(0)] = parameter(1e-3, "for so long", "s")
+    clear_time: NonNegative = parameter(1e-3, "for so long", "s")
 
 
 MEMBERS_LOST = "members_lost"  #: stands for a monitor where the host says that members of the cell are lost
@@ -154,7 +148,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`; for `_ANSWER` it stops at the end of the block."""
+    """Watch one block; for `_ANSWER` it stops at the end of the block."""
     state, reaction = outputs
     n = state.size
     if start == n:
@@ -177,7 +171,7 @@ def _real(port: Input, field: str) -> bool:
 
 
 class Supervisor(Stage):
-    """See `lathe_rc.safety`.
+    """Supervisor with its monitors; see `lathe_rc.safety`.
 
     Attributes:
         parameters: its table.
@@ -335,7 +329,7 @@ class Supervisor(Stage):
     # ---- samples ------------------------------------------------------------------------------------
 
     def perform(self, action: str) -> None:
-        """See `Stage`: a reset; what is still wrong raises its alarm again."""
+        """Reset the state; what is still wrong raises its alarm again."""
         if self.reaction is Reaction.NONE:
             return  # nothing has been found since the start or the last reset
         to = state_machine.after(self.state, action)
@@ -349,7 +343,7 @@ class Supervisor(Stage):
             self._told.append(RESET_REFUSED)
 
     def go_safe(self) -> None:
-        """See `Stage`: an alarm that nothing resets."""
+        """Raise an alarm that nothing resets: members of the cell are lost."""
         self._told.append(MEMBERS_LOST)
         self._ask_for(Reaction.STOP)
 
@@ -374,14 +368,14 @@ class Supervisor(Stage):
 
     @property
     def memory(self) -> Memory:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         self._state[_TOLD] = bool(self._told or self._plain)
         return Memory(self._lookout.watch, self._clearance.memory, self._out_number, self._state)
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """See `Stage`: say what has been found, and go from state to state."""
+        """Publish what the monitors have found, and go from state to state."""
         (safety,) = outputs
         sparse = [self._status(first, what, "", 0.0, 0.0) for what in self._told]
         self._told.clear()
@@ -433,7 +427,7 @@ class Supervisor(Stage):
     # ---- checks before a start ----------------------------------------------------------------------
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
-        """See `Stage`: where a retraction can be asked for, the tool gets out of the part."""
+        """Refuse a cell whose tool does not get out of the part where a retraction can be asked for."""
         super().check_cell(cell, cures=cures)
         if self.parameters.drives:
             self._check_obedience(cell)

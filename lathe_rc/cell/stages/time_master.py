@@ -9,8 +9,9 @@ from typing import Annotated, Literal
 import numpy as np
 from annotated_types import Ge, Le
 
-from lathe_rc.cell.parameters import NodeParameters, Value, about, parameter
-from lathe_rc.cell.stage import Stage, Trigger, WiredCell
+from lathe_rc.cell.events import Trigger
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, Value, about, parameter
+from lathe_rc.cell.stage import Stage, WiredCell
 from lathe_rc.errors import InputError
 from lathe_rc.signals.speed import SpeedLaw
 
@@ -24,12 +25,10 @@ class TimeMasterParameters(NodeParameters):
         0, "encoder counts per revolution after quadrature; 0: an ideal encoder"
     )
     speed_window: Annotated[int, Ge(1), Le(65536)] = parameter(
-        64,
-        "the measured speed is the angle's difference over so many samples; not used by an ideal encoder",
-        "sample",
+        64, "the measured speed is the angle's difference over so many samples; not used by an ideal encoder", "sample"
     )
-    revolutions: Annotated[float, Ge(0)] = parameter(0.0, "length of the run; 0: until stopped", "rev")
-    speed_factor: Annotated[float, Ge(0)] = parameter(
+    revolutions: NonNegative = parameter(0.0, "length of the run; 0: until stopped", "rev")
+    speed_factor: NonNegative = parameter(
         1.0, "pace of the run against real time; 0: as fast as the members follow", "1"
     )
     stall_reaction: Literal["wait", "safe"] = parameter(
@@ -48,7 +47,7 @@ class TimeMasterParameters(NodeParameters):
     )
 
     def known(self) -> Mapping[str, Value]:
-        """See `NodeParameters`."""
+        """Counts of the encoder, for laws that filter its angle."""
         return {"encoder_counts": self.counts_per_revolution}
 
 
@@ -71,7 +70,7 @@ class TimeMaster(Stage):
         self.samples: int | None = None
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
-        """See `Stage`: the spindle must turn, and not too fast for the sampling rate."""
+        """Refuse a spindle that turns back, or too fast for the sampling rate."""
         super().check_cell(cell, cures=cures)
         low, high = cell.speed_range
         if low <= 0.0:

@@ -9,7 +9,7 @@ from annotated_types import Ge, Le, MinLen
 
 from lathe_rc import messages
 from lathe_rc.arrays import put
-from lathe_rc.cell.parameters import Value, parameter, remapped
+from lathe_rc.cell.parameters import NonNegative, Value, parameter, remapped
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage, WiredCell
 from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, ProfileStage, evaluate
@@ -33,7 +33,7 @@ class ToolParameters(FormParameters):
         default=False,
         doc="the cross slide, positive into the part, counts in the form error; no drive's sensor sees it",
     )
-    nose_radius: Annotated[float, Ge(0)] = parameter(
+    nose_radius: NonNegative = parameter(
         0.0, "radius of its nose in the plane of the feed: the result tells the roughness along the part; 0: not", "m"
     )
     deflects: bool = parameter(
@@ -44,14 +44,14 @@ class ToolParameters(FormParameters):
         "deflects: delay of the feedback edge from the cut, at least a block; 0 where the cut does not read the tool",
         "sample",
     )
-    tolerance: Annotated[float, Ge(0)] = parameter(
+    tolerance: NonNegative = parameter(
         0.0, "form error that is allowed to each side, for the verdict on a run; 0: none is given", "m"
     )
 
     judging = frozenset({"tolerance"})
 
     def known(self) -> Mapping[str, Value]:
-        """See `NodeParameters`."""
+        """Form of the part, unless a profile node has it."""
         return super().known() if self.reference == "own" else {}
 
 
@@ -96,7 +96,7 @@ def add_drive(
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Sum the motions of one block, and compare them with the form."""
     reference, displacement, error, known, height = outputs
     if memory.form.heights.size:
         evaluate(memory.form, inputs, reference, known, height)
@@ -156,11 +156,11 @@ class Tool(Stage):
         self.declare(inputs=inputs, outputs=[Output("tool", messages.TOOL, Joint("displacement"))])
 
     def warnings(self, seconds: float) -> list[str]:
-        """See `Stage`."""
+        """Return the doubts about the form's file, one line each."""
         return self.form.doubts if self.form else []
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
-        """See `Stage`: the first drive carries the profile, the others what it leaves; and the flank must not rub."""
+        """Refuse a profile that the first drive cannot follow, and a flank that would rub."""
         super().check_cell(cell, cures=cures)
         owner = self._form_owner(cell)
         topic = remapped(self.shared, f"{self.parameters.drives[0]}/state")
@@ -187,7 +187,7 @@ class Tool(Stage):
 
     @property
     def memory(self) -> Memory:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         parameters = self.parameters
         form = self.form.table if self.form else _ELSEWHERE
         begin = 3 if self.form is None else 2 * len(self.form.inputs)

@@ -2,15 +2,14 @@
 """The set point of a servo controller, over time."""
 
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from annotated_types import Ge
 
 from lathe_rc import resources
 from lathe_rc.arrays import put
-from lathe_rc.cell.parameters import NodeParameters, about, parameter
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, about, parameter
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import MAX_BLOCK, Samples
@@ -25,7 +24,7 @@ class TrajectoryParameters(NodeParameters):
         "steps", "steps: set_point; csv: trajectory_file; paper_002: r(t) of its eq. 17"
     )
     set_point: list[float] = parameter([], "steps: values, each from its time on; empty: 0", "m")
-    set_point_time: list[Annotated[float, Ge(0)]] = parameter([], "steps: when; empty: a single one at 0", "s")
+    set_point_time: list[NonNegative] = parameter([], "steps: when; empty: a single one at 0", "s")
     trajectory_file: str = parameter(
         "", "csv: file with time_s and position_um or force_n, linear between and held at the ends", path=True
     )

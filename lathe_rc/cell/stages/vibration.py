@@ -5,10 +5,10 @@ import zlib
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
 from lathe_rc import messages
-from lathe_rc.cell.parameters import NodeParameters, about, parameter
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.errors import InputError, at_most
@@ -21,15 +21,15 @@ from lathe_rc.signals.noise import Sensor, SensorTable, measure
 class VibrationParameters(NodeParameters):
     """Random vibration within a band, harmonic lines, and the sensor that measures their sum."""
 
-    random_rms: Annotated[float, Ge(0)] = parameter(0.2e-6, "random vibration: RMS; 0: none", "m")
-    random_low: Annotated[float, Gt(0)] = parameter(200.0, "lower end of its band", "rad/s")
-    random_high: Annotated[float, Gt(0)] = parameter(2000.0, "upper end of its band", "rad/s")
+    random_rms: NonNegative = parameter(0.2e-6, "random vibration: RMS; 0: none", "m")
+    random_low: Positive = parameter(200.0, "lower end of its band", "rad/s")
+    random_high: Positive = parameter(2000.0, "upper end of its band", "rad/s")
     random_lines: Annotated[int, Ge(1), Le(1024)] = parameter(32, "spectral lines that it is made of")
     line_amplitude: list[float] = parameter([], "harmonic vibrations: amplitudes", "m")
-    line_frequency: list[Annotated[float, Gt(0)]] = parameter([], "their frequencies", "rad/s")
+    line_frequency: list[Positive] = parameter([], "their frequencies", "rad/s")
     line_phase: list[float] = parameter([], "their phases at sample 0; empty: all 0", "rad")
-    noise_rms: Annotated[float, Ge(0)] = parameter(0.0, "white noise of the sensor, RMS; 0: none", "m")
-    resolution: Annotated[float, Ge(0)] = parameter(0.0, "quantisation step of the sensor; 0: none", "m")
+    noise_rms: NonNegative = parameter(0.0, "white noise of the sensor, RMS; 0: none", "m")
+    resolution: NonNegative = parameter(0.0, "quantisation step of the sensor; 0: none", "m")
 
 
 class Memory(NamedTuple):
@@ -42,7 +42,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Sum the lines of one block, and measure them."""
     position, velocity, effort, measured_position = outputs
     vibration.evaluate(first, memory.period, memory.lines, position, velocity)
     effort[:] = 0.0
@@ -51,7 +51,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class Vibration(Stage):
-    """See `lathe_rc.signals.vibration`.
+    """Source of vibration between tool and part; see `lathe_rc.signals.vibration`.
 
     Attributes:
         parameters: its table.
@@ -91,9 +91,9 @@ class Vibration(Stage):
 
     @property
     def memory(self) -> Memory:
-        """See `Stage`."""
+        """Memory of the step, as it is now."""
         return Memory(self.lines, self.parameters.step, self._sensor.table)
 
     def prepare(self, first: int, samples: int) -> None:
-        """See `Stage`."""
+        """Draw the noise of the sensor for the samples ahead."""
         self._sensor.draw(samples)
