@@ -3,9 +3,10 @@
 
 import gc
 import itertools
+import random
 import sys
 import weakref
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import pytest
@@ -16,9 +17,12 @@ from hypothesis import strategies as st
 from lathe_rc import harness
 from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.engine import Engine
-from lathe_rc.cell.stage_cache import Start
+from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.stage import Output, Stage
+from lathe_rc.cell.stage_cache import Start, UnknownPartError
 from lathe_rc.cell.wiring import Cell, new_stage
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import COMMAND
 
 
 def load(name, revolutions, *overrides):
@@ -75,13 +79,13 @@ def test_each_cell_has_the_digests_that_it_has_alone_whatever_ran_before(kinds, 
 
 @pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
 def test_stages_of_all_kinds_are_set_back(path):
-    """A cell that runs again and again on a bench gives the same, though its stages are made once or twice."""
-    bench, told, stages = batch.CellRunner(), [], []
+    """A cell that runs again and again on a runner gives the same, though its stages are made once or twice."""
+    runner, told, stages = batch.CellRunner(), [], []
     described = load(path, 2)
     for _ in range(4):
-        cell = bench.cell(described)
+        cell = runner.cell(described)
         cell.check()
-        told.append(bench.run(cell, batch.Topics(cell, cell.samples, [*cell.dense, *cell.sparse])).digests())
+        told.append(runner.run(cell, batch.Topics(cell, cell.samples, [*cell.dense, *cell.sparse])).digests())
         stages.append(cell.stages)
     assert told[0] == dict(harness.run(described).digest)
     assert told[1:] == told[:1] * 3
@@ -133,11 +137,12 @@ class Field:
 
 def test_what_is_asked_for_is_kept_of_a_run_and_nothing_else():
     piston = load("piston", 3)
-    bench = batch.CellRunner()
-    assert np.array_equal(bench.run(bench.cell(piston), Field()), harness.run(piston).recording.dense["/tool"]["error"])
+    runner = batch.CellRunner()
+    kept = runner.run(runner.cell(piston), Field())
+    assert np.array_equal(kept, harness.run(piston).recording.dense["/tool"]["error"])
     for looked_at, told in (("tool.reference", "tool.reference"), ("encoder.angle", "encoder")):
         with pytest.raises(KeyError, match=f"{told} is not kept: `heard` of the sink has to name it"):
-            bench.run(bench.cell(piston), Field(looked_at))
+            runner.run(runner.cell(piston), Field(looked_at))
 
 
 def test_a_cell_that_cannot_work_is_an_outcome_and_the_others_go_on():
@@ -178,6 +183,71 @@ def test_a_cell_is_gone_when_nobody_holds_it(name):
 def test_a_topic_that_is_not_there_is_named():
     (outcome,) = batch.run_many([load("piston", 1)], ["tool", "fine/state"])
     assert str(outcome.error).startswith("no topic 'fine/state' in the cell; did you mean coarse/state?")
+
+
+# --- stages that are set back: all that a run changes of them, and what nobody can set back is not tried
+
+
+class Part:
+    """Something that a stage may hold."""
+
+    def __init__(self):
+        self.samples, self.said, self.known, self.seen = np.arange(3.0), [1], {"a": [2]}, {3}
+        self.draws = np.random.default_rng(5)
+        self.stage = None
+
+    @cached_property
+    def total(self):
+        return float(self.samples.sum())
+
+    def run(self):
+        """Change all of it."""
+        self.samples += 1.0
+        self.known["a"].append(int(self.samples[0]))
+        self.known["b"] = self.said
+        self.said.append(self.draws.random())
+        self.said, self.late = [*self.said, len(self.seen)], True
+        self.seen.clear()
+        return self.samples.tolist(), self.said, repr(self.known)
+
+
+class Holding(Stage):
+    """A stage with a part, which knows its stage."""
+
+    kind = "holding"
+    Parameters = NodeParameters
+
+    def __init__(self, part):
+        super().__init__("holding", NodeParameters.read("holding", {}))
+        self.part, self.parts, self.work = part, (part, {"part": part}), part.run if isinstance(part, Part) else None
+        if isinstance(part, Part):
+            part.stage = self
+        self.declare(outputs=[Output("half", COMMAND)])
+
+
+def test_everything_that_hangs_on_a_stage_is_set_back():
+    stage = Holding(Part())
+    before = stage.part.total
+    start = Start(stage)
+    first = stage.part.run()
+    stage.part, stage.more = None, 1
+    start.rewind()
+    assert not hasattr(stage, "more")
+    assert not hasattr(stage.part, "late")
+    assert stage.part.total == before
+    assert stage.part.run() == first
+
+
+HIDDEN = [random.Random(1), iter([1]), (each for each in "ab"), np.array([{}]), bytearray(b"ab"), {}.items()]  # noqa: S311
+
+
+@pytest.mark.parametrize("part", HIDDEN)
+def test_what_cannot_be_set_back_is_not_tried(part):
+    with pytest.raises(UnknownPartError):
+        Start(Holding(part))
+
+
+# --- variations of a scenario
 
 
 class TestVaried:

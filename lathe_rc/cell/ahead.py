@@ -30,6 +30,7 @@ _REFUSED = "refused: "  # begins what a process says of a stage whose step canno
 
 def uncompiled(stages: Iterable[Stage]) -> list[Stage]:
     """Return the stages whose steps are not compiled on this machine; of those with the same step, the first."""
+    # Backwards, so that of stages with one step the first stays in the dictionary.
     steps = {stage.native().name: stage for stage in reversed(list(stages)) if stage.is_compiled}
     return [stage for name, stage in reversed(steps.items()) if not is_kept(name)]
 
@@ -90,6 +91,7 @@ def _have_compiled(
             told = ""
             with contextlib.suppress(BrokenPipeError):
                 print(json.dumps(asked), file=process.stdin, flush=True)
+                # Empty at the end of the stream: the process has ended.
                 told = process.stdout.readline().rstrip()
             done.put((number, told))
 

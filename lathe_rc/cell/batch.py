@@ -114,6 +114,7 @@ def run_many(
     make = keep if callable(keep) else Errors if keep is None else partial(Topics, topics=keep)
     count = threads or os.cpu_count() or 1
     waiting: deque[Future[Outcome[Any]]] = deque()
+    # A runner a thread; a deque hands one out and takes it back without a lock.
     pool, idle = ThreadPoolExecutor(count), deque(CellRunner() for _ in range(count))
     try:
         for number, scenario in enumerate(scenarios):
@@ -135,7 +136,7 @@ class CellRunner:
         self._engine: Engine | None = None
 
     def cell(self, scenario: Scenario) -> Cell:
-        """The cell of a scenario; it is good until the next one is asked for.
+        """Return the cell of a scenario; it is good until the next one is asked for.
 
         Raises:
             InputError: see `Cell`.
@@ -155,15 +156,15 @@ class CellRunner:
 
 
 def _outcome(scenario: Scenario, keep: Make[K_co], idle: deque[CellRunner]) -> Outcome[K_co]:
-    bench = idle.pop()
+    runner = idle.pop()
     try:
-        cell = bench.cell(scenario)
+        cell = runner.cell(scenario)
         cell.check(cures=False)
-        return Outcome(scenario, bench.run(cell, keep(cell, cell.samples)))
+        return Outcome(scenario, runner.run(cell, keep(cell, cell.samples)))
     except LatheError as error:
         return Outcome(scenario, None, error)
     finally:
-        idle.append(bench)
+        idle.append(runner)
 
 
 class Errors:
@@ -182,7 +183,7 @@ class Errors:
             self._errors.add(dense[self._encoder]["angle_true"], dense[self._tool]["error"])
 
     def kept(self) -> FormErrors:
-        """Of each complete revolution; of none if the scenario has no tool."""
+        """Return the form error of each complete revolution; of none if the scenario has no tool."""
         return self._errors.found()
 
 
@@ -203,5 +204,5 @@ class Topics(Collector):
         self.heard = topics
 
     def kept(self) -> Recording:
-        """By fully qualified topic."""
+        """Return the recording of the topics."""
         return self.recording()

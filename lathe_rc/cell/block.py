@@ -124,6 +124,7 @@ class Pool:
             return {name: np.empty(samples, dtype) for name, dtype in self._fields.items()}, None
         if not self._free or samples != self._samples:
             self._samples, size = samples, samples * len(self._fields)
+            # Views of one allocation, which lives as long as a reader holds any of them.
             self._free = list(np.empty((max(_AT_ONCE // size, 1), len(self._fields), samples)))
         whole = self._free.pop()
         return dict(zip(self._fields, whole, strict=True)), whole
@@ -150,6 +151,7 @@ class Framer:
         self.companions += 1
         head = messages.header(message.index, self._step_ns)
         kind = messages.store().types[message.type]
+        # Types of ROS, such as JointState, have no place for run and source.
         if message.type.startswith(messages.PACKAGE):
             return kind(
                 header=head,

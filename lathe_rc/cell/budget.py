@@ -107,7 +107,7 @@ class _Keep:
             self._kept[name][first : first + samples] = dense[topic][of]
 
     def kept(self) -> _Tail:
-        """Of the last complete revolutions."""
+        """Return the last complete revolutions."""
         angle = self._kept["angle"]
         if angle.size < 2:
             return _Tail(0, np.empty((0, 0)), angle)
@@ -119,13 +119,13 @@ class _Keep:
 
 
 def _not_yet(scenario: Scenario, values: Mapping[str, Value]) -> dict[str, Value]:
-    """Those of some values that the scenario has not."""
+    """Return the values that differ from those of the scenario."""
     parts = {target: target.partition(".") for target in values}
     return {t: v for t, v in values.items() if getattr(scenario.nodes[parts[t][0]], parts[t][2]) != v}
 
 
 def _simple(scenario: Scenario) -> dict[str, Cause]:
-    """The causes that are a value of some parameters."""
+    """Return the causes that values of parameters switch off."""
     return {
         name: Cause(
             {
@@ -175,7 +175,7 @@ def _feed(scenario: Scenario, height: Samples) -> dict[str, Cause]:
 
 
 def _model(scenario: Scenario) -> dict[str, Cause]:
-    """A correction that takes the drive for another than it is."""
+    """Return the cause of a correction whose model differs from the drive."""
     off: dict[str, Value] = {}
     for node, table in _learners(scenario).items():
         if table.correction not in ("none", "lead_lag"):
@@ -265,7 +265,7 @@ def _with(scenario: Scenario, found: Mapping[str, Cause], acting: Causes) -> Sce
 
 
 def _compared(scenario: Scenario, runs: Mapping[Causes, _Tail]) -> dict[Causes, Samples]:
-    """The form errors of the same revolutions."""
+    """Return the form errors of the runs, if all are of the same revolutions."""
     if len({tail.whole for tail in runs.values()}) > 1:
         (master,) = scenario.masters
         raise InputError(

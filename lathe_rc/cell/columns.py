@@ -64,6 +64,7 @@ def columns(msgtype: str) -> tuple[Column, ...]:
     if msgtype in messages.block_types():
         fields = messages.sample_fields(msgtype)
     else:
+        # The index has a column of its own, `sample`.
         left_out = {*NOT_SIGNALS, "sample_index"}
         given = messages.fields(msgtype)
         fields = {name: _element(kind, detail) for name, (kind, detail) in given if name not in left_out}

@@ -58,6 +58,7 @@ class DelayBuffer:
         views = self._views.get((start, samples))
         if views is None:
             views = {name: array[start : start + samples] for name, array in self._arrays.items()}
+            # With blocks of changing lengths hardly a view comes again.
             if len(self._views) < _VIEWS:
                 self._views[start, samples] = views
         return views
@@ -65,6 +66,7 @@ class DelayBuffer:
     def extend(self, samples: int) -> Signals:
         """Views of ``samples`` new samples, for the caller to fill."""
         if self.end + samples - self._base > self._capacity:
+            # The kept samples move to the begin, once in several times their number.
             shift = self.end - self._kept - self._base
             for array in self._arrays.values():
                 array[: self._kept] = array[shift : shift + self._kept]
@@ -75,6 +77,7 @@ class DelayBuffer:
 
     def view(self, first: int, samples: int) -> Signals:
         """Views of the samples ``first`` on, which must have been added and not be too old."""
+        # Most readers want the block that came last, as a whole.
         if first == self._first and samples == self._size:
             return self._newest
         start = first - self._base

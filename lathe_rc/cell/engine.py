@@ -44,6 +44,7 @@ class Engine:
 
     def __init__(self, cell: Cell, heard: Collection[str] | None = None) -> None:
         self._chunk = chunk_of(cell.master.shared.block_size, [cell.shortest_feedback or 0])
+        # Whole chunks, and so whole blocks: no sink gets a part of one.
         self._piece = MAX_BLOCK // self._chunk * self._chunk
         self._heard = _heard(cell, heard)
         self._take(cell)
@@ -79,6 +80,7 @@ class Engine:
             Whether that can be: it must be wired as the one before, and as much heard of it.
         """
         block = cell.master.shared.block_size
+        # Cells whose ports are alike share one `Wiring`, so that to compare objects is enough.
         if cell.wiring is not self._wiring or block != self._block or _heard(cell, heard) != self._heard:
             return False
         self._take(cell)
@@ -111,6 +113,7 @@ class Engine:
             try:
                 broken = self._program.run(min(first + self._piece, self.samples), finite=bool(sinks))
             finally:
+                # After a number that is not finite there is nothing that a sink could use; after an error there is.
                 if not broken:
                     self._hand_over(first, self._program.reached, sinks)
             if broken:

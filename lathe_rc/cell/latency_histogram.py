@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Durations of wall time that are too many to be told one by one: counted by size, as text in a diagnostic report."""
+"""Latency histograms: durations of wall time, counted by size, as text in a diagnostic report."""
 
 import re
 from collections import Counter
@@ -17,7 +17,7 @@ _TEXT = re.compile(r"(?:[0-9]{1,2}:[0-9]{1,15})(?: [0-9]{1,2}:[0-9]{1,15})*")
 
 
 class Durations:
-    """Counts by size.
+    """Histogram of durations, whose bins are powers of 2 µs.
 
     Attributes:
         counts: number of durations in each bin, shape (`BINS`,): bin 0 below 1 µs, bin b from 2^(b-1) to 2^b µs; the
@@ -37,7 +37,7 @@ class Durations:
 
     @classmethod
     def parse(cls, text: str) -> "Durations":
-        """From what `__str__` made, or somebody else.
+        """Read a histogram that `__str__` has written, or another program.
 
         Raises:
             ValueError: it is none.

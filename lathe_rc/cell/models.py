@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A controller's models of its drive, the form and the encoder: given once, with those, unless it shall be another.
+"""Models that a controller has of drive, form and encoder: those of the nodes, unless the scenario gives others.
 
 A parameter that `lathe_rc.cell.parameters.parameter` marks with a quantity of the drive, and that nobody has given,
 gets the value of the drive that reads what the controller commands. Quantities with the same word before a dot belong
@@ -29,7 +29,7 @@ def _together(quantity: str) -> str:
 
 
 def _not_given(table: NodeParameters) -> Mapping[str, str]:
-    """Quantity of the drive by parameter, of those that nobody has given."""
+    """Quantity of the drive by parameter, of those that the scenario does not give."""
     marked = _marked(type(table))
     given = {_together(quantity) for name, quantity in marked.items() if name in table.model_fields_set}
     return {name: quantity for name, quantity in marked.items() if _together(quantity) not in given}
@@ -44,7 +44,7 @@ def _drives(tables: Mapping[str, NodeParameters], topic: str) -> Iterator[tuple[
 
 
 def _model(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters]) -> dict[str, Quantity]:
-    """The values of the parameters that nobody has given."""
+    """Values of the commanded drives for the parameters that the scenario does not give."""
     values: dict[str, Quantity] = {}
     of: dict[str, str] = {}
     missing = _not_given(table)
@@ -61,7 +61,7 @@ def _model(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters
 
 
 def _known(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters]) -> dict[str, Value]:
-    """The values that nobody has given of what a table asks."""
+    """Values of other nodes for what a table asks and the scenario does not give."""
     values: dict[str, Value] = {}
     for names in table.asks:
         if names & table.model_fields_set:
@@ -78,14 +78,14 @@ def _known(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters
 
 
 def given(table: NodeParameters) -> NodeParameters:
-    """The same table, whose models count as given."""
+    """Return the same table, whose models count as given."""
     made = table.model_copy()
     made.model_fields_set.update(_marked(type(table)))
     return made
 
 
 def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
-    """The tables of a cell by node, with the models that nobody has given; they count as not given still.
+    """Return the tables of a cell by node, with the models that the scenario does not give; they count as not given.
 
     Raises:
         InputError: several drives are commanded, and a model that is not given cannot be that of all.
@@ -95,12 +95,13 @@ def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
         values: dict[str, Value] = {**_model(node, table, tables), **_known(node, table, tables)}
         if any(getattr(table, name) != value for name, value in values.items()):
             made[node] = table.model_copy(update=values)
+            # They stay not given: another drive in a variation changes them again.
             made[node].model_fields_set.difference_update(values)
     return made
 
 
 def of_drives(node: str, tables: Mapping[str, NodeParameters]) -> dict[str, Quantity]:
-    """The model of a node as if nobody had given one: the values of the parameters by name.
+    """Return the model of a node as if the scenario gave none: values by parameter.
 
     Raises:
         InputError: see `resolved`.

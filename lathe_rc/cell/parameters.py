@@ -140,7 +140,7 @@ class Table(BaseModel):
         return _rows(cls)
 
     def other_than_default(self, names: Collection[str]) -> str:
-        """Those of some parameters that are not at their defaults, in words."""
+        """Return those of some parameters that are not at their defaults, in words."""
         told = []
         for row in self.rows().values():
             value = getattr(self, row.name)
@@ -180,6 +180,7 @@ class Table(BaseModel):
         checks = kind.__pydantic_decorators__  # those of others' tables may look at all values at once
         if not (checks.field_validators or checks.model_validators):
             try:
+                # Checks the changed values alone: in a batch, cells differ in a few.
                 found = self.model_copy(update={name: _check(kind, name)(value) for name, value in values.items()})
                 found.model_post_init(None)
             except (KeyError, InputError, ValidationError):
@@ -203,7 +204,7 @@ def _check(table: type[Table], name: str) -> Callable[[object], Any]:
 
 @contextmanager
 def about(node: str, *names: str) -> Iterator[None]:
-    """Let a refusal of what is made of some parameters name them: ``node.a, b: ...``; one that does stays as it is.
+    """Let refusals name the parameters that they are about: ``node.a, b: ...``; one that does stays as it is.
 
     Physics and control know nothing of parameters; the stage that makes them of a table does.
     """
@@ -317,15 +318,15 @@ class NodeParameters(SharedParameters):
 
 
 class ObedientParameters(NodeParameters):
-    """Of a node that obeys the supervisor."""
+    """Parameters of a node that obeys the supervisor."""
 
     reaction_delay: Annotated[int, Ge(0), Le(2**24)] = parameter(
-        0, "samples until a reaction of the supervisor is obeyed; at least a block; 0: nobody is listened to", "sample"
+        0, "samples until a reaction of the supervisor is obeyed; at least a block; 0 disables reactions", "sample"
     )
 
 
 class RestartParameters(NodeParameters):
-    """Of a node that another process may replace in mid-run."""
+    """Parameters of a node that another process may replace in mid-run."""
 
     restart_file: str = parameter(
         "", "the node's state is kept in this file, and another process of it goes on from there; empty: it is not"

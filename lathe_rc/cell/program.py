@@ -79,6 +79,7 @@ class Tapes:
     def place(self, topic: str, name: str, delay: int) -> tuple[int, int]:
         """Where a reader with this delay finds a field: its first address, and by how much it moves with a sample."""
         array = self._arrays[topic, name]
+        # The address counts from the begin of the history; a field that passes stays where it is.
         return address(array) - delay * array.itemsize, 0 if (topic, name) in self._passing else array.itemsize
 
     def advance(self, first: int) -> None:
@@ -87,6 +88,7 @@ class Tapes:
         for key, delay in self._delays.items():
             if delay:
                 array, kept = self._arrays[key], slice(self.history - delay, self.history)
+                # The copy: both slices may overlap.
                 array[kept] = array[kept.start + shift : kept.stop + shift].copy()
         self.begin = first
 
@@ -134,12 +136,14 @@ def _run(
         while stage < plan.shape[0] - 1:
             row = plan[stage]
             block = at.ctypes.data + 8 * row[_FIELD]
+            # Events are looked for where a stage begins a chunk; a step that goes on inside one has none in it.
             waits = row[_STEP] == 0 or (start == 0 and row[_DUE] < first + n)
             if start == 0 and turn[stage] < np.inf and row[_ANGLE] >= 0:
                 waits = waits or _passes(floats(block, row[_ANGLE] - row[_FIELD], n), turn[stage])
             where[0], where[1], where[2] = first, stage, start
             if waits:
                 return PYTHON
+            # An exception in a step is printed and swallowed by Numba: then the step does not write this place.
             where[2] = BROKEN
             reason: int = call(row[_STEP], row[_WORDS], first, start, n, block, where.ctypes.data + 16)
             if where[2] == BROKEN:
@@ -162,6 +166,7 @@ def _finite(samples: Samples) -> bool:
     """Whether no sample is NaN or infinite."""
     count = 0
     for k in range(samples.size):
+        # Counted to the end: the compiler vectorises a loop only if it has no early exit.
         count += not abs(samples[k]) < np.inf
     return count == 0
 
@@ -231,6 +236,7 @@ class Program:
         self._plan = np.zeros((len(stages) + 1, 5), np.int64)
         fields: list[tuple[int, int, int]] = []
         told: list[int] = []
+        # The plan has one row more, in which the fields of the last stage end.
         for row, (stage, inputs, outputs) in zip(self._plan, stages, strict=False):
             begin, angle, table = len(fields), stage.angle_input, AddressTable(*stage.field_types)
             row[_FIELD], row[_ANGLE] = begin, -1
@@ -296,6 +302,7 @@ class Program:
             return self._compute(end, self._told_of if finite else _NOBODY)
         finally:
             first = self.reached
+            # Stages before the one that has failed have computed the chunk at hand, the others have not.
             ahead = min(first + self._chunk, end)
             self.ends = [ahead if number < self._where[1] else first for number in range(len(self._stages))]
             for number, reached in enumerate(self.ends):
@@ -315,6 +322,7 @@ class Program:
                 return True
             first, self.number, reached = self._where.tolist()
             self._serve(reason, first, self.number, reached, min(self._chunk, end - first))
+            # What Python has done may have given the step another memory, or another event to wait for.
             self._load(self.number)
         return False
 

@@ -74,7 +74,7 @@ class Recording:
     first: int = 0
 
     def __repr__(self) -> str:
-        """Its content, in a line."""
+        """Return the content in a line."""
         size = f"{self.samples} samples ({self.samples * self.step_ns * 1e-9:.3g} s)"
         return f"<Recording: {', '.join([f'{len(self.types)} topics', size, *self.errors.told()])}>"
 
@@ -99,7 +99,7 @@ class Recording:
 
     @property
     def samples(self) -> int:
-        """Of each dense topic."""
+        """Number of samples of each dense topic."""
         return next((array.size for signals in self.dense.values() for array in signals.values()), 0)
 
     @cached_property
@@ -215,7 +215,7 @@ class Recording:
 class Digester:
     """Digests of a run whose signals come in pieces; see `Recording.digests`.
 
-    A thread makes them: it needs no interpreter for it, so whoever brings the pieces computes on.
+    A thread makes them: it needs no interpreter for it, so the caller computes on.
     """
 
     def __init__(self) -> None:
@@ -272,6 +272,7 @@ class _Topic:
 
     def _hand_over(self) -> None:
         self._wait()
+        # Two buffers: one is filled while the thread hashes the other.
         self._filled, self._hashed = self._hashed, self._filled
         self._at_work = self._thread.submit(self._hash, self._size)
         self._size = 0
@@ -285,7 +286,7 @@ class _Topic:
             made.update(piece[:size].data)
 
     def digests(self) -> list[bytes]:
-        """Of each field, to the last sample."""
+        """Return the digest of each field, to the last sample."""
         self._hand_over()
         self._wait()
         return [made.digest() for made in self._hashes]

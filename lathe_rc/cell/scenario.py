@@ -263,9 +263,11 @@ class Scenario:
         given = "run_id" in values or not self._has_own_run_id
         for node, changed in changes.items():
             tables[node] = self.nodes[node].changed(node, changed)
+        # A drive that has changed changes the models of its controllers, unless those were given.
         tables = models.resolved(tables)
         other = {node: table for node, table in tables.items() if table is not self.nodes[node]}
         if given and (run_id := next(iter(tables.values())).run_id):
+            # With a given run id, changed tables are hashed only when somebody asks for the identity.
             known = {node: told for node, told in fingerprints.items() if node not in other}
             return _agreed(self.name, tables, known, run_id)
         fingerprints |= {node: _fingerprint(table) for node, table in other.items()}
@@ -278,6 +280,7 @@ class Scenario:
             given: what was given alone; read again, the rest takes its defaults, and models follow their drives.
         """
         tree = {}
+        # One that is made of the content would be wrong as soon as a reader changes a value.
         left_out = {"run_id"} if given and self._has_own_run_id else None
         for name, table in self.nodes.items():
             kept = table.model_dump(exclude_unset=given, exclude=left_out)
@@ -338,6 +341,7 @@ def _override(text: str, nodes: dict[str, dict[str, Value]]) -> tuple[str, str]:
     parsed = ros_yaml.parse_value(value, f"--set {shown(target)}")
     if node == _EVERYONE:
         for values in nodes.values():
+            # A node's own value would be refused beside that for all.
             values.pop(name, None)
         nodes.setdefault(node, {})[name] = parsed
     else:
@@ -375,6 +379,7 @@ def read(
     """
     folder = path.parent if copies is not None else allowed_code.bag_around(path.parent)
     nodes = ros_yaml.read(path)
+    # Collected, not refused at once: an override may name another file.
     outside: dict[tuple[str, str], Path] = {}
     for name, values in nodes.items():
         if name == _EVERYONE:

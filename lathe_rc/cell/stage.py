@@ -34,6 +34,7 @@ from lathe_rc.names import instead
 from lathe_rc.safety import faults
 from lathe_rc.safety.faults import Fault
 from lathe_rc.safety.injection import Injection, Port
+from lathe_rc.signals.noise import Sensor
 
 
 @dataclass(frozen=True)
@@ -168,9 +169,11 @@ class Stage(ABC):
     step: ClassVar[Step | None] = None
     learns: ClassVar[bool] = False  #: whether a run tells its stability margin
     rooms: ClassVar[int] = 0  #: arrays of a block that the step needs for itself
+    _sensors: Sequence[Sensor] = ()  # whose noise the step needs
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
+        # Messages name a stage of another package by its class.
         if not hasattr(cls, "kind") and not is_ours(cls.__module__):
             cls.kind = cls.__name__
         if "process" in vars(cls) and "step" not in vars(cls):
@@ -223,6 +226,7 @@ class Stage(ABC):
             InputError: an event or fault that cannot be.
         """
         self.inputs, self.outputs, self.own_inputs = tuple(inputs), tuple(outputs), len(inputs)
+        # An event by revolutions needs the angle, even where the step does not: one more input, which it never sees.
         if inputs and self.angle_input is None and any(trigger.kind == "revolution" for trigger in self._triggers):
             self.inputs += (Input("encoder", messages.ENCODER, ("angle",)),)
         self._joints = [(place, output.joint) for place, output in enumerate(self.outputs) if output.joint]
@@ -398,6 +402,7 @@ class Stage(ABC):
             last: whether the run ends with them.
         """
         if last:
+            # Not in place: the list is the caller's.
             sparse = sparse + self.finish(end - 1)
         if self.tells_joints:
             for place, joint in self._joints:
@@ -429,6 +434,7 @@ class Stage(ABC):
         first, read, written = first + start, cut(inputs[: self.own_inputs], start, stop), cut(outputs, start, stop)
         if self._injection is None:
             return self.process(first, read, written)
+        # Faults of inputs act on copies: other stages read the same arrays.
         sparse = self.process(first, self._injection.inputs(first, read), written)
         self._injection.outputs(first, written)
         return sparse
@@ -531,10 +537,12 @@ class Stage(ABC):
         """The step with the memory as it is now, as a function of addresses."""
         if self._native is None:
             assert self.step is not None, "a stage without a step has its own `process`"
+            # Numba's own refusal of a memory says nothing that the author of a stage could use.
             if not is_ours(type(self).__module__) and (why := explain_unfit(self.memory)):
                 raise InputError(f"{self.name}: memory of a compiled step: {why}")
             self._native = CompiledStep(self.step, self.memory, *self.field_types)
         else:
+            # The same words at the same address: a program that has taken the address goes on with it.
             self._native.update(self.memory)
         return self._native
 
@@ -554,8 +562,10 @@ class Stage(ABC):
         """The state without addresses and scratch arrays."""
         return {**self.__dict__, "_native": None, "_room": None}
 
-    def prepare(self, first: int, samples: int) -> None:  # noqa: B027 - most stages need nothing
-        """Have ready, in the arrays of the memory, what a step cannot make for the samples ``first`` on."""
+    def prepare(self, first: int, samples: int) -> None:
+        """Have ready, in the arrays of the memory, what a step cannot make for the samples ``first`` on: the noise."""
+        for sensor in self._sensors:
+            sensor.draw(samples)
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
@@ -576,9 +586,11 @@ class Stage(ABC):
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """Compute samples ``first`` on without events and faults, by the step; see `advance`."""
         samples = next(iter(outputs[0].values())).size
+        # Tables of noise and clipped samples, and the room of a step, hold so many samples.
         if samples > messages.MAX_BLOCK:
             pieces = [(k, min(k + messages.MAX_BLOCK, samples)) for k in range(0, samples, messages.MAX_BLOCK)]
             return [said for k, m in pieces for said in self.process(first + k, cut(inputs, k, m), cut(outputs, k, m))]
+        # Not strict: an input for events alone is not handed over.
         fields = [part[name] for port, part in zip(self.inputs, inputs, strict=False) for name in port.fields]
         fields += [array for part in outputs for array in part.values()]
         self.prepare(first, samples)

@@ -69,6 +69,7 @@ class Start:
         self._seen[id(part)] = part
         parts: Iterable[Any] = ()
         if type(part) is np.ndarray and not part.dtype.hasobject:
+            # Nobody has changed one that is read-only.
             if part.flags.writeable:
                 self._back.append(partial(np.copyto, part, part.copy()))
         elif isinstance(part, tuple | frozenset) and not hasattr(part, "__dict__"):
@@ -77,6 +78,7 @@ class Start:
             parts = part.values() if type(part) is dict else part
             self._back.append(partial(_refill, part, part.copy()))
         elif isinstance(part, np.random.Generator):
+            # The generator itself must stay: others may hold it.
             bits = part.bit_generator
             self._back.append(partial(setattr, bits, "state", bits.state))
         elif isinstance(part, types.MethodType):
@@ -145,6 +147,7 @@ class StageCache:
             self._starts[name] = None
             with contextlib.suppress(UnknownPartError):
                 if made.is_compiled:
+                    # Now, so that its words are among what is set back.
                     made.native()
                 self._starts[name] = Start(made)
         return made

@@ -256,6 +256,7 @@ class Decoder:
             assert self._layout is not None, "that has been learned"
             other = np.flatnonzero(lengths[start:] != length)
             stop = start + int(other[0]) if other.size else len(places)
+            # A record at each byte of the whole, none of them copied: indexing takes those that begin a block.
             anywhere: Samples = np.ndarray(len(whole) - length + 1, f"V{length}", whole, strides=(1,))
             records = anywhere[begins[start:stop]].view(self._layout.dtype)
             count = self._following(records, first)
@@ -268,6 +269,7 @@ class Decoder:
         constant = records.view(np.uint8).reshape(records.size, -1)[:, self._layout.same]
         fits = (constant == constant[0]).all(axis=1)
         counts = np.arange(records.size, dtype=np.uint64) * np.uint64(first.samples)
+        # In uint64, as in the message: a first index of a damaged block may be any number.
         fits &= records["first_index"] == np.uint64(first.first_index) + counts
         fits &= records["step_ns"] == first.step_ns
         return int(np.argmin(fits)) if not fits.all() else records.size

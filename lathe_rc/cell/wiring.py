@@ -88,6 +88,7 @@ class Wiring:
 def _wire(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> Wiring:
     """Wire some stages and members; raises as `Cell` does."""
     dense, sparse = _sources(stages, unknown)
+    # All nodes first, so that those that do not depend on one another keep the order of the scenario.
     order: TopologicalSorter[str] = TopologicalSorter({stage.node: () for stage in stages})
     for stage in stages:
         for topic, port in stage.inputs:
@@ -124,6 +125,7 @@ def _sources(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> tuple[d
 
 @lru_cache
 def _wire_alike(stages: tuple[Ports, ...]) -> Wiring:
+    # Shared by all cells of a batch that are wired alike; `Engine.begin` compares it by identity.
     return _wire(stages, {})
 
 
@@ -205,6 +207,7 @@ class Cell:
     def replace(self, stage: Stage) -> None:
         """Put a stage in the place of the one of its name, whose ports it has."""
         self.stages[stage.name] = stage
+        # The cached master may be the stage that was there before.
         self.__dict__.pop("master", None)
 
     @cached_property

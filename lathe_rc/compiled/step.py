@@ -224,6 +224,7 @@ def _source(module: str) -> str:
 def is_kept(name: str) -> bool:
     """Whether the compiled code of a module is on this machine, undamaged."""
     files = list(cache_folder().glob(f"*/{name}.*"))
+    # To read them checks them: a damaged file is removed, and compiled anew.
     return any(path.suffix == ".nbi" for path in files) and None not in [read_kept(path) for path in files]
 
 
@@ -232,6 +233,7 @@ def _module(name: str, text: str, memory: StructView) -> ModuleType:
     """The module of a text, in no file: only what is compiled of it is kept."""
     module = ModuleType(f"lathe_rc_steps.{name}")
     vars(module)["MEMORY"] = memory
+    # Numba looks a function's module up by its name when it loads compiled code.
     sys.modules[module.__name__] = module
     exec(compile(text, f"/lathe_rc_steps/{name}.py", "exec"), vars(module))  # noqa: S102 - written here
     return module

@@ -102,6 +102,7 @@ def _spread(value: tuple[Any, ...], sorts: list[Any], leaves: list[Any]) -> None
     known = kind in _SIZED
     for part in value:
         if isinstance(part, np.ndarray):
+            # The shape is part of the type only where the NamedTuple is sized.
             sorts += (part.dtype, part.shape if known else part.ndim)
             leaves.append(part)
         elif isinstance(part, tuple):
@@ -170,6 +171,7 @@ class Struct:
         for part in leaves:
             words += _words(part) if isinstance(part, np.ndarray) else (part,)
         self.kind, pack = _layout(tuple(sorts))
+        # A struct without members needs an address as well.
         self.words = np.frombuffer(bytearray(pack.pack(*words)) or bytearray(8), np.int64)
         self._floats = self.words.view(np.float64)
         self._value = value  # keeps the arrays
@@ -182,6 +184,7 @@ class Struct:
     def _update(self, kind: StructView, begin: int, value: tuple[Any, ...], known: tuple[Any, ...]) -> None:
         for (member, place), part, before in zip(kind.members.values(), value, known, strict=True):
             at = begin + place
+            # A stage makes a new tuple each time, mostly of the same arrays: then nothing has to be written.
             if part is before:
                 continue
             if isinstance(member, StructView):
@@ -255,6 +258,7 @@ def _member(context: Any, builder: Any, kind: StructView, address: Any, name: st
         return words[0]
     if isinstance(member, types.Array):
         where, *shape = (_load(builder, word, _WORD) for word in words)
+        # Constants instead of loads: the compiler can unroll loops over them.
         if name in kind.shapes:
             shape = [_WORD(length) for length in kind.shapes[name]]
         return _array(context, builder, member, where, shape)

@@ -61,6 +61,7 @@ class Clipping:
             clipped = np.concatenate((clipped, self._flags[: end - first - clipped.size]))
         if not self._left and self._clipped == self._before and not clipped.any():
             return found
+        # Cut at multiples of `_TELL`, so that reports come at the same samples whatever the blocks.
         while start < clipped.size:
             stop = min(start + self._tell - (first + start) % self._tell, clipped.size)
             found += self._ends(first + start, clipped[start:stop])

@@ -202,6 +202,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     n = angle.size
     displacement, cross_position, feed_velocity = memory.room[0, :n], memory.room[1, :n], memory.room[2, :n]
     height = memory.room[3, :n]
+    # What does not move the edge counts as standing still.
     displacement[:] = cross_position[:] = height[:] = 0.0
     if memory.tool >= 0:
         height = inputs[memory.tool + 2]

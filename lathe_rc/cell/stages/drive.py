@@ -13,7 +13,6 @@ from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, follows, take_over
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
-from lathe_rc.signals.noise import Sensor
 
 
 class BoundedParameters(NodeParameters):
@@ -24,12 +23,12 @@ class BoundedParameters(NodeParameters):
     retract_jerk: Positive = parameter(1e5, "its largest jerk", "m/s^3")
 
     def bounds(self) -> Bounds:
-        """The same for a motion."""
+        """Return the bounds of a takeover."""
         return made_of(Bounds, self, "retract_")
 
 
 class RetractionParameters(BoundedParameters):
-    """Of a drive that takes the tool out of the part."""
+    """Parameters of a drive that takes the tool out of the part."""
 
     safe_position: float = parameter(
         0.3e-3, "where the drive goes by itself when members of the cell are lost: out of the part", "m"
@@ -61,6 +60,7 @@ class OwnRetraction:
 @kernel
 def followed(takeover: TakeoverTable, command: Samples) -> Samples:
     """The command that the drive follows [m], shape (n,)."""
+    # The input is another node's output, and a takeover writes into it.
     own = command if follows(takeover) else command.copy()
     take_over(takeover, own)
     return own
@@ -81,7 +81,6 @@ class Drive(Stage):
     announces = (LIMITED, FREE)
     _commands: Sequence[LimitedCommand] = ()
     _clippings: Sequence[Clipping] = ()  # of other quantities that are limited
-    _sensors: Sequence[Sensor] = ()
     _limits: Limits | None = None  # of a drive that carries the whole profile
     _retraction: OwnRetraction | None = None  # of one that takes the tool out
 
@@ -97,12 +96,6 @@ class Drive(Stage):
         """Retract the carriage, whatever is commanded: members of the cell are lost."""
         if self._retraction:
             self._retraction.begin()
-
-    def prepare(self, first: int, samples: int) -> None:
-        """Draw the noise of the sensors for the samples ahead."""
-        super().prepare(first, samples)
-        for sensor in self._sensors:
-            sensor.draw(samples)
 
     def tell(self, first: int, end: int) -> list[Sparse]:
         """Return the events of the samples that the step has computed last."""

@@ -196,6 +196,7 @@ class EncoderDevice(TimeMaster):
         angle = self.counted.take(first, out["angle"].size)
         window, step = self.parameters.speed_window, self.shared.step
         if self._before is None:
+            # Before the first reading the spindle is taken to have turned at its nominal speed.
             self._before = angle[0] + self.shared.nominal_speed * step * np.arange(-window, 0)
         whole = np.concatenate((self._before, angle))
         out["angle"][:] = out["angle_true"][:] = angle

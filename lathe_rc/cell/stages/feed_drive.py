@@ -205,6 +205,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
                 return start, OBEY
         given, samples, now = command[start:stop], stop - start, first + start
         if memory.listens or memory.safe:
+            # A takeover changes the command, and the input is another node's output.
             given = memory.room[0, :samples]
             put(given, command[start:stop])
         apply(memory.who, given)
@@ -254,7 +255,7 @@ class FeedDriveStage(Obedient):
         cuts = limits.any or bool(parameters.command_limit)
         self._clipped = np.zeros(messages.MAX_BLOCK if cuts else 1, np.uint8)
         self._clipping = Clipping(name, parameters, "", self._clipped)
-        self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
+        self._sensors = [Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)]
         limit = parameters.command_limit
         self._obedience: Obedience = parameters.obedience(name, speed=self.drive.integrates, limit=limit, settled=0)
         self._safe = False
@@ -284,7 +285,7 @@ class FeedDriveStage(Obedient):
         parameters = self.parameters
         return Memory(
             drive=self.drive.whole,
-            sensor=self._sensor.table,
+            sensor=self._sensors[0].table,
             who=self.listener,
             listens=bool(parameters.reaction_delay) and not self._safe,
             safe=self._safe,
@@ -293,10 +294,6 @@ class FeedDriveStage(Obedient):
             clipped=self._clipped,
             room=self.room,
         )
-
-    def prepare(self, first: int, samples: int) -> None:
-        """Draw the noise of the sensor for the samples ahead."""
-        self._sensor.draw(samples)
 
     def tell(self, first: int, end: int) -> list[Sparse]:
         """Return the events of the samples that the step has computed last."""

@@ -161,9 +161,11 @@ def evaluate(
         position, measured = inputs[form.slide], inputs[form.slide + 1]
     _place(form, angle_true, position, height)
     deviation_along(form.heights, form.table, angle_true, height, reference)
+    # Equal angles give equal bits: what an ideal encoder measures is looked up once.
     if form.alike and equal(angle, angle_true) and equal(position, measured):
         put(expected, reference)
     else:
+        # The height goes into the array of the result, and is copied out of it before that is written.
         _place(form, angle, measured, expected)
         deviation_along(form.heights, form.told, angle, expected.copy(), expected)
 

@@ -76,6 +76,7 @@ def _grows(guard: GuardTable, angle: float, error: float, form: float) -> bool:
         if number == 0:
             guard.sums[_FIRST] = guard.sums[_ENDED]
         guard.sums[_ALLOWED] = guard.sums[_FORM] / samples
+        # A round part has no form: then the first revolution is the measure.
         if guard.sums[_ALLOWED] == 0.0:
             guard.sums[_ALLOWED] = guard.sums[_FIRST]
         found = guard.limit > 0.0 and guard.sums[_ENDED] > guard.limit * guard.sums[_ALLOWED]
@@ -124,6 +125,7 @@ def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
             learning = memory.learns[0] != 0 and (not who.listens or may_learn(who))
             for k in range(start, stop):
                 n = first + k
+                # Before that the error is 0, and would make the first revolution look good.
                 if n >= memory.delay and _grows(memory.guard, error_angle[k], error[k], form[k]):
                     return k, _DIVERGED
                 sensed = position[k] if memory.senses else 0.0

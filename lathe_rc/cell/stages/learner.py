@@ -221,7 +221,7 @@ class Learner(Obedient):
         return Obedience(self.name, takeover, settled=settled)
 
     def _diverged(self, index: int, rms: float, first: float) -> DivergedError:
-        """Why a run is stopped: a cycle's RMS error and what it is compared with [m]."""
+        """Return the error of a run whose RMS error in a cycle grows beyond ``first`` [m]."""
         ratio = rms / first if first > 0.0 else np.inf
         return DivergedError(
             f"sample {index}: the error grows: {rms * 1e6:.4g} µm RMS in a cycle, {ratio:.3g} times {first * 1e6:.4g} "

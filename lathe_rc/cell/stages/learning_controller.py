@@ -71,6 +71,7 @@ class LearningController(Learner):
             step=parameters.step,
         )
         self._joined = self._controller.joined
+        # Where the end of a cycle changes what follows, the step stops for it; otherwise it is told later.
         self._asks = parameters.identify or parameters.publish_margin or parameters.stop_ratio > 0.0
         self._first_rms = np.nan
         self._controller.table.whole[angle_memory.ASKS] = self._asks
@@ -276,6 +277,7 @@ class LearningController(Learner):
         sparse = [message for cycle in self._controller.ended() for message in self._end_cycle(cycle)]
         self._margin[0] = sparse[0].values["stability_margin"]
         for published in outputs[1:]:
+            # That sample has been written already, with the margin of the cycle before.
             published["stability_margin"][reached - 1] = self._margin[0]
         return sparse
 
@@ -377,6 +379,7 @@ class Margins:
         """The margin at ``speed`` [rad/s], between tabulated speeds by interpolation."""
         speeds = _tabulated(self._parameters.nominal_speed)
         after = bisect_left(speeds, speed)
+        # Beyond the table each speed would be a new entry.
         if not 0 < after < len(speeds):
             return 1.0 - stage.loop(self._response(model)).supremum(speed)
         below, above = speeds[after - 1], speeds[after]

@@ -63,6 +63,7 @@ def _angle(memory: Memory, first: int, late: int, measured: Samples) -> Samples:
     for k in range(angle.size):
         angle[k] = memory.nominal * (memory.period * (first + k))
     if late:
+        # Multiplied and subtracted in this order: the bits of the angle depend on it.
         angle -= memory.nominal * (memory.period * late)
     return angle
 
@@ -98,6 +99,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     """Compute the command of one block, from the memory over the angle."""
     control, state, who, command = memory.control, memory.state, memory.who, outputs[0]
     n = command.size
+    # A step that has stopped within a piece comes back with the piece still open, maybe at its very end.
     while start < n or state[_INSIDE]:
         if not state[_INSIDE]:
             stop = piece(who, start, n, flags[0])

@@ -100,6 +100,7 @@ class LoadedSpindleStage(SpindleEncoder):
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: LoadedSpindleParameters) -> None:
+        # Before the base class, whose constructor asks for loads and lag.
         self.spindle = parameters.spindle(name)
         self._largest = parameters.largest_deviation * parameters.nominal_speed
         self._delay = parameters.load_delay

@@ -23,13 +23,13 @@ OBEY = 100  #: why a step stops: a reaction has to be obeyed
 
 
 def listens(parameters: ObedientParameters) -> list[Input]:
-    """The input with the reactions, if anybody is listened to."""
+    """Input with the reactions of the supervisor, if the node obeys it."""
     delay = parameters.reaction_delay
     return [Input("safety", messages.SAFETY, ("reaction",), delay)] if delay else []
 
 
 class FeedObedientParameters(ObedientParameters):
-    """Of a node of the feed that obeys the supervisor."""
+    """Parameters of a node of the feed that obeys the supervisor."""
 
     stop_rate: Positive = parameter(
         10.0, "largest rate of the command while it is brought to rest, and of what is left of that when given back",

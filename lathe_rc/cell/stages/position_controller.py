@@ -192,6 +192,7 @@ def _repeat(
         command[k] = held[0]
         held[1] = max(held[1], abs(error[k]))
         if (n + 1) % period == 0:
+            # A log, since a kernel cannot publish; the step stops when it is full.
             row = memory.log[memory.logged[0]]
             row[0], row[1] = n + 1, held[1]
             periodic.achieved(memory.state, row[2:])

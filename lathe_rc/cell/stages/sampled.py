@@ -44,7 +44,7 @@ class Sampled(Stage):
         """The memory before sample 0."""
 
     def started(self) -> Any:
-        """The same; what goes wrong is one line.
+        """Like `start`, with plug-in errors as one line.
 
         Raises:
             InputError: it raises something.

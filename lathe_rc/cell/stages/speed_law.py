@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The spindle's speed law as parameters: of the spindle that follows it, and of whoever knows it in advance."""
+"""The spindle's speed law as parameters: of the spindle that follows it, and of laws that know it in advance."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -102,6 +102,6 @@ class SpeedLawParameters(NodeParameters):
 def _harmonic(
     nominal: float, amplitude: tuple[float, ...], frequency: tuple[float, ...], phase: tuple[float, ...], start: float
 ) -> speed.SpeedLaw:
-    """The harmonic deviations, which all who know them in advance ask for."""
+    """The harmonic deviations, made once for all nodes that know them."""
     phases = np.array(phase) if phase else np.zeros(len(amplitude))
     return speed.harmonic(nominal, np.array(amplitude), np.array(frequency), phases, start)

@@ -71,6 +71,7 @@ class SpindleEncoder(TimeMaster):
 
     def __init__(self, name: str, parameters: SpindleEncoderParameters) -> None:
         super().__init__(name, parameters)
+        # Two names: a loaded spindle keeps its law to itself.
         self._law = self.law = parameters.speed_law(name)
         if parameters.revolutions:
             with about(name, f"revolutions = {parameters.revolutions:g}", "nominal_rpm and its deviations"):

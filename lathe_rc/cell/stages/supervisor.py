@@ -358,17 +358,18 @@ class Supervisor(Stage):
 
     @property
     def state(self) -> State:
-        """Of the cell."""
+        """State of the cell."""
         return State(self._state[_STATE])
 
     @property
     def reaction(self) -> Reaction:
-        """In force."""
+        """Reaction in force."""
         return Reaction(self._state[_REACTION])
 
     @property
     def memory(self) -> Memory:
         """Memory of the step, as it is now."""
+        # Monitors in Python have to see each block, so the step stops in each.
         self._state[_TOLD] = bool(self._told or self._plain)
         return Memory(self._lookout.watch, self._clearance.memory, self._out_number, self._state)
 

@@ -113,5 +113,6 @@ class Trajectory:
         if self._kind == "csv":
             set_point[:] = np.interp(time, self._times, self._values)
             return
+        # The factor lets a step begin at the sample of its time, not one later for a rounding error.
         place = np.searchsorted(self._times, time * (1 + 1e-12), side="right")
         set_point[:] = np.where(place > 0, self._values[place - 1], 0.0)

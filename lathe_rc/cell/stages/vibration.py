@@ -82,7 +82,7 @@ class Vibration(Stage):
                     f"{name}.{whose}: vibration at {lines[1].max():g} rad/s; allowed: below {at_most(nyquist)} rad/s, "
                     "half the sample rate"
                 )
-        self._sensor = Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)
+        self._sensors = [Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)]
         self.declare(
             # The angle itself is not used: the spindle's blocks say which samples are due.
             inputs=[Input("encoder", messages.ENCODER, ("angle",))],
@@ -92,8 +92,4 @@ class Vibration(Stage):
     @property
     def memory(self) -> Memory:
         """Memory of the step, as it is now."""
-        return Memory(self.lines, self.parameters.step, self._sensor.table)
-
-    def prepare(self, first: int, samples: int) -> None:
-        """Draw the noise of the sensor for the samples ahead."""
-        self._sensor.draw(samples)
+        return Memory(self.lines, self.parameters.step, self._sensors[0].table)
