@@ -40,8 +40,8 @@ class Run(NamedTuple):
 Delivery = Run | bytes  #: blocks, or an encoded message at a chosen sample
 
 
-def _alone(node: Any, cell: Cell | None) -> None:
-    """Let each node compute by itself."""
+def _alone(role: Any, cell: Cell | None) -> None:
+    """Let each stage compute by itself."""
 
 
 class Exchange:
@@ -49,8 +49,8 @@ class Exchange:
 
     Attributes:
         master: takes the Progress of a node, if the time master is in this process.
-        stages: nodes with a stage that are active and have not computed yet, see `lathe_rc.nodes.chain`.
-        form: lets a node and those of its cell that wait here compute together, if it is given what they make.
+        stages: roles with a stage that are active and have not computed yet, see `lathe_rc.nodes.chain`.
+        form: lets a stage and those of its cell that wait here compute together, if it is given what they make.
     """
 
     def __init__(self, form: Callable[[Any, Cell | None], None] = _alone) -> None:

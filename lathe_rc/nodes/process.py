@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from types import FrameType
 from typing import Any, NoReturn, cast
@@ -34,14 +34,14 @@ from lathe_rc.cell.stages.loaded_spindle import LoadedSpindleStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import arguments, chain, dds, declare
-from lathe_rc.nodes.cell_node import CellNode
-from lathe_rc.nodes.encoder_node import EncoderNode
+from lathe_rc.nodes.cell_node import CellNode, Role
+from lathe_rc.nodes.encoder_role import EncoderRole
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.executor import Events, drain_missed_messages
-from lathe_rc.nodes.recorder_node import RecorderNode
+from lathe_rc.nodes.recorder_role import RecorderRole
 from lathe_rc.nodes.report import THROUGHPUT, Reporter
-from lathe_rc.nodes.spindle_node import SpindleNode
-from lathe_rc.nodes.stage_node import StageNode
+from lathe_rc.nodes.spindle_role import SpindleRole
+from lathe_rc.nodes.stage_role import StageRole
 
 _MESSAGES = (  # what nodes send and offer, rclpy's own services among it
     *("lathe_rc_msgs.msg", "lathe_rc_msgs.srv", "rcl_interfaces.msg", "rcl_interfaces.srv", "lifecycle_msgs.msg"),
@@ -55,14 +55,14 @@ _LONGEST_WAIT = 0.1  # [s] until signals and the harness are looked at again
 def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellNode:
     if kind not in TABLES:
         raise InputError(f"{name}: no stage {kind!r}; {TABLES.instead(kind)}")
-    classes: dict[str, type[CellNode]] = {
-        RECORDER: RecorderNode,
-        SpindleEncoder.kind: SpindleNode,
-        LoadedSpindleStage.kind: SpindleNode,
-        EncoderDevice.kind: EncoderNode,
+    roles: dict[str, Callable[[CellNode], Role]] = {
+        RECORDER: RecorderRole,
+        SpindleEncoder.kind: SpindleRole,
+        LoadedSpindleStage.kind: SpindleRole,
+        EncoderDevice.kind: EncoderRole,
     }
     try:
-        return classes.get(kind, StageNode)(name, kind, reporter, exchange)
+        return CellNode(name, kind, roles.get(kind, StageRole), reporter, exchange)
     except RuntimeError as error:
         raise LatheError(f"{name}: {_words(error)}") from None
 
@@ -91,27 +91,27 @@ def _start(nodes: Sequence[CellNode], exchange: Exchange) -> None:
     """
     ready = [node for node in nodes if node.autostart and node.trigger_configure() == TransitionCallbackReturn.SUCCESS]
     for node in ready:
-        exchange.join(topic for topic, _, _ in node.publications())
+        exchange.join(node.protocol.own.publishes)
     for node in ready:
         node.trigger_activate()
 
 
 def _due(nodes: Sequence[CellNode], now: float) -> float:
     """When the next tick of a node is due; now if there is none."""
-    return min((node.next_tick for node in nodes if not node.done), default=now)
+    return min((node.next_tick for node in nodes if not node.protocol.done), default=now)
 
 
 def _leaves(node: CellNode) -> bool:
     """Whether a node has given up where nobody goes on."""
-    return node.failure is not None and not node.others_go_on
+    return node.protocol.failure is not None and not node.protocol.others_go_on
 
 
 def _tick(nodes: Sequence[CellNode], now: float) -> None:
     """Let nodes do what is due; one that has given up, and stays, has nothing more to write."""
     for node in nodes:
-        if now >= node.next_tick and not (node.done or _leaves(node)):
+        if now >= node.next_tick and not (node.protocol.done or _leaves(node)):
             node.tick(now)
-        if node.failure:
+        if node.protocol.failure:
             node.finish()
 
 
@@ -132,7 +132,7 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
         now = time.monotonic()
         if _due(nodes, now) <= now:
             _tick(nodes, now)
-            if all(node.done for node in nodes):
+            if all(node.protocol.done for node in nodes):
                 return
             if any(_leaves(node) for node in nodes):
                 return
@@ -206,7 +206,10 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
         gc.freeze()  # the collector skips existing objects: it would walk through them again and again between blocks
         gc.enable()  # a fork server has none
         _loop(nodes, reporter, stop)
-        return next((node.exit_code for node in nodes if node.exit_code), 0)
+        if stop.signal:
+            for node in nodes:
+                node.interrupt(signal.Signals(stop.signal).name)
+        return next((node.protocol.exit_code for node in nodes if node.protocol.exit_code), 0)
     except LatheError as error:
         print(f"lathe: {error}", file=sys.stderr)
         reporter("error", members[0][0], message=str(error), exit_code=error.exit_code)

@@ -3,26 +3,9 @@
 
 from collections.abc import Callable
 
-from lathe_rc.errors import LatheError
+from lathe_rc.protocol import ForeignMessage
 
 _MOST = 32  # senders that are counted by name
-_LONGEST = 256  # characters of a name that is kept
-
-
-class ForeignMessage(LatheError):  # noqa: N818 - the message, not what went wrong
-    """A message that does not belong; what was refused, and why.
-
-    Args:
-        topic: fully qualified.
-        source: who sent it, as it says; empty if it does not.
-        run_id: run that it says to be of.
-        why: what was expected.
-    """
-
-    def __init__(self, topic: str, source: str, run_id: str, why: str) -> None:
-        self.sender = f"{source[:_LONGEST] or 'an unknown sender'} of run {run_id[:_LONGEST]!r} on {topic}"
-        super().__init__(f"{topic}: message of run {run_id[:_LONGEST]!r} from {source[:_LONGEST] or '?'}; {why}")
-        self.topic = topic
 
 
 class RefusedMessages:

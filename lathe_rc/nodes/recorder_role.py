@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder: every signal topic of the cell into one bag, sorted, complete, and closed whatever happens."""
+"""The recorder as the role of a node: every signal topic of the cell in one bag, sorted, complete, always closed."""
 
 import json
 import shutil
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
@@ -27,10 +27,12 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import LatheError, LossyRunError
+from lathe_rc.nodes.block_queue import BlockQueue
 from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.exchange import Run
-from lathe_rc.nodes.ports import BlockQueue, latched_qos
-from lathe_rc.nodes.refused_messages import ForeignMessage
+from lathe_rc.nodes.ports import latched_qos
+from lathe_rc.protocol import Announcement, ForeignMessage, MemberProtocol
+from lathe_rc.protocol.actions import Action
 
 _HOST_TOPICS = {
     "/diagnostics": (DiagnosticArray, QoSProfile(depth=100)),
@@ -47,19 +49,23 @@ class _Encoders(dict[tuple[str, str, str, int], Encoder]):
         return encoder
 
 
-class RecorderNode(CellNode):
-    """See the module. It subscribes to what the members announce; alone, to what anybody announces."""
+class RecorderRole:
+    """See the module. It subscribes to the topics that the members announce; alone, to those of any announcement.
 
-    def configure_part(self) -> None:
-        """Open the bag."""
-        assert isinstance(self.table, RecorderParameters)
+    Args:
+        node: that it is the role of.
+    """
+
+    def __init__(self, node: CellNode) -> None:
+        self.node = node
+        self.table = cast("RecorderParameters", node.table)
         name = self.table.bag or f"bag_{self.table.run_id or 'cell'}"
         self._path = Path(name)
         self._snapshots: Snapshots | None = None
         if self.table.mode != "continuous":
-            place, namespace = self.table.snapshots_of(self._path), self.get_namespace().rstrip("/") + "/"
+            place, namespace = self.table.snapshots_of(self._path), node.namespace
             self._snapshots = Snapshots(
-                place, self.table, name=self.get_name(), namespace=namespace, told=self._tell_snapshot
+                place, self.table, name=node.get_name(), namespace=namespace, told=self._tell_snapshot
             )
         self._writer: Output | None = bag_of(self._path, self.table, self._snapshots)
         self._depth = signal_depth(self.table)
@@ -75,20 +81,45 @@ class RecorderNode(CellNode):
         self._log_ns = messages.START_NS
         self._flush_due = 0.0
 
-    def activate_part(self) -> None:
-        """Subscribe to the host topics; the signals follow when the members have announced them."""
-        self.create_service(Trigger, "~/snapshot", self._on_snapshot)
-        for topic, (kind, qos) in _HOST_TOPICS.items():
-            full = self.topic(topic)
-            self._open.add_topic(full, self._type_name(kind), offered_qos(qos.depth, "volatile"))
-            self.create_subscription(kind, full, self.guarded(partial(self._on_host, kind, full)), qos, raw=True)
+    def protocol(self, own: Announcement) -> MemberProtocol:
+        """See `Role`; it is wired once it has subscribed to the topics of the members."""
+        return MemberProtocol(own, self.table.window, masters=MASTERS, wired=False)
 
-    def clean_up_part(self) -> None:
-        """See `CellNode`; a bag without a block, of a cell that did not begin, is nothing to keep."""
+    def member_names(self) -> list[str]:
+        """See `Role`."""
+        return []
+
+    def relative_topics(self) -> list[str]:
+        """See `Role`."""
+        return []
+
+    def begin(self, *, joins: bool) -> None:
+        """See `Role`."""
+
+    def perform(self, action: Action) -> None:
+        """See `Role`."""
+
+    def work(self) -> None:
+        """See `Role`: messages are written as they come."""
+
+    def failed(self) -> None:
+        """See `Role`."""
+
+    def activate(self) -> None:
+        """Subscribe to the host topics; the signals follow when the members have announced them."""
+        self.node.create_service(Trigger, "~/snapshot", self._on_snapshot)
+        for topic, (kind, qos) in _HOST_TOPICS.items():
+            full = self.node.topic(topic)
+            self._open.add_topic(full, self._type_name(kind), offered_qos(qos.depth, "volatile"))
+            callback = self.node.guarded(partial(self._on_host, kind, full))
+            self.node.create_subscription(kind, full, callback, qos, raw=True)
+
+    def clean_up(self) -> None:
+        """See `Role`; a bag without a block, of a cell that did not begin, is nothing to keep."""
         self.finish()
         if not self._blocks and self._path.is_dir():
             shutil.rmtree(self._path)
-            self.get_logger().info(f"bag {self._path} removed: no block has come")
+            self.node.get_logger().info(f"bag {self._path} removed: no block has come")
 
     @staticmethod
     def _type_name(kind: Any) -> str:
@@ -110,7 +141,7 @@ class RecorderNode(CellNode):
         if kind is CellState:
             ours = told.run_id == self.table.run_id
         else:
-            ours = any(status.name in self.members for status in told.status)
+            ours = any(status.name in self.node.protocol.members for status in told.status)
         if ours:
             self._open.write(topic, self._log_ns, data)
 
@@ -118,16 +149,12 @@ class RecorderNode(CellNode):
         """It publishes no signals."""
         return []
 
-    def subscriptions_wanted(self) -> list[str]:
+    def subscriptions(self) -> list[str]:
         """All signal topics of the members."""
-        return [*self._queues, *self._sparse] if hasattr(self, "_queues") else []
-
-    def wired(self) -> bool:
-        """It is once it has subscribed to what the members announced."""
-        return bool(self._queues)
+        return [*self._queues, *self._sparse]
 
     def statistics(self) -> dict[str, object]:
-        """See `CellNode`."""
+        """See `Role`."""
         told: dict[str, object] = {"blocks": self._blocks, "lost blocks": self._lost, "bag": str(self._path)}
         if self._snapshots is not None:
             told |= {"snapshots": self._snapshots.bags, "memory for snapshots [B]": self._snapshots.held}
@@ -141,16 +168,17 @@ class RecorderNode(CellNode):
 
     def members_changed(self) -> None:
         """Subscribe once all members are known; beside a spindle that runs alone, to whatever is announced."""
+        members = self.node.protocol.members
         for name, pid in self._processes.items():
-            if self._merger is not None and self.members[name].pid != pid:
-                self._processes[name] = self.members[name].pid
+            if self._merger is not None and members[name].pid != pid:
+                self._processes[name] = members[name].pid
                 self._merger.restarted(name)
-        alone = any(member.stage in MASTERS and not member.members for member in self.members.values())
-        if not alone and (self._queues or not self.complete):
+        alone = any(member.stage in MASTERS and not member.members for member in members.values())
+        if not alone and (self._queues or not self.node.protocol.complete):
             return
         before = len(self._queues) + len(self._sparse)
-        for name in list(self.members) if self.master is None else list(self.master.members):
-            member = self.members[name]
+        for name in self._peers():
+            member = members[name]
             for topic, msgtype, sparse in zip(member.publishes, member.types, member.sparse, strict=True):
                 if topic not in self._queues and topic not in self._sparse:
                     self._subscribe(topic, msgtype, name, sparse=sparse, in_cell=not alone)
@@ -160,7 +188,8 @@ class RecorderNode(CellNode):
         dense = {topic: (queue.type, queue.source) for topic, queue in self._queues.items()}
         if self._snapshots is not None and dense:
             self._prepare(self._snapshots, dense)
-        self._processes = {name: member.pid for name, member in self.members.items() if self.restarts(name)}
+        restarts = self.node.protocol.restarts
+        self._processes = {name: member.pid for name, member in members.items() if restarts(name)}
         if not alone and self.table.window:
             self._merger = Merger(
                 self._open,
@@ -170,45 +199,51 @@ class RecorderNode(CellNode):
                 step_ns=self.table.step_ns,
                 samples=self.table.block_size,
             )
-        self.announce()
+        self.node.describe(subscribes=tuple(self.subscriptions()))
+
+    def _peers(self) -> list[str]:
+        """The members; beside a spindle that runs alone, all nodes that have announced themselves."""
+        protocol = self.node.protocol
+        return list(protocol.members if protocol.master is None else protocol.master.members)
 
     def _prepare(self, snapshots: Snapshots, dense: dict[str, tuple[str, str]]) -> None:
-        names = [name.removeprefix(self.get_namespace().rstrip("/") + "/") for name in self.members]
+        names = [name.removeprefix(self.node.namespace) for name in self.node.protocol.members]
         needed = snapshots.prepare(dense, names)
-        self.get_logger().info(f"snapshots: up to {needed} B of memory, bags in {snapshots.folder}")
+        self.node.get_logger().info(f"snapshots: up to {needed} B of memory, bags in {snapshots.folder}")
 
     def _explain(self) -> None:
         """Let the bag say what was run, with the parameters that the members really have."""
-        names = list(self.members) if self.master is None else list(self.master.members)
-        tables, _ = self.announced(names)
+        tables, _ = self.node.announced(self._peers())
         if tables:
-            host = [self.topic(topic) for topic in _HOST_TOPICS]
+            host = [self.node.topic(topic) for topic in _HOST_TOPICS]
             self._open.tell(provenance.tell(Scenario(self.table.run_id or "cell", tables), host))
 
     def _subscribe(self, topic: str, msgtype: str, source: str, *, sparse: bool, in_cell: bool) -> None:
         self._open.add_topic(topic, msgtype, offered_qos(self._depth, "transient_local"))
         if sparse:
             self._sparse[topic] = source
-            period = self._parameter(source, "joint_state_period")
+            period = self.node.protocol.parameter(source, "joint_state_period")
             self._joints[topic] = period if isinstance(period, int) else self.table.joint_state_period, set()
-            self.listen(topic, msgtype, partial(self._on_message_at, topic, msgtype), partial(self._on_sparse, topic))
+            self.node.listen(
+                topic, msgtype, partial(self._on_message_at, topic, msgtype), partial(self._on_sparse, topic)
+            )
             return
         queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
         queue.expect(source, 0 if in_cell else None)
-        queue.repeats = in_cell and self.restarts(source)
-        self.listen(topic, msgtype, partial(self._on_message, queue), partial(self._on_run, queue))
+        queue.repeats = in_cell and self.node.protocol.restarts(source)
+        self.node.listen(topic, msgtype, partial(self._on_message, queue), partial(self._on_run, queue))
 
-    def lose(self, lost: set[str], first: int, end: int) -> None:
-        """See `CellNode`; what they published is held, and the bag says from which sample on."""
+    def lose(self, lost: frozenset[str], first: int, end: int, *, again: bool) -> None:
+        """See `Role`; what they published is held, and the bag says from which sample on."""
         assert self._merger is not None, "only a cell with a window has a safe state"
         held: dict[str, int] = {}
         for topic, queue in self._queues.items():
             if queue.source in lost and queue.held_from is None:
                 data = self._newest.get(topic)
-                queue.hold(end, Decoder(queue.type).decode(data) if data else None)
+                queue.hold_newest(end, Decoder(queue.type).decode(data) if data else None)
             if queue.held_from is not None and queue.held_from < end:
                 held[topic] = queue.held_from
-        if self._snapshots is not None and not self._safe:
+        if self._snapshots is not None and not again:
             self._snapshots.trigger(f"cell: lost {', '.join(sorted(lost))}", first)
         self._open.tell({provenance.HELD: json.dumps(held)})
         self._merger.forget(lost)
@@ -229,10 +264,10 @@ class RecorderNode(CellNode):
             text = f"snapshot {snapshot.path} closed: {span}"
         else:
             text = f"snapshot {snapshot.path} closed: {span}; wanted up to {snapshot.wanted}, the run ended before"
-        self.get_logger().info(text)
-        self.reporter(
+        self.node.get_logger().info(text)
+        self.node.reporter(
             "snapshot",
-            self.get_name(),
+            self.node.get_name(),
             bag=str(snapshot.path),
             sample=sample,
             first=snapshot.first,
@@ -242,15 +277,15 @@ class RecorderNode(CellNode):
 
     def _on_snapshot(self, request: Any, response: Any) -> Any:
         if self._snapshots is None:
-            response.message = f"{self.get_name()}.mode = 'continuous'; allowed for snapshots: snapshot or both"
-        elif self._writer is None or self.failure or not self._queues:
+            response.message = f"{self.node.get_name()}.mode = 'continuous'; allowed for snapshots: snapshot or both"
+        elif self._writer is None or self.node.protocol.failure or not self._queues:
             response.message = "nothing is being recorded: the cell has not started, or it has ended"
         else:
             sample = self._snapshots.next_sample
             try:
-                found = self._snapshots.trigger(f"{self.get_name()}: service", sample)
+                found = self._snapshots.trigger(f"{self.node.get_name()}: service", sample)
             except LatheError as error:
-                self.fail(error)
+                self.node.fail(error)
                 response.message = str(error)
                 return response
             response.success, response.message = True, f"sample {sample}: {found.path}"
@@ -258,12 +293,12 @@ class RecorderNode(CellNode):
 
     # ---- data ---------------------------------------------------------------------------------------
 
-    def tick(self, now: float) -> None:
-        """See `CellNode`; what a crash may lose is bounded in time as well."""
-        super().tick(now)
+    def tick(self, now: float) -> float:
+        """See `Role`; what a crash may lose is bounded in time as well."""
         if self._writer is not None and now >= self._flush_due:
             self._flush_due = now + FLUSH_PERIOD
-            self.attempt(self._writer.flush)
+            self.node.attempt(self._writer.flush)
+        return self._flush_due
 
     def _on_message_at(self, topic: str, msgtype: str, data: bytes) -> None:
         """A message at a chosen sample, of a node in another process."""
@@ -296,7 +331,7 @@ class RecorderNode(CellNode):
         waiting.add(sample)
 
     def _on_sparse(self, topic: str, data: bytes) -> None:
-        if self.over:
+        if self.node.protocol.over:
             return
         stamp = messages.stamp_of(data)
         if self._merger is None:
@@ -307,7 +342,7 @@ class RecorderNode(CellNode):
 
     def _on_message(self, queue: BlockQueue, data: bytes) -> None:
         """A block of a node in another process."""
-        if self.over:
+        if self.node.protocol.over:
             return
         block = queue.add(data)
         if block is None:
@@ -321,7 +356,7 @@ class RecorderNode(CellNode):
 
     def _on_run(self, queue: BlockQueue, run: Run) -> None:
         """Blocks of a node in this process; the messages at chosen samples among them have come before."""
-        if self.over:
+        if self.node.protocol.over:
             return
         queue.take(run)
         queue.blocks.clear()
@@ -353,10 +388,10 @@ class RecorderNode(CellNode):
 
     def _complete(self) -> None:
         """The last block of every topic is written."""
-        self.reporter("complete", self.get_name(), blocks=self._blocks)
+        self.node.reporter("complete", self.node.get_name(), blocks=self._blocks)
         self.finish()
-        self.progressed(self._blocks, self._samples, last=True)
-        self.end([])
+        self.node.completed(self._blocks, self._samples, last=True)
+        self.node.complete_part()
 
     def _drain(self) -> None:
         """Write every block that is complete."""
@@ -366,7 +401,7 @@ class RecorderNode(CellNode):
         if self._merger.complete:
             self._complete()
         else:
-            self.progressed(self._blocks, self._samples, last=False)
+            self.node.completed(self._blocks, self._samples, last=False)
 
     def _write(self, log_ns: int, topic: str, data: bytes) -> None:
         self._open.write(topic, log_ns, data)
@@ -374,25 +409,25 @@ class RecorderNode(CellNode):
 
     def finish(self) -> None:
         """Write what is left and close the bag."""
-        if getattr(self, "_writer", None) is None:
+        if self._writer is None:
             return
         complete = bool(self._queues) and (self._merger.complete if self._merger else self._ended == set(self._queues))
         if self._snapshots is not None and not complete:
-            cause = f"{self.get_name()}: {self.failure or 'interrupted'}"
-            self.attempt(partial(self._snapshots.interrupt, cause))
+            cause = f"{self.node.get_name()}: {self.node.protocol.failure or 'interrupted'}"
+            self.node.attempt(partial(self._snapshots.interrupt, cause))
         if self._merger is not None:
-            self.attempt(self._merger.write_rest)
+            self.node.attempt(self._merger.write_rest)
         try:
-            self.attempt(self._open.close)
+            self.node.attempt(self._open.close)
         except OSError as error:
-            self.fail(LatheError(f"{self._path}: cannot be closed ({error.strerror})"))
+            self.node.fail(LatheError(f"{self._path}: cannot be closed ({error.strerror})"))
         finally:
             self._writer = None
-        complete = complete and not self.failure
+        complete = complete and not self.node.protocol.failure
         whole = "complete" if complete else "interrupted"
-        if complete and self._safe:
+        if complete and self.node.protocol.safe:
             whole = "to the end of the safe state; what lost members published is held"
-        self.get_logger().info(f"bag {self._path} closed: {self._blocks} blocks, {whole}")
-        self.reporter("closed", self.get_name(), bag=str(self._path), blocks=self._blocks, complete=complete)
+        self.node.get_logger().info(f"bag {self._path} closed: {self._blocks} blocks, {whole}")
+        self.node.reporter("closed", self.node.get_name(), bag=str(self._path), blocks=self._blocks, complete=complete)
         if self._lost:
-            self.fail(LossyRunError(f"{self.full_name}: lost {self._lost} blocks of a free-running cell"))
+            self.node.fail(LossyRunError(f"{self.node.full_name}: lost {self._lost} blocks of a free-running cell"))

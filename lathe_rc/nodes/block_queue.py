@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blocks of one topic that a node reads: checked, and in order."""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from lathe_rc import messages
+from lathe_rc.cell.block import Block
+from lathe_rc.cell.host_topics import signal_depth
+from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.wire import Decoder, NoBlockError
+from lathe_rc.errors import LatheError
+from lathe_rc.nodes.exchange import Run
+from lathe_rc.protocol import BlockOrder, ForeignMessage
+
+
+class BlockQueue(BlockOrder):
+    """Blocks of one topic, checked and in order.
+
+    Args:
+        topic: fully qualified name.
+        msgtype: message type.
+        parameters: of the node that reads.
+        fields: those that it reads.
+
+    Attributes:
+        blocks: checked blocks that wait to be used.
+        inside: its blocks are handed over in this process.
+    """
+
+    def __init__(self, topic: str, msgtype: str, parameters: NodeParameters, fields: list[str]) -> None:
+        self._limit, self._size = 8 * signal_depth(parameters), parameters.block_size
+        super().__init__(topic, parameters.run_id, None if parameters.window else self._limit * self._size)
+        self.type = msgtype
+        self.blocks: deque[Block] = deque()
+        self.inside = False
+        self._decoder = Decoder(msgtype, fields, self.admit)
+        self._decoder.prepare()
+        self._step_ns = parameters.step_ns
+        self._newest: Block | None = None
+
+    def expect(self, source: str, first: int | None = 0) -> None:
+        """See `BlockOrder`; what has come before is forgotten."""
+        super().expect(source, first)
+        self.blocks.clear()
+        self._newest = None
+
+    def add(self, data: bytes) -> Block | None:
+        """Check a block and queue it; None if another already stands for it, see `hold`, or if it is a repeat.
+
+        Raises:
+            ForeignMessage: another source or run, or no block at all.
+            LatheError: another step, another time than that of its samples, a gap, a repeat, arrays of different
+                lengths, or far more blocks waiting than the window allows.
+        """
+        if self.held_from is not None:
+            return None
+        try:
+            block = self._decoder.decode(data)
+        except NoBlockError as error:
+            raise ForeignMessage(self.topic, "", "", str(error)) from None
+        except ValueError as error:
+            raise LatheError(f"{self.topic}: {error}") from None
+        return self.accept(block)
+
+    def take(self, run: Run) -> None:
+        """Queue blocks that were handed over in this process.
+
+        Raises:
+            LatheError: see `add`.
+        """
+        if self.open or run.block.first_index != self.end:
+            for each in run.blocks(self._size):
+                self.accept(each)
+            return
+        # What else is checked cannot differ from block to block of a node in this process.
+        self._append(run.block, len(run.companions))
+
+    @property
+    def message(self) -> bytes:
+        """The block that `add` has taken last, as our nodes encode it."""
+        return self._decoder.message
+
+    def accept(self, block: Block) -> Block | None:
+        """Check a block and queue it; see `add`."""
+        self.admit(block.run_id, block.source)
+        if block.step_ns != self._step_ns:
+            raise LatheError(f"{self.topic}: {block.source} has a step of {block.step_ns} ns; expected {self._step_ns}")
+        if block.samples > self._size:
+            raise LatheError(
+                f"{self.topic}: {block.source} sends {block.samples} samples in a block; expected {self._size} at most"
+            )
+        stamp = messages.START_NS + (block.first_index + block.samples - 1) * self._step_ns
+        if block.log_ns != stamp:
+            raise LatheError(
+                f"{self.topic}: {block.source} stamps the block from sample {block.first_index} on with "
+                f"{block.log_ns} ns; expected {stamp} ns, the time of its last sample"
+            )
+        missing = self.missing(block.source, block.first_index, block.samples)
+        if missing is None:
+            return None
+        if missing:  # a free-running cell goes on with the last sample held, and counts
+            for held in self._held(self._last(), self.end, block.first_index):
+                self.blocks.append(held)
+                self.received += 1
+                self.lost += 1
+        return self._append(block)
+
+    def until(self, end: int) -> Iterator[Block]:
+        """Take out what waits of the samples before ``end``."""
+        while self.blocks and self.blocks[0].first_index < end:
+            block = self.blocks.popleft()
+            if (samples := end - block.first_index) < block.samples:
+                self.blocks.appendleft(block.part(samples, block.samples))
+                block = block.part(0, samples)
+            yield block
+
+    def state(self) -> tuple[int, int, list[Block], Block | None]:
+        """The state that another process needs to go on: next sample, blocks received, waiting and newest."""
+        return self.end, self.received, list(self.blocks), self._newest
+
+    def go_on(self, source: str, state: tuple[int, int, list[Block], Block | None]) -> None:
+        """Go on from the `state` of another process."""
+        end, received, waiting, self._newest = state
+        self.resume(source, end, received, ended=self._newest is not None and self._newest.last)
+        self.blocks = deque(waiting)
+
+    def hold_newest(self, end: int, newest: Block | None = None) -> None:
+        """Let the newest sample stand for those of a source that is lost, see `hold`.
+
+        Args:
+            end: of the run [sample].
+            newest: the newest block with all its fields; None: with those that are read.
+        """
+        first = self.end
+        self.hold(end)
+        for block in self._held(newest or self._last(), first, end):
+            block.last = block.first_index + block.samples == end
+            self.blocks.append(block)
+            self.received += 1
+
+    def _last(self) -> Block:
+        """The newest block; before the first one zeros."""
+        return self._newest or self._zero()
+
+    def _zero(self) -> Block:
+        """A block that stands for those before the first."""
+        zeros = {name: np.zeros(1, dtype) for name, dtype in messages.sample_fields(self.type).items()}
+        return Block(self._run_id, self.source, 0, self._step_ns, False, 0, 0, 0, zeros)  # noqa: FBT003
+
+    def _held(self, newest: Block, first: int, end: int) -> Iterator[Block]:
+        """Blocks with the last sample of another."""
+        for start in range(first, end, self._size):
+            samples = min(self._size, end - start)
+            yield replace(
+                newest,
+                first_index=start,
+                samples=samples,
+                log_ns=messages.START_NS + (start + samples - 1) * self._step_ns,
+                signals={name: np.repeat(array[-1:], samples) for name, array in newest.signals.items()},
+                whole=None,
+                last=False,
+            )
+
+    def _append(self, block: Block, count: int = 1) -> Block:
+        """Queue a block, or so many in one piece."""
+        self.append(block.first_index + block.samples, count, last=block.last)
+        self._newest = block
+        self.blocks.append(block)
+        if len(self.blocks) > self._limit:
+            raise LatheError(f"{self.topic}: {len(self.blocks)} blocks wait; the node cannot keep up")
+        return block

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Facts from ROS's graph and from announcements: which topics have met, and which parameters members really have."""
+
+import json
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rclpy.node import Node
+
+from lathe_rc import allowed_code, resources
+from lathe_rc.cell.beside import REPLAYED_FILES
+from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.scenario import TABLES
+from lathe_rc.cell.wiring import Unknown
+from lathe_rc.errors import InputError, shown
+from lathe_rc.nodes.exchange import Exchange
+from lathe_rc.protocol import Announcement, MemberProtocol
+
+if TYPE_CHECKING:
+    from lathe_rc.nodes.cell_node import CellNode
+
+_NOT_TOLD_YET = "_NODE_NAME_UNKNOWN_"  # what the graph calls a node whose name has not come
+
+Announced = tuple[dict[str, NodeParameters], dict[str, Unknown]]
+
+
+def publishers(node: Node, topic: str) -> list[str]:
+    """Nodes that publish a topic."""
+    return sorted(_name(end) for end in node.get_publishers_info_by_topic(topic))
+
+
+def unmatched(node: "CellNode", protocol: MemberProtocol, exchange: Exchange) -> Iterator[str]:
+    """Topics that have not met all of their members, each with the missing ones.
+
+    The graph knows names, but runs ahead of what DDS has matched; DDS counts matches, but without names.
+    """
+    for topic, inlet in node.inlets.items():
+        expected = protocol.expected_writers(topic)
+        there = {_name(end) for end in node.get_publishers_info_by_topic(topic)}
+        if not expected:
+            yield f"{topic}, which no member publishes"
+        elif not expected <= there or inlet.get_publisher_count() < len(expected):
+            yield f"{topic} from {', '.join(sorted(expected - there or expected))}"
+    for topic, outlet in node.outlets.items():
+        expected = protocol.expected_readers(topic) - exchange.readers(topic)
+        there = {_name(end) for end in node.get_subscriptions_info_by_topic(topic)}
+        if not expected <= there or outlet.get_subscription_count() < len(expected):
+            yield f"{topic} to {', '.join(sorted(expected - there or expected))}"
+
+
+def _name(end: Any) -> str:
+    if end.node_name == _NOT_TOLD_YET:
+        return "a node whose name DDS has not told yet"
+    return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
+
+
+def announced(
+    members: Mapping[str, Announcement],
+    names: Sequence[str],
+    namespace: str,
+    report_unknown: Callable[[str, str, str], None],
+) -> Announced:
+    """The members' announcements, by their name in a namespace: for a `lathe_rc.cell.wiring.Cell`.
+
+    Args:
+        members: all that have been heard.
+        names: those of the cell.
+        namespace: with its slash at the end.
+        report_unknown: gets the name and the stage of a member that is not known here, and why.
+
+    Returns:
+        The parameters of the members that are known here, and the topics of the others.
+
+    Raises:
+        InputError: a member that is known has a parameter that cannot be.
+    """
+    tables, unknown = dict[str, NodeParameters](), dict[str, Unknown]()
+    for name in names:
+        table = _table(members[name], report_unknown)
+        if table is None:
+            unknown[name.removeprefix(namespace)] = _topics_of(members[name], namespace)
+        else:
+            tables[name.removeprefix(namespace)] = table
+    return tables, unknown
+
+
+def _topics_of(member: Announcement, namespace: str) -> Unknown:
+    dense, sparse = dict[str, str](), dict[str, str]()
+    for topic, msgtype, is_sparse in zip(member.publishes, member.types, member.sparse, strict=True):
+        (sparse if is_sparse else dense)[topic.removeprefix(namespace)] = msgtype
+    return Unknown(dense, sparse, frozenset(topic.removeprefix(namespace) for topic in member.subscribes))
+
+
+def _table(member: Announcement, report_unknown: Callable[[str, str, str], None]) -> NodeParameters | None:
+    """The parameters that a member has announced; None, and reported, if its stage is unknown here."""
+    try:
+        kind = TABLES.get(member.stage)
+        why = "there is no such stage here"
+    except InputError as error:
+        kind, why = None, str(error)
+    if kind is not None:
+        values = json.loads(member.parameters) | {"stage": member.stage}
+        missing = [row for row in kind.rows() if row not in values]
+        refused = "" if missing else _refused(kind, values)
+        if not missing and not refused:
+            return kind.read(member.name, values)
+        others = f" and {len(missing) - 1} others" if missing[1:] else ""
+        why = refused or f"its parameters do not say {missing[0]}{others}"
+    report_unknown(member.name, member.stage, why)
+    return None
+
+
+def _refused(kind: type[NodeParameters], values: Mapping[str, object]) -> str:
+    """Why the parameters that a member announces are not taken: they name code or files that it may not name."""
+    for row in kind.rows().values():
+        value = values[row.name]
+        if row.named is not None:
+            registry = row.named.registry
+            for name in row.named.others(value):
+                if not registry.permits(name):
+                    return f"{row.name} = {shown(repr(name))}: {registry.why_not(name)}"
+        if row.is_file and value and not _may_announce(str(value)):
+            return f"{row.name} = {shown(repr(value))}: a file that no parameter file of this process names"
+    return ""
+
+
+def _may_announce(path: str) -> bool:
+    """Whether a member may name a file: as the user does, one that comes with lathe_rc, or one of a bag's replay."""
+    if allowed_code.is_named(path):
+        return True
+    place, temporary = resources.find(Path(path)).resolve(), Path(tempfile.gettempdir()).resolve()
+    replayed = any(each.parent == temporary and each.name.startswith(REPLAYED_FILES) for each in place.parents)
+    return replayed or resources.is_own(place)

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The spindle as time master: it checks the cell, releases blocks by window and pace, and tells the simulated time."""
+
+import time
+from collections import deque
+from functools import partial
+from typing import cast
+
+from lathe_rc_msgs.msg import Progress as ProgressMessage
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+
+from lathe_rc import messages
+from lathe_rc.cell.latency_histogram import LATENCY, LATENESS
+from lathe_rc.cell.stages import MASTERS
+from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError
+from lathe_rc.nodes.cell_node import CellNode
+from lathe_rc.nodes.ports import latched_qos
+from lathe_rc.nodes.stage_role import StageRole
+from lathe_rc.protocol import Announcement, Pace, Progress, Reactions, TimeMasterProtocol, actions
+
+_LOOK = 0.02  # [s] between looks at the members
+_BURST = 64  # blocks released before other work gets its turn
+
+
+class SpindleRole(StageRole):
+    """See the module; its stage is the spindle and its encoder.
+
+    Attributes:
+        pace: of the run.
+    """
+
+    stage: TimeMaster
+
+    def __init__(self, node: CellNode) -> None:
+        super().__init__(node)
+        table = self.table = cast("TimeMasterParameters", node.table)
+        if table.members and not table.window and not table.speed_factor:
+            raise InputError(
+                f"{node.get_name()}.speed_factor = 0 with window = 0: nothing would hold the spindle back; "
+                "allowed: a speed_factor above 0, or a window"
+            )
+        block = table.block_size * table.step
+        self.pace = Pace(block / table.speed_factor if table.speed_factor else 0.0, table.window)
+        self._reported: deque[Progress] = deque()  # of members in this process
+        self._cell: Cell | None = None
+
+    @property
+    def leads(self) -> TimeMasterProtocol:
+        """The node's protocol."""
+        return cast("TimeMasterProtocol", self.node.protocol)
+
+    def protocol(self, own: Announcement) -> TimeMasterProtocol:
+        """See `Role`."""
+        table = self.table
+        reactions = Reactions(
+            stall_reaction=table.stall_reaction,
+            stall_time=table.stall_time,
+            restart_time=table.restart_time,
+            safe_samples=max(1, round(table.safe_time * table.sample_rate)),
+            block_size=table.block_size,
+        )
+        protocol = TimeMasterProtocol(own, table.window, reactions, masters=MASTERS)
+        protocol.know_end(self.stage.samples)
+        return protocol
+
+    def member_names(self) -> list[str]:
+        """See `Role`: all members, the spindle included; none when it runs alone."""
+        if not self.table.members:
+            return []
+        others = (name if name.startswith("/") else self.node.namespace + name for name in self.table.members)
+        return [self.node.full_name, *others]
+
+    def activate(self) -> None:
+        """See `Role`."""
+        super().activate()
+        node = self.node
+        self._clock_publisher = node.create_publisher(Clock, "/clock", QoSProfile(depth=10))
+        node.create_subscription(ProgressMessage, "progress", node.guarded(self._on_progress), latched_qos())
+        node.exchange.master = node.guarded(self._reported.append)
+
+    def _on_progress(self, message: ProgressMessage) -> None:
+        progress = Progress(message.run_id, message.name, message.blocks, message.samples)
+        self.leads.hear_progress(progress, time.monotonic())
+
+    def statistics(self) -> dict[str, object]:
+        """See `Role`."""
+        leads = self.leads
+        return {
+            **super().statistics(),
+            "blocks in flight": self.blocks - leads.least,
+            "slowest member": leads.slowest,
+            "schedule slipped [s]": round(self.pace.slipped, 3),
+            LATENESS: self.pace.lateness,
+            LATENCY: leads.latency,
+        }
+
+    # ---- requests of the protocol -------------------------------------------------------------------
+
+    def perform(self, action: actions.Action) -> None:
+        """See `Role`."""
+        match action:
+            case actions.CheckCell():
+                self._check_cell()
+            case actions.Start():
+                self.start_run()
+            case actions.Release():
+                self.release()
+            case actions.TellTime(samples):
+                stamp = messages.header(max(samples - 1, 0), self.table.step_ns).stamp
+                clock = Clock()
+                clock.clock.sec, clock.clock.nanosec = stamp.sec, stamp.nanosec
+                self._clock_publisher.publish(clock)
+            case actions.TellPace():
+                if figures := self.pace.figures():
+                    self.node.reporter("pace", self.node.get_name(), **figures)
+
+    def _check_cell(self) -> None:
+        """Make the same check as before an offline run, with the parameters that the members really have."""
+        if names := self.leads.own.members:
+            cell = Cell(*self.node.announced(names))
+            cell.check()
+            for left_out in cell.unchecked:
+                self.node.get_logger().warning(f"not checked: {left_out}")
+            for warning in cell.warnings:
+                self.node.get_logger().warning(warning)
+            self._cell = cell
+        self.leads.start(time.monotonic())
+
+    def start_run(self) -> None:
+        """Block 0 may go."""
+        self.pace.schedule = time.monotonic()
+        self.node.exchange.form(self, self._cell)
+        if self.chain is None and self.inputs.ports:
+            self.start(0)
+
+    def become_safe(self, first: int) -> None:
+        """See `StageRole`: lead the others, as before; the newest samples of lost members are held."""
+
+    # ---- blocks -------------------------------------------------------------------------------------
+
+    def blocks_at_once(self) -> int:
+        """Blocks to release at once, at most."""
+        return 1 if self.table.speed_factor else min(self.leads.credit, self.together)
+
+    def possible(self) -> int:
+        """Samples to release at once; 0 while it, or others in its chain, wait for an input."""
+        samples = self.table.block_size * self.blocks_at_once()
+        if self.chain is None and not self.inputs.ports:
+            return samples
+        ready = self.chain.ready() if self.chain is not None else self.ready()
+        return min(samples, ready[0]) if ready else 0
+
+    def release(self) -> None:
+        """Release every block that credit and pace allow."""
+        leads, size = self.leads, self.table.block_size
+        begun = time.monotonic()
+        for _ in range(_BURST):
+            if not leads.may_release or self.blocks == leads.blocks_in_run or leads.credit <= 0:
+                return
+            if time.monotonic() - begun > _LOOK:
+                break  # a window may hold many blocks: meanwhile deaths shall be noticed
+            if not (samples := self.possible()):
+                return
+            if self.pace.block and not self._is_due(-(-samples // size)):
+                return
+            last = leads.end is not None and leads.end - self.samples <= samples
+            if last:
+                samples = cast("int", leads.end) - self.samples
+            leads.release(-(-samples // size), time.monotonic())
+            if self.chain is not None:
+                self.chain.compute(samples, last=last)
+            else:
+                self.compute(samples, last=last)
+        self.node.next_tick = time.monotonic()
+
+    def _is_due(self, blocks: int) -> bool:
+        """Whether the next blocks may go; counts how late they are."""
+        now, due = time.monotonic(), self.pace.due(self.blocks)
+        if now < due:
+            self.node.next_tick = min(self.node.next_tick, due)
+            return False
+        self.pace.count(now - due, blocks)
+        if now - due > self.pace.most_late:
+            self.fall_behind(now - due)
+        return self.leads.may_release
+
+    def fall_behind(self, late: float) -> None:
+        """Put the schedule off: the members are too slow for the pace."""
+        self.pace.slip(late)
+
+    def lead(self) -> None:
+        """See `StageRole`: as far as credit and pace allow."""
+        self.node.attempt(self.release)
+
+    def work(self) -> None:
+        """Take the progress of members in this process: not at once, the block that they report may be under way."""
+        for _ in range(len(self._reported)):  # their reports on the blocks that this releases have their turn later
+            report = self._reported.popleft()
+            self.node.due = self.node.due or bool(self._reported)  # an error leaves the rest for the next turn
+            self.node.attempt(partial(self.leads.hear_progress, report, time.monotonic()))
+        if self.inputs.ports and self.chain is None:
+            self.release()  # blocks of the cut may let others go
+
+    def tick(self, now: float) -> float:
+        """See `Role`."""
+        super().tick(now)
+        if self.leads.running:
+            self.node.attempt(self.release)
+        return min(now + _LOOK, self.node.next_tick)

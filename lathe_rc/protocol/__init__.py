@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The protocol of a cell, without I/O: joining, progress and credit, silence and death, the safe state and the end.
+
+A node hands events to its `MemberProtocol`, each with the time, and does what the protocol then asks for (`actions`).
+Nothing here publishes, waits, reads a clock or starts a thread: so thousands of cells can be simulated in a second.
+"""
+
+from lathe_rc.protocol.block_order import BlockOrder
+from lathe_rc.protocol.member import GIVEN_UP, SILENCE, MemberProtocol
+from lathe_rc.protocol.messages import Announcement, CellState, ForeignMessage, MemberState, Phase, Progress
+from lathe_rc.protocol.pace import Pace
+from lathe_rc.protocol.time_master import Reactions, TimeMasterProtocol
+
+__all__ = [
+    "GIVEN_UP",
+    "SILENCE",
+    "Announcement",
+    "BlockOrder",
+    "CellState",
+    "ForeignMessage",
+    "MemberProtocol",
+    "MemberState",
+    "Pace",
+    "Phase",
+    "Progress",
+    "Reactions",
+    "TimeMasterProtocol",
+]

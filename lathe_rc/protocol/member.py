@@ -1,0 +1,497 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One member of a cell: how it joins, begins, reports progress, notices the others' fate, fails and ends."""
+
+import json
+import math
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from difflib import get_close_matches
+from itertools import chain, repeat
+
+from lathe_rc import messages
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.protocol import actions as do
+from lathe_rc.protocol.actions import Action
+from lathe_rc.protocol.messages import Announcement, CellState, ForeignMessage, MemberState, Phase, Progress
+
+SILENCE = 0.08  #: [s] after which a node is silent that DDS does not hear, and that completes nothing
+GIVEN_UP = 2.0  #: [s] of silence after which a time master is lost in a cell that does not wait
+PATIENCE = 2.0  #: [s] for other nodes to acknowledge the last messages
+_REPEAT_PERIOD = 0.5  # [s] between announcements before the run, in the safe state, and after a failure
+_LAST_ANSWER = 1.0  # [s] until the caller of a shutdown has its answer: DDS does not say when
+_MOST_MEMBERS = 256  # announced names that are kept
+_WAIT_REPORTS = (2.0, 8.0, 30.0)  # [s] of waiting until it is reported; the last again and again
+
+
+class MemberProtocol:
+    """State of a member. Events are methods, with the monotonic time ``now`` [s]; requests wait in `actions`.
+
+    Args:
+        own: first announcement of this member, with all of its topics that are known already.
+        window: blocks that may be in flight; 0: nothing holds the time master back.
+        masters: kinds of node that may be time masters.
+        needs_phase: it may join in mid-run, so it must know whether the cell is running before it is ready.
+        wired: all publishers and subscriptions are there once it is active; else from `describe` on.
+
+    Attributes:
+        actions: requests to the node, oldest first; the node empties it after each event.
+        own: the newest announcement of this member.
+        members: the newest announcement of each member, by fully qualified name.
+        master: that of the time master; None as long as none has been heard.
+        phase: of the cell, as the time master says; None as long as it has said nothing.
+        active: between activation and deactivation.
+        ready: every topic is matched, and the node has begun.
+        safe: it knows that members are lost.
+        over: its part of the run is complete.
+        done: it may leave.
+        failure: why it gave up.
+        without: members that are lost.
+        unmatched: topics that have not met their peers, as the node has seen last, for messages.
+        patience: for messages to be acknowledged [s].
+        silent: since when a member is not heard any more, or stopped [s], by name.
+        ended: members whose process, on this machine, has ended.
+    """
+
+    def __init__(
+        self,
+        own: Announcement,
+        window: int,
+        *,
+        masters: Collection[str] = (),
+        needs_phase: bool = False,
+        wired: bool = True,
+    ) -> None:
+        self.own, self.window = own, window
+        self._masters, self._needs_phase, self._wired = masters, needs_phase, wired
+        self.actions: deque[Action] = deque()
+        self.members: dict[str, Announcement] = {}
+        self.master: Announcement | None = None
+        self.phase: Phase | None = None
+        self.active = self.ready = self.safe = self.over = self.done = False
+        self.failure: LatheError | None = None
+        self.without: frozenset[str] = frozenset()
+        self.unmatched: Sequence[str] = ()
+        self.patience = PATIENCE
+        self.silent: Mapping[str, float] = {}
+        self.ended: Collection[str] = ()
+        self._started = self._beginning = self._leaving = False
+        self.progress_step = max(1, window // 4)
+        self._reported_blocks = 0
+        self._moved = 0.0  # when this member has last completed a block
+        self._master_stalls = False
+        self._repeat_due = 0.0
+        self._leave_due = self._wait_report_due = math.inf
+        self._wait_report_after: Iterator[float] = iter(())
+
+    # ---- lifecycle ----------------------------------------------------------------------------------
+
+    @property
+    def takes_part(self) -> bool:
+        """Whether the others of a cell that runs need this member."""
+        runs = self.phase in (Phase.RUNNING, Phase.SAFE)
+        return runs and self.master is not None and not (self.over or self.failure)
+
+    def activate(self, now: float) -> None:
+        """The node exchanges messages from now on, or again."""
+        self.active = True
+        if not self._started:
+            self._started = True
+            self._wait_report_after = chain(_WAIT_REPORTS, repeat(_WAIT_REPORTS[-1]))
+            self._wait_report_due = now + next(self._wait_report_after)
+        self.announce()
+
+    def deactivate(self) -> None:
+        """The node stands still, and so does the cell."""
+        self.active = False
+
+    def clean_up(self) -> None:
+        """The node leaves the cell, which shall not begin without it: it says that it joins anew."""
+        self.active = self.ready = False
+        if self._started:
+            self.announce()
+
+    def shut_down(self, now: float) -> None:
+        """The node is finalized; in the middle of a run as one that has failed."""
+        if self.takes_part:
+            self.fail(LatheError(f"{self.own.name} was shut down in the middle of a run"))
+        else:
+            self._leave_due = now + _LAST_ANSWER
+        self.active = False
+
+    def interrupt(self, signal: str) -> None:
+        """The node's process is told to end by a signal."""
+        if self.takes_part:
+            self.fail(LatheError(f"{self.own.name} was ended by {signal} in the middle of a run"))
+        elif self._started and not (self.over or self.failure or self.done):
+            self.clean_up()
+            if self.master is not None:
+                self._report("interrupted", message=f"{self.own.name} was ended by {signal} before the run began")
+
+    # ---- announcements ------------------------------------------------------------------------------
+
+    def describe(self, **topics: tuple[object, ...]) -> None:
+        """Take new lists of topics into the announcement: fields of `Announcement`."""
+        self.own, self._wired = replace(self.own, **topics), True  # type: ignore[arg-type]
+        self.announce()
+
+    def announce(self) -> None:
+        """Publish name, topics and state."""
+        self.own = replace(self.own, state=self._state(), message=str(self.failure or ""))
+        self.members[self.own.name] = self.own
+        if self.own.members:
+            self.master = self.own
+        self.actions.append(do.Announce(self.own))
+
+    def _state(self) -> MemberState:
+        if self.failure:
+            return MemberState.FAILED
+        if self.safe:
+            return MemberState.SAFE
+        if self.ready:
+            return MemberState.READY
+        return MemberState.WIRED if self.active and self._wired else MemberState.JOINING
+
+    def hear_member(self, member: Announcement, now: float) -> None:
+        """A member has announced itself.
+
+        Raises:
+            ForeignMessage: it is no member of this cell.
+        """
+        if member.name == self.own.name and member.process == self.own.process:
+            return  # this one
+        self._check(member)
+        if member.name == self.own.name:
+            self._meet_namesake(member)
+            return
+        self.members[member.name] = member
+        if member.members:
+            self.master = member
+        self.actions.append(do.Follow(member))
+        peers = self.master.members if self.master else ()
+        if len(self.members) > _MOST_MEMBERS:
+            del self.members[next(n for n in reversed(self.members) if n not in peers and n != self.own.name)]
+        if member.state == MemberState.FAILED and not self.over and self._is_peer(member.name):
+            self.member_failed(member, now)
+        self.actions.append(do.MembersChanged())
+        self.members_changed(now)
+
+    def _is_peer(self, name: str) -> bool:
+        peers = self.master.members if self.master else ()
+        return name in peers and name != self.own.name and name not in self.without
+
+    def _check(self, member: Announcement) -> None:
+        """Refuse a stranger."""
+        why, known = "", self.members.get(member.name)
+        if self.own.run_id and member.run_id != self.own.run_id:
+            why = f"expected run {self.own.run_id!r}"
+        elif member.members and member.stage not in self._masters:
+            why = f"a time master is a {' or '.join(self._masters)}"
+        elif member.members and self.master is not None and member.name != self.master.name:
+            why = f"the time master is {self.master.name}"
+        elif not len(member.publishes) == len(member.types) == len(member.sparse):
+            why = "its topics, their types and what is sparse are lists of different lengths"
+        elif unknown := set(member.types) - messages.signal_types():
+            why = f"no signals are of type {min(unknown)}"
+        elif known and known.process != member.process and self._lives(known):
+            why = f"{known.name} is process {known.pid}, which has not ended"
+        else:
+            try:
+                why = "" if isinstance(json.loads(member.parameters), dict) else "its parameters are no map"
+            except (ValueError, RecursionError):
+                why = "its parameters are no JSON"
+        if why:
+            raise ForeignMessage("members", member.name, member.run_id, why)
+
+    def _lives(self, member: Announcement) -> bool:
+        """Whether a process of this machine is known to live; of other machines nothing is known."""
+        if member is self.own:
+            return False  # `_meet_namesake` decides
+        return bool(member.pid) and member.host == self.own.host and member.name not in self.ended
+
+    def _meet_namesake(self, other: Announcement) -> None:
+        """Another process has this member's name: the newcomer gives up, without a word that others take for ours.
+
+        Raises:
+            ForeignMessage: the other one is the newcomer.
+        """
+        established = (MemberState.READY, MemberState.SAFE)
+        if self.failure or self.done:
+            return
+        if self.ready or (other.state not in established and self.own.process < other.process):
+            self.announce()
+            why = f"this node, process {self.own.pid}, has that name"
+            raise ForeignMessage("members", other.name, other.run_id, why)
+        place = f"process {other.pid}" + ("" if other.host == self.own.host else " of another machine")
+        self.failure = InputError(f"{self.own.name}: {place} has this name already; give this node another one")
+        self._say_failure("error")
+        self.done = True
+
+    def members_changed(self, now: float) -> None:
+        """A member has announced something new."""
+
+    def member_failed(self, member: Announcement, now: float) -> None:
+        """A member has given up; once the cell may be running, the time master says what is to be done."""
+        if not self.ready:
+            self.abandon(member)
+
+    def abandon(self, member: Announcement) -> None:
+        """Give up because a member has."""
+        self.fail(LatheError(f"{member.name} {why_failed(member)}"), cause="abandoned")
+
+    def parameter(self, name: str, key: str) -> object:
+        """A parameter that a member has announced; None if it has no such."""
+        return json.loads(self.members[name].parameters).get(key)
+
+    def restarts(self, name: str) -> bool:
+        """Whether another process may take the place of a member."""
+        return bool(self.parameter(name, "restart_file"))
+
+    # ---- until block 0 ------------------------------------------------------------------------------
+
+    @property
+    def complete(self) -> bool:
+        """Whether the time master and all members that it names have announced themselves."""
+        return self.master is not None and all(name in self.members for name in self.master.members)
+
+    @property
+    def wants_match(self) -> bool:
+        """Whether the node shall look at ROS's graph and call `matched`: nothing else is missing until it is ready."""
+        if not self.active or self.ready or self._beginning or self.failure or not self.complete:
+            return False
+        if self._needs_phase and self.phase is None:
+            return False
+        assert self.master is not None, "the cell is complete"
+        return all(self.members[name].state != MemberState.JOINING for name in self.master.members)
+
+    def expected_writers(self, topic: str) -> set[str]:
+        """Members that publish a topic."""
+        return {peer.name for peer in self._peers() if topic in peer.publishes}
+
+    def expected_readers(self, topic: str) -> set[str]:
+        """Members that subscribe to a topic."""
+        return {peer.name for peer in self._peers() if topic in peer.subscribes}
+
+    def _peers(self) -> Iterator[Announcement]:
+        names: Iterable[str] = self.master.members if self.master else ()
+        return (self.members[name] for name in names if name != self.own.name and name in self.members)
+
+    def matched(self, unmatched: Sequence[str]) -> None:
+        """The node has looked at the graph.
+
+        Args:
+            unmatched: topics that have not met all of their members yet, each with the missing ones.
+        """
+        self.unmatched = unmatched
+        if not unmatched and self.wants_match:
+            self._beginning = True
+            self.actions.append(do.Begin(joins=self.phase not in (None, Phase.WAITING)))
+
+    def begun(self, now: float) -> None:
+        """The node is prepared for block 0."""
+        self.ready, self._beginning = True, False
+        self.announce()
+        self._report("ready")
+        self.members_changed(now)
+
+    def missing(self) -> list[str]:
+        """Members and topics that this one waits for until it can begin; empty if it has begun, or waits for none."""
+        if self.done or self.failure or (self.ready and self.phase not in (None, Phase.WAITING)):
+            return []
+        if not self.active:
+            return ["its own activation"]
+        if self.master is None:
+            alone = any(member.stage in self._masters for member in self.members.values())
+            lonely = [f"a publisher of {topic}" for topic in self.unmatched]
+            return [*([] if alone or not lonely else ["a time master"]), *lonely]
+        others = [name for name in self.master.members if name != self.own.name]
+        states = {name: self.members[name].state if name in self.members else None for name in others}
+        unheard = [name + self._near(name) for name, state in states.items() if state is None]
+        joining = [f"{name} to join" for name, state in states.items() if state == MemberState.JOINING]
+        if unheard or joining:
+            return [*unheard, *joining]
+        if not self.ready:
+            return list(self.unmatched)
+        return [f"{name} to be ready" for name, state in states.items() if state == MemberState.WIRED]
+
+    def _near(self, name: str) -> str:
+        """A hint at a node of nearly the name of a member, which the time master does not name."""
+        assert self.master is not None, "it names the member"
+        close = get_close_matches(name, self.members.keys() - set(self.master.members), 1)
+        return f" ({close[0]} is there)" if close else ""
+
+    # ---- progress -----------------------------------------------------------------------------------
+
+    def computed(self, blocks: int, samples: int, now: float, *, last: bool) -> None:
+        """The node has completed so many blocks and samples in all; the time master hears it now and then."""
+        self._moved = now
+        # At the same blocks in every member: the time master waits for the slowest.
+        if last or blocks // self.progress_step > self._reported_blocks // self.progress_step:
+            self._reported_blocks = blocks
+            self.actions.append(do.Tell(Progress(self.own.run_id, self.own.name, blocks, samples)))
+
+    def resumed(self, blocks: int) -> None:
+        """The node goes on in the place of another process, after so many blocks."""
+        self._reported_blocks = blocks
+
+    # ---- the state of the cell ----------------------------------------------------------------------
+
+    def hear_cell_state(self, state: CellState, now: float) -> None:
+        """The time master has said how the run goes.
+
+        Raises:
+            ForeignMessage: it is that of another run.
+        """
+        if state.run_id != self.own.run_id:
+            if self.own.run_id:
+                raise ForeignMessage("cell_state", "", state.run_id, f"expected run {self.own.run_id!r}")
+            return
+        self.phase = Phase(state.state)
+        if self.failure:
+            self._leave_with_the_cell()
+        elif self.phase == Phase.ENDED and self.over and not self.done:
+            self.leave()
+        elif self.phase == Phase.FAILED:
+            self.fail(LatheError(f"the cell failed: {state.message}"), cause="abandoned")
+        elif self.phase == Phase.SAFE:
+            self.go_safe(state)
+
+    def go_safe(self, state: CellState) -> None:
+        """Members are lost."""
+        if self.own.name in state.lost or not self.ready:
+            self.fail(LatheError(f"{self.own.name}: the cell went to its safe state without it"), cause="abandoned")
+            return
+        self.without = frozenset(state.lost)
+        self._log("error", f"safe state from sample {state.first_index} on: {state.message}")
+        if not self.over:
+            self.actions.append(do.Lose(self.without, state.first_index, state.end_index, self.safe))
+        self.safe = True
+        self.announce()
+
+    # ---- time ---------------------------------------------------------------------------------------
+
+    def look(self, now: float, silent: Mapping[str, float], ended: Collection[str]) -> None:
+        """Do what is due; the node calls this at least ten times a second, and when a member falls silent.
+
+        Args:
+            now: monotonic time [s].
+            silent: since when each member that is not heard, or stopped, has been so [s].
+            ended: members whose process, on this machine, has ended.
+        """
+        self.silent, self.ended = silent, ended
+        if now >= self._leave_due:
+            self.leave()
+        if not self._started or self.done:
+            return
+        self.look_after_others(now)
+        waits = self.phase != Phase.RUNNING or self.failure or not self.ready
+        if (self.master is not None or self.own.members) and waits and now >= self._repeat_due:
+            self._repeat_due = now + _REPEAT_PERIOD  # a flood of messages may have pushed the last one out
+            self.announce()
+        if now >= self._wait_report_due:
+            self._wait_report_due = now + next(self._wait_report_after)
+            if missing := self.missing():
+                self._log("warning", f"waits for {'; '.join(missing)}")
+                self._report("waits", missing=missing)
+
+    def look_after_others(self, now: float) -> None:
+        """Name a time master that is silent, and leave if it is gone: without it no sample follows."""
+        if self.master is None:
+            return
+        name = self.master.name
+        self._name_a_silent_master(name, now)
+        waits = self.parameter(name, "stall_reaction") != "safe"
+        silent = 0.0 if waits else now - self.silent.get(name, math.inf)
+        ended = name in self.ended
+        if self.failure:
+            # A master that comes back in between shall hear why the members are gone.
+            self.done = self.done or ended or silent > 2.0 * GIVEN_UP
+        elif (ended or silent > GIVEN_UP) and self.over:
+            self.leave()
+        elif ended:
+            self.fail(LatheError(f"{name}, the time master, is lost: no sample follows"), cause="abandoned")
+        elif silent > GIVEN_UP:
+            self.fail(LatheError(given_up(name)), cause="masterless")
+
+    def _name_a_silent_master(self, name: str, now: float) -> None:
+        """Say once that it stalls: it cannot say so itself."""
+        silent = self.phase == Phase.RUNNING and name in self.silent
+        if silent and not self._master_stalls:
+            if now - self._moved < SILENCE:  # blocks that were on their way are still being computed
+                return
+            self._tell_stall(name, self._reported_blocks)
+        self._master_stalls = silent
+
+    def _tell_stall(self, name: str, blocks: int) -> None:
+        """Say that a member is silent since it has completed so many blocks."""
+        # In this order: to log for the first time takes some 70 ms.
+        self._report("stall", member=name, blocks=blocks)
+        self._log("warning", f"{name} has been silent for {SILENCE * 1e3:.0f} ms at block {blocks}")
+
+    # ---- failure and end ----------------------------------------------------------------------------
+
+    def fail(self, error: LatheError, *, cause: str = "error") -> None:
+        """Give up, and say so to all; ``cause`` is ``abandoned`` if another node is to blame."""
+        if self.failure:
+            return
+        self.failure = error
+        self._say_failure(cause)
+        if self._started:
+            self.announce()
+        self._leave_with_the_cell()
+
+    def _say_failure(self, cause: str) -> None:
+        assert self.failure is not None, "it has just been set"
+        self._log("error", str(self.failure))
+        self._report(cause, message=str(self.failure), exit_code=self.failure.exit_code)
+
+    @property
+    def exit_code(self) -> int:
+        """Of the node's process: 0 if it has done its part of a run that came to its end."""
+        return self.failure.exit_code if self.failure else int(self.safe) * LatheError.exit_code
+
+    def _leave_with_the_cell(self) -> None:
+        """Leave, having given up, if the others go on no more."""
+        self.done = self.done or self.phase in (Phase.ENDED, Phase.FAILED)
+
+    @property
+    def others_go_on(self) -> bool:
+        """Whether this one has given up where the others may have to go on to the cell's safe state."""
+        return bool(self.failure) and self.ready and self.master is not None and self.master.name != self.own.name
+
+    def complete_part(self) -> None:
+        """The node's part is over. In a cell it stays until all have ended; else until others have its last messages.
+
+        DDS sends a lost message again only as long as its process lives. A node that has given up stays as well, while
+        the others go on: its announcement says why, also to members that look later.
+        """
+        self.over = True
+        if self.master is None or self.master.name == self.own.name:
+            self.leave(self.patience)
+
+    def leave(self, patience: float = 0.0) -> None:
+        """Ask the node to leave, once; with its messages unacknowledged if the others need none of them."""
+        if not self._leaving:
+            self._leaving = True
+            self.actions.append(do.Leave(patience))
+
+    def left(self) -> None:
+        """The node has waited for its last messages."""
+        self.done = True
+
+    def _log(self, level: str, text: str) -> None:
+        self.actions.append(do.Log(level, text))
+
+    def _report(self, event: str, **values: object) -> None:
+        self.actions.append(do.Report(event, values))
+
+
+def why_failed(member: Announcement) -> str:
+    """The member's message about its failure, without its name at the beginning."""
+    own_name = member.name.rpartition("/")[2]
+    return f"failed: {member.message.removeprefix(f'{own_name}: ')}"
+
+
+def given_up(master: str) -> str:
+    """The announcement of members that go on without a silent time master."""
+    return f"{master}, the time master, has been silent for {GIVEN_UP:g} s: no sample follows"

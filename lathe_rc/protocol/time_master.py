@@ -1,0 +1,339 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The time master: it starts the run, releases blocks by window, ends it, and leads the others to a safe state."""
+
+from collections import deque
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+from lathe_rc.cell.latency_histogram import Durations
+from lathe_rc.errors import LatheError
+from lathe_rc.protocol import actions as do
+from lathe_rc.protocol.member import GIVEN_UP, SILENCE, MemberProtocol, given_up, why_failed
+from lathe_rc.protocol.messages import Announcement, CellState, ForeignMessage, MemberState, Phase, Progress
+
+_REPORT_PERIOD = 0.05  # [s] between reports of progress
+_GONE = 0.2  # [s] for messages to be acknowledged, if a dead member never will
+
+
+@dataclass(frozen=True)
+class Reactions:
+    """Parameters of a time master; see `lathe_rc.cell.stages.time_master.TimeMasterParameters`."""
+
+    stall_reaction: str
+    stall_time: float
+    restart_time: float
+    safe_samples: int
+    block_size: int
+
+
+class TimeMasterProtocol(MemberProtocol):
+    """A `MemberProtocol` that counts the progress of all members; those that its announcement names.
+
+    Args:
+        own, window, masters: see `MemberProtocol`.
+        reactions: to silence and death.
+
+    Attributes:
+        blocks, samples: released so far.
+        end: of the run [sample]; None: endless, or not known yet.
+        blocks_in_run: the same in blocks.
+        running: from block 0 to the end.
+        unsafe: members that do not know yet of the safe state: until they do no block is released.
+        completed: blocks that each member has completed.
+        latency: from the release of a block until every member has completed it, by size.
+    """
+
+    def __init__(self, own: Announcement, window: int, reactions: Reactions, *, masters: Collection[str] = ()) -> None:
+        super().__init__(own, window, masters=masters)
+        self._reactions = reactions
+        self.blocks = self.samples = 0
+        self.end: int | None = None
+        self.blocks_in_run: int | None = None
+        self.running = False
+        self.unsafe: frozenset[str] = frozenset()
+        self.completed = {name: 0 for name in own.members if name != own.name}
+        self.latency = Durations()
+        self._released: deque[float] = deque()  # monotonic times at which the blocks in flight were released
+        self._checking = self._declared = False
+        self._why = ""
+        self._heard = self._looked = 0.0
+        self._members_moved: dict[str, float] = {}  # monotonic time at which each has last completed a block
+        self._stalled: frozenset[str] = frozenset()
+        self._dead: dict[str, float] = {}  # monotonic time until which a member may be restarted
+        self._report_due = 0.0
+
+    @property
+    def least(self) -> int:
+        """Blocks that every member has completed."""
+        return min(self.completed.values(), default=self.blocks)
+
+    @property
+    def slowest(self) -> str:
+        """The first of the members that are least far, as far as that is known.
+
+        They report blocks when they pass a multiple of some, and one that computes two at once reports one more: a
+        member that waits for another may have reported less.
+        """
+        return min(self.completed, key=lambda name: self.completed[name] // self.progress_step, default="")
+
+    @property
+    def credit(self) -> int:
+        """Blocks that the window allows."""
+        if not self.completed or not self.window:
+            return 1
+        return self.window - (self.blocks - self.least)
+
+    @property
+    def may_release(self) -> bool:
+        """Whether blocks go out at all."""
+        return self.running and self.active and not (self.failure or self.done or self.unsafe)
+
+    def know_end(self, samples: int | None) -> None:
+        """The stage knows the length of the run [sample]; a safe state may have set another end."""
+        if self.end is None and samples is not None:
+            self._set_end(samples)
+
+    def _set_end(self, samples: int) -> None:
+        self.end = samples
+        self.blocks_in_run = -(-samples // self._reactions.block_size)
+
+    # ---- start --------------------------------------------------------------------------------------
+
+    def activate(self, now: float) -> None:
+        """See `MemberProtocol`."""
+        first = not self._started
+        super().activate(now)
+        if first:
+            self._say(Phase.WAITING, 0)
+
+    def members_changed(self, now: float) -> None:
+        """Ask for the check of the cell when every member is ready; count those that know of the safe state."""
+        if self.unsafe:
+            self.unsafe -= {name for name in self.unsafe if self.members[name].state == MemberState.SAFE}
+            self.actions.append(do.Release())
+        if self.running or self._checking or not self.own.members or not self.active or self.failure:
+            return
+        if all(name in self.members and self.members[name].state == MemberState.READY for name in self.own.members):
+            self._checking = True
+            self.actions.append(do.CheckCell())
+
+    def start(self, now: float) -> None:
+        """The cell has passed its check: the run begins."""
+        self.running, self._checking = True, False
+        self._log("info", f"run {self.own.run_id or '(no id)'} begins with {len(self.completed)} members")
+        self._say(Phase.RUNNING, 0)
+        self._report("block0")
+        self._heard = self._looked = now
+        self._members_moved = dict.fromkeys(self.completed, now)
+        self.actions += [do.Start(), do.Release()]
+
+    def _say(self, phase: Phase, first: int, why: str = "") -> None:
+        end, lost = (self.end or 0, tuple(sorted(self.without))) if self._declared else (0, ())
+        self.phase = phase
+        self.actions.append(do.Say(CellState(self.own.run_id, phase, first, why[:1024], end, lost)))
+
+    def hear_cell_state(self, state: CellState, now: float) -> None:
+        """The time master itself says how the run goes; another one is a stranger.
+
+        Raises:
+            ForeignMessage: it is not what this one has said.
+        """
+        if state.run_id != self.own.run_id:
+            raise ForeignMessage("cell_state", "", state.run_id, f"this node, {self.own.name}, is the time master")
+
+    # ---- progress -----------------------------------------------------------------------------------
+
+    def release(self, blocks: int, now: float) -> None:
+        """The node releases so many blocks now."""
+        if self.completed:
+            self._released.extend([now] * blocks)
+
+    def computed(self, blocks: int, samples: int, now: float, *, last: bool) -> None:
+        """See `MemberProtocol`."""
+        self.blocks, self.samples = blocks, samples
+        super().computed(blocks, samples, now, last=last)
+
+    def hear_progress(self, progress: Progress, now: float) -> None:
+        """A member has completed blocks.
+
+        Raises:
+            ForeignMessage: of another run.
+        """
+        if progress.run_id != self.own.run_id:
+            raise ForeignMessage("progress", progress.name, progress.run_id, f"expected run {self.own.run_id!r}")
+        name = progress.name
+        if not self.running:
+            raise ForeignMessage("progress", name, progress.run_id, "the run has not begun, or it is over")
+        if name not in self.completed:
+            return
+        if progress.blocks <= self.completed[name]:
+            if self.restarts(name):  # it computes once more: that is no silence
+                self._heard = self._members_moved[name] = now
+            return
+        if progress.blocks > self.blocks:
+            self._give_up_on(name, f"claims {progress.blocks} blocks; {self.blocks} were sent", now)
+            return
+        before = self.least
+        self.completed[name] = progress.blocks
+        self._heard = self._members_moved[name] = now
+        if name in self._stalled:
+            self._stalled = frozenset()
+        self._after(before, now)
+
+    def _after(self, before: int, now: float) -> None:
+        """Every member may have completed some more blocks."""
+        least = self.least
+        if least > before:
+            for _ in range(least - before):
+                self.latency.add(now - self._released.popleft())
+            samples = min(least * self._reactions.block_size, self.samples)
+            self.actions.append(do.TellTime(samples))
+            if now >= self._report_due:
+                self._report_due = now + _REPORT_PERIOD
+                self._report("progress", samples=samples)
+        if least == self.blocks_in_run:
+            self.finish_run()
+        else:
+            self.actions.append(do.Release())
+
+    # ---- end ----------------------------------------------------------------------------------------
+
+    def complete_part(self) -> None:
+        """The last block is out; the run ends when all members have completed it."""
+        if not self.completed:
+            self.finish_run()
+
+    def finish_run(self) -> None:
+        """All members have completed the last block."""
+        self.actions.append(do.TellPace())
+        self._say(Phase.ENDED, self.samples, self._why)
+        self._log("info", f"run ended: {self.blocks} blocks, {self.samples} samples")
+        self.over, self.running = True, False
+        if self._declared:
+            super().fail(LatheError(self._why))
+        self.leave(self.patience)
+
+    def fail(self, error: LatheError, *, cause: str = "error") -> None:
+        """As the time master, fail the cell with it."""
+        first = not self.failure
+        if first and self._started:
+            self._say(Phase.FAILED, self.samples, str(error))
+        super().fail(error, cause=cause)
+
+    # ---- silence and death --------------------------------------------------------------------------
+
+    def look(self, now: float, silent: Mapping[str, float], ended: Collection[str]) -> None:
+        """See `MemberProtocol`; alone, the run begins at once."""
+        if self.active and not (self.running or self._checking or self.over or self.own.members or self.failure):
+            self._checking = True
+            self.actions.append(do.CheckCell())
+        super().look(now, silent, ended)
+
+    def look_after_others(self, now: float) -> None:
+        """Name the members that are dead or silent, and do what is to be done about them."""
+        if not self.running or self.over or self.failure:
+            return
+        self._forgive(now - self._looked)
+        self._looked = now
+        for name in [each for each in self.completed if each in self.ended and each not in self._dead]:
+            restarts, self.patience = self.restarts(name) and not self._declared, _GONE
+            self._dead[name] = now + (self._reactions.restart_time if restarts else 0.0)
+            self._log("error", f"{name} has died at block {self.completed[name]}")
+            self._report("dead", member=name, blocks=self.completed[name], restarts=restarts)
+        for name in [each for each in self._dead if self._is_back(each)]:
+            del self._dead[name]
+            self._heard = now
+            self._report("back", member=name)
+        if any(now >= until for until in self._dead.values()):
+            # Those that others were waited for as well: they could not join any more.
+            self._lose(dict.fromkeys(self._dead, "died"), now)
+        elif not self._dead:
+            self._look_at_the_silent(now)
+
+    def _is_back(self, name: str) -> bool:
+        return self.members[name].state == MemberState.READY and name not in self.ended
+
+    def _look_at_the_silent(self, now: float) -> None:
+        silent = self.silent.keys() & self.completed.keys()
+        stopped = {name for name in silent if now - self._members_moved[name] > SILENCE}
+        stands = (self.unsafe or self.credit <= 0) and now - self._heard > SILENCE
+        if stands:
+            # Waiting members lag as much as the stalled one: those come first that DDS does not hear any more.
+            self._name_the_silent(frozenset(silent or self.unsafe or {self.slowest}))
+        elif stopped:
+            self._name_the_silent(frozenset(stopped) | self._stalled)
+        if stands and self._reactions.stall_reaction == "safe" and now - self._heard > self._reactions.stall_time:
+            late = now - self._reactions.stall_time
+            lost = {name for name, since in self.silent.items() if since < late} & self.completed.keys()
+            self._lose(dict.fromkeys(lost or self._stalled, "fell silent"), now)
+
+    def _forgive(self, passed: float) -> None:
+        """While this node stood still itself, for so long [s], it could hear none: that is not the others' silence.
+
+        Members that have given it up meanwhile repeat it: it waits for that before it does without any.
+        """
+        if passed > SILENCE:
+            passed += GIVEN_UP if passed > GIVEN_UP else 0.0
+            self._heard += passed
+            self._members_moved = {name: moved + passed for name, moved in self._members_moved.items()}
+            self.silent = {name: since + passed for name, since in self.silent.items()}
+
+    def _name_the_silent(self, names: frozenset[str]) -> None:
+        new, self._stalled = names - self._stalled, names
+        for name in sorted(new):
+            self._tell_stall(name, self.completed[name])
+
+    def member_failed(self, member: Announcement, now: float) -> None:
+        """See `MemberProtocol`: the others go on to their safe state, if they can wait until all know."""
+        if member.message == given_up(self.own.name):
+            why = f"{self.own.name} stood still at sample {self.samples}: the others have given it up"
+            self.fail(LatheError(why))
+        else:
+            self._give_up_on(member.name, why_failed(member), now)
+
+    def _give_up_on(self, name: str, why: str, now: float) -> None:
+        if self.running and self.window:
+            self._lose(dict.fromkeys(self._dead, "died") | {name: why}, now)
+        else:
+            self.fail(LatheError(f"{name} {why}"), cause="abandoned")
+
+    def _lose(self, members: Mapping[str, str], now: float) -> None:
+        """Bring the cell to its safe state without some members, from the next sample on: once all others know.
+
+        Args:
+            members: the fate of each.
+            now: monotonic time [s].
+        """
+        who = ", ".join(f"{name} {fate}" for name, fate in sorted(members.items()))
+        if not self.window:
+            self.fail(LatheError(f"{who} at sample {self.samples}; a cell with window = 0 cannot go on without it"))
+            return
+        if self.completed.keys() <= members.keys():
+            before = f"{self._why}; " if self._why else ""
+            self.fail(LatheError(f"{before}{who}: nobody is left at sample {self.samples}"))
+            return
+        least = self.least
+        for name in members:
+            del self.completed[name]
+            self._dead.pop(name, None)
+        self.without |= members.keys()
+        self.unsafe -= members.keys()
+        self.patience = _GONE
+        self.declare_safe(who, now)
+        self._after(least, now)
+
+    def declare_safe(self, why: str, now: float) -> None:
+        """Bring the cell to its safe state from the next sample on, once all members know."""
+        self._why = f"{self._why}; {why}" if self._why else f"{why}: safe state from sample {self.samples} on"
+        again, self._declared = self._declared, True
+        if not again:
+            if self.end != self.samples:
+                self._set_end(self.samples + self._reactions.safe_samples)
+            # After the first time all know what to do, and need only hear of the lost.
+            self.unsafe = frozenset(self.completed)
+        self._say(Phase.SAFE, self.samples, self._why)
+        assert self.end is not None, "a safe state has an end"
+        self._log("error", self._why)
+        self._report("safe", sample=self.samples, end=self.end, lost=sorted(self.without), why=self._why)
+        self.actions.append(do.Lose(self.without, self.samples, self.end, again))
+        self._heard = now

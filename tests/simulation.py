@@ -1,0 +1,778 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated cells: members with the real protocol, a network and a clock in one thread, and a seed for all of it.
+
+A schedule draws a cell of 3 to 13 members and what happens to them: delays, kills, stops, cuts, slow members, lifecycle
+calls, strangers. `Cell.run` plays it and `Cell.check` looks at the promises of docs/cell.md. The same seed gives the
+same schedule.
+"""
+
+import heapq
+import random
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from lathe_rc import messages
+from lathe_rc.errors import LatheError
+from lathe_rc.protocol import (
+    Announcement,
+    BlockOrder,
+    CellState,
+    ForeignMessage,
+    MemberProtocol,
+    Progress,
+    Reactions,
+    TimeMasterProtocol,
+    actions,
+)
+
+SIZE = 4  # samples in a block
+HOST = "here"
+LEASE = 0.08  # [s] of DDS's liveliness
+HORIZON = 60.0  # [s] of simulated wall time after which a member that is still there hangs
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of one topic; `value` stands for its samples and depends on all that it was computed from."""
+
+    source: str
+    index: int
+    value: int
+    last: bool
+
+
+@dataclass(frozen=True)
+class Design:
+    """A member as the scenario has it.
+
+    Attributes:
+        name: fully qualified; it publishes the topic of the same name.
+        inputs: name of each publisher that it reads, and by how many blocks later.
+        restarts: another process may take its place.
+    """
+
+    name: str
+    inputs: tuple[tuple[str, int], ...] = ()
+    restarts: bool = False
+
+    @property
+    def records(self) -> bool:
+        """Whether it is the recorder, which publishes nothing."""
+        return self.name == "/recorder"
+
+
+class Network:
+    """Reliable channels between processes, in order on each topic and in any order across topics."""
+
+    def __init__(self, cell: "Simulation") -> None:
+        self._cell = cell
+        self._history: dict[tuple[str, str], deque[object]] = {}  # of the newest messages, by process and topic
+        self._matched: set[tuple[str, str, str]] = set()  # writing process, reading process, topic
+        self._newest: dict[tuple[str, str, str], float] = {}  # arrival of the last message
+        self._cut: dict[frozenset[str], float] = {}  # pairs of processes that do not hear each other, until when
+
+    def advertise(self, writer: str, topic: str, depth: int) -> None:
+        self._history.setdefault((writer, topic), deque(maxlen=depth))
+
+    def match(self, writer: str, reader: str, topic: str) -> None:
+        """A reader has found a writer: it gets the newest messages, and all that follow."""
+        if (writer, topic) in self._history and (writer, reader, topic) not in self._matched:
+            self._matched.add((writer, reader, topic))
+            for message in self._history[writer, topic]:
+                self._send(writer, reader, topic, message)
+
+    def is_matched(self, writer: str, reader: str, topic: str) -> bool:
+        return (writer, reader, topic) in self._matched
+
+    def publish(self, writer: str, topic: str, message: object) -> None:
+        self._history[writer, topic].append(message)
+        for reader in self._cell.processes:
+            if (writer, reader, topic) in self._matched:
+                self._send(writer, reader, topic, message)
+
+    def _send(self, writer: str, reader: str, topic: str, message: object) -> None:
+        cell, channel = self._cell, (writer, reader, topic)
+        begin = max(cell.now, self._cut.get(frozenset((writer, reader)), 0.0))
+        arrival = max(begin + cell.delay(), self._newest.get(channel, 0.0))
+        self._newest[channel] = arrival
+        cell.at(arrival, partial(self._arrive, channel, message))
+
+    def _arrive(self, channel: tuple[str, str, str], message: object) -> None:
+        writer, reader, topic = channel
+        if channel in self._matched and reader in self._cell.processes:
+            self._cell.processes[reader].take(topic, message)
+
+    def cut(self, one: str, other: str, until: float) -> None:
+        self._cut[frozenset((one, other))] = until
+
+    def heard_until(self, one: str, other: str) -> float:
+        return self._cut.get(frozenset((one, other)), 0.0)
+
+    def forget(self, process: str, *, sent: bool) -> None:
+        """A process is gone; ``sent``: its last messages are on their way all the same."""
+        self._history = {key: queue for key, queue in self._history.items() if key[0] != process}
+        self._matched = {key for key in self._matched if key[1] != process and (sent or key[0] != process)}
+
+
+class Process:
+    """A process with one member: as `lathe_rc.nodes.cell_node.CellNode` and its roles, without ROS."""
+
+    def __init__(self, cell: "Simulation", design: Design, pid: int) -> None:
+        self.cell, self.design, self.pid = cell, design, pid
+        self.identity = f"{design.name} {pid}"
+        self.stopped = False
+        self.free_at, self.cost = 0.0, 0.0  # until when it computes, and how long a message takes it [s]
+        self._inbox: deque[Callable[[], None]] = deque()
+        self._waits = False
+        self.strangers = 0
+        self.namesake = False  # a second node with this name
+        self.reports: list[tuple[str, Any]] = []
+        self.configure()
+
+    # ---- lifecycle
+
+    def configure(self) -> None:
+        """Be as before the first activation."""
+        cell, design = self.cell, self.design
+        self._performs = self.listens = False
+        self.blocks = 0
+        self.values: list[int] = []
+        self.orders = {name: BlockOrder(name, cell.run_id) for name, _ in design.inputs}
+        self.taken: dict[str, list[int]] = {name: [] for name, _ in design.inputs}
+        self.last: dict[str, int | None] = dict.fromkeys(self.taken)  # index of the last block
+        self.held: dict[str, int] = {}  # index of the block from which on the newest stands for all others
+        self._pace: BlockOrder | None = None  # of the time master, where no input holds it back
+        self._early: list[tuple[str, Block]] = []
+        self.undecided = design.restarts  # where to begin
+        is_master = design.name == cell.master
+        own = Announcement(
+            run_id=cell.run_id,
+            name=design.name,
+            stage="spindle_encoder" if is_master else "tool",
+            members=tuple(each.name for each in cell.designs) if is_master else (),
+            publishes=() if design.records else (design.name,),
+            types=() if design.records else (messages.ENCODER if is_master else messages.STATE,),
+            sparse=() if design.records else (False,),
+            subscribes=() if design.records else tuple(self.orders),
+            parameters='{"stall_reaction": "%s", "restart_file": "%s"}' % (cell.stalls, "x" if design.restarts else ""),
+            host=HOST,
+            pid=self.pid,
+        )
+        masters = ("spindle_encoder",)
+        self.protocol: MemberProtocol
+        if is_master:
+            reactions = Reactions(cell.stalls, 0.5, 1.0, cell.safe_blocks * SIZE, SIZE)
+            self.protocol = TimeMasterProtocol(own, cell.window, reactions, masters=masters)
+            self.protocol.know_end(cell.length * SIZE)
+        else:
+            self.protocol = MemberProtocol(
+                own, cell.window, masters=masters, needs_phase=design.restarts, wired=not design.records
+            )
+
+    def activate(self) -> None:
+        if not self.listens:
+            self.listens = True
+            self._advertise()
+        self.protocol.activate(self.cell.now)
+        while self._put_off:
+            self._receive(*self._put_off.popleft())
+        self._step()
+
+    def _advertise(self) -> None:
+        net = self.cell.network
+        for topic in ("members", "cell_state", "progress"):
+            net.advertise(self.identity, topic, 1)
+        net.advertise(self.identity, self.design.name, 3 * self.cell.window + 32)
+        self._put_off: deque[tuple[str, object]] = deque()
+        self.cell.discover(self)
+
+    def reads(self, topic: str) -> bool:
+        if topic == "progress":
+            return self.design.name == self.cell.master
+        if topic in ("members", "cell_state"):
+            return True
+        return self.wired and (topic in self.orders or (self._pace is not None and topic == self.cell.master))
+
+    wired = True
+
+    # ---- messages
+
+    def take(self, topic: str, message: object) -> None:
+        """A message has arrived."""
+        self._inbox.append(partial(self._receive, topic, message))
+        self.wake()
+
+    def wake(self) -> None:
+        """Handle what waits, one after the other, as the process has time."""
+        if self._waits or self.stopped or not self._inbox:
+            return
+        self._waits = True
+        self.cell.at(max(self.cell.now, self.free_at), self._handle)
+
+    def _handle(self) -> None:
+        self._waits = False
+        if self.stopped or not self.alive or not self._inbox:
+            return
+        self.free_at = self.cell.now + self.cost
+        self._inbox.popleft()()
+        self._step()
+        self.wake()
+
+    @property
+    def alive(self) -> bool:
+        return self.cell.processes.get(self.identity) is self
+
+    def _receive(self, topic: str, message: object) -> None:
+        protocol, now = self.protocol, self.cell.now
+        if not self.listens or (protocol.failure and topic != "cell_state"):
+            return
+        try:
+            if isinstance(message, Announcement):
+                known = protocol.members.get(message.name)
+                if known and known.process != message.process:
+                    self.look()
+                protocol.hear_member(message, now)
+            elif isinstance(message, CellState):
+                protocol.hear_cell_state(message, now)
+            elif isinstance(message, Progress):
+                assert isinstance(protocol, TimeMasterProtocol)
+                protocol.hear_progress(message, now)
+            elif not protocol.active:
+                self._put_off.append((topic, message))
+            elif isinstance(message, Block):
+                self._take_block(topic, message)
+        except ForeignMessage:
+            self.strangers += 1
+        except LatheError as error:
+            protocol.fail(error)
+
+    def _take_block(self, topic: str, block: Block) -> None:
+        if self.undecided:
+            self._early.append((topic, block))
+            return
+        order = self.orders.get(topic) or self._pace
+        assert order is not None, "it reads the topic"
+        order.admit(self.cell.run_id, block.source)
+        if order.missing(block.source, block.index * SIZE, SIZE) is not None:
+            order.append((block.index + 1) * SIZE, last=block.last)
+            if order is self._pace:
+                return
+            self.taken[topic].append(block.value)
+            if block.last:
+                self.last[topic] = block.index
+
+    # ---- protocol
+
+    def look(self) -> None:
+        """Let the protocol see the time, the others and the graph."""
+        silent, ended = self.cell.seen_by(self)
+        self.protocol.look(self.cell.now, silent, ended)
+        self._step()
+
+    def tick(self) -> None:
+        if self.alive and not self.stopped and self.listens and not self.protocol.done:
+            self.look()
+        if self.alive:
+            self.cell.at(self.cell.now + (0.1 if self.protocol.ready else 0.02), self.tick)
+
+    def _step(self) -> None:
+        self._perform_all()
+        if self.protocol.wants_match:
+            self.protocol.matched(list(self._unmatched()))
+            self._perform_all()
+        self._work()
+        self._perform_all()
+        if self.protocol.failure and not self.protocol.others_go_on and not self.protocol.done:
+            self.protocol.left()
+        if self.protocol.done:
+            self.cell.leave(self)
+
+    def _unmatched(self) -> Iterator[str]:
+        cell, net, protocol = self.cell, self.cell.network, self.protocol
+        for topic in self.orders:
+            for name in protocol.expected_writers(topic):
+                process = cell.process_of(name)
+                if process is None or not net.is_matched(process.identity, self.identity, topic):
+                    yield topic
+        for name in protocol.expected_readers(self.design.name):
+            process = cell.process_of(name)
+            if process is None or not net.is_matched(self.identity, process.identity, self.design.name):
+                yield self.design.name
+
+    def _perform_all(self) -> None:
+        if self._performs:
+            return
+        self._performs = True
+        while self.protocol.actions:
+            try:
+                self._perform(self.protocol.actions.popleft())
+            except LatheError as error:
+                self.protocol.fail(error)
+        self._performs = False
+
+    def _perform(self, action: actions.Action) -> None:
+        net, now = self.cell.network, self.cell.now
+        match action:
+            case actions.Announce(member):
+                if self.listens:
+                    net.publish(self.identity, "members", member)
+            case actions.Say(state):
+                net.publish(self.identity, "cell_state", state)
+            case actions.Tell(progress):
+                net.publish(self.identity, "progress", progress)
+            case actions.Report(event, values):
+                self.reports.append((event, values))
+                self.cell.reports.append((now, self.design.name, event, values))
+            case actions.MembersChanged():
+                self._members_changed()
+            case actions.Begin(joins):
+                self._begin(joins=joins)
+                self.protocol.begun(now)
+            case actions.CheckCell():
+                assert isinstance(self.protocol, TimeMasterProtocol)
+                self.protocol.start(now)
+            case actions.Lose(lost, _, end, _):
+                self._lose(lost, end // SIZE)
+            case actions.Leave():
+                self.protocol.left()
+
+    def _members_changed(self) -> None:
+        if self.design.records and not self.wired and self.protocol.complete:
+            self.wired = True
+            self.protocol.describe(subscribes=tuple(self.orders))
+            self.cell.discover(self)
+        if self.undecided:
+            return
+        peers = self.protocol.master.members if self.protocol.master else ()
+        for name, order in self.orders.items():
+            if name in peers and order.source != name:
+                order.expect(name)
+                order.repeats = name in self.protocol.members and self.protocol.restarts(name)
+            elif name in peers and name in self.protocol.members:
+                order.repeats = self.protocol.restarts(name)
+
+    def _begin(self, *, joins: bool) -> None:
+        if joins and not self.design.restarts:
+            raise LatheError(f"{self.design.name}: the cell is running already")
+        if not self.design.restarts:
+            return
+        if joins:
+            self._resume()
+        self.undecided = False
+        self._members_changed()
+        for topic, block in self._early:
+            self._receive(topic, block)
+        self._early.clear()
+        self._keep()
+
+    def _keep(self) -> None:
+        """Keep the state; another process begins with that of a window ago."""
+        kept = self.cell.files.setdefault(self.design.name, deque())
+        queues = {name: (order.end, order.received, list(self.taken[name])) for name, order in self.orders.items()}
+        kept.append((self.blocks, list(self.values), queues))
+        while len(kept) > 1 and kept[1][0] <= self.blocks - self.cell.window:
+            kept.popleft()
+
+    def _resume(self) -> None:
+        kept = self.cell.files.get(self.design.name)
+        if not kept:
+            raise LatheError(f"{self.design.name}: no state to go on from")
+        self.blocks, values, queues = kept[0]
+        self.values = list(values)
+        kept.clear()
+        self.protocol.resumed(self.blocks)
+        for name, (end, received, taken) in queues.items():
+            self.orders[name].resume(name, end, received, ended=False)
+            self.taken[name] = list(taken)
+
+    # ---- role
+
+    def _lose(self, lost: frozenset[str], end: int) -> None:
+        for name, order in self.orders.items():
+            if name in lost and order.held_from is None:
+                self.held[name] = len(self.taken[name])
+                order.hold(end * SIZE)
+                self.last[name] = max(end - 1, len(self.taken[name]) - 1)
+        forward = [name for name, delay in self.design.inputs if not delay]
+        if forward and all(name in self.held for name in forward) and self.cell.master not in self.orders:
+            self._follow(self.cell.master)
+
+    def _follow(self, master: str) -> None:
+        """Go no further than the spindle."""
+        self._pace = BlockOrder(master, self.cell.run_id)
+        self._pace.expect(master, self.blocks * SIZE)
+        self._pace.repeats = True
+        self.cell.discover(self)
+
+    def _block(self, name: str, index: int) -> int | None:
+        """Value of a block of an input; None while it is missing."""
+        if index < 0:
+            return 0
+        taken = self.taken[name]
+        if index < len(taken):
+            return taken[index]
+        if name in self.held:
+            return taken[-1] if taken else 0
+        return None
+
+    def _work(self) -> None:
+        protocol, cell = self.protocol, self.cell
+        if not protocol.active or protocol.over or protocol.failure or self.undecided or protocol.master is None:
+            return
+        if isinstance(protocol, TimeMasterProtocol):
+            while protocol.may_release and protocol.credit > 0 and self.blocks != protocol.blocks_in_run:
+                if not self._compute(last=self.blocks + 1 == protocol.blocks_in_run):
+                    return
+                self._perform_all()
+            return
+        while not protocol.over and not protocol.failure:
+            if self.design.restarts and self.blocks >= cell.files[self.design.name][-1][0] + cell.window:
+                self._keep()
+            lasts = [self.last[name] for name, delay in self.design.inputs if not delay]
+            last = bool(lasts) and all(each is not None and self.blocks >= each for each in lasts)
+            if not self._compute(last=last):
+                return
+            self._perform_all()
+
+    def _compute(self, *, last: bool) -> bool:
+        """Compute the next block, if its inputs are there."""
+        if self._pace is not None and self.blocks * SIZE >= self._pace.end:
+            return False
+        inputs = []
+        for name, delay in self.design.inputs:
+            value = self._block(name, self.blocks - delay)
+            if value is None:
+                return False
+            inputs.append(value)
+        value = hash((self.design.name, self.blocks, *inputs))
+        self.values.append(value)
+        if isinstance(self.protocol, TimeMasterProtocol):
+            self.protocol.release(1, self.cell.now)
+        self.blocks += 1
+        self.free_at = max(self.free_at, self.cell.now) + self.cost
+        if not self.design.records:
+            block = Block(self.design.name, self.blocks - 1, value, last)
+            self.cell.network.publish(self.identity, self.design.name, block)
+        self.protocol.computed(self.blocks, self.blocks * SIZE, self.cell.now, last=last)
+        if self.design.name == self.cell.master:
+            for call in self.cell.at_block.pop(self.blocks, ()):
+                self.cell.at(self.cell.now + self.cell.delay(), call)
+        if last:
+            self.protocol.complete_part()
+        return True
+
+
+class Simulation:
+    """A cell, its network and its clock.
+
+    Args:
+        seed: of everything that is drawn.
+        designs: members; the first is the time master.
+        window: blocks that may be in flight.
+        length: of the run [block].
+        stalls: reaction to silence, ``wait`` or ``safe``.
+    """
+
+    def __init__(self, seed: int, designs: tuple[Design, ...], window: int, length: int, stalls: str) -> None:
+        self.random = random.Random(seed)
+        self.designs, self.window, self.length, self.stalls = designs, window, length, stalls
+        self.master, self.run_id, self.safe_blocks = designs[0].name, "run", 3
+        self.now = 0.0
+        self._events: list[tuple[float, int, Callable[[], None]]] = []
+        self._number = 0
+        self.processes: dict[str, Process] = {}
+        self.gone: list[Process] = []  # that have ended in order
+        self.killed: dict[str, float] = {}  # process that has ended otherwise, and when
+        self.since: dict[str, float] = {}  # when a process was stopped
+        self.files: dict[str, deque[Any]] = {}
+        self.reports: list[tuple[float, str, str, Any]] = []
+        self.network = Network(self)
+        self._pids = 100
+        self.slow_match = 0.05  # [s] that discovery takes at most
+        self.at_block: dict[int, list[Callable[[], None]]] = {}  # disturbances, by blocks that the master has released
+        self.culprits: set[str] = set()  # members to which something was done that may end the run
+        self.plan: list[str] = []
+
+    def delay(self) -> float:
+        """How long a message takes [s]: mostly little, now and then much."""
+        draw = self.random.random()
+        return 1e-4 * draw if draw < 0.9 else 0.02 * (draw - 0.9) / 0.1
+
+    def at(self, time: float, call: Callable[[], None]) -> None:
+        self._number += 1
+        heapq.heappush(self._events, (time, self._number, call))
+
+    def start(self, design: Design) -> Process:
+        """Start a process, which configures and activates itself."""
+        self._pids += 1
+        process = Process(self, design, self._pids)
+        process.wired = not design.records
+        process._put_off = deque()
+        self.processes[process.identity] = process
+        process.activate()
+        self.at(self.now + 0.02 * self.random.random(), process.tick)
+        return process
+
+    def discover(self, new: Process) -> None:
+        """Let a process and the others meet, topic by topic, at some time."""
+        for other in self.processes.values():
+            if other is new or not other.listens:
+                continue
+            for writer, reader in ((new, other), (other, new)):
+                for topic in ("members", "cell_state", "progress", writer.design.name):
+                    if reader.reads(topic):
+                        meet = self.now + self.slow_match * self.random.random()
+                        self.at(meet, partial(self.network.match, writer.identity, reader.identity, topic))
+
+    def process_of(self, name: str) -> Process | None:
+        return next((each for each in self.processes.values() if each.design.name == name), None)
+
+    def seen_by(self, process: Process) -> tuple[dict[str, float], set[str]]:
+        """Members that a process does not hear, since when; and those whose process has ended."""
+        silent: dict[str, float] = {}
+        ended: set[str] = set()
+        for name, member in process.protocol.members.items():
+            if name == process.design.name:
+                continue
+            identity = f"{name} {member.pid}"
+            other = self.processes.get(identity)
+            if other is None:
+                if member.pid:
+                    ended.add(name)
+            elif other.stopped:
+                silent[name] = self.since[identity]
+            elif self.network.heard_until(process.identity, identity) > self.now + LEASE:
+                silent[name] = self.now
+        return silent, ended
+
+    def leave(self, process: Process) -> None:
+        """A process ends in order: its last messages reach the others."""
+        if process.alive:
+            del self.processes[process.identity]
+            self.gone.append(process)
+            self.network.forget(process.identity, sent=True)
+
+    def kill(self, process: Process) -> None:
+        if process.alive:
+            del self.processes[process.identity]
+            self.killed[process.design.name] = self.now
+            self.network.forget(process.identity, sent=self.random.random() < 0.5)
+
+    def stop(self, process: Process, seconds: float) -> None:
+        if process.alive and not process.stopped:
+            process.stopped = True
+            self.since[process.identity] = self.now
+            self.at(self.now + seconds, partial(self._continue, process))
+
+    def _continue(self, process: Process) -> None:
+        process.stopped = False
+        if process.alive:
+            process.wake()
+
+    def run(self, until: float = HORIZON) -> None:
+        """Play events until every process has ended, or for so long [s]."""
+        while self._events and (self.processes or self._pids < 100 + len(self.designs)):
+            time, _, call = heapq.heappop(self._events)
+            if time > until:
+                return
+            self.now = time
+            call()
+
+    def expected(self) -> dict[str, list[int]]:
+        """The values that each member computes in an undisturbed run."""
+        values: dict[str, list[int]] = {design.name: [] for design in self.designs}
+        for index in range(self.length):
+            for design in self.designs:
+                inputs = [
+                    values[name][index - delay] if index >= delay else 0 for name, delay in design.inputs
+                ]
+                values[design.name].append(hash((design.name, index, *inputs)))
+        return values
+
+
+# ---- schedules
+
+
+def draw_designs(draw: random.Random) -> tuple[Design, ...]:
+    """A cell: a chain of stages with branches and feedback, and a recorder of everything."""
+    count = draw.choice((1, 2, 2, 3, 3, 4, 5, 7, 11))
+    names = ["/spindle", *(f"/stage_{number}" for number in range(count))]
+    designs = []
+    restarting = draw.randrange(1, count + 1) if draw.random() < 0.5 else 0
+    for place, name in enumerate(names):
+        inputs = {}
+        if place:
+            inputs = {other: 0 for other in draw.sample(names[:place], min(place, draw.choice((1, 1, 2))))}
+        if place < count and draw.random() < (0.15 if place == 0 else 0.3):
+            inputs |= {other: draw.choice((1, 1, 2)) for other in draw.sample(names[place + 1 :], 1)}
+        designs.append(Design(name, tuple(inputs.items()), restarts=bool(place) and place == restarting))
+    return (*designs, Design("/recorder", tuple((name, 0) for name in names)))
+
+
+class Schedule:
+    """What happens to a cell, drawn by a seed; `Simulation.plan` has it in words."""
+
+    def __init__(self, seed: int) -> None:
+        draw = random.Random(f"schedule {seed}")
+        designs = draw_designs(draw)
+        window, length = draw.choice((1, 2, 3, 4, 8)), draw.randrange(4, 25)
+        self.cell = cell = Simulation(seed, designs, window, length, draw.choice(("wait", "wait", "safe")))
+        cell.slow_match = draw.choice((0.005, 0.05, 0.05, 0.3))
+        for design in designs:
+            cell.at(draw.choice((0.0, 0.02, 0.3)) * draw.random(), partial(self._launch, design))
+        kinds = (*self._HARMLESS, *self._HARMFUL)
+        for kind in draw.choices(kinds, k=draw.choice((0, 1, 1, 1, 2, 3))):
+            design = draw.choice(designs)
+            name, seconds = design.name, draw.choice((0.02, 0.1, 0.3, 2.5, 5.0)) * draw.random()
+            when = draw.randrange(1, length + 1) if draw.random() < 0.7 else 0.4 * draw.random()
+            cell.plan.append(f"{kind} {name} at {f'block {when}' if isinstance(when, int) else f'{when:.3f} s'}, {seconds:.3f} s")
+            call = partial(getattr(self, f"_{kind}"), design, seconds, draw.choice(designs))
+            if isinstance(when, int):
+                cell.at_block.setdefault(when, []).append(call)
+            else:
+                cell.at(when, call)
+
+    _HARMLESS = ("stop", "cut", "slow", "pause", "stranger", "namesake")
+    _HARMFUL = ("kill", "kill", "kill", "interrupt", "shutdown", "clean_up", "claim")
+
+    def _launch(self, design: Design) -> None:
+        self.cell.start(design)
+
+    def _running(self) -> bool:
+        """Whether block 0 has been released."""
+        return any(event == "block0" for _, _, event, _ in self.cell.reports)
+
+    def _process(self, design: Design) -> Process | None:
+        return self.cell.process_of(design.name)
+
+    # ---- disturbances; each gets a member, a time [s] and another member
+
+    def _stop(self, design: Design, seconds: float, other: Design) -> None:
+        if process := self._process(design):
+            self.cell.stop(process, seconds)
+            if self.cell.stalls == "safe" and seconds > 0.3:
+                self.cell.culprits.add(design.name)
+
+    def _cut(self, design: Design, seconds: float, other: Design) -> None:
+        one, another = self._process(design), self._process(other)
+        if one and another and one is not another:
+            self.cell.network.cut(one.identity, another.identity, self.cell.now + seconds)
+            if self.cell.stalls == "safe" and seconds > 0.3:
+                self.cell.culprits |= {design.name, other.name}
+
+    def _slow(self, design: Design, seconds: float, other: Design) -> None:
+        if process := self._process(design):
+            process.cost = min(seconds, 0.02)
+
+    def _pause(self, design: Design, seconds: float, other: Design) -> None:
+        """Deactivate a node, and activate it again."""
+        if (process := self._process(design)) and process.listens and process.protocol.active:
+            process.protocol.deactivate()
+            self.cell.at(self.cell.now + min(seconds, 0.3), partial(self._resume, process))
+            if self.cell.stalls == "safe":
+                self.cell.culprits.add(design.name)
+
+    def _resume(self, process: Process) -> None:
+        if process.alive and not process.protocol.done:
+            process.activate()
+
+    def _stranger(self, design: Design, seconds: float, other: Design) -> None:
+        """A node of another run says that it is a member."""
+        if process := self._process(design):
+            process.take("members", Announcement("another", "/spindle", "spindle_encoder", 2, ("/spindle",)))
+            process.take("members", Announcement("run", "/second", "spindle_encoder", 2, ("/second",)))
+            process.take("cell_state", CellState("another", 3, 0))
+
+    def _namesake(self, design: Design, seconds: float, other: Design) -> None:
+        """A second node has a member's name."""
+        if self._process(design) and self._running():
+            self.cell.start(design).namesake = True
+
+    def _kill(self, design: Design, seconds: float, other: Design) -> None:
+        if process := self._process(design):
+            self._blame(design)
+            self.cell.kill(process)
+            self._bring_back(design, seconds)
+
+    def _blame(self, design: Design) -> None:
+        if self._running():
+            self.cell.culprits.add(design.name)
+
+    def _bring_back(self, design: Design, seconds: float) -> None:
+        """The harness starts a member again that can go on; an operator any, before the run."""
+        if design.restarts or not self._running():
+            self.cell.at(self.cell.now + min(seconds, 0.5), partial(self._launch, design))
+
+    def _interrupt(self, design: Design, seconds: float, other: Design) -> None:
+        """SIGTERM."""
+        if process := self._process(design):
+            self._blame(design)
+            process.protocol.interrupt("SIGTERM")
+            process._perform_all()
+            self.cell.leave(process)
+            if not self._running():
+                self._bring_back(design, seconds)
+
+    def _shutdown(self, design: Design, seconds: float, other: Design) -> None:
+        if process := self._process(design):
+            if process.protocol.phase in (None, 0):
+                return
+            self._blame(design)
+            process.protocol.shut_down(self.cell.now)
+            process._step()
+
+    def _clean_up(self, design: Design, seconds: float, other: Design) -> None:
+        if (process := self._process(design)) and not process.protocol.takes_part and not self._running():
+            process.protocol.clean_up()
+            process._perform_all()
+            process.configure()
+            process.wired = not design.records
+            process.activate()
+
+    def _claim(self, design: Design, seconds: float, other: Design) -> None:
+        """A member claims blocks that were never sent."""
+        master = self._process(self.cell.designs[0])
+        if master and design.name != self.cell.master and self._running():
+            self._blame(design)
+            master.take("progress", Progress("run", design.name, 10**6, 10**7))
+
+
+def violations(cell: Simulation) -> list[str]:
+    """Promises that a cell has broken, after `Simulation.run`."""
+    found = [f"{process.identity} hangs" for process in cell.processes.values() if not process.namesake]
+    expected = cell.expected()
+    safe = next((values["sample"] // SIZE for _, _, event, values in cell.reports if event == "safe"), cell.length)
+    everyone = [process for process in (*cell.gone, *cell.processes.values()) if not process.namesake]
+    held = min((index for process in everyone for index in process.held.values()), default=safe)
+    for process in everyone:
+        certain = process.values[: min(safe, held)]
+        if certain != expected[process.design.name][: len(certain)]:
+            found.append(f"{process.identity} has computed other values than offline")
+        if len(process.values) > max(cell.length, safe + cell.safe_blocks):
+            found.append(f"{process.identity} ran beyond the end")
+        if process.protocol.failure and any(
+            words in str(process.protocol.failure) for words in ("missing", "twice", "heard before")
+        ):
+            found.append(f"{process.identity}: {process.protocol.failure}")
+    for _, _, event, values in cell.reports:
+        if event == "safe" and not set(values["lost"]) <= cell.culprits:
+            found.append(f"lost {values['lost']}; {sorted(cell.culprits)} are to blame")
+    if not cell.culprits:
+        found += [f"{p.identity}: {p.protocol.failure}" for p in everyone if p.protocol.exit_code]
+        recorders = [p for p in everyone if p.design.records and p.blocks == cell.length]
+        if not recorders and not cell.killed:
+            found.append("no recorder has every block")
+    causes = [str(process.protocol.failure) for process in everyone if process.protocol.failure]
+    if causes and not any(name in text for name in cell.culprits for text in causes):
+        found.append(f"none of {causes} names {sorted(cell.culprits)}")
+    return found
+
+
+def play(seed: int) -> tuple[Simulation, list[str]]:
+    """Play the schedule of a seed."""
+    cell = Schedule(seed).cell
+    cell.run()
+    return cell, violations(cell)
