@@ -7,6 +7,7 @@ same schedule.
 """
 
 import heapq
+import json
 import random
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -88,6 +89,8 @@ class Network:
         return (writer, reader, topic) in self._matched
 
     def publish(self, writer: str, topic: str, message: object) -> None:
+        if writer not in self._cell.processes:
+            return  # it has ended
         self._history[writer, topic].append(message)
         for reader in self._cell.processes:
             if (writer, reader, topic) in self._matched:
@@ -101,7 +104,7 @@ class Network:
         cell.at(arrival, partial(self._arrive, channel, message))
 
     def _arrive(self, channel: tuple[str, str, str], message: object) -> None:
-        writer, reader, topic = channel
+        _, reader, topic = channel
         if channel in self._matched and reader in self._cell.processes:
             self._cell.processes[reader].take(topic, message)
 
@@ -111,10 +114,15 @@ class Network:
     def heard_until(self, one: str, other: str) -> float:
         return self._cut.get(frozenset((one, other)), 0.0)
 
-    def forget(self, process: str, *, sent: bool) -> None:
-        """A process is gone; ``sent``: its last messages are on their way all the same."""
+    def acknowledged(self, writer: str) -> float:
+        """When the last message of a process arrives."""
+        return max((time for channel, time in self._newest.items() if channel[0] == writer), default=0.0)
+
+    def forget(self, process: str) -> None:
+        """A process is gone: messages that are on their way may be lost, for it sends none again."""
         self._history = {key: queue for key, queue in self._history.items() if key[0] != process}
-        self._matched = {key for key in self._matched if key[1] != process and (sent or key[0] != process)}
+        gone = {key for key in self._matched if process in key[:2]}
+        self._matched -= {key for key in gone if key[1] == process or self._cell.random.random() < 0.5}
 
 
 class Process:
@@ -146,7 +154,6 @@ class Process:
         self.held: dict[str, int] = {}  # index of the block from which on the newest stands for all others
         self._pace: BlockOrder | None = None  # of the time master, where no input holds it back
         self._early: list[tuple[str, Block]] = []
-        self.undecided = design.restarts  # where to begin
         is_master = design.name == cell.master
         own = Announcement(
             run_id=cell.run_id,
@@ -157,9 +164,10 @@ class Process:
             types=() if design.records else (messages.ENCODER if is_master else messages.STATE,),
             sparse=() if design.records else (False,),
             subscribes=() if design.records else tuple(self.orders),
-            parameters='{"stall_reaction": "%s", "restart_file": "%s"}' % (cell.stalls, "x" if design.restarts else ""),
+            parameters=json.dumps({"stall_reaction": cell.stalls, "restart_file": "x" * design.restarts}),
             host=HOST,
             pid=self.pid,
+            session=self.pid if is_master else 0,
         )
         masters = ("spindle_encoder",)
         self.protocol: MemberProtocol
@@ -168,9 +176,7 @@ class Process:
             self.protocol = TimeMasterProtocol(own, cell.window, reactions, masters=masters)
             self.protocol.know_end(cell.length * SIZE)
         else:
-            self.protocol = MemberProtocol(
-                own, cell.window, masters=masters, needs_phase=design.restarts, wired=not design.records
-            )
+            self.protocol = MemberProtocol(own, cell.window, masters=masters, wired=not design.records)
 
     def activate(self) -> None:
         if not self.listens:
@@ -250,7 +256,7 @@ class Process:
             protocol.fail(error)
 
     def _take_block(self, topic: str, block: Block) -> None:
-        if self.undecided:
+        if not self.protocol.ready:
             self._early.append((topic, block))
             return
         order = self.orders.get(topic) or self._pace
@@ -331,42 +337,41 @@ class Process:
             case actions.Begin(joins):
                 self._begin(joins=joins)
                 self.protocol.begun(now)
+                early, self._early = self._early, []
+                for topic, block in early:
+                    self._receive(topic, block)
             case actions.CheckCell():
                 assert isinstance(self.protocol, TimeMasterProtocol)
                 self.protocol.start(now)
             case actions.Lose(lost, _, end, _):
                 self._lose(lost, end // SIZE)
-            case actions.Leave():
-                self.protocol.left()
+            case actions.Leave(patience):
+                # It waits until the others have its messages; or none of them is needed any more.
+                acknowledged = net.acknowledged(self.identity) if patience else now
+                self.cell.at(min(acknowledged, now + patience), self._left)
+
+    def _left(self) -> None:
+        self.protocol.left()
+        self.cell.leave(self)
 
     def _members_changed(self) -> None:
         if self.design.records and not self.wired and self.protocol.complete:
             self.wired = True
             self.protocol.describe(subscribes=tuple(self.orders))
             self.cell.discover(self)
-        if self.undecided:
-            return
         peers = self.protocol.master.members if self.protocol.master else ()
         for name, order in self.orders.items():
-            if name in peers and order.source != name:
+            if name in peers and name in self.protocol.members and order.source != name:
                 order.expect(name)
-                order.repeats = name in self.protocol.members and self.protocol.restarts(name)
-            elif name in peers and name in self.protocol.members:
                 order.repeats = self.protocol.restarts(name)
 
     def _begin(self, *, joins: bool) -> None:
         if joins and not self.design.restarts:
             raise LatheError(f"{self.design.name}: the cell is running already")
-        if not self.design.restarts:
-            return
         if joins:
             self._resume()
-        self.undecided = False
-        self._members_changed()
-        for topic, block in self._early:
-            self._receive(topic, block)
-        self._early.clear()
-        self._keep()
+        if self.design.restarts:
+            self._keep()
 
     def _keep(self) -> None:
         """Keep the state; another process begins with that of a window ago."""
@@ -420,7 +425,7 @@ class Process:
 
     def _work(self) -> None:
         protocol, cell = self.protocol, self.cell
-        if not protocol.active or protocol.over or protocol.failure or self.undecided or protocol.master is None:
+        if not protocol.active or protocol.over or protocol.failure or not protocol.ready:
             return
         if isinstance(protocol, TimeMasterProtocol):
             while protocol.may_release and protocol.credit > 0 and self.blocks != protocol.blocks_in_run:
@@ -457,7 +462,8 @@ class Process:
             block = Block(self.design.name, self.blocks - 1, value, last)
             self.cell.network.publish(self.identity, self.design.name, block)
         self.protocol.computed(self.blocks, self.blocks * SIZE, self.cell.now, last=last)
-        if self.design.name == self.cell.master:
+        if self.design.name == self.cell.master and not self.namesake:
+            self.cell.look_at_window(self)
             for call in self.cell.at_block.pop(self.blocks, ()):
                 self.cell.at(self.cell.now + self.cell.delay(), call)
         if last:
@@ -485,6 +491,7 @@ class Simulation:
         self._number = 0
         self.processes: dict[str, Process] = {}
         self.gone: list[Process] = []  # that have ended in order
+        self.dead: list[Process] = []  # that were killed
         self.killed: dict[str, float] = {}  # process that has ended otherwise, and when
         self.since: dict[str, float] = {}  # when a process was stopped
         self.files: dict[str, deque[Any]] = {}
@@ -495,6 +502,7 @@ class Simulation:
         self.at_block: dict[int, list[Callable[[], None]]] = {}  # disturbances, by blocks that the master has released
         self.culprits: set[str] = set()  # members to which something was done that may end the run
         self.plan: list[str] = []
+        self.overrun = ""
 
     def delay(self) -> float:
         """How long a message takes [s]: mostly little, now and then much."""
@@ -548,18 +556,32 @@ class Simulation:
                 silent[name] = self.now
         return silent, ended
 
+    def look_at_window(self, master: Process) -> None:
+        """Note a time master that has released more blocks than the window allows."""
+        assert isinstance(master.protocol, TimeMasterProtocol)
+        counted = [
+            process.blocks
+            for process in self.processes.values()
+            if process.design.name in master.protocol.completed
+            and not (process.design.restarts or process.namesake)  # one that goes on for another computes blocks again
+        ]
+        slowest = min(counted, default=master.blocks)
+        if master.blocks - slowest > self.window and not self.overrun:
+            self.overrun = f"{master.blocks - slowest} blocks are in flight"
+
     def leave(self, process: Process) -> None:
-        """A process ends in order: its last messages reach the others."""
+        """A process ends in order."""
         if process.alive:
             del self.processes[process.identity]
             self.gone.append(process)
-            self.network.forget(process.identity, sent=True)
+            self.network.forget(process.identity)
 
     def kill(self, process: Process) -> None:
         if process.alive:
             del self.processes[process.identity]
             self.killed[process.design.name] = self.now
-            self.network.forget(process.identity, sent=self.random.random() < 0.5)
+            self.dead.append(process)
+            self.network.forget(process.identity)
 
     def stop(self, process: Process, seconds: float) -> None:
         if process.alive and not process.stopped:
@@ -586,9 +608,7 @@ class Simulation:
         values: dict[str, list[int]] = {design.name: [] for design in self.designs}
         for index in range(self.length):
             for design in self.designs:
-                inputs = [
-                    values[name][index - delay] if index >= delay else 0 for name, delay in design.inputs
-                ]
+                inputs = [values[name][index - delay] if index >= delay else 0 for name, delay in design.inputs]
                 values[design.name].append(hash((design.name, index, *inputs)))
         return values
 
@@ -605,7 +625,7 @@ def draw_designs(draw: random.Random) -> tuple[Design, ...]:
     for place, name in enumerate(names):
         inputs = {}
         if place:
-            inputs = {other: 0 for other in draw.sample(names[:place], min(place, draw.choice((1, 1, 2))))}
+            inputs = dict.fromkeys(draw.sample(names[:place], min(place, draw.choice((1, 1, 2)))), 0)
         if place < count and draw.random() < (0.15 if place == 0 else 0.3):
             inputs |= {other: draw.choice((1, 1, 2)) for other in draw.sample(names[place + 1 :], 1)}
         designs.append(Design(name, tuple(inputs.items()), restarts=bool(place) and place == restarting))
@@ -628,7 +648,9 @@ class Schedule:
             design = draw.choice(designs)
             name, seconds = design.name, draw.choice((0.02, 0.1, 0.3, 2.5, 5.0)) * draw.random()
             when = draw.randrange(1, length + 1) if draw.random() < 0.7 else 0.4 * draw.random()
-            cell.plan.append(f"{kind} {name} at {f'block {when}' if isinstance(when, int) else f'{when:.3f} s'}, {seconds:.3f} s")
+            cell.plan.append(
+                f"{kind} {name} at {f'block {when}' if isinstance(when, int) else f'{when:.3f} s'}, {seconds:.3f} s"
+            )
             call = partial(getattr(self, f"_{kind}"), design, seconds, draw.choice(designs))
             if isinstance(when, int):
                 cell.at_block.setdefault(when, []).append(call)
@@ -713,6 +735,7 @@ class Schedule:
             process.protocol.interrupt("SIGTERM")
             process._perform_all()
             self.cell.leave(process)
+            self.cell.killed[design.name] = self.cell.now
             if not self._running():
                 self._bring_back(design, seconds)
 
@@ -728,6 +751,7 @@ class Schedule:
         if (process := self._process(design)) and not process.protocol.takes_part and not self._running():
             process.protocol.clean_up()
             process._perform_all()
+            self.cell.network.forget(process.identity)
             process.configure()
             process.wired = not design.records
             process.activate()
@@ -742,11 +766,17 @@ class Schedule:
 
 def violations(cell: Simulation) -> list[str]:
     """Promises that a cell has broken, after `Simulation.run`."""
-    found = [f"{process.identity} hangs" for process in cell.processes.values() if not process.namesake]
+    # A node whose time master is gone waits for another one, and says so: an operator ends it, or starts that.
+    left = [process for process in cell.processes.values() if process.protocol.master or not cell.killed]
+    found = [f"{process.identity} hangs" for process in left if not process.namesake]
+    found += [cell.overrun] if cell.overrun else []
     expected = cell.expected()
     safe = next((values["sample"] // SIZE for _, _, event, values in cell.reports if event == "safe"), cell.length)
+    for _, _, event, values in cell.reports:
+        if event == "safe" and values["end"] // SIZE != (safe if safe == cell.length else safe + cell.safe_blocks):
+            found.append(f"a safe state from block {safe} ends with sample {values['end']}")
     everyone = [process for process in (*cell.gone, *cell.processes.values()) if not process.namesake]
-    held = min((index for process in everyone for index in process.held.values()), default=safe)
+    held = min((index for process in (*everyone, *cell.dead) for index in process.held.values()), default=safe)
     for process in everyone:
         certain = process.values[: min(safe, held)]
         if certain != expected[process.design.name][: len(certain)]:
@@ -757,17 +787,18 @@ def violations(cell: Simulation) -> list[str]:
             words in str(process.protocol.failure) for words in ("missing", "twice", "heard before")
         ):
             found.append(f"{process.identity}: {process.protocol.failure}")
-    for _, _, event, values in cell.reports:
-        if event == "safe" and not set(values["lost"]) <= cell.culprits:
-            found.append(f"lost {values['lost']}; {sorted(cell.culprits)} are to blame")
-    if not cell.culprits:
+    lost = {name for _, _, event, values in cell.reports if event == "safe" for name in values["lost"]}
+    to_blame = cell.culprits | cell.killed.keys()
+    if not lost <= to_blame:
+        found.append(f"lost {sorted(lost)}; {sorted(to_blame)} are to blame")
+    if not cell.culprits and not lost:
         found += [f"{p.identity}: {p.protocol.failure}" for p in everyone if p.protocol.exit_code]
         recorders = [p for p in everyone if p.design.records and p.blocks == cell.length]
         if not recorders and not cell.killed:
             found.append("no recorder has every block")
     causes = [str(process.protocol.failure) for process in everyone if process.protocol.failure]
-    if causes and not any(name in text for name in cell.culprits for text in causes):
-        found.append(f"none of {causes} names {sorted(cell.culprits)}")
+    if causes and not any(name in text for name in to_blame for text in causes):
+        found.append(f"none of {causes} names {sorted(to_blame)}")
     return found
 
 

@@ -12,7 +12,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -27,8 +26,9 @@ from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
-from lathe_rc.nodes.membership import Membership
+from lathe_rc.nodes import graph
 from lathe_rc.nodes.ports import message_class
+from lathe_rc.protocol import Announcement
 
 NUMBERS = itertools.count()
 FORM = "angle_deg,radius_um\n0,0\n120,30\n240,-10\n"
@@ -264,18 +264,11 @@ def test_metadata_in_the_current_folder_is_no_installed_package(received):
 # ---- announcements
 
 
-class Hearing(Membership):
-    """A node that has heard of one member."""
-
-    def __init__(self, stage, **values):
-        parameters = TABLES.get(stage if stage in TABLES.own else "tool")().model_dump() | values
-        told = SimpleNamespace(stage=stage, parameters=json.dumps(parameters))
-        self.members, self.said, self._told_unknown = {"/it": told}, [], set()
-
-    def get_logger(self):
-        return SimpleNamespace(info=self.said.append)
-
-    publications = subscriptions_wanted = None
+def announced(stage, said, **values):
+    """The tables of a cell with one member, as they are announced; ``said`` gets why it is not known."""
+    parameters = TABLES.get(stage if stage in TABLES.own else "tool")().model_dump() | values
+    member = Announcement("", "/it", stage, parameters=json.dumps(parameters))
+    return graph.announced({"/it": member}, ["/it"], "/", lambda *words: said.append(words))[0]
 
 
 @pytest.mark.parametrize(
@@ -293,18 +286,17 @@ class Hearing(Membership):
 def test_a_member_that_announces_code_or_files_is_known_by_its_topics_alone(received, stage, parameter, value):
     """The recorder would keep such a file in its bag, the time master read it."""
     told = json.loads(json.dumps(value).replace("{0}", received.module).replace("{1}", str(received.secret)))
-    node = Hearing(stage.replace("{0}", received.module), **{parameter: told})
+    said = []
     with allowed_code.call():
-        assert node._table("/it") is None
-    assert "is known by its topics alone" in node.said[0]
+        assert not announced(stage.replace("{0}", received.module), said, **{parameter: told})
+    assert said
     assert not received.mark.exists()
 
 
 def test_a_member_may_announce_the_files_that_the_user_names(received):
-    node = Hearing("tool", profile_file=str(received.secret))
     with allowed_code.call():
         allowed_code.user_names(lambda: {str(received.secret)})
-        assert node._table("/it").profile_file == str(received.secret)
+        assert announced("tool", [], profile_file=str(received.secret))["it"].profile_file == str(received.secret)
 
 
 # ---- files

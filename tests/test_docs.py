@@ -75,23 +75,24 @@ class TestReference:
 def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     rclpy = pytest.importorskip("rclpy")
     from lathe_rc.harness import free_domain
+    from lathe_rc.nodes.cell_node import CellNode
     from lathe_rc.nodes.exchange import Exchange
-    from lathe_rc.nodes.recorder_node import RecorderNode
+    from lathe_rc.nodes.recorder_role import RecorderRole
     from lathe_rc.nodes.report import Reporter
-    from lathe_rc.nodes.spindle_node import SpindleNode
-    from lathe_rc.nodes.stage_node import StageNode
+    from lathe_rc.nodes.spindle_role import SpindleRole
+    from lathe_rc.nodes.stage_role import StageRole
 
     bag = tmp_path_factory.mktemp("docs") / "bag"
-    kinds = {"spindle_encoder": SpindleNode, "tool": StageNode, "recorder": RecorderNode}
+    kinds = {"spindle_encoder": SpindleRole, "tool": StageRole, "recorder": RecorderRole}
     with free_domain() as domain:
         rclpy.init(args=["docs", "--ros-args", "-p", f"recorder:bag:={bag}"], domain_id=domain)
         made = {}
         try:
-            for kind, node in kinds.items():
-                made[kind] = node(kind, kind, Reporter(), Exchange())
+            for kind, role in kinds.items():
+                made[kind] = CellNode(kind, kind, role, Reporter(), Exchange())
                 made[kind].trigger_configure()
                 made[kind].trigger_activate()
-                assert made[kind].failure is None
+                assert made[kind].protocol.failure is None
             yield made
         finally:
             for node in made.values():

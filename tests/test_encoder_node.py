@@ -16,7 +16,7 @@ from lathe_rc.bag.check import check
 from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.errors import LatheError
-from lathe_rc.nodes import encoder_node
+from lathe_rc.nodes import encoder_role
 
 pytest.importorskip("rclpy")
 
@@ -234,7 +234,7 @@ def test_silence_of_the_spindle_among_others_is_an_error_that_names_them(ghost, 
     ],
 )
 def test_a_joint_state_without_the_spindle_s_position_is_another_s(joint, names, positions, place):
-    assert encoder_node._place(JointState(name=names, position=positions), joint) == place
+    assert encoder_role._place(JointState(name=names, position=positions), joint) == place
 
 
 def test_a_line_that_cannot_be_opened_is_refused_before_the_cell_begins():

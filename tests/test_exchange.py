@@ -1,22 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Blocks that the nodes of one process hand over to each other."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
-from lathe_rc.errors import LatheError
-
 rclpy = pytest.importorskip("rclpy")
 
-from lathe_rc_msgs.msg import Progress  # noqa: E402 - only where there is ROS 2
-
 from lathe_rc.harness import free_domain  # noqa: E402
-from lathe_rc.nodes import spindle_node  # noqa: E402
+from lathe_rc.nodes.cell_node import CellNode  # noqa: E402
 from lathe_rc.nodes.exchange import Exchange  # noqa: E402
 from lathe_rc.nodes.report import Reporter  # noqa: E402
-from lathe_rc.nodes.spindle_node import SpindleNode  # noqa: E402
+from lathe_rc.nodes.spindle_role import SpindleRole  # noqa: E402
+from lathe_rc.protocol import Progress  # noqa: E402
 
 
 @pytest.fixture
@@ -26,14 +21,23 @@ def spindle(monkeypatch):
     with free_domain() as domain:
         rclpy.init(args=["test", "--ros-args", *(part for text in given for part in ("-p", text))], domain_id=domain)
         try:
-            node = SpindleNode("spindle_encoder", "spindle_encoder", Reporter(), Exchange())
+            node = CellNode("spindle_encoder", "spindle_encoder", SpindleRole, Reporter(), Exchange())
             node.trigger_configure()
-            node.exchange.join([topic for topic, _, _ in node.publications()])
+            node.exchange.join(node.protocol.own.publishes)
             yield node
-            # Left alive, it would hand its blocks to whoever comes to this domain next.
+            # Left alive, it would hand its blocks to the next cell in this domain.
             node.destroy_node()
         finally:
             rclpy.shutdown()
+
+
+def begin(spindle):
+    """Let the run begin, as if its member were ready."""
+    spindle.trigger_activate()
+    spindle.protocol.begun(0.0)
+    spindle.attempt(lambda: spindle.protocol.start(0.0))
+    while spindle.protocol.credit and not spindle.protocol.failure:  # it looks at its members between two bursts
+        spindle.attempt(spindle.role.release)
 
 
 def test_a_member_that_completes_a_block_at_once_does_not_get_it_twice(spindle):
@@ -45,15 +49,14 @@ def test_a_member_that_completes_a_block_at_once_does_not_get_it_twice(spindle):
 
     def complete(delivery):
         seen.append(delivery.block.first_index)
-        spindle.exchange.master(Progress(name="/eager", blocks=len(seen), samples=64 * len(seen)))
+        spindle.exchange.master(Progress("", "/eager", len(seen), 64 * len(seen)))
 
     spindle.exchange.listen("/encoder", "/eager", complete)
-    spindle.trigger_activate()
-    spindle._begin()
+    begin(spindle)
     while spindle.due:  # as the loop of its process
         spindle.due = False
         spindle.work()
-    assert spindle.done
+    assert spindle.protocol.done
     assert seen == list(range(0, 64 * len(seen), 64))
 
 
@@ -61,8 +64,7 @@ def test_what_is_handed_over_is_not_written_to_again(spindle):
     """Arrays that a node has handed to the nodes of its process never change."""
     blocks = []
     spindle.exchange.listen("/encoder", "/eager", blocks.append)
-    spindle.trigger_activate()
-    spindle._begin()
+    begin(spindle)
     angle = np.concatenate([run.block.signals["angle_true"] for run in blocks])
     assert len(blocks) == 3  # the window
     assert np.all(np.diff(angle) > 0.0)
@@ -75,17 +77,15 @@ def test_blocks_that_may_go_at_once_go_in_one_piece(spindle):
     """
     runs = []
     spindle.exchange.listen("/encoder", "/eager", runs.append)
-    spindle.together = 2
-    spindle.trigger_activate()
-    spindle._begin()
+    spindle.role.together = 2
+    begin(spindle)
     assert [(run.block.first_index, run.block.samples) for run in runs] == [(0, 128), (128, 64)]
     assert [len(run.companions) for run in runs] == [2, 1]
-    assert spindle.blocks == 3
+    assert spindle.role.blocks == 3
 
 
 def test_a_sample_that_is_not_finite_is_refused_where_it_is_made(spindle, monkeypatch):
     spindle.exchange.listen("/encoder", "/eager", list)
-    spindle.trigger_activate()
 
     def spoil(first, inputs, outputs):
         outputs[0]["speed"][:] = 1.0
@@ -94,9 +94,10 @@ def test_a_sample_that_is_not_finite_is_refused_where_it_is_made(spindle, monkey
         outputs[0]["speed"][5] = np.nan
         return []
 
-    monkeypatch.setattr(spindle.stage, "process", spoil)
-    with pytest.raises(LatheError, match="/encoder: /spindle_encoder sends speed = nan at sample 5; allowed: finite"):
-        spindle._begin()
+    monkeypatch.setattr(spindle.role.stage, "process", spoil)
+    begin(spindle)
+    wrong = "/encoder: /spindle_encoder sends speed = nan at sample 5; allowed: finite"
+    assert str(spindle.protocol.failure).startswith(wrong)
 
 
 def test_a_transition_that_breaks_fails_the_node(spindle, monkeypatch):
@@ -105,23 +106,6 @@ def test_a_transition_that_breaks_fails_the_node(spindle, monkeypatch):
     def breaks():
         raise StopIteration("no types")
 
-    monkeypatch.setattr(spindle, "activate_part", breaks)
+    monkeypatch.setattr(spindle.role, "activate", breaks)
     spindle.trigger_activate()
-    assert str(spindle.failure) == "spindle_encoder: StopIteration: no types"
-
-
-def test_the_schedule_makes_up_half_a_window_and_slips_by_more(spindle, monkeypatch):
-    now = 100.0
-    monkeypatch.setattr(spindle_node, "time", SimpleNamespace(monotonic=lambda: now))
-    spindle.trigger_activate()
-    spindle._pace = SimpleNamespace(speed_factor=1.0)
-    spindle._begin()
-    block = 64 * spindle.table.step
-    half = spindle.table.window // 2  # of 3: one block
-    now += (1.0 + 0.9 * half) * block
-    spindle.release()
-    assert (spindle.blocks, spindle.slipped) == (1, 0.0)
-    now = 100.0 + (2.0 + 1.1 * half) * block
-    spindle.release()
-    assert spindle.blocks == 2
-    assert spindle.slipped == pytest.approx(1.1 * half * block)
+    assert str(spindle.protocol.failure) == "spindle_encoder: StopIteration: no types"

@@ -78,7 +78,7 @@ def close(self):
 
 class Finder:
     def find_spec(self, name, path=None, target=None):
-        if name == "lathe_rc.nodes.recorder_node":
+        if name == "lathe_rc.nodes.recorder_role":
             sys.meta_path.remove(self)
             from lathe_rc.bag.writing.writer import BagWriter
             BagWriter.close = close
@@ -353,7 +353,8 @@ def test_a_process_with_a_whole_cell_that_runs_flat_out_is_not_deaf(tmp_path):
     with harness.Processes(cell, [list(cell.nodes)]) as processes:
         processes.wait_for("cycle")
         os.kill(processes.pids["tool"], signal.SIGTERM)
-        assert not processes.wait_for("closed")["complete"]
+        closed = next(event for event in processes.events(60.0) if event["event"] == "closed")
+        assert not closed["complete"]
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,6 @@ from cells import scenario
 
 pytest.importorskip("rclpy")
 
-from lathe_rc_msgs.msg import Member
 
 from lathe_rc import harness, messages
 from lathe_rc.analysis.form_errors import form_errors
@@ -26,9 +26,8 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.cell.wiring import Unknown
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes.exchange import Exchange
-from lathe_rc.nodes.report import Reporter
-from lathe_rc.nodes.stage_node import StageNode
+from lathe_rc.nodes import graph
+from lathe_rc.protocol import Announcement
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PROGRAMS = {"learning_controller": "controller.py", "electrodynamic_actuator": "drive.py", "listener": "listener.py"}
@@ -176,33 +175,27 @@ DRIVE = "electrodynamic_actuator"
         ("os:getpid", "{}", "stage 'os:getpid': code that no installed package offers; allowed: .*"),
     ],
 )
-def test_a_member_is_known_if_its_stage_and_all_its_parameters_are(ghost, capfd, stage, parameters, why):
+def test_a_member_is_known_if_its_stage_and_all_its_parameters_are(stage, parameters, why):
     """A member is checked if its stage and all its parameters are known, else known by its topics alone.
 
     Of others the topics count; why nobody knows them is said once.
     """
-    node = StageNode("tool", "tool", Reporter(), Exchange())
-    topics = {"publishes": ["/coarse/state", "/drive/events"], "types": [messages.STATE, messages.EVENT]}
-    member = Member(name="/drive", stage=stage, parameters=parameters, sparse=[False, True], **topics)
-    member.subscribes = ["/coarse/command"]
-    node.members = {"/drive": member}
-    for _ in range(2):
-        unknown = Unknown(
-            {"coarse/state": messages.STATE}, {"drive/events": messages.EVENT}, frozenset({"coarse/command"})
-        )
-        known = {"drive": KNOWN.model_copy(update={"stage": DRIVE})}
-        assert node.announced(["/drive"]) == ((known, {}) if why is None else ({}, {"drive": unknown}))
-    said = "".join(capfd.readouterr())
-    found = re.findall(rf"/drive, stage '{stage}', is known by its topics alone: (.*)$", said, re.MULTILINE)
-    assert len(found) == (why is not None)
-    assert all(re.fullmatch(why, text) for text in found)
-    node.destroy_node()
+    topics = {"publishes": ("/coarse/state", "/drive/events"), "types": (messages.STATE, messages.EVENT)}
+    member = Announcement("", "/drive", stage, parameters=parameters, sparse=(False, True), **topics)
+    member = replace(member, subscribes=("/coarse/command",))
+    said = []
+    found = graph.announced({"/drive": member}, ["/drive"], "/", lambda *words: said.append(words))
+    unknown = Unknown({"coarse/state": messages.STATE}, {"drive/events": messages.EVENT}, frozenset({"coarse/command"}))
+    known = {"drive": KNOWN.model_copy(update={"stage": DRIVE})}
+    assert found == ((known, {}) if why is None else ({}, {"drive": unknown}))
+    if why is None:
+        assert not said
+    else:
+        assert said[0][:2] == ("/drive", stage)
+        assert re.fullmatch(why, said[0][2])
 
 
-def test_a_parameter_that_cannot_be_is_refused_with_the_name_of_its_member(ghost):
-    node = StageNode("tool", "tool", Reporter(), Exchange())
-    wrong = KNOWN.model_copy(update={"damping": -1.0}).model_dump_json()
-    node.members = {"/drive": Member(name="/drive", stage=DRIVE, parameters=wrong)}
+def test_a_parameter_that_cannot_be_is_refused_with_the_name_of_its_member():
+    wrong = Announcement("", "/drive", DRIVE, parameters=KNOWN.model_copy(update={"damping": -1.0}).model_dump_json())
     with pytest.raises(InputError, match=r"^/drive.damping = -1.0; allowed: a finite number above 0"):
-        node.announced(["/drive"])
-    node.destroy_node()
+        graph.announced({"/drive": wrong}, ["/drive"], "/", print)

@@ -13,18 +13,19 @@ from cells import Seen, scenario
 pytest.importorskip("rclpy")
 
 import rclpy
-from lathe_rc_msgs.msg import CellState, Member
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.lifecycle import TransitionCallbackReturn
 
-from lathe_rc import harness, messages
+from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.errors import LatheError
+from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.liveliness import this_host
-from lathe_rc.nodes.losses import LossWatch
-from lathe_rc.nodes.stage_node import StageNode
+from lathe_rc.nodes.report import Reporter
+from lathe_rc.nodes.stage_role import StageRole
+from lathe_rc.protocol import Announcement
 
 WALK = [  # transition, whether it is possible, and where the node is then
     (Transition.TRANSITION_ACTIVATE, False, "active"),
@@ -157,48 +158,18 @@ def test_who_is_shut_down_before_the_run_leaves_and_the_others_say_for_whom_they
 
 @pytest.fixture
 def tool(ghost):
-    """A tool that has been activated in this process, and what it reports."""
-    told = []
-    node = StageNode("tool", "tool", lambda event, _, **values: told.append((event, values)), Exchange())
+    """A tool that has been activated in this process."""
+    node = CellNode("tool", "tool", StageRole, Reporter(), Exchange())
     assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
-    yield node, told
+    yield node
     node.destroy_node()
-
-
-def joins(node, name, state=Member.WIRED, **said):
-    """Let a member announce itself."""
-    node._on_member(Member(name=name, state=state, parameters="{}", **said))
-
-
-def test_who_waits_names_each_member_and_topic_that_is_missing(tool):
-    """A waiting node names each missing member and topic."""
-    node, _ = tool
-    topics = ["/coarse/state", "/encoder"]
-    assert sorted(node.missing()) == ["a publisher of /coarse/state", "a publisher of /encoder", "a time master"]
-    joins(node, "/spindle", stage="spindle_encoder", members=["/spindle", "/drive", "/recorder", "/tool"])
-    assert node.missing() == ["/drive", "/recorder"]
-    joins(node, "/drive", Member.JOINING)
-    joins(node, "/recorder", Member.JOINING)
-    assert node.missing() == ["/drive to join", "/recorder to join"]
-    joins(node, "/drive", Member.READY, publishes=topics[:1], types=[messages.STATE], sparse=[False])
-    joins(node, "/recorder", subscribes=["/tool"])
-    joins(node, "/tool")
-    missing = ["/coarse/state from /drive", "/encoder, which no member publishes", "/tool to /recorder"]
-    assert sorted(node.missing()) == missing
-    node._ready = True
-    assert node.missing() == ["/spindle to be ready", "/recorder to be ready"]
-    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
-    assert node.missing() == ["its own activation"]
-    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
-    node._on_cell_state(CellState(state=CellState.RUNNING))
-    assert node.missing() == []
 
 
 def test_a_member_that_is_stopped_is_silent_whatever_dds_says_of_it(tool):
     """Fast DDS takes it for alive for ever if its last sign of life comes when its lease runs out."""
-    watch = tool[0].watch
+    watch = tool.watch
     with subprocess.Popen(["/bin/sleep", "1000"]) as child:
-        watch.follow(Member(name="/stopped", pid=child.pid, host=this_host()))
+        watch.follow(Announcement("", "/stopped", "tool", pid=child.pid, host=this_host()))
         watch._changed("/stopped", SimpleNamespace(alive_count=1, not_alive_count=0))
         for number, change, silent in (
             (signal.SIGSTOP, os.WSTOPPED, ["/stopped"]),
@@ -209,30 +180,6 @@ def test_a_member_that_is_stopped_is_silent_whatever_dds_says_of_it(tool):
             watch.look()
             assert list(watch.silent) == silent
         child.kill()
-
-
-def test_what_is_missing_is_told_now_and_then_until_it_is_there(tool):
-    """A waiting node repeats the names of missing members and topics, ever more seldom."""
-    node, told = tool
-    begun = node._tell_due - 2.0
-    times = []
-    for second in range(101):
-        before = len(told)
-        node.tick(begun + second)
-        times += [second] * (len(told) - before)
-    assert times == [2, 10, 40, 70, 100]
-    node._cell, node._ready = CellState.RUNNING, True
-    node.tick(begun + 131.0)
-    assert [event for event, _ in told].count("waits") == 5
-
-
-def test_who_stands_still_is_named_and_not_who_waits_for_it():
-    """Members tell how far they are when they pass a multiple of a quarter of the window, some a block later."""
-    told = {"/learning_controller": 17, "/tool": 17, "/recorder": 16}
-    watch = SimpleNamespace(_completed=told, _progress_step=16)
-    assert LossWatch._slowest.fget(watch) == "/learning_controller"
-    told["/recorder"] = 15
-    assert LossWatch._slowest.fget(watch) == "/recorder"
 
 
 def test_who_is_shut_down_in_the_middle_of_a_run_makes_the_cell_safe(manager, domain, tmp_path):

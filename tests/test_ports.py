@@ -13,10 +13,10 @@ from lathe_rc.cell.delay_buffer import DelayBuffer
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import LatheError
+from lathe_rc.nodes.block_queue import BlockQueue
 from lathe_rc.nodes.exchange import Run
-from lathe_rc.nodes.ports import BlockQueue
-from lathe_rc.nodes.refused_messages import ForeignMessage, RefusedMessages
-from lathe_rc.nodes.stage_node import StageNode
+from lathe_rc.nodes.refused_messages import RefusedMessages
+from lathe_rc.protocol import ForeignMessage
 
 SIZE = 4
 
@@ -56,7 +56,7 @@ def test_blocks_in_one_piece_count_one_by_one_and_are_taken_in_any_pieces():
     taken.take(run_of(4, 3))
     taken.take(run_of(16, 2, last=True))
     assert (taken.received, taken.end, taken.ended) == (6, 23, True)
-    pieces = [StageNode._taken(taken, samples)["angle"] for samples in (8, 4, 11)]
+    pieces = [taken.pop(samples)["angle"] for samples in (8, 4, 11)]
     assert [piece.tolist() for piece in pieces] == [list(range(8)), list(range(8, 12)), list(range(12, 23))]
     assert not taken.blocks
 

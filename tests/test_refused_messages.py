@@ -24,8 +24,8 @@ from std_msgs.msg import Header
 from lathe_rc import harness, messages
 from lathe_rc.bag import reader
 from lathe_rc.errors import LatheError
+from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.ports import latched_qos
-from lathe_rc.nodes.stage_node import StageNode
 
 
 def uneven(msgtype, source, run_id):
@@ -227,7 +227,7 @@ def test_a_member_that_goes_wrong_makes_the_cell_safe(ghost, domain, tmp_path, b
 
 def test_nobody_listens_for_lost_messages():
     """A flood loses some, and in rmw_fastrtps 8.4 whoever listens for that may stand still for ever."""
-    events = StageNode.subscription_events(SimpleNamespace(), "/encoder")
+    events = CellNode.subscription_events(SimpleNamespace(), "/encoder")
     assert events.incompatible_qos is not None
     assert events.message_lost is None
 

@@ -5,14 +5,12 @@ import os
 import pickle
 import signal
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rclpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lathe_rc_msgs.msg import Progress
 from lathe_rc_msgs.srv import Schedule
 
 from lathe_rc import files, harness
@@ -24,7 +22,6 @@ from lathe_rc.cell.scenario import load
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import sample_fields
-from lathe_rc.nodes.spindle_node import SpindleNode
 
 CONFIG = Path(__file__).parents[1] / "config"
 BLOCK = 64
@@ -146,17 +143,6 @@ def test_an_event_that_was_asked_for_is_kept_when_a_state_of_before_is_written(g
         "spindle_encoder.revolutions=20.0", f"{OWN}.events=['sample {promised}: freeze']",
     ]))  # fmt: skip
     assert reader.read_bag(tmp_path / "bag").digests() == expected.digest
-
-
-@pytest.mark.parametrize("restarts", [True, False])
-def test_who_computes_blocks_once_more_is_not_silent(restarts):
-    """With ``stall_reaction: safe`` the cell would lose a controller that has just come back."""
-    spindle = SimpleNamespace(
-        table=SimpleNamespace(run_id="r"), restarts=lambda _: restarts,
-        _completed={"/c": 10}, _heard=0.0, _members_moved={"/c": 0.0},
-    )  # fmt: skip
-    SpindleNode._on_progress(spindle, Progress(run_id="r", name="/c", blocks=5))
-    assert (spindle._heard > 0.0) == (spindle._members_moved["/c"] > 0.0) == restarts
 
 
 def test_a_controller_whose_state_is_lost_is_not_waited_for(tmp_path):

@@ -12,7 +12,8 @@ import numpy as np
 import rclpy.executors
 
 from lathe_rc.cell.latency_histogram import Durations
-from lathe_rc.nodes import container, process, spindle_node
+from lathe_rc.nodes import container, process
+from lathe_rc.protocol import pace, time_master
 
 EXECUTOR, DURATIONS = "LATHE_BENCH_EXECUTOR", "LATHE_BENCH_DURATIONS"
 
@@ -45,7 +46,8 @@ def main() -> None:
     if os.environ.get(EXECUTOR) == "single":
         setattr(process, "EventsExecutor", rclpy.executors.SingleThreadedExecutor)  # noqa: B010 - it is only imported there
     if DURATIONS in os.environ:
-        setattr(spindle_node, "Durations", _Kept)  # noqa: B010 - likewise
+        for module in (pace, time_master):
+            setattr(module, "Durations", _Kept)  # noqa: B010 - likewise
         atexit.register(_keep, os.environ[DURATIONS])
     container.main()
 

@@ -323,7 +323,7 @@ class Processes:
         node = event["node"]
         if event["event"] == "abandoned":
             self._is_no_cause(node)
-        if event["event"] == "masterless":
+        if event["event"] in ("masterless", "interrupted"):
             raise LatheError(self._with_the_lost(event["message"]))
         if event["event"] == "error":
             kinds = {InputError.exit_code: InputError, LossyRunError.exit_code: LossyRunError}

@@ -13,6 +13,7 @@ from lathe_rc.cell.host_topics import signal_depth
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.wire import Decoder, NoBlockError
 from lathe_rc.errors import LatheError
+from lathe_rc.messages import Signals
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.protocol import BlockOrder, ForeignMessage
 
@@ -117,6 +118,13 @@ class BlockQueue(BlockOrder):
                 self.blocks.appendleft(block.part(samples, block.samples))
                 block = block.part(0, samples)
             yield block
+
+    def pop(self, samples: int) -> Signals:
+        """Take out the next samples of blocks of this process; without a copy if they are one piece."""
+        if self.blocks[0].samples == samples:
+            return self.blocks.popleft().signals
+        pieces = [block.signals for block in self.until(self.blocks[0].first_index + samples)]
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
     def state(self) -> tuple[int, int, list[Block], Block | None]:
         """The state that another process needs to go on: next sample, blocks received, waiting and newest."""

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lathe_rc_msgs.msg import CellState as CellStateMessage
@@ -45,6 +45,9 @@ _IDLE_TICK = 0.1  # [s] between looks at the others
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _LATCHED_DEPTH = 256
 _MOST_PUT_OFF = 8  # times the blocks in flight of each topic, while a node is deactivated
+_EARLY = 4  # times the blocks in flight of each topic, before a node is ready
+
+T = TypeVar("T")
 
 
 class Role(Protocol):
@@ -153,6 +156,7 @@ class CellNode(LifecycleNode):
         self.protocol = MemberProtocol(Announcement("", self.full_name, self.kind), 0)
         self._performs = False
         self._put_off: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals that came while deactivated
+        self._early: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals that came before it was ready
         self._read_elsewhere = True  # whether other nodes than the time master read the progress
         self._host: dict[str, Publisher] = {}
         self.outlets: dict[str, Publisher] = {}
@@ -236,6 +240,7 @@ class CellNode(LifecycleNode):
             parameters=self._effective(self.role).model_dump_json(),
             host=this_host(),
             pid=os.getpid(),
+            session=time.monotonic_ns() if self.role.member_names() else 0,
         )
         self.protocol = self.role.protocol(own)
 
@@ -252,9 +257,7 @@ class CellNode(LifecycleNode):
             self._begin_to_exchange()
             self.role.activate()
         self.protocol.activate(time.monotonic())
-        while self._put_off:
-            callback, message = self._put_off.popleft()
-            self.guarded(callback)(message)
+        self._take_up(self._put_off)
         self._perform_actions()
         self.reporter("active", self.get_name(), pid=os.getpid())
 
@@ -307,14 +310,14 @@ class CellNode(LifecycleNode):
     # ---- events of the protocol ---------------------------------------------------------------------
 
     def _on_member(self, message: Any) -> None:
-        member = Announcement(**_values(message, Announcement))
+        member = from_ros(message, Announcement)
         known = self.protocol.members.get(member.name)
         if known and known.process != member.process:
             self._look()  # the process before may have ended
         self.protocol.hear_member(member, time.monotonic())
 
     def _on_cell_state(self, message: Any) -> None:
-        self.protocol.hear_cell_state(CellState(**_values(message, CellState)), time.monotonic())
+        self.protocol.hear_cell_state(from_ros(message, CellState), time.monotonic())
 
     def completed(self, blocks: int, samples: int, *, last: bool) -> None:
         """The role has completed so many blocks and samples in all."""
@@ -443,6 +446,7 @@ class CellNode(LifecycleNode):
             case actions.Begin(joins):
                 role.begin(joins=joins)
                 self.protocol.begun(time.monotonic())
+                self._take_up(self._early)
             case actions.Lose(lost, first, end, again):
                 role.lose(lost, first, end, again=again)
             case _:
@@ -490,21 +494,39 @@ class CellNode(LifecycleNode):
         return call
 
     def _in_turn(self, callback: Callable[[Any], object]) -> Callable[[Any], None]:
-        """A callback for signals, which are put off while the node is deactivated: then nothing is lost.
+        """A callback for signals, which are put off while the node is deactivated, and until it is ready.
 
-        Where nothing holds the spindle back they are left out, and counted as any that are missing.
+        So nothing is lost, and a node that joins late is not told of blocks that it could not hear. Where nothing holds
+        the spindle back, signals are left out while it is deactivated, and counted as any that are missing.
         """
         most = _MOST_PUT_OFF * signal_depth(self.table)
 
         def call(message: Any) -> None:
-            if self.protocol.active:
-                callback(message)
-            elif self.table.window:
-                self._put_off.append((callback, message))
+            if not self.protocol.active:
+                if self.table.window:
+                    self._put_off.append((callback, message))
                 if len(self._put_off) > most * (len(self.inlets) + 1):
                     raise LatheError(f"{self.full_name}: {len(self._put_off)} messages wait until it is active again")
+            elif self._is_early():
+                self._early.append((callback, message))
+                if len(self._early) > _EARLY * signal_depth(self.table) * (len(self.inlets) + 1):
+                    self._early.popleft()  # of a flood from outside
+            else:
+                self._take_up(self._early)
+                callback(message)
 
         return call
+
+    def _is_early(self) -> bool:
+        """Whether signals have to wait: until the node is ready, and knows where to begin if it may go on."""
+        if self.protocol.master is not None:
+            return not self.protocol.ready
+        return bool(getattr(self.table, "restart_file", "")) and not self.protocol.alone
+
+    def _take_up(self, waiting: deque[tuple[Callable[[Any], object], Any]]) -> None:
+        while waiting:
+            callback, message = waiting.popleft()
+            self.guarded(callback)(message)
 
     def _one_of_many(self, topic: str, callback: Callable[[bytes], object]) -> Callable[[bytes], None]:
         """A callback whose errors name all publishers of its topic, if there are several: any of them may be it."""
@@ -553,12 +575,11 @@ class CellNode(LifecycleNode):
         """
 
         def incompatible(status: Any) -> None:
-            self.fail(
-                LatheError(
-                    f"{topic}: a publisher offers a quality of service that does not fit ({status.last_policy_kind}); "
-                    f"if it is a device that keeps no messages, add {topic} to {self.get_name()}.volatile_inputs"
-                )
+            why = (
+                f"a publisher offers a quality of service that does not fit ({status.last_policy_kind}); if it is a "
+                f"device that keeps no messages, add {topic} to {self.get_name()}.volatile_inputs"
             )
+            self._refuse(ForeignMessage(topic, "", "", why))
 
         return SubscriptionEventCallbacks(incompatible_qos=incompatible)
 
@@ -601,10 +622,7 @@ class CellNode(LifecycleNode):
         self._host["diagnostics"].publish(message)
 
 
-def _values(message: Any, kind: type) -> dict[str, Any]:
-    """The fields of a ROS message for the protocol's own of the same name."""
-    return {field.name: _plain(getattr(message, field.name)) for field in fields(kind)}
-
-
-def _plain(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
+def from_ros(message: Any, kind: type[T]) -> T:
+    """The protocol's own message with the fields of the ROS message of the same name."""
+    values = {field.name: getattr(message, field.name) for field in fields(kind)}  # type: ignore[arg-type]
+    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})

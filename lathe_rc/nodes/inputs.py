@@ -3,8 +3,6 @@
 
 from collections.abc import Collection, Sequence
 
-import numpy as np
-
 from lathe_rc.cell.delay_buffer import DelayBuffer, longest_delays
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.stage import Input
@@ -118,7 +116,7 @@ class Inputs:
 
     def read(self, first: int, samples: int) -> list[Signals]:
         """The next samples of all inputs, which are there."""
-        taken = {queue.topic: _taken(queue, samples) for queue in self._shared}
+        taken = {queue.topic: queue.pop(samples) for queue in self._shared}
         return [
             taken[queue.topic] if queue.topic in taken else self._view(place, first, samples)
             for place, (queue, _, _) in enumerate(self._inputs)
@@ -170,11 +168,3 @@ def _load(queue: BlockQueue, buffer: DelayBuffer, until: int) -> None:
             block.copy_to(buffer.extend(block.samples), check=not queue.inside)
         except ValueError as error:
             raise LatheError(f"{queue.topic}: {error}") from None
-
-
-def _taken(queue: BlockQueue, samples: int) -> Signals:
-    """The next samples of blocks that were computed in this process; without a copy if they are one piece."""
-    if queue.blocks[0].samples == samples:
-        return queue.blocks.popleft().signals
-    pieces = [block.signals for block in queue.until(queue.blocks[0].first_index + samples)]
-    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}

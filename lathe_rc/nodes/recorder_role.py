@@ -94,7 +94,15 @@ class RecorderRole:
         return []
 
     def begin(self, *, joins: bool) -> None:
-        """See `Role`."""
+        """See `Role`.
+
+        Raises:
+            LatheError: the cell is running, and its first blocks are gone.
+        """
+        if joins:
+            raise LatheError(
+                f"{self.node.full_name}: the cell is running already; start a recorder before it, or use lathe record"
+            )
 
     def perform(self, action: Action) -> None:
         """See `Role`."""

@@ -7,21 +7,15 @@ more. Nor is it older than two windows: suppliers, which may be a window ahead, 
 """
 
 from collections import deque
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lathe_rc.cell import state_file
 from lathe_rc.cell.block import Block
-from lathe_rc.cell.host_topics import signal_depth
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes.block_queue import BlockQueue
 
 if TYPE_CHECKING:
     from lathe_rc.nodes.stage_role import StageRole
-
-_EARLY = 4  # times the blocks in flight are kept until it is known where to go on
 
 
 class Restart:
@@ -32,7 +26,6 @@ class Restart:
         file: where to keep the state.
 
     Attributes:
-        waits: it is not known yet with which block to begin.
         keep_at: blocks after which the state is kept next.
 
     Raises:
@@ -49,24 +42,11 @@ class Restart:
         self.keep_at = 0
         # The newest states: after how many blocks, the state, and events that were asked for since.
         self._states: deque[tuple[int, bytes, list[tuple[str, int]]]] = deque()
-        self.waits = True
-        self._early: deque[tuple[BlockQueue, bytes]] = deque(
-            maxlen=_EARLY * signal_depth(role.node.table) * max(1, len(role.inputs.queues))
-        )
 
-    def put_off(self, queue: BlockQueue, data: bytes) -> None:
-        """Keep a block that has come before it is known where to begin."""
-        self._early.append((queue, data))
-
-    def begin(self, take_in: Callable[[BlockQueue, bytes], None], *, joins: bool) -> None:
-        """Begin, or go on from another process's state, and take in the blocks that have come."""
+    def begin(self, *, joins: bool) -> None:
+        """Begin, or go on from the state of another process."""
         if joins:
             self._resume()
-        self.waits = False
-        self._role.members_changed()
-        while self._early:
-            queue, data = self._early.popleft()
-            self._node.guarded(partial(take_in, queue))(data)
         self.keep()
 
     def keep(self) -> None:

@@ -16,7 +16,7 @@ from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
-from lathe_rc.nodes.cell_node import CellNode
+from lathe_rc.nodes.cell_node import CellNode, from_ros
 from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.stage_role import StageRole
 from lathe_rc.protocol import Announcement, Pace, Progress, Reactions, TimeMasterProtocol, actions
@@ -82,8 +82,7 @@ class SpindleRole(StageRole):
         node.exchange.master = node.guarded(self._reported.append)
 
     def _on_progress(self, message: ProgressMessage) -> None:
-        progress = Progress(message.run_id, message.name, message.blocks, message.samples)
-        self.leads.hear_progress(progress, time.monotonic())
+        self.leads.hear_progress(from_ros(message, Progress), time.monotonic())
 
     def statistics(self) -> dict[str, object]:
         """See `Role`."""

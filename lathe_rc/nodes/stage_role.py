@@ -75,7 +75,7 @@ class StageRole:
 
     def protocol(self, own: Announcement) -> MemberProtocol:
         """See `Role`."""
-        return MemberProtocol(own, self.node.table.window, masters=MASTERS, needs_phase=self.restart is not None)
+        return MemberProtocol(own, self.node.table.window, masters=MASTERS)
 
     def member_names(self) -> list[str]:
         """See `Role`."""
@@ -99,29 +99,14 @@ class StageRole:
         self.outputs.activate()
         for topic, queue in self.inputs.queues.items():
             queue.inside = self.node.exchange.has(topic)
-            self.node.listen(topic, queue.type, partial(self._take_in, queue), queue.take)
+            self.node.listen(topic, queue.type, queue.add, queue.take)
         self.inputs.share()
         self.node.exchange.stages.append(self)
         self.node.create_service(Schedule, "~/schedule", self._on_schedule)
 
-    def _take_in(self, queue: BlockQueue, data: bytes) -> None:
-        if self._waits and self.restart is not None:
-            self.restart.put_off(queue, data)
-        else:
-            queue.add(data)
-
-    @property
-    def _waits(self) -> bool:
-        return self.restart is not None and self.restart.waits
-
     def members_changed(self) -> None:
         """Learn whose blocks to accept, before the first of them."""
         protocol = self.node.protocol
-        members = protocol.members.values()
-        if self.restart is not None and any(m.stage in MASTERS and not m.members for m in members):
-            self.restart.waits = False  # alone with a spindle, it joins where it can
-        if self._waits:
-            return
         peers = protocol.master.members if protocol.master else tuple(protocol.members)
         for name in peers:
             member = protocol.members.get(name)
@@ -148,8 +133,7 @@ class StageRole:
             LatheError: the cell is running, and there is nothing to go on from.
         """
         if self.restart is not None:
-            self.restart.begin(self._take_in, joins=joins)
-            self.node.due = True
+            self.restart.begin(joins=joins)
         elif joins:
             raise LatheError(
                 f"{self.node.full_name}: the cell is running already, and this node cannot go on in mid-run"
@@ -226,7 +210,7 @@ class StageRole:
 
     def _on_schedule(self, request: Any, response: Any) -> Any:
         node, index = self.node, max(self.samples, int(request.not_before))
-        if self._waits or node.protocol.failure:
+        if (self.restart is not None and not node.protocol.ready) or node.protocol.failure:
             response.message = str(node.protocol.failure or f"{node.full_name} is not ready yet; ask again")
             return response
         try:
@@ -245,13 +229,12 @@ class StageRole:
     def computes(self) -> bool:
         """Whether it takes part in a cell that runs."""
         protocol = self.node.protocol
-        leads = protocol.active and protocol.master is not None
-        return leads and not (protocol.failure or protocol.over or self._waits)
+        return protocol.active and protocol.ready and not (protocol.failure or protocol.over)
 
     def work(self) -> None:
         """See `Role`: compute every block whose inputs are there."""
-        if self._waits:
-            return
+        if self.node.protocol.master is not None and not self.node.protocol.ready:
+            return  # blocks may wait there for a latecomer
         if not self.started and any(queue.blocks for queue in self.inputs.forward):
             self.node.exchange.form(self, None)
         if self.chain is not None:

@@ -7,7 +7,9 @@ from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
+from functools import lru_cache
 from itertools import chain, repeat
+from typing import Any
 
 from lathe_rc import messages
 from lathe_rc.errors import InputError, LatheError
@@ -31,7 +33,6 @@ class MemberProtocol:
         own: first announcement of this member, with all of its topics that are known already.
         window: blocks that may be in flight; 0: nothing holds the time master back.
         masters: kinds of node that may be time masters.
-        needs_phase: it may join in mid-run, so it must know whether the cell is running before it is ready.
         wired: all publishers and subscriptions are there once it is active; else from `describe` on.
 
     Attributes:
@@ -59,14 +60,15 @@ class MemberProtocol:
         window: int,
         *,
         masters: Collection[str] = (),
-        needs_phase: bool = False,
         wired: bool = True,
     ) -> None:
         self.own, self.window = own, window
-        self._masters, self._needs_phase, self._wired = masters, needs_phase, wired
+        self._masters, self._wired = masters, wired
         self.actions: deque[Action] = deque()
         self.members: dict[str, Announcement] = {}
         self.master: Announcement | None = None
+        self._former_peers: tuple[str, ...] = ()
+        self._newest_state: CellState | None = None  # of a time master that has not been heard yet
         self.phase: Phase | None = None
         self.active = self.ready = self.safe = self.over = self.done = False
         self.failure: LatheError | None = None
@@ -137,11 +139,16 @@ class MemberProtocol:
 
     def announce(self) -> None:
         """Publish name, topics and state."""
-        self.own = replace(self.own, state=self._state(), message=str(self.failure or ""))
+        session = self.own.session if self.own.members else self._session
+        self.own = replace(self.own, state=self._state(), message=str(self.failure or ""), session=session)
         self.members[self.own.name] = self.own
         if self.own.members:
             self.master = self.own
         self.actions.append(do.Announce(self.own))
+
+    @property
+    def _session(self) -> int:
+        return self.master.session if self.master else 0
 
     def _state(self) -> MemberState:
         if self.failure:
@@ -166,7 +173,7 @@ class MemberProtocol:
             return
         self.members[member.name] = member
         if member.members:
-            self.master = member
+            self._hear_master(member, now)
         self.actions.append(do.Follow(member))
         peers = self.master.members if self.master else ()
         if len(self.members) > _MOST_MEMBERS:
@@ -176,8 +183,23 @@ class MemberProtocol:
         self.actions.append(do.MembersChanged())
         self.members_changed(now)
 
+    def _hear_master(self, master: Announcement, now: float) -> None:
+        """A time master has announced itself: the one of this cell, or its newest process."""
+        if self.master is not None and (master.name, master.session) != (self.master.name, self.master.session):
+            self._forget_master()
+        self.master = master
+        if (state := self._newest_state) is not None:
+            self._newest_state = None
+            self.hear_cell_state(state, now)
+
+    def _forget_master(self) -> None:
+        """Wait for another time master, before the run."""
+        self.master = self.phase = None
+        self.ready = self._beginning = False
+        self.announce()
+
     def _is_peer(self, name: str) -> bool:
-        peers = self.master.members if self.master else ()
+        peers = self.master.members if self.master else self._former_peers
         return name in peers and name != self.own.name and name not in self.without
 
     def _check(self, member: Announcement) -> None:
@@ -187,8 +209,8 @@ class MemberProtocol:
             why = f"expected run {self.own.run_id!r}"
         elif member.members and member.stage not in self._masters:
             why = f"a time master is a {' or '.join(self._masters)}"
-        elif member.members and self.master is not None and member.name != self.master.name:
-            why = f"the time master is {self.master.name}"
+        elif member.members and not self._may_lead(member):
+            why = f"the time master is {self.master.name if self.master else ''}"
         elif not len(member.publishes) == len(member.types) == len(member.sparse):
             why = "its topics, their types and what is sparse are lists of different lengths"
         elif unknown := set(member.types) - messages.signal_types():
@@ -197,11 +219,18 @@ class MemberProtocol:
             why = f"{known.name} is process {known.pid}, which has not ended"
         else:
             try:
-                why = "" if isinstance(json.loads(member.parameters), dict) else "its parameters are no map"
+                why = "" if isinstance(_parsed(member.parameters), dict) else "its parameters are no map"
             except (ValueError, RecursionError):
                 why = "its parameters are no JSON"
         if why:
             raise ForeignMessage("members", member.name, member.run_id, why)
+
+    def _may_lead(self, other: Announcement) -> bool:
+        """Whether a time master may take the place of the one so far: before the run, if it alone names this member."""
+        if self.master is None or other.name == self.master.name:
+            return True
+        names_this = self.own.name in other.members and self.own.name not in self.master.members
+        return names_this and self.phase in (None, Phase.WAITING)
 
     def _lives(self, member: Announcement) -> bool:
         """Whether a process of this machine is known to live; of other machines nothing is known."""
@@ -241,7 +270,7 @@ class MemberProtocol:
 
     def parameter(self, name: str, key: str) -> object:
         """A parameter that a member has announced; None if it has no such."""
-        return json.loads(self.members[name].parameters).get(key)
+        return _parsed(self.members[name].parameters).get(key)
 
     def restarts(self, name: str) -> bool:
         """Whether another process may take the place of a member."""
@@ -255,11 +284,16 @@ class MemberProtocol:
         return self.master is not None and all(name in self.members for name in self.master.members)
 
     @property
+    def alone(self) -> bool:
+        """Whether a time master is there that names no members."""
+        return any(member.stage in self._masters and not member.members for member in self.members.values())
+
+    @property
     def wants_match(self) -> bool:
         """Whether the node shall look at ROS's graph and call `matched`: nothing else is missing until it is ready."""
         if not self.active or self.ready or self._beginning or self.failure or not self.complete:
             return False
-        if self._needs_phase and self.phase is None:
+        if self.phase is None:  # the cell may be running already
             return False
         assert self.master is not None, "the cell is complete"
         return all(self.members[name].state != MemberState.JOINING for name in self.master.members)
@@ -285,7 +319,7 @@ class MemberProtocol:
         self.unmatched = unmatched
         if not unmatched and self.wants_match:
             self._beginning = True
-            self.actions.append(do.Begin(joins=self.phase not in (None, Phase.WAITING)))
+            self.actions.append(do.Begin(joins=self.phase != Phase.WAITING))
 
     def begun(self, now: float) -> None:
         """The node is prepared for block 0."""
@@ -301,9 +335,8 @@ class MemberProtocol:
         if not self.active:
             return ["its own activation"]
         if self.master is None:
-            alone = any(member.stage in self._masters for member in self.members.values())
             lonely = [f"a publisher of {topic}" for topic in self.unmatched]
-            return [*([] if alone or not lonely else ["a time master"]), *lonely]
+            return [*([] if self.alone or not lonely else ["a time master"]), *lonely]
         others = [name for name in self.master.members if name != self.own.name]
         states = {name: self.members[name].state if name in self.members else None for name in others}
         unheard = [name + self._near(name) for name, state in states.items() if state is None]
@@ -328,7 +361,7 @@ class MemberProtocol:
         # At the same blocks in every member: the time master waits for the slowest.
         if last or blocks // self.progress_step > self._reported_blocks // self.progress_step:
             self._reported_blocks = blocks
-            self.actions.append(do.Tell(Progress(self.own.run_id, self.own.name, blocks, samples)))
+            self.actions.append(do.Tell(Progress(self.own.run_id, self.own.name, blocks, samples, self._session)))
 
     def resumed(self, blocks: int) -> None:
         """The node goes on in the place of another process, after so many blocks."""
@@ -345,6 +378,11 @@ class MemberProtocol:
         if state.run_id != self.own.run_id:
             if self.own.run_id:
                 raise ForeignMessage("cell_state", "", state.run_id, f"expected run {self.own.run_id!r}")
+            return
+        if self.master is None:
+            self._newest_state = state
+        elif state.session and state.session != self.master.session:
+            self._newest_state = state  # of a process that has not announced itself yet, or of a stranger
             return
         self.phase = Phase(state.state)
         if self.failure:
@@ -408,10 +446,22 @@ class MemberProtocol:
             self.done = self.done or ended or silent > 2.0 * GIVEN_UP
         elif (ended or silent > GIVEN_UP) and self.over:
             self.leave()
+        elif ended and self.phase in (None, Phase.WAITING):
+            self._wait_for_another_master(self.master)
         elif ended:
             self.fail(LatheError(f"{name}, the time master, is lost: no sample follows"), cause="abandoned")
         elif silent > GIVEN_UP:
             self.fail(LatheError(given_up(name)), cause="masterless")
+
+    def _wait_for_another_master(self, master: Announcement) -> None:
+        """The time master has ended before the run, as far as this member knows; others may know better."""
+        failed = [each for each in self._peers() if each.state == MemberState.FAILED]
+        self._former_peers = master.members
+        if failed:
+            self.abandon(failed[0])
+        else:
+            self._log("warning", f"{master.name}, the time master, has ended before the run; waiting for another")
+            self._forget_master()
 
     def _name_a_silent_master(self, name: str, now: float) -> None:
         """Say once that it stalls: it cannot say so itself."""
@@ -484,6 +534,12 @@ class MemberProtocol:
 
     def _report(self, event: str, **values: object) -> None:
         self.actions.append(do.Report(event, values))
+
+
+@lru_cache(maxsize=_MOST_MEMBERS)
+def _parsed(parameters: str) -> Any:
+    """Announced parameters: each member repeats the same ones, and the time master asks for them again and again."""
+    return json.loads(parameters)
 
 
 def why_failed(member: Announcement) -> str:

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The three messages of the protocol, with the fields of the ROS messages of the same names."""
+"""The three messages of the protocol, with the fields of the ROS messages of the same names.
+
+A ``session`` tells two starts of one scenario apart, whose run ids are equal: the time master draws it, members take it
+over from its announcement, and 0, of a third-party node, stands for any.
+"""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -46,6 +50,7 @@ class Announcement:
     message: str = ""
     host: str = ""
     pid: int = 0
+    session: int = 0
 
     @property
     def process(self) -> tuple[str, int]:
@@ -63,6 +68,7 @@ class CellState:
     message: str = ""
     end_index: int = 0
     lost: tuple[str, ...] = ()
+    session: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +79,7 @@ class Progress:
     name: str
     blocks: int
     samples: int
+    session: int = 0
 
 
 class ForeignMessage(LatheError):  # noqa: N818 - the message, not what went wrong

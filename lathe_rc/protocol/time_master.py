@@ -113,9 +113,14 @@ class TimeMasterProtocol(MemberProtocol):
             self.actions.append(do.Release())
         if self.running or self._checking or not self.own.members or not self.active or self.failure:
             return
-        if all(name in self.members and self.members[name].state == MemberState.READY for name in self.own.members):
+        if all(name in self.members and self._is_ready(self.members[name]) for name in self.own.members):
             self._checking = True
             self.actions.append(do.CheckCell())
+
+    def _is_ready(self, member: Announcement) -> bool:
+        """Whether a member is ready for this start of the cell, and not for another one with the same run id."""
+        here = member.session in (0, self.own.session) and member.name not in self.ended
+        return here and member.state == MemberState.READY
 
     def start(self, now: float) -> None:
         """The cell has passed its check: the run begins."""
@@ -130,7 +135,7 @@ class TimeMasterProtocol(MemberProtocol):
     def _say(self, phase: Phase, first: int, why: str = "") -> None:
         end, lost = (self.end or 0, tuple(sorted(self.without))) if self._declared else (0, ())
         self.phase = phase
-        self.actions.append(do.Say(CellState(self.own.run_id, phase, first, why[:1024], end, lost)))
+        self.actions.append(do.Say(CellState(self.own.run_id, phase, first, why[:1024], end, lost, self.own.session)))
 
     def hear_cell_state(self, state: CellState, now: float) -> None:
         """The time master itself says how the run goes; another one is a stranger.
@@ -138,7 +143,7 @@ class TimeMasterProtocol(MemberProtocol):
         Raises:
             ForeignMessage: it is not what this one has said.
         """
-        if state.run_id != self.own.run_id:
+        if (state.run_id, state.session) != (self.own.run_id, self.own.session):
             raise ForeignMessage("cell_state", "", state.run_id, f"this node, {self.own.name}, is the time master")
 
     # ---- progress -----------------------------------------------------------------------------------
@@ -164,6 +169,8 @@ class TimeMasterProtocol(MemberProtocol):
         name = progress.name
         if not self.running:
             raise ForeignMessage("progress", name, progress.run_id, "the run has not begun, or it is over")
+        if progress.session not in (0, self.own.session):
+            raise ForeignMessage("progress", name, progress.run_id, f"expected session {self.own.session}")
         if name not in self.completed:
             return
         if progress.blocks <= self.completed[name]:

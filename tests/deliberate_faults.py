@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Deliberate faults of the protocol, each of which the simulation has to find: it proves that the schedules can fail.
+
+A fault replaces a piece of a module's source while it is imported: python deliberate_faults.py NUMBER [SCHEDULES]
+plays schedules with one fault until a promise is broken, and prints the seed.
+"""
+
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+MOST = 20_000  # schedules within which each fault is found
+PROTOCOL = Path(__file__).parents[1] / "lathe_rc" / "protocol"
+
+
+class Fault(NamedTuple):
+    """A piece of a module of the protocol, another one in its place, and the mistake that this is."""
+
+    module: str
+    piece: str
+    instead: str
+    mistake: str
+
+
+FAULTS = (
+    Fault(
+        "member",
+        "        self.ready, self._beginning = True, False\n        self.announce()\n",
+        "        self.ready, self._beginning = True, False\n",
+        "a member is ready and does not say so",
+    ),
+    Fault(
+        "member",
+        "        elif self.phase == Phase.ENDED and self.over and not self.done:\n            self.leave()\n",
+        "",
+        "the end of the cell is not heard",
+    ),
+    Fault(
+        "member",
+        "        self.safe = True\n        self.announce()\n",
+        "        self.safe = True\n",
+        "a member is safe and does not say so",
+    ),
+    Fault(
+        "member",
+        "            self.actions.append(do.Lose(self.without, state.first_index, state.end_index, self.safe))\n",
+        "            pass\n",
+        "a safe state is announced, and lost members are waited for",
+    ),
+    Fault(
+        "member",
+        "        if self.own.name in state.lost or not self.ready:\n",
+        "        if not self.ready:\n",
+        "a member that the cell has lost goes on",
+    ),
+    Fault(
+        "member",
+        "        ended = name in self.ended\n",
+        "        ended = False\n",
+        "the death of the time master is overlooked",
+    ),
+    Fault(
+        "member",
+        "        elif self.phase == Phase.FAILED:\n",
+        "        elif False:\n",
+        "the failure of the cell is not heard",
+    ),
+    Fault(
+        "member",
+        "        if self._started:\n            self.announce()\n        self._leave_with_the_cell()\n",
+        "        self._leave_with_the_cell()\n",
+        "a member fails and does not say so",
+    ),
+    Fault(
+        "member", "        if last or blocks // self", "        if blocks // self", "the last blocks are not reported"
+    ),
+    Fault(
+        "member",
+        "        if member.name == self.own.name:\n            self._meet_namesake(member)\n            return\n",
+        "",
+        "a namesake is taken for this member",
+    ),
+    Fault(
+        "member",
+        "        elif known and known.process != member.process and self._lives(known):\n",
+        "        elif False:\n",
+        "a namesake is taken for the member that has not ended",
+    ),
+    Fault(
+        "member",
+        "        return names_this and self.phase in (None, Phase.WAITING)\n",
+        "        return True\n",
+        "a second time master takes the place of the first",
+    ),
+    Fault(
+        "member",
+        "        return all(self.members[name].state != MemberState.JOINING for name in self.master.members)\n",
+        "        return True\n",
+        "members whose topics are not known yet are not waited for",
+    ),
+    Fault(
+        "member",
+        "        if self.phase is None:  # the cell may be running already\n            return False\n",
+        "",
+        "a latecomer does not wait for the state of the cell",
+    ),
+    Fault(
+        "member",
+        '            self.fail(LatheError(f"{self.own.name} was shut down in the middle of a run"))\n',
+        "            self._leave_due = now\n",
+        "a shutdown in the middle of a run is not told",
+    ),
+    Fault(
+        "member",
+        "        elif state.session and state.session != self.master.session:\n",
+        "        elif False:\n",
+        "the state of another start of the cell is taken for this one's",
+    ),
+    Fault(
+        "time_master",
+        "        return min(self.completed.values(), default=self.blocks)\n",
+        "        return max(self.completed.values(), default=self.blocks)\n",
+        "the fastest member gives credit",
+    ),
+    Fault(
+        "time_master",
+        "        return self.window - (self.blocks - self.least)\n",
+        "        return self.window + 1 - (self.blocks - self.least)\n",
+        "the window is off by one",
+    ),
+    Fault(
+        "time_master",
+        "        self.completed[name] = progress.blocks\n",
+        "        self.completed[name] += 1\n",
+        "messages are counted, not the blocks that they report",
+    ),
+    Fault(
+        "time_master",
+        "        if progress.blocks > self.blocks:\n",
+        "        if False:\n",
+        "a member may claim blocks that were never sent",
+    ),
+    Fault(
+        "time_master",
+        "            self.unsafe = frozenset(self.completed)\n",
+        "            pass\n",
+        "blocks go out before all know of the safe state",
+    ),
+    Fault("time_master", "        self.unsafe -= members.keys()\n", "", "the word of a dead member is waited for"),
+    Fault(
+        "time_master",
+        "self._reactions.restart_time if restarts else 0.0",
+        "0.0",
+        "a member that can be restarted is not waited for",
+    ),
+    Fault(
+        "time_master",
+        "        if any(now >= until for until in self._dead.values()):\n",
+        "        if False:\n",
+        "the deadline of a restart is forgotten",
+    ),
+    Fault(
+        "time_master",
+        "        for name in [each for each in self._dead if self._is_back(each)]:\n            del self._dead[name]\n",
+        "        for name in [each for each in self._dead if self._is_back(each)]:\n",
+        "a member that is back counts as dead",
+    ),
+    Fault(
+        "time_master",
+        "            del self.completed[name]\n            self._dead.pop(name, None)\n",
+        "            self._dead.pop(name, None)\n",
+        "the blocks of a lost member are waited for",
+    ),
+    Fault(
+        "time_master",
+        "            self._set_end(self.samples + self._reactions.safe_samples)\n",
+        "            pass\n",
+        "a safe state has no end of its own",
+    ),
+    Fault(
+        "time_master",
+        "        if first and self._started:\n            self._say(Phase.FAILED, self.samples, str(error))\n",
+        "",
+        "the time master fails and does not say so",
+    ),
+    Fault(
+        "time_master", "        self._say(Phase.ENDED, self.samples, self._why)\n", "", "the end of the run is not told"
+    ),
+    Fault(
+        "time_master",
+        'self._lose(dict.fromkeys(self._dead, "died") | {name: why}, now)',
+        "self._lose({next(iter(self.completed)): why}, now)",
+        "the wrong member is named",
+    ),
+    Fault(
+        "time_master",
+        '        if not self.running:\n            raise ForeignMessage("progress", name, progress.run_id,',
+        '        if False:\n            raise ForeignMessage("progress", name, progress.run_id,',
+        "progress before the run is taken for this run's",
+    ),
+    Fault(
+        "time_master",
+        "        here = member.session in (0, self.own.session) and member.name not in self.ended\n",
+        "        here = True\n",
+        "a member that is ready for another start of the cell is taken for ready",
+    ),
+    Fault(
+        "block_order",
+        "        if self.repeats and first + samples <= self.end:\n            return None\n",
+        "",
+        "repeats after a restart are refused",
+    ),
+    Fault(
+        "block_order",
+        "        if missing < 0 or (missing and (self._longest_gap is None or not self.received)):\n",
+        "        if missing < 0:\n",
+        "a gap is taken",
+    ),
+    Fault(
+        "block_order",
+        "        if self.held_from is not None:\n            return None\n",
+        "",
+        "late blocks of a lost member are taken after those that stand for them",
+    ),
+)
+
+
+class _Faulty(importlib.abc.MetaPathFinder):
+    """Imports one module of the protocol with a fault."""
+
+    def __init__(self, fault: Fault) -> None:
+        self._fault = fault
+
+    def find_spec(self, name: str, path: object, target: object = None) -> importlib.machinery.ModuleSpec | None:
+        if name != f"lathe_rc.protocol.{self._fault.module}":
+            return None
+        file = PROTOCOL / f"{self._fault.module}.py"
+
+        class Loader(importlib.machinery.SourceFileLoader):
+            def get_code(self, fullname: str) -> object:  # type: ignore[override] - never from a cache
+                return compile(faulty(FAULT), str(file), "exec")
+
+        FAULT = self._fault  # noqa: N806
+        return importlib.util.spec_from_file_location(name, file, loader=Loader(name, str(file)))
+
+
+def faulty(fault: Fault) -> str:
+    """The source of a module with a fault."""
+    source = (PROTOCOL / f"{fault.module}.py").read_text(encoding="utf-8")
+    assert source.count(fault.piece) == 1, f"{fault.mistake}: its piece stands {source.count(fault.piece)} times"
+    return source.replace(fault.piece, fault.instead)
+
+
+def find(fault: Fault, most: int) -> int | None:
+    """The first schedule that finds a fault, in this fresh interpreter; None: none does."""
+    sys.meta_path.insert(0, _Faulty(fault))
+    from simulation import play
+
+    for seed in range(most):
+        try:
+            broken = play(seed)[1]
+        except Exception as error:  # noqa: BLE001 - that is found as well
+            broken = [repr(error)]
+        if broken:
+            print(f"schedule {seed}: {broken[0]}")
+            return seed
+    return None
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parent))
+    sys.exit(find(FAULTS[int(sys.argv[1])], int(sys.argv[2]) if sys.argv[2:] else MOST) is None)
