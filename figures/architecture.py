@@ -22,7 +22,10 @@ LAYERS = (
     Layer("Python", {"harness": "runs a scenario, scores it"}),
     Layer("hosts", {"nodes": "ROS 2 nodes, processes, DDS", "sweep": "variations, tuning, on all cores"}),
     Layer("to look at", {"view": "report, figures, Rerun, notebooks"}),
-    Layer("recordings", {"bag": "MCAP: record, read, check, recover, simulate again"}),
+    Layer(
+        "beside the cell",
+        {"bag": "MCAP: record, read, check, recover, simulate again", "protocol": "joining, progress, deaths, the end"},
+    ),
     Layer("the cell", {"cell": "stages, blocks, scenario, checks, offline run"}),
     Layer(
         "around it",

@@ -446,7 +446,7 @@ class MemberProtocol:
             self.done = self.done or ended or silent > 2.0 * GIVEN_UP
         elif (ended or silent > GIVEN_UP) and self.over:
             self.leave()
-        elif ended and self.phase in (None, Phase.WAITING):
+        elif ended and self.phase in (None, Phase.WAITING) and not self._moved:
             self._wait_for_another_master(self.master)
         elif ended:
             self.fail(LatheError(f"{name}, the time master, is lost: no sample follows"), cause="abandoned")
