@@ -492,7 +492,7 @@ class Simulation:
         self.processes: dict[str, Process] = {}
         self.gone: list[Process] = []  # that have ended in order
         self.dead: list[Process] = []  # that were killed
-        self.killed: dict[str, float] = {}  # process that has ended otherwise, and when
+        self.killed: dict[str, float] = {}  # members that have left otherwise, and when
         self.since: dict[str, float] = {}  # when a process was stopped
         self.files: dict[str, deque[Any]] = {}
         self.reports: list[tuple[float, str, str, Any]] = []
@@ -749,6 +749,7 @@ class Schedule:
 
     def _clean_up(self, design: Design, seconds: float, other: Design) -> None:
         if (process := self._process(design)) and not process.protocol.takes_part and not self._running():
+            self.cell.killed[design.name] = self.cell.now  # the run may begin before the others hear of it
             process.protocol.clean_up()
             process._perform_all()
             self.cell.network.forget(process.identity)
