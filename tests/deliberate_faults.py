@@ -28,21 +28,21 @@ class Fault(NamedTuple):
 FAULTS = (
     Fault(
         "member",
-        "        self.ready, self._beginning = True, False\n        self.announce()\n",
-        "        self.ready, self._beginning = True, False\n",
+        "        if self.ready:\n            return MemberState.READY\n",
+        "",
         "a member is ready and does not say so",
     ),
     Fault(
         "member",
-        "        elif self.phase == Phase.ENDED and self.over and not self.done:\n            self.leave()\n",
+        "        if self.safe:\n            return MemberState.SAFE\n",
         "",
-        "the end of the cell is not heard",
+        "a member is safe and does not say so",
     ),
     Fault(
         "member",
-        "        self.safe = True\n        self.announce()\n",
-        "        self.safe = True\n",
-        "a member is safe and does not say so",
+        "        if self.master is None or self.master.name == self.own.name:\n            self.leave(self.patience)\n",
+        "        self.leave()\n",
+        "a member leaves before others have its last blocks",
     ),
     Fault(
         "member",
