@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 from random import Random
 
 import zstandard
+from bags import record
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
-from mcap_damage import HEAD, records_of
+from mcap_damage import HEAD, flipped, records_of
 
 from lathe_rc.bag.reading.unpacking import read_chunk
 
@@ -37,8 +38,7 @@ def some_bytes(data: bytes, random: Random) -> bytes:  # noqa: PLR0911
     length = random.choice((1, 2, 4, 8, 16, 100, 5000))
     kind = random.randrange(8)
     if kind == 0 and data:
-        place = min(place, len(data) - 1)
-        return data[:place] + bytes([data[place] ^ 1 << random.randrange(8)]) + data[place + 1 :]
+        return flipped(data, min(place, len(data) - 1), 1 << random.randrange(8))
     if kind <= 2:
         width = random.choice((1, 2, 4, 8))
         number = (random.choice(NUMBERS) % 2 ** (8 * width)).to_bytes(width, "little")
@@ -85,7 +85,7 @@ class _Record:
 
     def whole(self) -> bytes:
         """As it stands in a file."""
-        return struct.pack("<BQ", self.opcode, len(self.content)) + self.content
+        return record(self.opcode, self.content)
 
 
 def _records(data: bytes, start: int = 0, end: int | None = None) -> list[_Record]:

@@ -18,10 +18,10 @@ from random import Random
 import cells
 import fuzz_mutate as mutate
 import numpy as np
+from bags import MODES, QOS, strange_bag
 from click.testing import CliRunner
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
-from rosbags.rosbag2 import Writer as RosbagWriter
-from rosbags.typesys import Stores, get_typestore
+from rosbags.interfaces import Nodetype
+from rosbags.rosbag2 import CompressionMode
 
 from lathe_papers.formulas import step_fit
 from lathe_rc import files, harness, messages
@@ -30,7 +30,7 @@ from lathe_rc.bag import check, provenance, reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.repairing import recover
 from lathe_rc.bag.resimulation import resim
-from lathe_rc.bag.writing.writer import BagWriter, offered_qos
+from lathe_rc.bag.writing.writer import BagWriter
 from lathe_rc.cell import scenario, state_file
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import TABLES, Scenario
@@ -50,7 +50,6 @@ CUT = b"\n-- cut --\n"  #: between the files of an input that stands for several
 CONFIG = Path(__file__).parents[1] / "config"
 _POINTS, _GRID = 64, 32
 _LONGEST_LINE = 20_000  # characters of a refusal
-_QOS = offered_qos(10, "volatile")
 
 
 class NotOneLineError(AssertionError):
@@ -228,7 +227,7 @@ def make_bag(path: Path, text: str = "plain", *, compression: str = "none", bloc
     }
     host = f"/{name}/diagnostics"
     for topic, kind in {**made, **{topic: given[0] for topic, given in sparse.items()}, host: DIAGNOSTICS}.items():
-        writer.add_topic(topic, kind, _QOS)
+        writer.add_topic(topic, kind, QOS)
     encoders = {topic: Encoder(kind, text, text, 15_625) for topic, kind in made.items()}
     angle = np.arange(64 * blocks) * (6.0 * np.pi / (64 * blocks))
     for number in range(blocks):
@@ -253,8 +252,6 @@ def make_bag(path: Path, text: str = "plain", *, compression: str = "none", bloc
 
 def _message(kind: str, index: int, values: Mapping[str, Value]) -> bytes:
     """A sparse message with the given values, the others 0."""
-    from rosbags.interfaces import Nodetype
-
     fields = {}
     for name, (node, detail) in messages.store().fielddefs[kind][1]:
         zero = "" if node == Nodetype.BASE and detail[0] == "string" else 0  # type: ignore[index]
@@ -262,20 +259,6 @@ def _message(kind: str, index: int, values: Mapping[str, Value]) -> bytes:
     if "sample_index" in fields:
         fields["sample_index"] = index
     return messages.encode(kind, messages.store().types[kind](**fields))
-
-
-def _strange(path: Path, plugin: StoragePlugin, mode: CompressionMode) -> None:
-    """A bag that somebody else's tool might have made."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    kind = "geometry_msgs/msg/Point"
-    writer = RosbagWriter(path, version=9, storage_plugin=plugin)
-    if mode != CompressionMode.NONE:
-        writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        topic = writer.add_connection("/where", kind, typestore=store, offered_qos_profiles=[_QOS])
-        for number in range(20):
-            data = store.serialize_cdr(store.types[kind](number, 0.5, -number), kind)
-            writer.write(topic, 10**9 + number * 1000, data)
 
 
 def _read_bag(path: Path) -> None:
@@ -300,7 +283,7 @@ def _mcaps() -> list[bytes]:
         for compression in ("none", "zstd"):
             make_bag(folder / compression, compression=compression)
         for mode in (CompressionMode.NONE, CompressionMode.STORAGE):
-            _strange(folder / mode.name, StoragePlugin.MCAP, mode)
+            strange_bag(folder / mode.name, mode=mode, count=20)
         return [path.read_bytes() for path in sorted(folder.glob("*/*.mcap"))]
 
 
@@ -324,12 +307,10 @@ def _folders(data: bytes) -> None:
 @functools.cache
 def _folder_seeds() -> list[bytes]:
     found = []
-    for plugin in StoragePlugin:
-        for mode in CompressionMode:
-            if plugin == StoragePlugin.MCAP or mode != CompressionMode.STORAGE:
-                with _folder() as folder:
-                    _strange(folder / "bag", plugin, mode)
-                    found.append(_joined(folder / "bag"))
+    for plugin, mode in MODES:
+        with _folder() as folder:
+            strange_bag(folder / "bag", plugin, mode, count=20)
+            found.append(_joined(folder / "bag"))
     with _folder() as folder:
         make_bag(folder / "bag")
         check.write_digests(folder / "bag", {"/plain/tool": "0" * 64})
@@ -446,8 +427,8 @@ def _pages(data: bytes) -> None:
 
 
 def _page_seeds() -> list[bytes]:
-    texts = ("word", "<script>alert(1)</script>", "\" onload='alert(1)", "</pre><img src=x onerror=y>", "{{ 7 * 7 }}")
-    return [text.encode() for text in texts] + [b"<!-- x -->", b"&lt;b&gt;", b"]]>", b"$\\frac{a}{b}$", b"a/../b c"]
+    texts = ("<script>alert(1)</script>", "\" onload='x", "</pre><img src=x onerror=y>", "{{ 7 * 7 }}{% x %}")
+    return [b"word", "".join(texts).encode(), b"<!-- x -->&lt;b&gt;]]>$\\frac{a}{b}$a/../b c"]
 
 
 def _reports(data: bytes) -> None:

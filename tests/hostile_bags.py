@@ -24,11 +24,9 @@ import fuzz_targets as fuzz
 import lz4.frame
 import yaml
 import zstandard
-from click.testing import CliRunner
+from bags import EMPTY, FIRST, SCHEMA, channel, chunk, chunk_index, lathe, mcap, mcap_writer, record, statistics
 from mcap.records import ChunkIndex, Statistics
-from mcap.writer import CompressionType, IndexType, Writer
-
-from lathe_rc.cli import main
+from mcap.writer import CompressionType, IndexType
 
 MEMORY = 2**30  #: that a command may take beyond what the process has [B]
 LONGEST = 30  #: of CPU time [s]
@@ -60,19 +58,19 @@ ODD: Sequence[Any] = (
 
 def _bomb(folder: Path, random: Random) -> Path:
     """Chunks that unpack to far more than the file, of what takes long to read, with or without an index."""
-    record = random.choice(
+    whole = random.choice(
         (
             bytes(9),  # empty records
-            struct.pack("<BQHIQQ", 5, 22, 1, 0, 10**18, 10**18),  # empty messages
-            struct.pack("<BQHIQQ", 5, 32, 1, 0, 10**18, 10**18) + STRING,
-            struct.pack("<BQHIII", 3, 14, 1, 0, 0, 0),  # schemas
-            struct.pack("<BQ", 4, 0),
+            EMPTY,
+            record(5, EMPTY[9:] + STRING),
+            record(3, struct.pack("<HIII", 1, 0, 0, 0)),  # schemas
+            record(4, b""),
         )
     )
     size, count = random.choice((2**16, 2**20, 2**24, 2**26)), random.choice((1, 3, 40))
-    if record[0] == 5:  # sound messages: to copy some millions of them takes its time, as that of any bag
+    if whole[0] == 5:  # sound messages: to copy some millions of them takes its time, as that of any bag
         size, count = min(size, 2**24), min(count, 3)
-    whole = record * (size // len(record))
+    whole *= size // len(whole)
     declared = random.choice((len(whole), len(whole), 2**28, 2**27, 2**62, 1))
     name, packed = random.choice(
         (
@@ -82,34 +80,13 @@ def _bomb(folder: Path, random: Random) -> Path:
             (b"lz4", lz4.frame.compress(b"") * 10**5),
         )
     )
-    head = struct.pack("<QQQII", 10**18, 10**18, declared, 0, len(name)) + name
-    chunks = [(6, head + struct.pack("<Q", len(packed)) + packed)] * count
-    return _assemble(folder, chunks, random, (declared, len(packed)) if random.random() < 0.5 else ())
-
-
-def _assemble(folder: Path, records: Sequence[tuple[int, bytes]], random: Random, sizes: Sequence[int]) -> Path:
-    """An MCAP file, with an index if there are ``sizes`` for it."""
-    string = b"std_msgs/msg/String"
-    schema = struct.pack("<HI", 1, len(string)) + string + struct.pack("<I7sI11s", 7, b"ros2msg", 11, b"string data")
-    channel = struct.pack("<HHI2sI3sI", 1, 1, 2, b"/t", 3, b"cdr", 0)
-    data, index = b"\x89MCAP0\r\n" + _record(1, struct.pack("<I4sI", 4, b"ros2", 0)), b""
-    head = [(3, schema), (4, channel)]
-    for opcode, content in (*head, *records):
-        if opcode == 6 and sizes:
-            place = struct.pack("<QQQQIQ", 10**18, 10**18, len(data), len(content) + 9, 0, 0)
-            index += _record(8, place + struct.pack("<I4sQQ", 4, b"zstd", sizes[1], sizes[0]))
-        data += _record(opcode, content)
-    count = len(records)
-    counts = struct.pack("<HQ", 1, random.choice((5, 2**63)))
-    statistics = struct.pack("<QHIIIIQQI", 5, 1, 1, 0, 0, count, 10**18, 10**18, 10) + counts
-    summary = b"".join(_record(*each) for each in head) + index + _record(11, statistics) if sizes else b""
-    path = folder / "bag.mcap"
-    path.write_bytes(data + summary + _record(2, struct.pack("<QQI", len(data) if sizes else 0, 0, 0)) + data[:8])
-    return path
-
-
-def _record(opcode: int, content: bytes) -> bytes:
-    return struct.pack("<BQ", opcode, len(content)) + content
+    announced, one, summary = SCHEMA + channel(), chunk(compression=name, size=declared, packed=packed), b""
+    if random.random() < 0.5:
+        first = FIRST + len(announced)
+        places = range(first, first + count * len(one), len(one))
+        index = b"".join(chunk_index(place, len(one), size=declared, packed=len(packed)) for place in places)
+        summary = announced + index + statistics(count, random.choice((5, 2**63)))
+    return mcap(folder / "bag.mcap", announced + count * one, summary)
 
 
 def _written(folder: Path, random: Random) -> Path:
@@ -120,9 +97,7 @@ def _written(folder: Path, random: Random) -> Path:
     options: dict[str, Any] = {"use_chunking": random.random() < 0.7, "use_statistics": random.random() < 0.8}
     options |= {"index_types": types, "compression": compression, "chunk_size": random.choice((1, 500, 10**6))}
     options |= {"use_summary_offsets": random.random() < 0.5, "repeat_channels": random.random() < 0.8}
-    with path.open("wb") as stream:
-        writer = Writer(stream, **options)
-        writer.start(profile=random.choice(("ros2", "", "ros1", "x" * 1000)))
+    with mcap_writer(path, random.choice(("ros2", "", "ros1", "x" * 1000)), **options) as writer:
         channels: list[int] = []
         for _ in range(random.choice((0, 1, 3, 3, 3, 100, 5000))):
             encoding = random.choice(("ros2msg", "ros2msg", "ros2idl", "jsonschema", ""))
@@ -135,16 +110,13 @@ def _written(folder: Path, random: Random) -> Path:
             log_ns = random.choice((10**18 + number, 10**18 + number, 0, 2**63, 2**64 - 1, 10**18 - number * 10**9))
             data = random.choice((STRING, STRING, b"", random.randbytes(50), b"\0\1\0\0" + b"\xff" * 60))
             writer.add_message(random.choice(channels), log_ns, data, log_ns, number)
-        writer.finish()
     return path
 
 
 def _index(folder: Path, random: Random) -> Path:
     """One number of the index or the statistics that is another."""
     path = folder / "bag.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=200, enable_crcs=False)
-        writer.start(profile="ros2")
+    with mcap_writer(path, chunk_size=200, enable_crcs=False) as writer:
         schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
         channels = [writer.register_channel(name, "cdr", schema) for name in ("/a", "/b")]
         for number in range(40):
@@ -157,7 +129,6 @@ def _index(folder: Path, random: Random) -> Path:
             small = isinstance(target, Statistics) and name.endswith("_count") and name != "message_count"
             most = 2 ** (16 if name == "schema_count" else 32 if small else 64) - 2  # the writer adds one to some
             setattr(target, name, min(random.choice((*mutate.NUMBERS, getattr(target, name) + 1)), most))
-        writer.finish()
     return path
 
 
@@ -333,7 +304,7 @@ def attack(box: Path, bag: Path, command: str) -> tuple[int, str]:
     tempfile.tempdir = str(temporary)
     try:
         with limits():
-            done = CliRunner().invoke(main, words(command, bag, out))
+            done = lathe(*words(command, bag, out))
     finally:
         os.chdir(was)
         tempfile.tempdir = before_it

@@ -8,14 +8,14 @@ from pathlib import Path
 from random import Random
 from typing import NamedTuple
 
+from bags import QOS, mcap_writer
 from mcap.opcode import Opcode
 from mcap.records import Message
 from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import Writer as McapWriter
 
 from lathe_rc import messages
 from lathe_rc.bag.repairing.salvage import Salvage
-from lathe_rc.bag.writing.writer import BagWriter, offered_qos
+from lathe_rc.bag.writing.writer import BagWriter
 
 PER_CHUNK = 40  #: messages in a chunk of a small bag
 HEAD = struct.Struct("<BQ")
@@ -69,19 +69,21 @@ def chunk_ends(data: bytes) -> list[tuple[int, int]]:
 
 def plain_file(file: Path, count: int) -> bytes:
     """A file of messages outside of chunks."""
-    with file.open("wb") as stream:
-        writer = McapWriter(stream, use_chunking=False, enable_data_crcs=True)
-        writer.start("ros2", "")
+    with mcap_writer(file, use_chunking=False, enable_data_crcs=True) as writer:
         channel = writer.register_channel("/x", "json", writer.register_schema("x", "jsonschema", b"{}"))
         for number in range(count):
             writer.add_message(channel, number, b"%020d" % number, number)
-        writer.finish()
     return file.read_bytes()
 
 
 def _hit(data: bytes, first: int, last: int) -> frozenset[int]:
     """Chunks with a byte from ``first`` to ``last``."""
     return frozenset(k for k, (begin, end) in enumerate(chunks_of(data)) if begin <= last and first < end)
+
+
+def flipped(data: bytes, place: int, bits: int = 1) -> bytes:
+    """The bytes with some bits of one of them flipped."""
+    return data[:place] + bytes([data[place] ^ bits]) + data[place + 1 :]
 
 
 def _changed(data: bytes, what: str, place: int, new: bytes) -> Damaged:
@@ -137,7 +139,7 @@ def small_bag(path: Path, compression: str = "zstd", chunks: int = 10) -> bytes:
     """The file of a bag of two topics in small chunks."""
     writer = BagWriter(path, compression=compression, chunk_size=2**20, about={"text": "of the bag"})  # type: ignore[arg-type]
     for topic in ("/a", "/b"):
-        writer.add_topic(topic, messages.EVENT, offered_qos(10, "volatile"))
+        writer.add_topic(topic, messages.EVENT, QOS)
     for number in range(PER_CHUNK * chunks):
         writer.write(("/a", "/b")[number % 2], number, bytes([number % 251]) * 50)
         if number % PER_CHUNK == PER_CHUNK - 1:

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 import yaml
 import zstandard
+from bags import MODES, bag_writer, lathe, mcap_writer, read_by_others, storage_of, strange_bag
 from cells import files_up_to, scenario
-from click.testing import CliRunner
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
-from mcap.writer import Writer as McapWriter
 from mcap_damage import (
     PER_CHUNK,
     check_damage,
     chunk_ends,
     chunks_of,
+    flipped,
     flips,
     plain_file,
     saved_of,
@@ -30,55 +30,17 @@ from mcap_damage import (
 )
 from mcap_damage import records_of as record_places
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
-from rosbags.rosbag2 import Writer as RosbagWriter
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from lathe_rc import harness, messages
 from lathe_rc.bag.check import check
 from lathe_rc.bag.reading.limits import MOST_BYTES
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.repairing.recover import recover
-from lathe_rc.bag.repairing.salvage import Salvage
-from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.cell.wire import Encoder
-from lathe_rc.cli import main
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 
-MODES = [
-    pytest.param(plugin, mode, id=f"{plugin.name}-{mode.name}".lower())
-    for plugin in (StoragePlugin.SQLITE3, StoragePlugin.MCAP)
-    for mode in (CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE, CompressionMode.STORAGE)
-    if plugin == StoragePlugin.MCAP or mode != CompressionMode.STORAGE
-]
-
-
-def lathe(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
-def strange_bag(path, plugin, mode, count=600):
-    """A bag that other people's tools might have made, of types that this package does not publish."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    point, text = store.types["geometry_msgs/msg/Point"], store.types["std_msgs/msg/String"]
-    sent = []
-    writer = RosbagWriter(path, version=9, storage_plugin=plugin)
-    if mode != CompressionMode.NONE:
-        writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        points = writer.add_connection("/where", point.__msgtype__, typestore=store)
-        texts = writer.add_connection("/said", text.__msgtype__, typestore=store)
-        for number in range(count):
-            topic, message = (points, point(number, 0.5, -number)) if number % 3 else (texts, text(f"word {number}"))
-            data = bytes(store.serialize_cdr(message, topic.msgtype))
-            writer.write(topic, 10**9 + number * 1000, data)
-            sent.append((topic.topic, 10**9 + number * 1000, data))
-    return sent
-
-
-def read_by_others(path):
-    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
-        return [(connection.topic, stamp, bytes(data)) for connection, stamp, data in bag.messages()]
+PLUGINS = pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
 
 
 @pytest.fixture(scope="module")
@@ -88,62 +50,42 @@ def turned(tmp_path_factory):
     return path
 
 
-def copied(path, folder):
-    return shutil.copytree(path, folder / "copy")
-
-
-def mcap_of(path):
-    return next(path.glob("*.mcap"))
-
-
-@pytest.mark.parametrize(("plugin", "mode"), MODES)
+@pytest.mark.parametrize(("plugin", "mode"), MODES, ids=lambda value: value.name)
 def test_bags_of_others_are_read_checked_and_recovered(tmp_path, plugin, mode):
-    sent = strange_bag(tmp_path / "strange", plugin, mode)
-    with Source(tmp_path / "strange") as source:
+    """Cut off anywhere, they give what is whole."""
+    bag = tmp_path / "strange"
+    sent = strange_bag(bag, plugin, mode)
+    with Source(bag) as source:
         assert list(source.messages()) == sent
         assert {topic: said.count for topic, said in source.topics.items()} == {"/where": 400, "/said": 200}
-    assert check(tmp_path / "strange").exit_code == 0
-    assert recover(tmp_path / "strange", tmp_path / "new").saved == len(sent)
+    assert check(bag).exit_code == 0
+    assert recover(bag, tmp_path / "new").saved == len(sent)
     assert read_by_others(tmp_path / "new") == sent
-
-
-@pytest.mark.parametrize(("plugin", "mode"), MODES)
-def test_bags_of_others_that_are_cut_off_give_what_is_whole(tmp_path, plugin, mode):
-    strange_bag(tmp_path / "strange", plugin, mode)
-    file = next(file for file in (tmp_path / "strange").iterdir() if file.suffix != ".yaml")
+    file = storage_of(bag)
     whole = file.read_bytes()
-    sent = strange_bag(tmp_path / "again", plugin, CompressionMode.NONE)
-    random = np.random.default_rng(3)
-    for number, length in enumerate(random.integers(0, len(whole), 25)):
+    for length in np.random.default_rng(3).integers(0, len(whole), 10):
         file.write_bytes(whole[:length])
-        target = tmp_path / f"new{number}"
-        recover(tmp_path / "strange", target)
-        assert set(read_by_others(target)) <= set(sent)
+        recover(bag, tmp_path / f"cut{length}")
+        assert set(read_by_others(tmp_path / f"cut{length}")) <= set(sent)
 
 
 def test_a_thousand_cuts_lose_no_more_than_the_cut_chunk(tmp_path):
-    made = scenario(spindle_encoder={"revolutions": 1.0}, recorder={"chunk_size": 4096})
-    harness.run(made, bag=tmp_path / "bag")
-    data = mcap_of(tmp_path / "bag").read_bytes()
-    ends = chunk_ends(data)
-    assert len(ends) > 20
-    place = tmp_path / "cut.mcap"
+    data = small_bag(tmp_path / "bag", chunks=20)
+    ends = [end for _, end in chunks_of(data)]
     for number, length in enumerate(np.random.default_rng(1).integers(0, len(data), 1000)):
-        place.write_bytes(data[:length])
-        expected = max((count for end, count in ends if end <= length), default=0)
-        found = Salvage(place)
-        assert sum(1 for _ in found) == expected
+        found, saved = saved_of(tmp_path / "cut.mcap", data[:length])
+        expected = PER_CHUNK * sum(end <= length for end in ends)
+        assert len(saved) == expected
         assert found.damage
-        if number % 50 == 0:
-            assert recover(place, tmp_path / f"new{number}").saved == expected
+        if number % 100 == 0:
+            assert recover(tmp_path / "cut.mcap", tmp_path / f"new{number}").saved == expected
 
 
 def test_a_broken_chunk_in_the_middle_costs_that_chunk_alone(turned, tmp_path):
-    bag = copied(turned, tmp_path)
-    data = bytearray(mcap_of(bag).read_bytes())
-    ends = chunk_ends(bytes(data))
-    data[(ends[4][0] + ends[5][0]) // 2] ^= 0x10
-    mcap_of(bag).write_bytes(data)
+    bag = shutil.copytree(turned, tmp_path / "bag")
+    data = storage_of(bag).read_bytes()
+    ends = chunk_ends(data)
+    storage_of(bag).write_bytes(flipped(data, (ends[4][0] + ends[5][0]) // 2, 0x10))
     assert lathe("bag", "check", bag).exit_code == 2
     found = lathe("bag", "recover", bag, "-o", tmp_path / "new", "--json")
     assert found.exit_code == 3
@@ -152,33 +94,21 @@ def test_a_broken_chunk_in_the_middle_costs_that_chunk_alone(turned, tmp_path):
 
 
 def test_what_is_clean_is_said_to_be_clean(turned, tmp_path):
-    found = lathe("bag", "check", turned, "--json")
-    assert found.exit_code == 0
-    told = json.loads(found.stdout)
-    assert told["digest"] == json.loads((turned / "digests.json").read_text())["digest"]
+    """And another digest than the recorded one is wrong."""
+    told = json.loads(lathe("bag", "check", turned, "--json").stdout)
+    recorded = json.loads((turned / "digests.json").read_text())
+    assert told["digest"] == recorded["digest"]
     assert told["digests_compared"] == len(told["digest"]) == 9
     again = lathe("bag", "recover", turned, "-o", tmp_path / "new")
     assert again.exit_code == 0, again.stdout
-    assert check(tmp_path / "new").digests == check(turned).digests
-
-
-def test_another_digest_than_recorded_is_wrong(turned, tmp_path):
-    bag = copied(turned, tmp_path)
-    told = json.loads((bag / "digests.json").read_text())
-    told["digest"]["/tool"] = "0" * 64
-    (bag / "digests.json").write_text(json.dumps(told))
-    found = lathe("bag", "check", bag)
-    assert found.exit_code == 1
-    assert "/tool: digest " in found.stdout
+    assert check(tmp_path / "new").digests == told["digest"]
+    recorded["digest"]["/tool"] = "0" * 64
+    (tmp_path / "new" / "digests.json").write_text(json.dumps(recorded))
+    found = lathe("bag", "check", tmp_path / "new")
+    assert (found.exit_code, "/tool: digest " in found.stdout) == (1, True)
 
 
 INF_AT_7 = np.where(np.arange(64) == 7, np.inf, 0.0)
-
-
-def blocks(change, count=10):
-    """Blocks of a topic as (first sample, samples, last), changed on the way."""
-    made = [change(number, (64 * number, np.full(64, float(number)), number == count - 1)) for number in range(count)]
-    return [block for block in made if block is not None]
 
 
 @pytest.mark.parametrize(
@@ -193,11 +123,12 @@ def blocks(change, count=10):
 )  # fmt: skip
 def test_each_flaw_is_named(tmp_path, change, code, said):
     encoder = Encoder(messages.COMMAND, "run", "/a", 15_625)
-    writer = BagWriter(tmp_path / "bag", compression="none", chunk_size=4096, about={})
-    writer.add_topic("/a/command", messages.COMMAND, offered_qos(10, "volatile"))
-    for first, samples, last in blocks(change):
-        stamp, data = encoder.encode(first, {"position": samples}, last=last, companions=0)
-        writer.write("/a/command", stamp, data)
+    writer = bag_writer(tmp_path / "bag", "/a/command", messages.COMMAND)
+    for number in range(10):
+        if block := change(number, (64 * number, np.full(64, float(number)), number == 9)):
+            first, samples, last = block
+            stamp, data = encoder.encode(first, {"position": samples}, last=last, companions=0)
+            writer.write("/a/command", stamp, data)
     writer.close()
     found = lathe("bag", "check", tmp_path / "bag")
     assert found.exit_code == code
@@ -207,8 +138,7 @@ def test_each_flaw_is_named(tmp_path, change, code, said):
 @pytest.mark.parametrize("flushed", [True, False])
 def test_what_the_disk_does_not_take_is_told_with_the_chunk_or_flush(tmp_path, flushed):
     """And the bag says of itself what is in it: all before, nothing after."""
-    writer = BagWriter(tmp_path / "bag", compression="none", chunk_size=4096, about={})
-    writer.add_topic("/said", messages.EVENT, offered_qos(10, "volatile"))
+    writer = bag_writer(tmp_path / "bag", "/said", messages.EVENT)
     told = 0
 
     def fill():
@@ -242,15 +172,17 @@ def unreadable(path, make):
             path.mkdir()
         return path
     plugin = StoragePlugin.MCAP if "MCAP" in make else StoragePlugin.SQLITE3
-    strange_bag(path, plugin, CompressionMode.NONE, 6000 if "page" in make else 600)
-    file, metadata = next(file for file in path.iterdir() if file.suffix != ".yaml"), path / "metadata.yaml"
+    strange_bag(path, plugin, count=6000 if "page" in make else 600)
+    file = storage_of(path)
+    whole = file.read_bytes()
     if "cut" in make:
-        file.write_bytes(file.read_bytes()[:20000])
+        file.write_bytes(whole[:20000])
     elif "page" in make:
-        whole = file.read_bytes()
         file.write_bytes(whole[:200_704] + bytes(4096) + whole[204_800:])
-    elif "broken metadata" in make:
-        metadata.write_text("}")
+    elif "junk" in make:
+        file.write_bytes(b"junk" * 100)
+    else:
+        (path / "metadata.yaml").write_text("}")
     return file if "alone" in make else path
 
 
@@ -260,6 +192,7 @@ def unreadable(path, make):
         ("nothing there", "(there is no such folder or file)"),
         ("empty folder", "(no metadata.yaml in that folder, nor a .mcap or .db3 file)"),
         ("SQLite, broken metadata", f"(metadata.yaml: not YAML in line 1){HINT}"),
+        ("MCAP, junk", "(bag.mcap: not an MCAP or SQLite file)"),
         ("MCAP, cut", "(bag.mcap: cut off at byte 43)"),
         ("SQLite, cut", "(bag.db3: database disk image is malformed)"),
         ("SQLite, lost page, alone", f"(bag.db3: database disk image is malformed){HINT}"),
@@ -282,11 +215,12 @@ def test_what_cannot_be_read_is_the_same_fault_for_all_with_a_hint_where_recover
     saved = json.loads(recovered.stdout)["saved"] if recovered.exit_code != 2 else 0
     assert bool(saved) == (HINT in said), recovered.stderr
     assert recovered.exit_code == (2 if "there" in said or "folder" in said else 0 if "metadata" in make else 3)
+    assert (tmp_path / "new").exists() == (recovered.exit_code != 2)
 
 
-@pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+@PLUGINS
 def test_folder_without_metadata_is_read_and_called_wrong(tmp_path, plugin):
-    sent = strange_bag(tmp_path / "bag", plugin, CompressionMode.NONE)
+    sent = strange_bag(tmp_path / "bag", plugin)
     (tmp_path / "bag" / "metadata.yaml").unlink()
     with Source(tmp_path / "bag") as source:
         assert list(source.messages()) == sent
@@ -315,7 +249,6 @@ def records_of(path):
     return profile, set(channels.values()), messages, others
 
 
-QOS = "- history: keep_last\n  depth: 10\n"
 KINDS = {
     "CRLF": ("my_msgs/msg/Odd", "ros2msg", b"int32 A=1\r\nint32 x\r\n", "cdr", {}),
     "CRLF, hash": ("my_msgs/msg/Odd", "ros2msg", b"int32 x\r\n", "cdr", {"topic_type_hash": "RIHS01_" + "0" * 64}),
@@ -332,7 +265,7 @@ KINDS = {
     "ROS 1": ("std_msgs/String", "ros1msg", b"string data\n", "ros1", {"md5sum": "99", "latching": "1"}),
     "no schema": (None, "json", {}),
     "no schema, CDR": (None, "cdr", {}),
-    "partial QoS": ("std_msgs/msg/String", "ros2msg", b"string data\n", "cdr", {"offered_qos_profiles": QOS}),
+    "partial QoS": ("std_msgs/msg/String", "ros2msg", b"string data\n", "cdr", {"offered_qos_profiles": "- depth: 10"}),
     "map as QoS": ("std_msgs/msg/String", "ros2msg", b"string data\n", "cdr", {"offered_qos_profiles": "depth: 1"}),
     "no QoS": ("std_msgs/msg/String", "ros2msg", b"string data\n", "cdr", {"offered_qos_profiles": "a: b: c"}),
 }  # fmt: skip
@@ -342,9 +275,7 @@ KINDS = {
 def test_copies_what_it_need_not_understand(tmp_path, profile):
     """Schemas, channels, message encodings, sequence numbers, both times, attachments and metadata: to the byte."""
     file = tmp_path / "foreign.mcap"
-    with file.open("wb") as stream:
-        writer = McapWriter(stream)
-        writer.start(profile, "another library")
+    with mcap_writer(file, profile) as writer:
         writer.add_attachment(create_time=1, log_time=2, name="calibration", media_type="text/csv", data=b"1,2\n")
         writer.add_metadata("vehicle", {"serial": "\xb5 7"})
         for number, (name, kind) in enumerate(KINDS.items()):
@@ -353,18 +284,17 @@ def test_copies_what_it_need_not_understand(tmp_path, profile):
             for topic in (f"/topic{number}", "/shared"):
                 channel = writer.register_channel(topic, encoding, known, metadata | {"kind": name})
                 writer.add_message(channel, 10**9 + number, name.encode(), 10**9 - number, sequence=number)
-        writer.finish()
     found = recover(file, tmp_path / "new")
     assert (found.saved, found.lossy) == (2 * len(KINDS), False)
-    assert records_of(mcap_of(tmp_path / "new")) == records_of(file)
+    assert records_of(storage_of(tmp_path / "new")) == records_of(file)
     assert recover(tmp_path / "new", tmp_path / "again").saved == found.saved
 
 
 LOGS = {
     "whole": lambda log: log,
     "cut": lambda log: log[:-5000],
-    "flipped": lambda log: log[:50_000] + bytes([log[50_000] ^ 1]) + log[50_001:],
-    "salt flipped": lambda log: log[:17] + bytes([log[17] ^ 1]) + log[18:],
+    "flipped": lambda log: flipped(log, 50_000),
+    "salt flipped": lambda log: flipped(log, 17),
     "another file": lambda _log: b"no log at all" * 500,
     "not written to the end": lambda log: log,
 }
@@ -372,8 +302,12 @@ LOGS = {
 
 @pytest.mark.parametrize("kind", LOGS)
 def test_what_a_write_ahead_log_does_not_give_is_told(tmp_path, kind):
-    """The bytes of a log that give no message count as lost; a log of whole transactions loses nothing."""
-    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE, count=30)
+    """The bytes of a log that give no message count as lost; a log of whole transactions loses nothing.
+
+    The recorder was killed: some messages are in the log alone. Neither file is touched.
+    """
+    bag = tmp_path / "killed"
+    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3, count=30)
     base = sqlite3.connect(tmp_path / "bag" / "bag.db3", isolation_level=None)
     base.executescript(
         "PRAGMA synchronous=OFF; PRAGMA journal_mode=WAL; PRAGMA wal_autocheckpoint=0; PRAGMA cache_size=1"
@@ -386,26 +320,29 @@ def test_what_a_write_ahead_log_does_not_give_is_told(tmp_path, kind):
         sent.append((sent[0][0], sent[0][1] + 90_000, sent[0][2]))
     if kind == "not written to the end":
         base.executescript("BEGIN; UPDATE messages SET data = zeroblob(5000)")
-    (tmp_path / "killed").mkdir()
-    shutil.copy(tmp_path / "bag" / "bag.db3", tmp_path / "killed")
-    log = LOGS[kind]((tmp_path / "bag" / "bag.db3-wal").read_bytes())
-    (tmp_path / "killed" / "bag.db3-wal").write_bytes(log)
+    bag.mkdir()
+    shutil.copy(tmp_path / "bag" / "bag.db3", bag)
+    (bag / "bag.db3-wal").write_bytes(LOGS[kind]((tmp_path / "bag" / "bag.db3-wal").read_bytes()))
     base.close()
+    before = {file.name: file.read_bytes() for file in bag.iterdir()}
     lost = kind != "whole"
-    found = recover(tmp_path / "killed", tmp_path / "new")
+    found = recover(bag, tmp_path / "new")
     assert (found.lossy, bool(found.lost_bytes)) == (lost, lost)
     assert found.saved == 50 if kind in ("whole", "not written to the end") else 30 <= found.saved < 50
     assert read_by_others(tmp_path / "new") == sent[: found.saved]
-    checked = lathe("bag", "check", tmp_path / "killed")
+    with Source(bag, partial=True) as source:
+        assert list(source.messages()) == sent[: found.saved]
+    checked = lathe("bag", "check", bag)
     told = f"{found.lost_bytes} B of its write-ahead log are broken, or were not written to the end"
     assert f"(bag.db3: {told}); lathe bag recover saves the rest" in checked.stderr or not lost
-    assert (checked.exit_code, lathe("bag", "info", tmp_path / "killed").exit_code) == ((2, 3) if lost else (1, 0))
+    assert (checked.exit_code, lathe("bag", "info", bag).exit_code) == ((2, 3) if lost else (1, 0))
+    assert {file.name: file.read_bytes() for file in bag.iterdir()} == before
 
 
 @pytest.fixture
 def broken_off(tmp_path):
     """A database that was being written, with its rollback journal; and what it held before."""
-    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE)
+    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3)
     base = sqlite3.connect(tmp_path / "bag" / "bag.db3", isolation_level=None)
     base.executescript("PRAGMA cache_size=1; BEGIN; UPDATE messages SET timestamp = 7, data = zeroblob(3000)")
     (tmp_path / "killed").mkdir()
@@ -467,13 +404,10 @@ def test_files_that_overlap_in_any_way_are_merged_by_time(tmp_path, kind):
     path = tmp_path / "bag"
     path.mkdir()
     for number, times in enumerate(files):
-        with (path / f"{number}.mcap").open("wb") as stream:
-            writer = McapWriter(stream, **options)
-            writer.start("ros2")
+        with mcap_writer(path / f"{number}.mcap", **options) as writer:
             channel = writer.register_channel("/x", "cdr", writer.register_schema("my_msgs/msg/X", "", b""))
             for log_ns in times:
                 writer.add_message(channel, log_ns, b"%d" % number, log_ns)
-            writer.finish()
     # Of equal times, the order of the files and that within them.
     sent = sorted([(t, b"%d" % n) for n, times in enumerate(files) for t in times], key=lambda said: said[0])
     assert recover(path, tmp_path / "new").saved == len(sent)
@@ -484,7 +418,7 @@ def test_files_that_overlap_in_any_way_are_merged_by_time(tmp_path, kind):
 
 def test_a_compressed_file_that_a_player_unpacked_beside_is_read_once(tmp_path):
     sent = strange_bag(tmp_path / "bag", StoragePlugin.MCAP, CompressionMode.FILE)
-    file = next((tmp_path / "bag").glob("*.zstd"))
+    file = storage_of(tmp_path / "bag")
     file.with_suffix("").write_bytes(zstandard.decompress(file.read_bytes(), max_output_size=2**24))
     assert check(tmp_path / "bag").exit_code == 0
     assert recover(tmp_path / "bag", tmp_path / "new").saved == len(sent)
@@ -495,8 +429,8 @@ def test_a_compressed_file_that_a_player_unpacked_beside_is_read_once(tmp_path):
 
 def test_a_file_that_the_metadata_do_not_name_is_told(tmp_path):
     """A recorder that was killed wrote them last before its last file; or a file was renamed."""
-    sent = strange_bag(tmp_path / "bag", StoragePlugin.MCAP, CompressionMode.NONE)
-    file = mcap_of(tmp_path / "bag")
+    sent = strange_bag(tmp_path / "bag")
+    file = storage_of(tmp_path / "bag")
     shutil.copy(file, file.with_name("later.mcap"))
     said = "metadata.yaml does not name later.mcap: not read; lathe bag recover saves its messages too"
     checked = lathe("bag", "check", tmp_path / "bag")
@@ -527,15 +461,12 @@ def test_what_is_not_of_ros_2_hides_nothing_of_it(tmp_path, kind, topic):
     (encoding, schema), name = FOREIGN[kind]
     for alone in (False, True):
         file = tmp_path / f"{alone}.mcap"
-        with file.open("wb") as stream:
-            writer = McapWriter(stream)
-            writer.start("another")
+        with mcap_writer(file, "another") as writer:
             known = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
             text = () if alone else ((writer.register_channel("/said", "cdr", known), b"\0\1\0\0\1\0\0\0\0"),)
             number = writer.register_schema(*schema) if schema else 0
             for channel, data in (*text, (writer.register_channel(topic, encoding, number), b"?")):
                 writer.add_message(channel, 10**9, data, 10**9)
-            writer.finish()
         found = recover(file, tmp_path / f"new {alone}")
         assert (found.saved, found.lossy) == (2 - alone, False)
         read = alone or topic == "/other" if kind == "two types" else False
@@ -545,11 +476,9 @@ def test_what_is_not_of_ros_2_hides_nothing_of_it(tmp_path, kind, topic):
         assert read or (f"no topic that can be read ({told}" if alone else f"not read: {told}") in checked.output
 
 
-@pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-def test_files_that_overlap_in_time_are_merged_by_it(tmp_path, plugin):
-    sent = strange_bag(tmp_path / "bag", plugin, CompressionMode.NONE)
-    file = next(file for file in (tmp_path / "bag").iterdir() if file.suffix != ".yaml")
-    shutil.copy(file, file.with_name(f"further{file.suffix}"))
+def test_databases_that_overlap_in_time_are_merged_by_it(tmp_path):
+    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3)
+    shutil.copy(tmp_path / "bag" / "bag.db3", tmp_path / "bag" / "further.db3")
     (tmp_path / "bag" / "metadata.yaml").unlink()
     with Source(tmp_path / "bag") as source:
         assert list(source.messages()) == [message for message in sent for _ in range(2)]
@@ -557,14 +486,14 @@ def test_files_that_overlap_in_time_are_merged_by_it(tmp_path, plugin):
     assert part == [message for message in sent[1:7] if message[0] == "/said" for _ in range(2)]
 
 
-@pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+@PLUGINS
 def test_topics_in_other_serializations_are_named_and_copied_and_the_rest_is_read(tmp_path, plugin):
-    sent = strange_bag(tmp_path / "bag", plugin, CompressionMode.NONE)
+    sent = strange_bag(tmp_path / "bag", plugin)
     if plugin == StoragePlugin.SQLITE3:
         with sqlite3.connect(tmp_path / "bag" / "bag.db3") as database:
             database.execute("UPDATE topics SET serialization_format = 'xdr' WHERE name = '/said'")
     else:
-        file = mcap_of(tmp_path / "bag")
+        file = storage_of(tmp_path / "bag")
         file.write_bytes(file.read_bytes().replace(b"/said\x03\0\0\0cdr", b"/said\x03\0\0\0xdr"))
     with Source(tmp_path / "bag") as source:
         assert list(source.messages()) == [message for message in sent if message[0] != "/said"]
@@ -573,16 +502,16 @@ def test_topics_in_other_serializations_are_named_and_copied_and_the_rest_is_rea
         found = lathe("bag", command, tmp_path / "bag")
         assert (found.exit_code, said in found.stdout) == (0, True)
     assert lathe("bag", "recover", tmp_path / "bag", "-o", tmp_path / "new").exit_code == 0
-    _, channels, copied, _ = records_of(mcap_of(tmp_path / "new"))
+    _, channels, copied, _ = records_of(storage_of(tmp_path / "new"))
     assert {channel[:2] for channel in channels} == {("/said", "xdr"), ("/where", "cdr")}
     assert [(channel[0], log_ns, data) for channel, _, log_ns, _, data in copied] == sent
 
 
-@pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+@PLUGINS
 def test_the_files_count_where_the_metadata_contradict_them(tmp_path, plugin):
     """And it is told: by `info` on stderr, by `check` as wrong."""
     path = tmp_path / "bag"
-    sent = strange_bag(path, plugin, CompressionMode.NONE)
+    sent = strange_bag(path, plugin)
     metadata = yaml.safe_load((path / "metadata.yaml").read_text())
     told = metadata["rosbag2_bagfile_information"]
     told["starting_time"]["nanoseconds_since_epoch"] += 100_000
@@ -604,40 +533,26 @@ def test_the_files_count_where_the_metadata_contradict_them(tmp_path, plugin):
     assert checked.exit_code == 1
 
 
-def test_where_there_is_no_bag_it_says_so(tmp_path):
-    with pytest.raises(InputError, match="no bag; allowed"):
-        recover(tmp_path, tmp_path / "new")
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_message_that_unpacks_to_gigabytes_is_refused(tmp_path):
-    path = tmp_path / "bag"
-    strange_bag(path, StoragePlugin.SQLITE3, CompressionMode.MESSAGE)
+def test_what_unpacks_to_gigabytes_is_refused(tmp_path, monkeypatch):
+    """A message, or a file that is compressed as a whole."""
+    strange_bag(tmp_path / "messages", StoragePlugin.SQLITE3, CompressionMode.MESSAGE)
+    strange_bag(tmp_path / "file", StoragePlugin.SQLITE3, CompressionMode.FILE)
     bomb = zstandard.compress(bytes(MOST_BYTES + 1))
-    with sqlite3.connect(next(path.glob("*.db3"))) as database:
+    with sqlite3.connect(storage_of(tmp_path / "messages")) as database:
         database.execute("UPDATE messages SET data = ? WHERE id = 1", (bomb,))
     refused = pytest.raises(InputError, match=f"{MOST_BYTES + 1} B when unpacked; allowed: up to {MOST_BYTES}")
-    with Source(path) as source, refused:
+    with Source(tmp_path / "messages") as source, refused:
         list(source.messages())
-
-
-def test_a_file_that_unpacks_to_more_than_allowed_is_refused(tmp_path, monkeypatch):
-    path = tmp_path / "bag"
-    strange_bag(path, StoragePlugin.SQLITE3, CompressionMode.FILE)
-    Source(path).__exit__(None, None, None)
     monkeypatch.setattr("lathe_rc.bag.reading.unpacking.MOST_SMALL", 0)
     monkeypatch.setattr("lathe_rc.bag.reading.unpacking.EXPANSION", 1)
     with pytest.raises(InputError, match="unpacks to more than 1 times its size"):
-        Source(path)
+        Source(tmp_path / "file")
 
 
 def test_a_bag_of_a_cell_that_did_not_begin_is_not_clean(tmp_path):
     """It has the state of the cell, and no signals."""
-    path = tmp_path / "bag"
-    writer = BagWriter(path, compression="none", chunk_size=4096, about={})
-    writer.add_topic("/cell_state", messages.CELL_STATE, offered_qos(1, "transient_local"))
-    writer.close()
-    result = lathe("bag", "check", path)
+    bag_writer(tmp_path / "bag", "/cell_state", messages.CELL_STATE).close()
+    result = lathe("bag", "check", tmp_path / "bag")
     assert result.exit_code == LossyRunError.exit_code, result.output
     assert "no block: the cell of this bag did not begin" in result.output
 
@@ -671,7 +586,7 @@ def test_schemas_and_channels_stand_in_several_chunks(tmp_path):
 def test_a_damaged_index_is_not_clean_and_costs_no_message(tmp_path, opcode):
     data = small_bag(tmp_path / "bag")
     begin = next(begin for found, begin, _ in record_places(data) if found == opcode)
-    mcap_of(tmp_path / "bag").write_bytes(data[: begin + 2] + bytes([data[begin + 2] ^ 4]) + data[begin + 3 :])
+    storage_of(tmp_path / "bag").write_bytes(flipped(data, begin + 2, 4))
     assert lathe("bag", "check", tmp_path / "bag").exit_code in (1, 2)
     found = lathe("bag", "recover", tmp_path / "bag", "-o", tmp_path / "new", "--json")
     assert found.exit_code == 0
@@ -683,10 +598,10 @@ def test_fewer_messages_than_are_counted_is_lossy(tmp_path, place):
     """Each of the two counts is enough, also if every record is sound."""
     data = small_bag(tmp_path / "bag")
     begin, end = chunks_of(data)[3]
-    mcap_of(tmp_path / "bag").write_bytes(data[:begin] + data[end:])
-    path = tmp_path / "bag" if place == "metadata.yaml" else mcap_of(tmp_path / "bag")
+    storage_of(tmp_path / "bag").write_bytes(data[:begin] + data[end:])
+    path = tmp_path / "bag" if place == "metadata.yaml" else storage_of(tmp_path / "bag")
     if place == "metadata.yaml":
-        mcap_of(tmp_path / "bag").write_bytes((data[:begin] + data[end:])[: -len(data) // 10])
+        storage_of(tmp_path / "bag").write_bytes((data[:begin] + data[end:])[: -len(data) // 10])
     found = lathe("bag", "recover", path, "-o", tmp_path / "new", "--json")
     told = json.loads(found.stdout)
     assert (found.exit_code, told["saved"], told["missing"]) == (3, 9 * PER_CHUNK, PER_CHUNK)
@@ -700,37 +615,16 @@ def test_messages_outside_of_chunks_are_found_again(tmp_path):
     _, whole = saved_of(file, data)
     begin = [begin for opcode, begin, _ in record_places(data) if opcode == Opcode.MESSAGE][50]
     for place, left in ((begin, 99), (begin + 1, 99), (begin + 5, 98), (begin + 40, 100)):
-        salvage, saved = saved_of(file, data[:place] + bytes([data[place] ^ 8]) + data[place + 1 :])
+        salvage, saved = saved_of(file, flipped(data, place, 8))
         assert len(saved) == left
         assert left == 100 or set(saved) < set(whole)
         assert salvage.lossy
         assert f"{file.name}: {left} messages have no checksum of their own; some may be wrong" in salvage.damage
 
 
-def test_write_ahead_log_is_part_of_a_database(tmp_path):
-    """The recorder was killed: some messages are in bag.db3-wal alone. Neither file is touched."""
-    sent = strange_bag(tmp_path / "strange", StoragePlugin.SQLITE3, CompressionMode.NONE)
-    (tmp_path / "killed").mkdir()
-    base = sqlite3.connect(next((tmp_path / "strange").glob("*.db3")))
-    base.execute("PRAGMA journal_mode=WAL")
-    base.execute("UPDATE messages SET timestamp = timestamp + 5")
-    base.execute("DELETE FROM messages WHERE id > 500")
-    base.commit()
-    for file in (tmp_path / "strange").glob("*.db3*"):
-        shutil.copy(file, tmp_path / "killed")
-    base.close()
-    before = {file.name: file.read_bytes() for file in (tmp_path / "killed").iterdir()}
-    left = [(topic, stamp + 5, data) for topic, stamp, data in sent[:500]]
-    assert recover(tmp_path / "killed", tmp_path / "new").saved == 500
-    assert read_by_others(tmp_path / "new") == left
-    with Source(tmp_path / "killed") as source:
-        assert list(source.messages()) == left
-    assert {file.name: file.read_bytes() for file in (tmp_path / "killed").iterdir()} == before
-
-
 def test_a_broken_page_of_a_database_costs_its_messages(tmp_path):
-    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE)
-    file = next((tmp_path / "bag").glob("*.db3"))
+    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3)
+    file = storage_of(tmp_path / "bag")
     data = bytearray(file.read_bytes())
     page = data.index(b"word 300") // 4096 * 4096
     data[page : page + 100] = bytes(100)
@@ -742,8 +636,8 @@ def test_a_broken_page_of_a_database_costs_its_messages(tmp_path):
 
 
 def test_rows_that_are_no_messages_are_told(tmp_path):
-    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE)
-    with sqlite3.connect(next((tmp_path / "bag").glob("*.db3"))) as base:
+    sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3)
+    with sqlite3.connect(storage_of(tmp_path / "bag")) as base:
         base.execute("UPDATE messages SET topic_id = 77 WHERE id = 1")
         base.execute("UPDATE messages SET timestamp = -1 WHERE id = 2")
         base.execute("UPDATE messages SET data = 'text' WHERE id = 3")
@@ -752,7 +646,7 @@ def test_rows_that_are_no_messages_are_told(tmp_path):
 
 
 def test_a_full_disk_leaves_no_half_of_a_bag(tmp_path):
-    strange_bag(tmp_path / "bag", StoragePlugin.MCAP, CompressionMode.NONE, count=20_000)
+    strange_bag(tmp_path / "bag", count=20_000)
     with files_up_to(2**16):
         refused = lathe("bag", "recover", tmp_path / "bag", "-o", tmp_path / "new")
     assert (refused.exit_code, refused.stderr.count("\n")) == (1, 1)

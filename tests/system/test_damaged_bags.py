@@ -5,10 +5,10 @@ from collections import Counter
 from random import Random
 
 import pytest
-from campaign import sized
+from bags import sized
 from cells import scenario
 from mcap.opcode import Opcode
-from mcap_damage import check_damage, chunks_of, flips, plain_file, records_of, saved_of, small_bag, structured
+from mcap_damage import check_damage, chunks_of, flipped, flips, plain_file, records_of, saved_of, small_bag, structured
 
 from lathe_rc import harness
 from lathe_rc.bag.repairing.recover import recover
@@ -73,8 +73,6 @@ def test_messages_outside_of_chunks(tmp_path):
     random = Random(15)  # noqa: S311
     for _ in range(sized(500)):
         place = random.randrange(8, end)
-        salvage, saved = saved_of(
-            file, data[:place] + bytes([data[place] ^ 1 << random.randrange(8)]) + data[place + 1 :]
-        )
+        salvage, saved = saved_of(file, flipped(data, place, 1 << random.randrange(8)))
         assert len(saved) >= len(whole) - 2 or "described" in "".join(salvage.damage)
         assert salvage.lossy or saved == whole

@@ -3,7 +3,7 @@
 
 import kept_files
 import pytest
-from campaign import sized
+from bags import sized
 
 pytestmark = pytest.mark.system
 

@@ -7,7 +7,7 @@ import sys
 from random import Random
 
 import pytest
-from campaign import sized
+from bags import sized
 from hostile_bags import COMMANDS, LONGEST, MAKERS, MEMORY, attack
 
 pytestmark = pytest.mark.system
