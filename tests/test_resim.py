@@ -6,8 +6,8 @@ import shutil
 
 import numpy as np
 import pytest
+from bags import lathe, storage_of
 from cells import SCENARIOS, scenario
-from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
 from lathe_rc import harness, part
@@ -17,19 +17,15 @@ from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import feed
 from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cli import main
 from lathe_rc.errors import InputError
 from lathe_rc.part import ErrorsByRevolution
 
+EVENTS = {"events": ["revolution 5.5: freeze", "second 0.3: learn"]}
 DEVIATION = {"deviation_amplitude": [0.1], "deviation_frequency": [10.7]}
 
 
-def lathe(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
 def made(**nodes):
-    spindle = {"revolutions": 30.0, **DEVIATION}
+    spindle = {"revolutions": 15.0, **DEVIATION}
     form = {"profile": "harmonics", "harmonic_order": [2], "harmonic_amplitude": [100e-6], "harmonic_phase": [0.0]}
     given = {"spindle_encoder": spindle, "tool": form, **nodes}
     return scenario(**given)
@@ -39,8 +35,7 @@ def made(**nodes):
 def processes(tmp_path_factory):
     """A run of real processes, with events on the way."""
     path = tmp_path_factory.mktemp("processes") / "bag"
-    loaded = made(learning_controller={"events": ["revolution 5.5: freeze", "second 0.6: learn"]})
-    return path, harness.run(loaded, mode="processes", bag=path)
+    return path, harness.run(made(learning_controller=EVENTS), mode="processes", bag=path)
 
 
 def test_an_unchanged_process_run_comes_out_to_the_bit(processes):
@@ -75,8 +70,7 @@ def test_a_changed_lead_shows_the_change_of_a_run_with_that_lead(processes):
     path, _ = processes
     change = "learning_controller.lead_time=1.2e-3"
     found = resimulate(path, [change])
-    other = made(learning_controller={"lead_time": 1.2e-3, "events": ["revolution 5.5: freeze", "second 0.6: learn"]})
-    expected = harness.run(other)
+    expected = harness.run(made(learning_controller={"lead_time": 1.2e-3, **EVENTS}))
     assert found.changed
     assert set(found.different) == {
         "/coarse/command", "/coarse/learning", "/coarse/state", "/tool", "/tool/joint_states",
@@ -92,7 +86,7 @@ def test_a_changed_lead_shows_the_change_of_a_run_with_that_lead(processes):
 def test_a_controller_from_a_file_takes_the_place_of_the_recorded_one(processes, tmp_path):
     path, result = processes
     file = tmp_path / "mine.yaml"
-    text = "/learning_controller:\n  ros__parameters:\n    feedback_delay: 2048\n    learning_gain: 0.5\n"
+    text = "/learning_controller: {ros__parameters: {feedback_delay: 2048, learning_gain: 0.5}}"
     file.write_text(text)
     found = resimulate(path, controller=file)
     assert found.scenario.nodes["learning_controller"].learning_gain == 0.5
@@ -104,7 +98,7 @@ def test_a_controller_from_a_file_takes_the_place_of_the_recorded_one(processes,
 def test_the_recorded_spindle_counts_not_the_law(processes, tmp_path):
     """A bag whose spindle really turned otherwise than its parameters say."""
     other = tmp_path / "other"
-    slow = {"revolutions": 30.0, "deviation_amplitude": [0.05], "deviation_frequency": [7.0]}
+    slow = {"revolutions": 15.0, "deviation_amplitude": [0.05], "deviation_frequency": [7.0]}
     harness.run(made(spindle_encoder=slow), bag=other)
     metadata = other / "metadata.yaml"
     metadata.write_text(metadata.read_text().replace("deviation_amplitude: [0.05]", "deviation_amplitude: [0.02]"))
@@ -114,11 +108,8 @@ def test_the_recorded_spindle_counts_not_the_law(processes, tmp_path):
 
 
 def test_the_bag_holds_the_files_of_its_scenario(tmp_path):
-    form = tmp_path / "form.csv"
-    angle = np.arange(0.0, 360.0, 2.0)
-    lines = [f"{a},{30.0 * np.cos(2 * np.radians(a))}" for a in angle]
-    form.write_text("angle_deg,radius_um\n" + "\n".join(lines) + "\n")
-    bag = tmp_path / "bag"
+    form, bag = tmp_path / "form.csv", tmp_path / "bag"
+    form.write_text("angle_deg,radius_um\n0,0\n120,30\n240,-10\n")
     harness.run(scenario(tool={"profile": "csv", "profile_file": str(form)}), bag=bag)
     form.unlink()
     assert resimulate(bag).different == []
@@ -133,48 +124,36 @@ def test_versions_and_identity_are_in_the_bag(processes):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("change", "said"),
     [
-        (["--set", "spindle_encoder.nominal_rpm=900"], "the spindle and what all nodes share come from the bag"),
-        (["--set", "block_size=32"], "the spindle and what all nodes share come from the bag"),
-        (["--set", "tool.fed=1"], "tool.fed: unknown parameter"),
-        (["--set", "learning_controller.lead_time=0.02"], "learning diverges"),
+        ("spindle_encoder.nominal_rpm=900", "the spindle and what all nodes share come from the bag"),
+        ("block_size=32", "the spindle and what all nodes share come from the bag"),
+        ("tool.fed=1", "tool.fed: unknown parameter"),
+        ("learning_controller.lead_time=0.02", "learning diverges"),
     ],
 )
-def test_changes_that_cannot_be_are_refused(processes, arguments, said):
-    found = lathe("resim", processes[0], *arguments)
+def test_changes_that_cannot_be_are_refused(processes, change, said):
+    found = lathe("resim", processes[0], "--set", change)
     assert found.exit_code == 2
     assert said in found.stderr
 
 
 def test_a_bag_without_a_scenario_says_what_is_missing(processes, tmp_path):
-    bag = tmp_path / "bag"
-    shutil.copytree(processes[0], bag)
-    file = next(bag.glob("*.mcap"))
-    (bag / "metadata.yaml").unlink()
-    file.rename(tmp_path / "alone.mcap")
+    shutil.copy(storage_of(processes[0]), tmp_path / "alone.mcap")
     with pytest.raises(InputError, match="the bag holds no scenario"):
         resimulate(tmp_path / "alone.mcap")
 
 
 @pytest.mark.parametrize("piece", [64, 1000, 65536])
-def test_errors_by_revolution_are_those_of_the_whole(processes, piece):
-    path, result = processes
-    sink = ErrorsByRevolution(result.recording.types)
-    feed(path, [sink], piece=piece)
-    whole = result.recording
-    angle, error = whole.dense["/encoder"]["angle_true"], whole.dense["/tool"]["error"]
-    assert np.array_equal(sink.rms(), form_errors(angle, error).rms)
-
-
-@pytest.mark.parametrize("piece", [64, 1000, 65536])
 @pytest.mark.parametrize("together", [2, 16])
-def test_first_and_last_revolution_are_those_of_the_whole(processes, piece, together, monkeypatch):
+def test_errors_by_revolution_and_the_first_and_last_are_those_of_the_whole(processes, piece, together, monkeypatch):
     path, result = processes
     monkeypatch.setattr(part, "_TOGETHER", together)
-    ends = part.FirstAndLast(result.recording.types)
-    feed(path, [ends], piece=piece)
+    ends, errors = part.FirstAndLast(result.recording.types), ErrorsByRevolution(result.recording.types)
+    feed(path, [ends, errors], piece=piece)
     told, whole = ends.numbers(), part.measured(result.recording)
+    angle = result.recording.dense["/encoder"]["angle_true"]
+    assert np.array_equal(errors.rms(), form_errors(angle, result.recording.dense["/tool"]["error"]).rms)
     assert told["revolutions"] == whole.form.rms.size
     for name, revolution in (("first", 0), ("last", -1)):
         for key, value in part.numbers(whole, revolution).items():
@@ -183,20 +162,12 @@ def test_first_and_last_revolution_are_those_of_the_whole(processes, piece, toge
                 assert_allclose(told[name][key], value, rtol=1e-6, atol=1e-9, err_msg=f"{name} {key}")
 
 
-@pytest.mark.parametrize(
-    "asked",
-    ["learning_controller.events=['revolution 5: freeze']", "electrodynamic_actuator.faults=[]"],
-)
-def test_other_events_than_those_of_the_bag_are_refused(processes, asked):
-    with pytest.raises(InputError, match=r"^--set .*: events and faults come from the bag, as they took effect; leave"):
-        resimulate(processes[0], [asked])
-
-
-def test_a_controller_with_events_of_its_own_is_refused(processes, tmp_path):
+def test_other_events_than_those_of_the_bag_are_refused(processes, tmp_path):
+    said = "events and faults come from the bag, as they took effect; leave"
+    for asked in ("learning_controller.events=['revolution 5: freeze']", "electrodynamic_actuator.faults=[]"):
+        with pytest.raises(InputError, match=rf"^--set .*: {said}"):
+            resimulate(processes[0], [asked])
     file = tmp_path / "controller.yaml"
-    text = "/learning_controller:\n  ros__parameters:\n    events: ['revolution 5: freeze']\n"
-    file.write_text(text, encoding="utf-8")
-    with pytest.raises(
-        InputError, match=r"^learning_controller.events = \['revolution 5: freeze'\]: events and faults"
-    ):
+    file.write_text("/learning_controller: {ros__parameters: {events: ['revolution 5: freeze']}}")
+    with pytest.raises(InputError, match=rf"^learning_controller.events = \['revolution 5: freeze'\]: {said}"):
         resimulate(processes[0], controller=file)
