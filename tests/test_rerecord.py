@@ -3,18 +3,16 @@
 
 import itertools
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import rclpy
+from bags import JAZZY
 from cells import refusals, scenario, started
 from rclpy.qos import QoSProfile
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
-from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 
@@ -24,7 +22,6 @@ from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.writing.writer import offered_qos
 from lathe_rc.errors import InputError
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
 LATCHED = "transient_local"
 TOPICS = {
     "/note": ("std_msgs/msg/String", "volatile"),
@@ -42,27 +39,27 @@ def filled(data):
 
 def message(topic, number, chance):
     kind = TOPICS[topic][0]
-    made = STORE.types[kind]
+    made = JAZZY.types[kind]
     if kind == "std_msgs/msg/String":
         size = 1_500_000 if number % 400 == 399 else int(chance.integers(40))
-        return STORE.serialize_cdr(made("x" * size + str(number)), kind)
+        return JAZZY.serialize_cdr(made("x" * size + str(number)), kind)
     if kind == "geometry_msgs/msg/Point":
-        return STORE.serialize_cdr(made(float(number), 0.5, -1.0), kind)
-    stamp = STORE.types["builtin_interfaces/msg/Time"](number, 17)  # not the log time
-    header = STORE.types["std_msgs/msg/Header"](stamp, "base")
+        return JAZZY.serialize_cdr(made(float(number), 0.5, -1.0), kind)
+    stamp = JAZZY.types["builtin_interfaces/msg/Time"](number, 17)  # not the log time
+    header = JAZZY.types["std_msgs/msg/Header"](stamp, "base")
     values = np.arange(number % 3, dtype=np.float64)
-    return STORE.serialize_cdr(made(header, ["axis"] * values.size, values, values, values), kind)
+    return JAZZY.serialize_cdr(made(header, ["axis"] * values.size, values, values, values), kind)
 
 
-@pytest.fixture(params=[StoragePlugin.MCAP, StoragePlugin.SQLITE3], ids=["mcap", "sqlite"])
-def foreign(request, tmp_path):
+@pytest.fixture
+def foreign(tmp_path):
     """A bag of another maker: equal log times on several topics, irregular intervals, small and large messages."""
     chance = np.random.default_rng(5)
     path, log_ns, sent = tmp_path / "foreign", 0, []
-    with RosbagWriter(path, version=9, storage_plugin=request.param) as writer:
+    with RosbagWriter(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connections = {
             topic: writer.add_connection(
-                topic, kind, typestore=STORE, offered_qos_profiles=[offered_qos(10, durability)]
+                topic, kind, typestore=JAZZY, offered_qos_profiles=[offered_qos(10, durability)]
             )
             for topic, (kind, durability) in TOPICS.items()
         }
@@ -75,11 +72,15 @@ def foreign(request, tmp_path):
     return path, sent
 
 
-def replay(bag, *arguments):
-    command = [sys.executable, "-m", "lathe_rc", "replay", bag, "--rate", "0", "--wait", "1", *arguments]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert ended.returncode == 0, ended.stderr
-    return ended
+def recorded_again(bag, again, *recorder, topics=()):
+    """The messages of a bag that a recorder makes of the replay of another one."""
+    named = [word for topic in topics for word in ("--topics", topic)]
+    with started("record", again, *recorder, "--once", *named) as recording:
+        ((code, said),) = refusals(["replay", bag, "--rate", "0", "--wait", "1", *named])
+        assert code == 0, said
+        said, _ = recording.communicate()
+        assert recording.returncode == 0, said
+    return messages(again)
 
 
 def messages(path):
@@ -99,11 +100,7 @@ def described(path):
 def test_a_bag_of_others_is_recorded_again_as_it_was(foreign, domain, tmp_path):
     path, sent = foreign
     again = tmp_path / "again"
-    with started("record", again, "--sim-time", "--once") as recording:
-        replay(path)
-        said, _ = recording.communicate()
-        assert recording.returncode == 0, said
-    assert messages(again) == sent
+    assert recorded_again(path, again, "--sim-time") == sent
     assert described(again) == described(path)
     with AnyReader([again]) as reader:  # with the definitions in the bag alone
         known = {c.topic: c for c in reader.connections}
@@ -115,35 +112,18 @@ def test_a_bag_of_others_is_recorded_again_as_it_was(foreign, domain, tmp_path):
 def test_a_bag_of_the_cell_is_recorded_again_as_it_was(domain, tmp_path):
     first, again = tmp_path / "first", tmp_path / "again"
     harness.run(scenario(spindle_encoder={"revolutions": 6.0}), mode="composed", bag=first)
-    with started("record", again, "--sim-time", "--once") as recording:
-        replay(first)
-        said, _ = recording.communicate()
-        assert recording.returncode == 0, said
-    assert messages(again) == [(topic, log_ns, filled(data)) for topic, log_ns, data in messages(first)]
+    found = recorded_again(first, again, "--sim-time")
+    assert found == [(topic, log_ns, filled(data)) for topic, log_ns, data in messages(first)]
     assert described(again) == described(first)
     assert check(again).digests == check(first).digests
 
 
-@pytest.mark.parametrize("foreign", [StoragePlugin.MCAP], indirect=True)
 def test_without_simulated_time_the_order_is_that_of_publication(foreign, domain, tmp_path):
-    path, sent = foreign
-    with started("record", tmp_path / "again", "--once", "--topics", "/note", "--topics", "/robot/point") as recording:
-        replay(path, "--topics", "/note", "--topics", "/robot/point")
-        said, _ = recording.communicate()
-        assert recording.returncode == 0, said
-    found = messages(tmp_path / "again")
-    wanted = [(topic, data) for topic, _, data in sent if topic in ("/note", "/robot/point")]
+    (path, sent), topics = foreign, ("/note", "/robot/point")
+    found = recorded_again(path, tmp_path / "again", topics=topics)
+    wanted = [(topic, data) for topic, _, data in sent if topic in topics]
     assert [(topic, data) for topic, _, data in found] == wanted
     assert all(a[1] < b[1] for a, b in itertools.pairwise(found))
-
-
-@pytest.fixture
-def node(domain):
-    rclpy.init()
-    made = rclpy.create_node("talker")
-    yield made
-    made.destroy_node()
-    rclpy.shutdown()
 
 
 def matched(node, publisher):
@@ -151,12 +131,12 @@ def matched(node, publisher):
         rclpy.spin_once(node, timeout_sec=0.02)
 
 
-def last_word(node, talker, word, recording):
+def last_word(ghost, talker, word, recording):
     """Let the talker say a word that is heard, and go; what the recorder told until it ended."""
-    matched(node, talker)
+    matched(ghost, talker)
     talker.publish(String(data=word))
     assert talker.wait_for_all_acked()
-    node.destroy_node()
+    ghost.destroy_node()
     return recording.communicate()[0]
 
 
@@ -164,39 +144,39 @@ def last_word(node, talker, word, recording):
 LOOKS = "from lathe_rc.nodes import topic_recorder; topic_recorder._LOOKS = {}"
 
 
-def test_what_was_missed_is_told(node, tmp_path):
+def test_what_was_missed_is_told(ghost, tmp_path):
     """A recorder that was there first reports the messages that it missed of a publisher that did not wait for it."""
     # Nobody is in this domain yet: to look for them for 3 s would find nobody.
     with started("record", tmp_path / "bag", "--once", first=LOOKS.format(4)) as recording:
         assert any("what begins from now on is heard from its first message on" in line for line in recording.stdout)
         recording.send_signal(signal.SIGSTOP)
-        talker = node.create_publisher(String, "/talk", 10)
+        talker = ghost.create_publisher(String, "/talk", 10)
         for _ in range(3):
             talker.publish(String(data="nobody hears"))
         recording.send_signal(signal.SIGCONT)
-        said = last_word(node, talker, "heard", recording)
+        said = last_word(ghost, talker, "heard", recording)
     assert recording.returncode == 3
     assert f"lathe: {tmp_path / 'bag'}: 3 messages of /talk are missing" in said
     assert len(messages(tmp_path / "bag")) == 1
 
 
-def test_what_was_before_it_is_told_and_no_loss(node, tmp_path):
+def test_what_was_before_it_is_told_and_no_loss(ghost, tmp_path):
     """Messages from before the start of a recorder are reported, and are no loss."""
-    talker = node.create_publisher(String, "/talk", 10)
+    talker = ghost.create_publisher(String, "/talk", 10)
     for _ in range(3):
         talker.publish(String(data="nobody hears"))
     # It looks until it has found them, however long DDS takes for that.
     with started("record", tmp_path / "bag", "--once", first=LOOKS.format(10**6)) as recording:
-        said = last_word(node, talker, "heard", recording)
+        said = last_word(ghost, talker, "heard", recording)
     assert recording.returncode == 0
     assert "/talk is heard from its message 4 on" in said
 
 
-def test_it_ends_with_a_whole_bag_when_told_to(node, tmp_path):
+def test_it_ends_with_a_whole_bag_when_told_to(ghost, tmp_path):
     """A recorder that is told to end closes a bag with all that it heard."""
-    talker = node.create_publisher(String, "/talk", QoSProfile(depth=10))
+    talker = ghost.create_publisher(String, "/talk", QoSProfile(depth=10))
     with started("record", tmp_path / "bag") as recording:
-        matched(node, talker)
+        matched(ghost, talker)
         for number in range(5):
             talker.publish(String(data=f"{number:03d}"))
         assert talker.wait_for_all_acked()
@@ -207,11 +187,11 @@ def test_it_ends_with_a_whole_bag_when_told_to(node, tmp_path):
     assert check(tmp_path / "bag").exit_code == 0
 
 
-def test_simulated_time_that_nobody_tells_is_no_success(node, tmp_path):
+def test_simulated_time_that_nobody_tells_is_no_success(ghost, tmp_path):
     """A recording by simulated time fails if nobody tells the time."""
-    talker, _clock = node.create_publisher(String, "/talk", 10), node.create_publisher(Clock, "/clock", 10)
+    talker, _clock = ghost.create_publisher(String, "/talk", 10), ghost.create_publisher(Clock, "/clock", 10)
     with started("record", tmp_path / "bag", "--sim-time", "--once") as recording:
-        said = last_word(node, talker, "when?", recording)
+        said = last_word(ghost, talker, "when?", recording)
     assert recording.returncode == 1
     assert "/clock told no time: 1 messages are not recorded" in said
 
@@ -238,4 +218,4 @@ def test_a_type_that_is_not_installed_is_refused():
     with pytest.raises(InputError, match="message type nowhere_msgs/msg/Thing is not installed"):
         publisher_info.installed("nowhere_msgs/msg/Thing")
     store = publisher_info.installed("sensor_msgs/msg/JointState")
-    assert store.hash_rihs01("sensor_msgs/msg/JointState") == STORE.hash_rihs01("sensor_msgs/msg/JointState")
+    assert store.hash_rihs01("sensor_msgs/msg/JointState") == JAZZY.hash_rihs01("sensor_msgs/msg/JointState")

@@ -136,13 +136,13 @@ def by_hand(msgtype, signals, info, log_ns, *, seed, frame="", big=False, rest=0
     return made.bytes(rest)
 
 
-@settings(max_examples=200)
+@settings(max_examples=20)
 @given(
     types, st.integers(1, 70), names, names, names, st.booleans(), st.integers(0, 3), st.booleans(),
     st.integers(0, 2**32),
 )  # fmt: skip
 def test_blocks_as_others_may_encode_them_are_taken(msgtype, samples, run_id, source, frame, big, rest, last, seed):
-    """Of 10 000 blocks with random padding, in any byte order, with any frame and encapsulation, none is refused."""
+    """Of 1000 blocks with random padding, in any byte order, with any frame and encapsulation, none is refused."""
     decoder, ours = Decoder(msgtype), Encoder(msgtype, run_id, source, 15_625)
     for number in range(50):
         end = last and number == 49
@@ -154,14 +154,6 @@ def test_blocks_as_others_may_encode_them_are_taken(msgtype, samples, run_id, so
         assert (block.run_id, block.source, block.first_index, block.step_ns, block.last, block.companions) == info
         assert (block.log_ns, same_bits(block.signals, signals)) == (log_ns, True)
         assert decoder.message == expected
-
-
-@pytest.mark.parametrize("representation", [2, 3, 6, 7, 10, 0x0100])
-def test_encapsulations_that_are_not_plain_cdr_are_no_blocks(representation):
-    signals, _ = encoded()
-    data = by_hand(messages.TOOL, signals, INFO, 0, seed=1, representation=representation)
-    with pytest.raises(NoBlockError, match="ToolBlock cannot be decoded"):
-        Decoder(messages.TOOL).decode(data)
 
 
 @pytest.mark.parametrize("frame", ["", "lathe"])
@@ -179,29 +171,20 @@ def test_a_block_that_ros_itself_serializes_is_taken(frame):
     assert (block.source, decoder.message) == ("/tool", ours)
 
 
-def test_lengths_bytes_that_are_missing_or_too_many_are_refused_in_any_encoding():
+@pytest.mark.parametrize("big", [False, True])
+def test_bytes_that_are_no_block_are_refused_in_any_encoding(big):
+    """Other encapsulations than plain CDR, missing or additional bytes, arrays of different lengths or empty."""
     signals, _ = encoded()
-    for big in (False, True):
-        data = by_hand(messages.TOOL, signals, INFO, 0, seed=1, big=big)
-        decoder = Decoder(messages.TOOL)
-        for broken in (data[:-1], data[:40], data + bytes(4), b"", data[:3]):
-            with pytest.raises(NoBlockError):
-                decoder.decode(broken)
-        short = signals | {"error": signals["error"][:-1]}
-        with pytest.raises(ValueError, match=r"^/tool sends arrays of \[4, 5\] samples in one block$"):
-            decoder.decode(by_hand(messages.TOOL, short, INFO, 0, seed=1, big=big))
-
-
-def test_block_of_arrays_of_different_lengths_is_refused():
-    signals, _ = encoded()
-    signals["error"] = signals["error"][:-1]
-    with pytest.raises(ValueError, match=r"/tool sends arrays of \[4, 5\] samples in one block"):
-        Decoder(messages.TOOL).decode(by_rosbags(messages.TOOL, signals, info=INFO))
-
-
-def test_block_without_samples_is_refused():
-    with pytest.raises(ValueError, match=r"/tool sends arrays of \[0\] samples in one block"):
-        Decoder(messages.TOOL).decode(by_rosbags(messages.TOOL, signals_of(messages.TOOL, 0, 0), info=INFO))
+    data, decoder = by_hand(messages.TOOL, signals, INFO, 0, seed=1, big=big), Decoder(messages.TOOL)
+    others = [by_hand(messages.TOOL, signals, INFO, 0, seed=1, representation=k) for k in (2, 3, 6, 7, 10, 0x0100)]
+    for broken in (data[:-1], data[:40], data + bytes(4), b"", data[:3], *others):
+        with pytest.raises(NoBlockError, match="ToolBlock cannot be decoded"):
+            decoder.decode(broken)
+    short = by_hand(messages.TOOL, signals | {"error": signals["error"][:-1]}, INFO, 0, seed=1, big=big)
+    empty = by_rosbags(messages.TOOL, signals_of(messages.TOOL, 0, 0), info=INFO)
+    for uneven, sizes in ((short, "4, 5"), (empty, "0")):
+        with pytest.raises(ValueError, match=rf"^/tool sends arrays of \[{sizes}\] samples in one block$"):
+            decoder.decode(uneven)
 
 
 @given(st.integers(0, 4), st.sampled_from([np.nan, np.inf, -np.inf]))
