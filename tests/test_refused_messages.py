@@ -205,7 +205,6 @@ def test_who_speaks_in_the_name_of_a_member_makes_the_cell_safe_and_all_publishe
     ("bad", "words"),
     [
         (block(messages.TOOL, 0, "/tool", "test", step=20_000), "/tool: /tool has a step of 20000 ns; expected 15625"),
-        (block(messages.TOOL, 0, "/tool", "test", size=65), "/tool: /tool sends 65 samples in a block; expected 64"),
         (uneven(messages.TOOL, "/tool", "test"), r"/tool: /tool sends arrays of \[1, 64\] samples in one block"),
     ],
 )
