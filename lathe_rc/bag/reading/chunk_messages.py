@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The records of a piece of an MCAP file, found by compiled code; for readers, and for the index of our own writer."""
 
+import struct
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,8 +10,9 @@ import numpy.typing as npt
 from lathe_rc.bag.reading.limits import MOST_ANNOUNCED, TooMuchError
 from lathe_rc.jit import kernel
 
+HEAD = struct.Struct("<BQ")  #: opcode and length ahead of a record
+_HEAD = HEAD.size
 _MESSAGE = 5  # opcode
-_HEAD = 9  # bytes of opcode and length ahead of a record
 _BEFORE = 22  # bytes of a message record ahead of its data: channel, sequence, log time, publish time
 BEFORE_DATA = _HEAD + _BEFORE  #: both [B]
 

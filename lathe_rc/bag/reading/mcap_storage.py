@@ -8,20 +8,18 @@ file's, records are counted before there is memory for them.
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Schema, Statistics
 
-from lathe_rc.bag.reading.chunk_messages import Places, walk_whole
+from lathe_rc.bag.reading.chunk_messages import HEAD, Places, walk_whole
 from lathe_rc.bag.reading.limits import MOST_ANNOUNCED, MOST_BYTES, MOST_METADATA, TooMuchError
-from lathe_rc.bag.reading.sound_records import HEAD, MAGIC, Record, SoundRecords
+from lathe_rc.bag.reading.sound_records import MAGIC, Record, SoundRecords, parsed
 from lathe_rc.bag.reading.storage import Batch, Channel, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget, read_chunk
 from lathe_rc.errors import shown
@@ -119,12 +117,11 @@ class _Mcap:
         self._described += len(content)
         if self._described > MOST_METADATA:
             raise ValueError(f"more than {MOST_METADATA} B of schemas and channels")
-        stream = ReadDataStream(BytesIO(content))
         if opcode == Opcode.SCHEMA:
-            schema = Schema.read(stream)
+            schema = parsed(Schema, content)
             self._schemas.setdefault(schema.id, schema.name)
             return
-        channel = ChannelRecord.read(stream)
+        channel = parsed(ChannelRecord, content)
         known = self._channels.setdefault(channel.id, channel)
         before, now = ((c.topic, c.schema_id, c.message_encoding) for c in (known, channel))
         if before != now:
@@ -175,7 +172,7 @@ class _Mcap:
             if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._announce(record.opcode, record.content)
             elif record.opcode == Opcode.STATISTICS:
-                statistics = Statistics.read(ReadDataStream(BytesIO(record.content)))
+                statistics = parsed(Statistics, record.content)
             elif record.opcode == Opcode.CHUNK_INDEX:
                 chunks.append(self._indexed(record.content, records.summary_start))
         free = MAGIC

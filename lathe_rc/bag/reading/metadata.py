@@ -15,15 +15,7 @@ from typing import Any, TypeVar
 import yaml
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
-from lathe_rc.bag.reading.limits import (
-    LONGEST_NAME,
-    MOST_DEPTH,
-    MOST_EVENTS,
-    MOST_FILES,
-    MOST_METADATA,
-    MOST_TEXT,
-    MOST_TOPICS,
-)
+from lathe_rc.bag.reading import limits
 from lathe_rc.files import contents
 
 NAME = "metadata.yaml"
@@ -77,15 +69,15 @@ def read(folder: Path) -> Metadata:
         OSError: they cannot be read.
     """
     try:
-        text = contents(folder / NAME, MOST_METADATA).decode()
+        text = contents(folder / NAME, limits.MOST_METADATA).decode()
     except OSError as error:
-        most = f"; allowed: up to {MOST_METADATA} B" if error.errno == errno.EFBIG else ""
+        most = f"; allowed: up to {limits.MOST_METADATA} B" if error.errno == errno.EFBIG else ""
         raise ValueError(f"{NAME}: {error.strerror}{most}") from None
     bag = _of(read_yaml(text, NAME), "rosbag2_bagfile_information", dict)
     names = [PurePath(str(name)).name for name in _of(bag, "relative_file_paths", list)]
     files = tuple(dict.fromkeys(names))
-    if len(files) > MOST_FILES or not all(files):
-        raise ValueError(f"{NAME}: relative_file_paths are not up to {MOST_FILES} names of files")
+    if len(files) > limits.MOST_FILES or not all(files):
+        raise ValueError(f"{NAME}: relative_file_paths are not up to {limits.MOST_FILES} names of files")
     mode, form = (str(bag.get(key, "")) for key in ("compression_mode", "compression_format"))
     if mode.lower() not in ("", "none") and (mode.lower() not in ("file", "message") or form != "zstd"):
         raise ValueError(f"{NAME}: compression {form[:64]!r} by {mode[:64]!r}; allowed: zstd, by file or message")
@@ -101,13 +93,13 @@ def read(folder: Path) -> Metadata:
         mode.lower() == "message",
         span,
         _topics(_of(bag, "topics_with_message_count", list)),
-        {key[:256]: text[:MOST_TEXT] for key, text in texts if isinstance(text, str)},
+        {key[:256]: text[: limits.MOST_TEXT] for key, text in texts if isinstance(text, str)},
     )
 
 
 def _topics(listed: list[object]) -> dict[str, Topic]:
-    if len(listed) > MOST_TOPICS:
-        raise ValueError(f"{NAME}: {len(listed)} topics; allowed: up to {MOST_TOPICS}")
+    if len(listed) > limits.MOST_TOPICS:
+        raise ValueError(f"{NAME}: {len(listed)} topics; allowed: up to {limits.MOST_TOPICS}")
     topics: dict[str, Topic] = {}
     for each in listed:
         told = _of(each, "topic_metadata", dict)
@@ -216,8 +208,10 @@ def check_yaml(text: str, what: str) -> None:
             if isinstance(event, yaml.AliasEvent):
                 raise ValueError(f"{what}: YAML aliases; ROS 2 writes none")  # noqa: TRY004 - the file's fault
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > MOST_DEPTH or count > MOST_EVENTS:
-                raise ValueError(f"{what}: nested deeper than {MOST_DEPTH} or of more than {MOST_EVENTS} parts")
+            if depth > limits.MOST_DEPTH or count > limits.MOST_EVENTS:
+                raise ValueError(
+                    f"{what}: nested deeper than {limits.MOST_DEPTH} or of more than {limits.MOST_EVENTS} parts"
+                )
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         raise ValueError(f"{what}: not YAML{f' in line {mark.line + 1}' if mark else ''}") from None
@@ -231,5 +225,5 @@ def check_name(name: object) -> None:
     Raises:
         ValueError: it is no text, too long, or has characters that do not print.
     """
-    if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= LONGEST_NAME:
-        raise ValueError(f"name {str(name)[:80]!r}; allowed: up to {LONGEST_NAME} characters that print")
+    if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= limits.LONGEST_NAME:
+        raise ValueError(f"name {str(name)[:80]!r}; allowed: up to {limits.LONGEST_NAME} characters that print")

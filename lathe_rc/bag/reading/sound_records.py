@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 import numpy as np
 from isal.isal_zlib import crc32
@@ -24,16 +24,15 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from lathe_rc.bag.reading.chunk_messages import BEFORE_DATA, Found, walk
+from lathe_rc.bag.reading.chunk_messages import BEFORE_DATA, HEAD, Found, walk
 from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_METADATA, MOST_TEXT, TooMuchError
-from lathe_rc.bag.reading.unpacking import Budget, read_chunk
+from lathe_rc.bag.reading.unpacking import CHUNK, Budget, read_chunk
 
+Parsed = TypeVar("Parsed")
 Told = Callable[[str, int], None]  #: a damage, and the bytes in which messages may have stood
 
 MAGIC = len(MCAP0_MAGIC)  #: length of what a file begins and ends with [B]
-HEAD = struct.Struct("<BQ")  #: opcode and length ahead of a record
 _INDEX = struct.Struct("<HI")  # channel, length of the pairs of time and place
-_CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
 _COMPRESSIONS = (b"", b"lz4", b"zstd")
 _FOOTER, _DATA_END = 29, 13  # [B]
 _PRIVATE = 0x80  # opcodes from here on are anybody's
@@ -292,13 +291,13 @@ class SoundRecords:
     def _chunk(self, place: int, end: int) -> Record:
         """A chunk says its length twice: one of them may be wrong."""
         begin = place + HEAD.size
-        head = self._at(begin, _CHUNK.size + 4 + 8)
-        if len(head) < _CHUNK.size + 8:
+        head = self._at(begin, CHUNK.size + 4 + 8)
+        if len(head) < CHUNK.size + 8:
             raise _UnsoundError(f"cut off at byte {place}")
-        _, _, size, crc, length = _CHUNK.unpack_from(head)
-        if head[_CHUNK.size : _CHUNK.size + length] not in _COMPRESSIONS:
+        _, _, size, crc, length = CHUNK.unpack_from(head)
+        if head[CHUNK.size : CHUNK.size + length] not in _COMPRESSIONS:
             raise _UnsoundError(f"chunk at byte {place}: its compression is none of zstd, lz4, none")
-        start = begin + _CHUNK.size + length + 8
+        start = begin + CHUNK.size + length + 8
         said = start + int.from_bytes(self._at(start - 8, 8), "little")
         try:
             self._effort.budget.take(min(size, MOST_BYTES))
@@ -348,6 +347,11 @@ class SoundRecords:
         return True
 
 
+def parsed(kind: type[Parsed], content: bytes) -> Parsed:
+    """A record as an object of the mcap library, which raises whatever broken bytes lead to."""
+    return kind.read(ReadDataStream(BytesIO(content)))  # type: ignore[attr-defined, no-any-return]  # each has it
+
+
 def _found(record: Record, *walked: int) -> Found:
     """The records in one; of one whose opcode is not among ``walked``, itself."""
     if record.opcode in walked:
@@ -362,7 +366,7 @@ def _as_written(opcode: int, content: bytes) -> bool:
         return False
     builder = RecordBuilder()
     try:
-        _PLAIN[opcode].read(ReadDataStream(BytesIO(content))).write(builder)
+        parsed(_PLAIN[opcode], content).write(builder)
     except MemoryError:
         raise
     except Exception:  # noqa: BLE001 - mcap raises whatever broken bytes lead to

@@ -9,6 +9,7 @@ import sqlite3
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -134,14 +135,22 @@ def left_over(size: int) -> str:
 
 
 def _read_topics(base: sqlite3.Connection, storage: Storage) -> None:
-    columns = {name for (name,) in base.execute("SELECT name FROM pragma_table_info('topics')")}
-    offered = "offered_qos_profiles" if "offered_qos_profiles" in columns else "''"  # the oldest bags do not have it
-    rows = base.execute(f"SELECT id, name, type, serialization_format, {offered} FROM topics")  # noqa: S608 - see above
-    for number, name, kind, encoding, qos in rows.fetchmany(MOST_TOPICS + 1):
+    base.execute("SELECT id FROM topics LIMIT 0")  # an error where there is no such table
+    columns = ("id", "name", "type", "serialization_format", "offered_qos_profiles")
+    for number, topic, msgtype, encoding, profiles in select(base, "topics", columns):
         if not isinstance(number, int) or not 0 <= number <= _LAST:
             raise ValueError(f"topic {str(number)[:80]!r}; allowed: whole numbers from 0 on")
-        topic, msgtype, form, profiles = (text if isinstance(text, str) else "" for text in (name, kind, encoding, qos))
-        storage.announce(number, Channel(topic, msgtype, form), profiles)
+        storage.announce(number, Channel(topic, msgtype, encoding), profiles)
+
+
+def select(base: sqlite3.Connection, table: str, columns: tuple[str, ...]) -> list[tuple[Any, ...]]:
+    """Rows of a table as texts, but for a number in the first column; bags of older ROS lack columns and tables."""
+    there = {row[1] for row in base.execute(f"PRAGMA table_info({table})")}
+    if columns[0] not in there:
+        return []
+    listed = ", ".join(name if name in there else "''" for name in columns)
+    rows = base.execute(f"SELECT {listed} FROM {table}").fetchmany(MOST_TOPICS + 1)  # noqa: S608 - of constants
+    return [(first, *(text if isinstance(text, str) else "" for text in rest)) for first, *rest in rows]
 
 
 def _count(base: sqlite3.Connection, storage: Storage) -> tuple[int, int]:

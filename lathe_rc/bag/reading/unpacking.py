@@ -14,7 +14,7 @@ from lathe_rc.errors import shown
 
 _OVERHEAD = 2**16  # of compression, beyond 1/128 of what does not shrink [B]
 _PIECE = 2**20  # of a file that is unpacked [B]
-_CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
+CHUNK = struct.Struct("<QQQII")  #: first and last time, size, CRC, length of the compression's name
 
 
 class Budget:
@@ -103,9 +103,9 @@ def read_chunk(content: bytes, place: int) -> bytes:
         ValueError: it is broken.
     """
     try:
-        _, _, size, crc, name = _CHUNK.unpack_from(content)
-        start = _CHUNK.size + name
-        name_of = content[_CHUNK.size : start].decode("utf-8", "replace")
+        _, _, size, crc, name = CHUNK.unpack_from(content)
+        start = CHUNK.size + name
+        name_of = content[CHUNK.size : start].decode("utf-8", "replace")
         whole = unpack(name_of, memoryview(content)[start + 8 :], size)
     except (ValueError, struct.error) as error:
         raise ValueError(f"chunk at byte {place}: {shown(error)}") from None

@@ -46,8 +46,7 @@ def _copy(salvage: Salvage, writer: BagWriter) -> None:
     channels: dict[Topic, int] = {}
 
     def announce(topic: Topic) -> int:
-        listed = ListedTopic(topic.name, topic.type, topic.encoding, topic.qos)
-        channels[topic] = writer.copy_channel(listed, topic.digest, (topic.schema, topic.channel))
+        channels[topic] = writer.copy_channel(ListedTopic(*topic[:4]), topic.digest, (topic.schema, topic.channel))
         return channels[topic]
 
     salvage.copied = writer.copy_record

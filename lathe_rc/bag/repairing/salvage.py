@@ -10,14 +10,12 @@ import tempfile
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, suppress
-from dataclasses import dataclass, field, replace
-from io import BytesIO
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import zstandard
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema, Statistics
 from rosbags.interfaces import Qos
@@ -26,11 +24,12 @@ from lathe_rc import messages
 from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_METADATA, MOST_TEXT, MOST_TOPICS
 from lathe_rc.bag.reading.metadata import check_name, qos_of_text
-from lathe_rc.bag.reading.sound_records import SoundRecords, Told
+from lathe_rc.bag.reading.sound_records import SoundRecords, Told, parsed
 from lathe_rc.bag.reading.source import files_of
-from lathe_rc.bag.reading.sqlite_storage import check_tables, connect, left_over, with_journal
+from lathe_rc.bag.reading.sqlite_storage import check_tables, connect, left_over, select, with_journal
 from lathe_rc.bag.reading.unpacking import unpack, unpack_file, unpacked_size
 from lathe_rc.bag.writing.mcap_file import channel_content, schema_content
+from lathe_rc.bag.writing.writer import definition
 from lathe_rc.errors import InputError, shown
 
 ROS2 = "ros2"  #: profile of the files of rosbag2
@@ -43,8 +42,7 @@ _MOST_DAMAGE = 1000  # places that are told
 _SCHEMALESS = "__schemaless__"  # type of messages without a schema, as rosbags calls it
 
 
-@dataclass(frozen=True)
-class Topic:
+class Topic(NamedTuple):
     """A channel of a bag; the bytes are those of its records, numbers at their beginning included.
 
     Attributes:
@@ -148,7 +146,7 @@ class Salvage:
             first = next(iter(SoundRecords(stream, size, lambda _why, _lost: None)), None)
         if first is None or first.opcode != Opcode.HEADER:
             return ROS2
-        return str(Header.read(ReadDataStream(BytesIO(first.content))).profile)
+        return str(parsed(Header, first.content).profile)
 
     def __iter__(self) -> Iterator[Message]:
         """The whole messages in the order of the files."""
@@ -234,7 +232,7 @@ class Salvage:
         """
         check_name(topic.name)
         try:
-            topic = replace(topic, qos=qos_of_text(offered))
+            topic = topic._replace(qos=qos_of_text(offered))
         except ValueError as error:
             self._tell(f"{topic.name}: quality of service that is copied, not understood ({shown(error)})")
         if len(self.topics) >= MOST_TOPICS and topic not in self.topics:
@@ -256,7 +254,7 @@ class Salvage:
                 known.add(record.opcode, record.content, checked=record.checked)
             for record in sound:
                 if record.opcode == Opcode.STATISTICS and not sound.summary_wrong:
-                    self._counted = Statistics.read(ReadDataStream(BytesIO(record.content))).message_count
+                    self._counted = parsed(Statistics, record.content).message_count
                 for content, found in sound.inside(record):
                     for opcode, begin, end in found.others.tolist():
                         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -278,7 +276,7 @@ class Salvage:
         """Keep what is neither a message nor describes one."""
         try:
             if opcode == Opcode.METADATA:
-                metadata = Metadata.read(ReadDataStream(BytesIO(content)))
+                metadata = parsed(Metadata, content)
                 if metadata.name == "lathe_rc":
                     self._describe(metadata.metadata)
                 elif metadata.name != "rosbag2":  # the new bag has its own
@@ -295,41 +293,40 @@ class Salvage:
     # ---- SQLite -------------------------------------------------------------------------------------
 
     def _sqlite(self, file: Path) -> Iterator[Message]:
-        with tempfile.TemporaryDirectory(prefix="lathe-salvage-") as folder:
-            yield from self._database(file, Path(folder))
-
-    def _database(self, file: Path, folder: Path) -> Iterator[Message]:
+        strange = 0
         try:
-            database, left = with_journal(file, folder)
-            if left:
-                self._lose(file, left_over(left), left)
-            with closing(connect(database)) as base:
+            with ExitStack() as stack:
+                folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-salvage-"))
+                database, left = with_journal(file, Path(folder))
+                if left:
+                    self._lose(file, left_over(left), left)
+                base = stack.enter_context(closing(connect(database)))
                 with suppress(sqlite3.DatabaseError):  # of a broken page; the others are read below
                     check_tables(base)
-                topics, strange = self._sqlite_topics(file, base), 0
+                topics = self._sqlite_topics(file, base)
                 for number, log_ns, data in _readable_rows(base, lambda why, lost: self._lose(file, why, lost)):
                     topic = topics.get(number)
                     if topic and isinstance(log_ns, int) and log_ns >= 0 and isinstance(data, bytes):
                         yield Message(topic, 0, log_ns, log_ns, data)
                     else:
                         strange += 1
-                if strange:
-                    self.skipped += strange
-                    self._tell(f"{file.name}: {strange} messages without a topic, a time or bytes that can be copied")
+            if strange:
+                self.skipped += strange
+                self._tell(f"{file.name}: {strange} messages without a topic, a time or bytes that can be copied")
         except (sqlite3.Error, ValueError) as error:
             self._lose(file, str(error), file.stat().st_size)
 
     def _sqlite_topics(self, file: Path, base: sqlite3.Connection) -> dict[Any, Topic]:
         """Topics by number."""
-        definitions = _select(base, "message_definitions", ("topic_type", "encoding", "encoded_message_definition"))
+        definitions = select(base, "message_definitions", ("topic_type", "encoding", "encoded_message_definition"))
         defined = {kind: (encoding, text) for kind, encoding, text in definitions}
         names = ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
         topics: dict[Any, Topic] = {}
-        for number, name, kind, encoding, offered, digest in _select(base, "topics", names):
+        for number, name, kind, encoding, offered, digest in select(base, "topics", names):
             try:
                 check_name(kind)
-                how, text, known = _known_definition(kind)
-                how, text = defined.get(kind, (how, text))
+                known_text, known = definition(kind) if kind in messages.store().fielddefs else ("", "")
+                how, text = defined.get(kind, ("ros2msg" if known_text else "", known_text))
                 self.count(len(text) + len(offered))
                 said = {"offered_qos_profiles": offered, "topic_type_hash": digest or known}
                 schema, channel = schema_content(kind, how, text.encode()), channel_content(name, encoding, said)
@@ -398,14 +395,14 @@ class _Definitions:
         return None
 
     def _made(self, content: bytes) -> Topic:
-        channel = Channel.read(ReadDataStream(BytesIO(content)))
+        channel = parsed(Channel, content)
         name, schema, kind = shown(channel.topic), None, _SCHEMALESS
         if channel.schema_id:
             schema = self._find(Opcode.SCHEMA, channel.schema_id)
             if schema is None:
                 self._sound.told(f"{name}: schema {channel.schema_id} is described nowhere", 0)
             else:
-                kind = Schema.read(ReadDataStream(BytesIO(schema))).name or _SCHEMALESS
+                kind = parsed(Schema, schema).name or _SCHEMALESS
                 check_name(kind)
         self._salvage.count(len(content) + len(schema or b""))
         digest = channel.metadata.get("topic_type_hash", "")
@@ -451,21 +448,3 @@ def _readable_rows(base: sqlite3.Connection, told: Told) -> Iterator[tuple[Any, 
         if step is None:
             return
         first += bisect_left(range(step), 1, lo=step // 2, key=readable)
-
-
-def _known_definition(kind: str) -> tuple[str, str, str]:
-    """Encoding, text and hash of a type's definition, empty if this package does not have it."""
-    store = messages.store()
-    if kind not in store.fielddefs:
-        return "", "", ""
-    return "ros2msg", store.generate_msgdef(kind, ros_version=2)[0], store.hash_rihs01(kind)
-
-
-def _select(base: sqlite3.Connection, table: str, columns: tuple[str, ...]) -> list[tuple[Any, ...]]:
-    """Rows of a table as texts, but for a number in the first column; bags of older ROS lack columns and tables."""
-    there = {row[1] for row in base.execute(f"PRAGMA table_info({table})")}
-    if columns[0] not in there:
-        return []
-    listed = ", ".join(name if name in there else "''" for name in columns)
-    rows = base.execute(f"SELECT {listed} FROM {table}").fetchmany(MOST_TOPICS)  # noqa: S608 - of constants
-    return [(first, *(text if isinstance(text, str) else "" for text in rest)) for first, *rest in rows]

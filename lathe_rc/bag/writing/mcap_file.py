@@ -20,28 +20,13 @@ from typing import Protocol
 import numpy as np
 import zstandard
 from isal.isal_zlib import crc32
+from mcap import records
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
 from mcap.writer import MCAP0_MAGIC
 
-from lathe_rc.bag.reading.chunk_messages import BEFORE_DATA, walk
+from lathe_rc.bag.reading.chunk_messages import BEFORE_DATA, HEAD, walk
 
-_HEAD = struct.Struct("<BQ")  # opcode, length
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 TIMES = (16, 8)  #: where log time and publish time stand ahead of a message's bytes [B]
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of what follows: log time and place in pairs
@@ -60,31 +45,31 @@ class _Record(Protocol):
 def message_head(channel: int, log_ns: int, length: int, publish_ns: int | None = None, sequence: int = 0) -> bytes:
     """The bytes of a file ahead of the ``length`` bytes of a message; by default published at its log time."""
     published = log_ns if publish_ns is None else publish_ns
-    size = length + _MESSAGE.size - _HEAD.size
+    size = length + _MESSAGE.size - HEAD.size
     return _MESSAGE.pack(Opcode.MESSAGE, size, channel, sequence, log_ns, published)
 
 
 def _record(opcode: int, *parts: bytes) -> bytes:
     """A record of these contents."""
-    return b"".join([_HEAD.pack(opcode, sum(map(len, parts))), *parts])
+    return b"".join([HEAD.pack(opcode, sum(map(len, parts))), *parts])
 
 
-def _encoded(*records: _Record) -> bytes:
+def _encoded(*each: _Record) -> bytes:
     builder = RecordBuilder()
-    for record in records:
+    for record in each:
         record.write(builder)
     return bytes(builder.end())
 
 
 def schema_content(name: str, encoding: str, text: bytes) -> bytes:
     """The content of a schema record, with number 0."""
-    return _encoded(Schema(id=0, data=text, encoding=encoding, name=name))[_HEAD.size :]
+    return _encoded(records.Schema(id=0, data=text, encoding=encoding, name=name))[HEAD.size :]
 
 
 def channel_content(topic: str, encoding: str, metadata: Mapping[str, str]) -> bytes:
     """The content of a channel record, with number 0."""
-    channel = Channel(id=0, topic=topic, message_encoding=encoding, metadata=dict(metadata), schema_id=0)
-    return _encoded(channel)[_HEAD.size :]
+    channel = records.Channel(id=0, topic=topic, message_encoding=encoding, metadata=dict(metadata), schema_id=0)
+    return _encoded(channel)[HEAD.size :]
 
 
 class McapFile:
@@ -112,8 +97,8 @@ class McapFile:
         self._channels: list[bytes] = []
         self._chunks = 0
         self._chunk_index = bytearray()  # encoded: as objects, the chunks of a long run take ten times as much memory
-        self._metadata: list[MetadataIndex] = []
-        self._attachments: list[AttachmentIndex] = []
+        self._metadata: list[records.MetadataIndex] = []
+        self._attachments: list[records.AttachmentIndex] = []
         self.counts: dict[int, int] = {}
         self.first_ns: int | None = None
         self.last_ns: int | None = None
@@ -123,7 +108,7 @@ class McapFile:
         self._reserve = path.with_name(f"{path.name}.reserve")
         self._kept = self._described = 0
         self._refused: OSError | None = None
-        self._put(MCAP0_MAGIC + _encoded(Header(profile, "lathe_rc")))
+        self._put(MCAP0_MAGIC + _encoded(records.Header(profile, "lathe_rc")))
 
     def _begin_chunk(self) -> None:
         self._chunk.seek(0)  # its memory is used again
@@ -238,14 +223,14 @@ class McapFile:
             data = self._compressor.compress(whole) if self._compressor else bytes(whole)
         first, last = int(messages[:, 1].min()), int(messages[:, 1].max())
         compression = "zstd" if self._compressor else ""
-        chunk = _encoded(Chunk(compression, data, last, first, crc, self._size))
+        chunk = _encoded(records.Chunk(compression, data, last, first, crc, self._size))
         pairs = np.stack([messages[:, 1], messages[:, 2] - np.uint64(BEFORE_DATA)], axis=1)
         counts = np.bincount(messages[:, 0].astype(np.int64))
         start = self._offset
         parts, offsets, end = [chunk], {}, start + len(chunk)
         for channel in np.flatnonzero(counts).tolist():
             text = pairs[messages[:, 0] == channel].tobytes()
-            head = _INDEX.pack(Opcode.MESSAGE_INDEX, len(text) + _INDEX.size - _HEAD.size, channel, len(text))
+            head = _INDEX.pack(Opcode.MESSAGE_INDEX, len(text) + _INDEX.size - HEAD.size, channel, len(text))
             parts += head, text
             offsets[channel] = end
             end += len(head) + len(text)
@@ -256,7 +241,7 @@ class McapFile:
         self.last_ns = last if self.last_ns is None else max(last, self.last_ns)
         self._chunks += 1
         self._chunk_index += _encoded(
-            ChunkIndex(
+            records.ChunkIndex(
                 message_start_time=first,
                 message_end_time=last,
                 chunk_start_offset=start,
@@ -271,7 +256,7 @@ class McapFile:
 
     def add_metadata(self, name: str, values: Mapping[str, str], *, last: bool = False) -> None:
         """Append texts that describe the file; ``last``: in the room that has been kept for them."""
-        content = _encoded(Metadata(name=name, metadata=dict(values)))[_HEAD.size :]
+        content = _encoded(records.Metadata(name=name, metadata=dict(values)))[HEAD.size :]
         self.copy_record(Opcode.METADATA, content, last=last)
 
     def copy_record(self, opcode: int, content: bytes, *, last: bool = False) -> None:
@@ -282,14 +267,16 @@ class McapFile:
             self._described += len(record)
             self._keep_room()
         if opcode == Opcode.METADATA:
-            name = Metadata.read(stream).name
+            name = records.Metadata.read(stream).name
             self._put(record)
-            self._metadata.append(MetadataIndex(offset=self._offset - len(record), length=len(record), name=name))
+            self._metadata.append(
+                records.MetadataIndex(offset=self._offset - len(record), length=len(record), name=name)
+            )
         else:
-            found = Attachment.read(stream)
+            found = records.Attachment.read(stream)
             self._put(record)
             self._attachments.append(
-                AttachmentIndex(
+                records.AttachmentIndex(
                     offset=self._offset - len(record),
                     length=len(record),
                     log_time=found.log_time,
@@ -304,7 +291,7 @@ class McapFile:
         """Write the summary and close the file."""
         try:
             self.flush()
-            self._put(_encoded(DataEnd(self._crc)))
+            self._put(_encoded(records.DataEnd(self._crc)))
             self._put(self._summary())
         finally:
             self.abort()
@@ -315,7 +302,7 @@ class McapFile:
         self._stream.close()
 
     def _summary(self) -> bytes:
-        statistics = Statistics(
+        statistics = records.Statistics(
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts=self.counts,
@@ -339,9 +326,9 @@ class McapFile:
         for opcode, data in groups.items():
             if not data:
                 continue
-            offsets.append(SummaryOffset(group_opcode=opcode, group_start=place, group_length=len(data)))
+            offsets.append(records.SummaryOffset(group_opcode=opcode, group_start=place, group_length=len(data)))
             place += len(data)
         summary = b"".join(groups.values()) + _encoded(*offsets)
         crc = crc32(_FOOTER.pack(Opcode.FOOTER, 20, start, place), crc32(summary))
-        footer = Footer(summary_start=start, summary_offset_start=place, summary_crc=crc)
+        footer = records.Footer(summary_start=start, summary_offset_start=place, summary_crc=crc)
         return summary + _encoded(footer) + MCAP0_MAGIC

@@ -37,10 +37,6 @@ class _Item(NamedTuple):
     data: bytes | memoryview
 
 
-def _ignore(snapshot: Snapshot) -> None:
-    """Tell nobody."""
-
-
 class Snapshots:
     """Keeps what came last, and writes a bag of it at every trigger; an `Output` of messages in the order of a bag.
 
@@ -70,7 +66,7 @@ class Snapshots:
         *,
         name: str,
         namespace: str = "/",
-        told: Callable[[Snapshot], None] = _ignore,
+        told: Callable[[Snapshot], None] = lambda _: None,
     ) -> None:
         refuse_existing(folder)
         self.folder, self._table, self._name, self._namespace, self._told = folder, table, name, namespace, told

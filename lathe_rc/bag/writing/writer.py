@@ -88,7 +88,7 @@ class Output(Protocol):
 
 
 @cache
-def _definition(msgtype: str) -> tuple[str, str]:
+def definition(msgtype: str) -> tuple[str, str]:
     """Text and hash of a message type that this package knows."""
     store = messages.store()
     return store.generate_msgdef(msgtype, ros_version=2)[0], store.hash_rihs01(msgtype)
@@ -186,7 +186,7 @@ class BagWriter:
 
     def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
         """Announce a fully qualified topic of a type that this package knows."""
-        text, digest = _definition(msgtype)
+        text, digest = definition(msgtype)
         self.copy_topic(topic, msgtype, [qos], definition=text, digest=digest)
 
     def copy_topic(self, topic: str, msgtype: str, qos: Sequence[Qos], *, definition: str, digest: str) -> None:
