@@ -206,5 +206,5 @@ def test_memory_does_not_grow_with_the_run(tmp_path):
         for topic in KINDS:
             if merger.add_block(topic, block(topic, 8 * row, 8)):
                 merger.release()
-        assert len(merger._sheets) + len(merger._free) <= 2
+        assert len(merger._buffers) + len(merger._free) <= 2
     writer.close()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a bag is what it should be: every sample once, finite, and as it was when it was recorded."""
+"""Check of a bag: every sample once, finite, and with the bits of the recorded run."""
 
 import json
 from collections.abc import Mapping
@@ -58,7 +58,7 @@ class Findings:
 
 
 class _Sparse:
-    """Looks at the messages of a topic that are no blocks."""
+    """Check of a topic whose messages are no blocks."""
 
     def __init__(self, topic: str, msgtype: str, findings: Findings) -> None:
         self._topic, self._type, self._findings = topic, msgtype, findings
@@ -76,7 +76,7 @@ class _Sparse:
 
 
 class _Dense:
-    """Looks at the blocks of a topic."""
+    """Check of a topic of blocks."""
 
     def __init__(self, topic: str, msgtype: str, findings: Findings, digester: Digester) -> None:
         self._topic, self._findings, self._digester = topic, findings, digester

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading bags of the cell back, whole."""
+"""Bags of the cell as recordings in memory."""
 
 import os
 from collections.abc import Mapping
@@ -14,8 +14,8 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.messages import START_NS, Samples, Signals
 
 
-class _Whole:
-    """Keeps every piece; a sink."""
+class _Collector:
+    """Pieces of all signal topics in memory; a sink."""
 
     def __init__(self) -> None:
         self.dense: dict[str, dict[str, list[Samples]]] = {}
@@ -32,7 +32,7 @@ class _Whole:
 
 
 def read_bag(path: str | os.PathLike[str]) -> Recording:
-    """All signal topics of a bag; memory for all of it is needed, see `lathe_rc.bag.reading.stream` otherwise.
+    """Read all signal topics of a bag into memory; bags beyond it are read in pieces, see `lathe_rc.bag.reading.stream`.
 
     Example:
         >>> import lathe_rc
@@ -48,17 +48,17 @@ def read_bag(path: str | os.PathLike[str]) -> Recording:
         InputError: not a bag.
         LatheError: a block is missing or repeated.
     """
-    whole = _Whole()
-    header = feed(Path(path), [whole])
+    collected = _Collector()
+    header = feed(Path(path), [collected])
     dense, sparse = {}, {}
     for topic, msgtype in header.types.items():
         if msgtype in messages.block_types():
-            parts = whole.dense.get(topic, {})
+            parts = collected.dense.get(topic, {})
             empty = messages.allocate(msgtype, 0)
             dense[topic] = {name: np.concatenate(parts.get(name) or [array]) for name, array in empty.items()}
         else:
             sparse[topic] = SparseTopic()
-            for message in whole.sparse.get(topic, []):
+            for message in collected.sparse.get(topic, []):
                 sparse[topic].append(START_NS + message.index * header.step_ns, message.values)
     samples = next((array.size for signals in dense.values() for array in signals.values()), 0)
     return Recording(header.types, dense, sparse, header.step_ns, header.samples - samples)

@@ -168,7 +168,7 @@ def export_bag(
             exporter = Exporter(types, step_ns, target)
             feed(bag, [exporter])
             rows = exporter.close()
-            _refuse_existing(place)
+            _refuse_existing(place)  # made by others meanwhile: a rename would replace it
             result.rename(place)
     except OSError as error:
         raise LatheError(f"{place}: cannot be written ({error.strerror or error})") from None

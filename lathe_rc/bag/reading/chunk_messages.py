@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The records of a piece of an MCAP file, found by compiled code; for readers, and for the index of our own writer."""
+"""Compiled walk over the records of a piece of an MCAP file, for readers and for the index of our own writer."""
 
 import struct
 from typing import Any, NamedTuple
@@ -46,6 +46,7 @@ def _little(data: Bytes, place: int, size: int) -> Any:
 @kernel
 def _walk(data: Bytes, messages: Places, others: Places, alone: bool) -> tuple[int, int, int]:  # noqa: FBT001 - a kernel
     """Fill both tables as far as they go; returns the numbers of messages and of others, and the end."""
+    # All comparisons are of what is left, never of sums with a length: a length near 2**64 would wrap around.
     place, count, further, size = 0, 0, 0, data.size
     while place + _HEAD <= size:
         length = _little(data, place + 1, 8)

@@ -53,6 +53,7 @@ class _Records(Span):
         found = found[wanted[found[:, 0]]]
         if start_ns > self.first_ns or stop_ns <= self.last_ns:
             found = found[(found[:, 1] >= np.uint64(max(start_ns, 0))) & (found[:, 1] < stop_ns)]
+        # A stable sort: messages of one time keep the order of the file.
         if np.any(found[1:, 1] < found[:-1, 1]):
             found = found[np.argsort(found[:, 1], kind="stable")]
         for first in range(0, len(found), _AT_ONCE):
@@ -175,6 +176,7 @@ class _Mcap:
                 statistics = parsed(Statistics, record.content)
             elif record.opcode == Opcode.CHUNK_INDEX:
                 chunks.append(self._indexed(record.content, records.summary_start))
+        # Chunks that overlap would be unpacked once for each entry: a small file with work for hours.
         free = MAGIC
         for chunk in sorted(chunks, key=lambda chunk: chunk.start):
             if chunk.start < free:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dense topics of a bag that may lack some, under the names that a cell has for them, checked as they are read."""
+"""Dense topics of a bag under the names that a cell has for them, checked as they are read; some may be missing."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.bag.reading.stream import Tape
+from lathe_rc.bag.reading.stream import SampleReader, check_next
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import Samples, Signals
 
@@ -96,9 +96,9 @@ class Recorded:
         options = " or ".join(f"--topic {name}={topic}" for topic in others or ["/TOPIC"])
         return f"{msgtype.rpartition('/')[2]} on {messages.full(name)} (or {options})"
 
-    def tape(self, topic: str) -> Tape:
+    def samples_of(self, topic: str) -> SampleReader:
         """A topic to be read along with a run."""
-        return Tape(self._source, topic)
+        return SampleReader(self._source, topic)
 
     def step_ns(self, topic: str) -> int:
         """Sampling step [ns]; 0 if there is no block."""
@@ -113,10 +113,9 @@ class Recorded:
         end, step_ns = 0, 0
         for block in self._source.blocks(topic):
             where = f"{self.path}: {topic}"
-            if block.first_index != end:
-                raise LatheError(f"{where} goes from sample {end} to {block.first_index}; allowed: all, from 0 on")
-            if step_ns not in (0, block.step_ns) or not block.step_ns:
-                raise LatheError(f"{where}: the step changes from {step_ns} to {block.step_ns} ns at sample {end}")
+            check_next(where, block, end, step_ns)
+            if not block.step_ns:
+                raise LatheError(f"{where}: the step is 0 ns at sample {end}")
             for name in fields:
                 wrong = np.flatnonzero(~np.isfinite(block.signals[name]))
                 if wrong.size:
@@ -165,6 +164,7 @@ class Recorded:
                 f"{self.lacks(name, messages.ENCODER)}; the bag has {self.holdings()}"
             )
         fields = ["angle", "speed", "angle_true", "speed_true"]
+        # Two passes over the topic: in memory, hours of a spindle would take gigabytes.
         has_truth = any(np.any(signals["angle_true"]) for _, signals in self.pieces(topic, fields))
         angle, speed = ("angle_true", "speed_true") if has_truth else ("angle", "speed")
         low, high, last, samples = np.inf, -np.inf, np.nan, 0

@@ -370,8 +370,10 @@ def _merged(group: Sequence[Read], start: int, stop: int, budget: Budget) -> Ite
         if at_a_time > MOST_OPEN:
             raise ValueError(f"chunks of the same time take more than {MOST_OPEN} B; record them in order of time")
 
+    # The merge asks each generator for its first message at once, which would unpack all chunks of the group: a mark at
+    # the span's first time comes ahead of them.
     def late(span: Span, wanted: Mapping[int, str]) -> Iterator[Message]:
-        yield "", span.first_ns, b""  # a span is not read before its time
+        yield "", span.first_ns, b""
         yield from chain.from_iterable(span.read(wanted, start, stop, budget))
 
     for message in heapq.merge(*(late(*read) for read in group), key=itemgetter(1)):

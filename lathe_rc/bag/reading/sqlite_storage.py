@@ -53,6 +53,7 @@ def with_journal(path: Path, folder: Path) -> tuple[Path, int]:
     shutil.copyfile(path, copy)
     for log in logs:
         shutil.copyfile(log, folder / f"{path.name}{log.name.removeprefix(beside.name)}")
+    # Any connection works a hot journal into the database; a write-ahead log needs the checkpoint.
     with contextlib.closing(sqlite3.connect(copy)) as base:
         _, frames, _ = base.execute("PRAGMA wal_checkpoint").fetchone()
         base.execute("PRAGMA journal_mode=DELETE").fetchall()
@@ -80,7 +81,8 @@ def _left(log: Path, frames: int) -> int:
 
 
 def connect(path: Path) -> sqlite3.Connection:
-    """A database that nobody writes."""
+    """Open a database for reading alone."""
+    # Immutable: no locks, and neither -wal nor -shm files beside a bag that may be on a read-only disk.
     return sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
 
 

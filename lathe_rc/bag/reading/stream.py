@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags piece by piece: what they hold goes to sinks as from an offline run, in as little memory."""
+"""Bags piece by piece: their signals go to sinks as from an offline run, in as little memory."""
 
 from collections import deque
 from collections.abc import Iterable, Mapping
@@ -46,6 +46,24 @@ class BagHeader:
     about: Mapping[str, str]
 
 
+def check_next(topic: str, block: Block, end: int, step_ns: int) -> None:
+    """Refuse a block that does not follow the one before, which ends ahead of sample ``end``.
+
+    Args:
+        topic: of the block.
+        block: the block.
+        end: index of its first sample if none is missing.
+        step_ns: sampling step so far [ns]; 0: any.
+
+    Raises:
+        LatheError: samples are missing or repeated, or the step changes.
+    """
+    if block.first_index != end:
+        raise LatheError(f"{topic} goes from sample {end} to {block.first_index}; allowed: every sample, once")
+    if step_ns not in (0, block.step_ns):
+        raise LatheError(f"{topic}: the step changes from {step_ns} to {block.step_ns} ns at sample {end}")
+
+
 class _Dense:
     """Blocks of a topic that have not been handed on, from sample ``first`` on."""
 
@@ -77,6 +95,7 @@ class _Dense:
         Raises:
             LatheError: see `read_all`.
         """
+        # The decoder joins blocks of one piece of memory: together they take a fraction of the time of each alone.
         messages, self._messages, self._bytes = self._messages, [], 0
         ends = np.cumsum([0, *map(len, messages)])
         self.read_all(b"".join(messages), np.stack([ends[:-1], ends[1:]], axis=1))
@@ -94,10 +113,7 @@ class _Dense:
             raise LatheError(f"{self.topic}: {shown(error)}") from None
 
     def _append(self, block: Block) -> None:
-        if block.first_index != self.end:
-            raise LatheError(f"{self.topic} goes from sample {self.end} to {block.first_index}")
-        if self.newest and block.step_ns != self.newest.step_ns:
-            raise LatheError(f"{self.topic}: the step changes from {self.newest.step_ns} to {block.step_ns} ns")
+        check_next(self.topic, block, self.end, self.newest.step_ns if self.newest else 0)
         self.end += block.samples
         self.newest = block
         self.blocks.append(block)
@@ -217,7 +233,7 @@ class Feeder:
         return max(ends) - min(ends)
 
 
-class Tape:
+class SampleReader:
     """A dense topic of a bag, read as it is needed.
 
     Args:

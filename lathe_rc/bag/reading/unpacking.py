@@ -103,6 +103,7 @@ def read_chunk(content: bytes, place: int) -> bytes:
         ValueError: it is broken.
     """
     try:
+        # The checksum is that of the unpacked records; 0 stands for none.
         _, _, size, crc, name = CHUNK.unpack_from(content)
         start = CHUNK.size + name
         name_of = content[CHUNK.size : start].decode("utf-8", "replace")

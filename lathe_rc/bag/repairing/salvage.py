@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every message that is whole in a bag that is not: cut off, or broken in places.
+"""Every sound message of a bag that is cut off or broken in places.
 
 Bytes are copied, not understood: schemas, channels and messages keep every byte but for their numbers.
 """
@@ -444,6 +444,7 @@ def _readable_rows(base: sqlite3.Connection, told: Told) -> Iterator[tuple[Any, 
             told(f"from message {first} on: {error}", _PAGE)
         else:
             return
+        # Rows behind a broken page are searched by doubling, then by bisection: row numbers have gaps of any length.
         step = next((2**k for k in range(_MOST_ID_BITS) if readable(2**k)), None)
         if step is None:
             return

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cell whose spindle is the one of a bag."""
+"""A cell whose spindle is the one of a bag, and the recorded tool position beside the re-simulated one."""
 
 from collections import deque
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -11,17 +12,19 @@ from lathe_rc import messages
 from lathe_rc.arrays import put
 from lathe_rc.bag.reading.recorded import Recorded, Spindle
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.bag.reading.stream import Tape
-from lathe_rc.bag.resimulation.compare import Comparison, positions
+from lathe_rc.bag.reading.stream import SampleReader
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stage import DONE, Fields, Reached
+from lathe_rc.cell.stage import DONE, Fields, Reached, Sparse
 from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.jit import kernel
-from lathe_rc.messages import Samples
+from lathe_rc.messages import Samples, Signals
+from lathe_rc.part import ErrorsByRevolution
+
+_TYPES = {"/encoder": messages.ENCODER, "/tool": messages.TOOL}
 
 
 class Memory(NamedTuple):
@@ -53,15 +56,15 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     return n, DONE
 
 
-class _PlayedSpindle(TimeMaster):
+class _RecordedSpindle(TimeMaster):
     """The spindle as it was recorded."""
 
     step = staticmethod(step)
 
-    def __init__(self, made: TimeMaster, tape: Tape, samples: int, said: Spindle | None = None) -> None:
+    def __init__(self, made: TimeMaster, reader: SampleReader, samples: int, said: Spindle | None = None) -> None:
         super().__init__(made.name, made.parameters)
         self._made, self.law = made, made.law
-        self._tape, self.samples, self._said = tape, samples, said
+        self._reader, self.samples, self._said = reader, samples, said
         self.place_triggers()
         self.declare(outputs=made.outputs, tells=made.tells)  # its events stand in the recording
         self._ready = messages.allocate(messages.ENCODER, messages.MAX_BLOCK)
@@ -97,6 +100,7 @@ class _PlayedSpindle(TimeMaster):
         Raises:
             LatheError: the recording has not so many samples, or some are missing.
         """
+        # Samples that were read ahead move to the front: the kernel sees one array without a wrap-around.
         begin, end = self._span.tolist()
         if first + samples <= end:
             return
@@ -105,7 +109,7 @@ class _PlayedSpindle(TimeMaster):
             array[:left] = array[first - begin : end - begin].copy()
         self._span[:] = first, end
         signals = {name: array[left:samples] for name, array in self._ready.items()}
-        self._tape.take_into(signals)
+        self._reader.take_into(signals)
         self._span[1] = first + samples
         if self._said and not self._said.has_truth:
             signals["angle_true"][:], signals["speed_true"][:] = signals["angle"], signals["speed"]
@@ -119,6 +123,58 @@ class _PlayedSpindle(TimeMaster):
 
     def act(self, action: str, index: int) -> None:
         """Faults of the encoder are in the recording already."""
+
+
+def _positions(recorded: Recorded, tool: Tool) -> list[tuple[str, str]]:
+    """Topics and fields of a bag whose sum is the tool's position; empty if not all of them are there.
+
+    The tool's own topic, or the measured positions of the drives that move it.
+    """
+    own = recorded.find(remapped(tool.shared, tool.outputs[0].topic), messages.TOOL)
+    if own is not None:
+        return [(own, "displacement")]
+    names = [remapped(tool.shared, f"{drive}/state") for drive in tool.parameters.drives]
+    topics = [recorded.find(name, messages.STATE) for name in names]
+    return [(topic, "measured_position") for topic in topics if topic is not None] if all(topics) else []
+
+
+class Comparison:
+    """Form error of the recorded tool position, and how far the re-simulated one is off, by revolution; a sink.
+
+    The recorded one is that of the re-simulation with the recorded position in place of the simulated: same desired
+    form, same cross slide, same deflection.
+
+    Args:
+        recorded: the bag.
+        cell: that runs.
+        tool: its tool.
+        topics: see `_positions`.
+
+    Attributes:
+        topics: see above.
+    """
+
+    def __init__(self, recorded: Recorded, cell: Cell, tool: Tool, topics: list[tuple[str, str]]) -> None:
+        self.topics = topics
+        self._encoder = remapped(cell.master.shared, "encoder")
+        self._tool = remapped(tool.shared, tool.outputs[0].topic)
+        self._readers = [(recorded.samples_of(topic), field) for topic, field in topics]
+        self._recorded, self._between = ErrorsByRevolution(_TYPES), ErrorsByRevolution(_TYPES)
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """See `lathe_rc.cell.engine.Sink`."""
+        tool, encoder = dense[self._tool], dense[self._encoder]
+        between: Samples = tool["displacement"] - sum(reader.take(samples)[field] for reader, field in self._readers)
+        for sink, error in ((self._recorded, tool["error"] + between), (self._between, between)):
+            sink.chunk(first, samples, {"encoder": encoder, "tool": {"error": error}}, {})
+
+    def recorded_rms(self) -> Samples:
+        """Form error of the recorded position by revolution, RMS [m], shape (revolutions,)."""
+        return self._recorded.rms()
+
+    def between_rms(self) -> Samples:
+        """Difference of the two positions by revolution, RMS [m], shape (revolutions,)."""
+        return self._between.rms()
 
 
 Events = dict[str, list[tuple[int, str]]]  #: sample and action of the events of each node
@@ -151,7 +207,7 @@ def wire(
     recorded.check_names([*cell.dense])
     name = remapped(master.shared, "encoder")
     tool = next((stage for stage in cell.stages.values() if isinstance(stage, Tool)), None)
-    topics = positions(recorded, tool) if tool else []
+    topics = _positions(recorded, tool) if tool else []
     spindle = None if original is not None else recorded.spindle(name)
     topic = spindle.topic if spindle else recorded.find(name, messages.ENCODER) or messages.full(name)
     samples = spindle.samples if spindle else _samples(source, topic)
@@ -165,7 +221,7 @@ def wire(
                 f"{source.path}: {of} has a step of {step_ns} ns, the scenario one of {master.shared.step_ns} ns; "
                 f"allowed: sample_rate = {1e9 / step_ns:.10g} Hz under /**"
             )
-    cell.replace(_PlayedSpindle(master, recorded.tape(topic), samples, spindle))
+    cell.replace(_RecordedSpindle(master, recorded.samples_of(topic), samples, spindle))
     cell.check()
     compared = Comparison(recorded, cell, tool, topics) if tool and topics else None
     return cell, compared, _events(source) if original is not None else {}

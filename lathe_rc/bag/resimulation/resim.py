@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Re-simulation: what the spindle did is taken from a bag, everything behind it computes again.
+"""Re-simulation: the spindle turns as in a bag, everything behind it is computed again.
 
 With nothing changed every bit must come out as it was recorded. With another controller the run shows what that
 controller would have made of the same spindle, disturbances and form.
@@ -204,6 +204,7 @@ def resimulate(
         with _without_strangers(path, changed=changed):
             cell, compared, events = wire(chosen, original, recorded, source)
         warnings += cell.warnings if changed else []
+        # Events go in as they took effect: their samples depended on an operator or on the recorded spindle.
         for name, stage in cell.stages.items():
             for index, action in events.get(name, []):
                 stage.replay(action, index)

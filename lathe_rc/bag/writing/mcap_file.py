@@ -90,6 +90,7 @@ class McapFile:
     """
 
     def __init__(self, path: Path, *, chunk_size: int, compress: bool, profile: str = "ros2") -> None:
+        # Unbuffered: flush() hands all bytes to the operating system, and a failed write is cut off again by `_put`.
         self._stream = path.open("xb", buffering=0)
         self._chunk_size = chunk_size
         self._compressor = zstandard.ZstdCompressor(level=_LEVEL) if compress else None
@@ -138,6 +139,7 @@ class McapFile:
         if needed > self._kept:
             needed += _ROOM
             with self._reserve.open("ab") as stream:
+                # A sparse file would promise blocks that a full disk does not have.
                 os.posix_fallocate(stream.fileno(), 0, needed)
             self._kept = needed
 
@@ -194,6 +196,7 @@ class McapFile:
         """Append rows of ``size`` bytes, each some whole message records."""
         rest = memoryview(data)
         while rest:
+            # As many whole rows as bring the chunk beyond its size, at least one.
             fill = (max(self._chunk_size - self._size, 0) // size + 1) * size
             self._size += self._chunk.write(rest[:fill])
             self._filled, rest = True, rest[fill:]
@@ -266,26 +269,16 @@ class McapFile:
         if opcode == Opcode.METADATA and not last:  # metadata.yaml may repeat it, twice as long for its escapes
             self._described += len(record)
             self._keep_room()
+        place = {"offset": self._offset, "length": len(record)}
         if opcode == Opcode.METADATA:
             name = records.Metadata.read(stream).name
             self._put(record)
-            self._metadata.append(
-                records.MetadataIndex(offset=self._offset - len(record), length=len(record), name=name)
-            )
+            self._metadata.append(records.MetadataIndex(name=name, **place))
         else:
             found = records.Attachment.read(stream)
+            place |= {"log_time": found.log_time, "create_time": found.create_time, "data_size": len(found.data)}
             self._put(record)
-            self._attachments.append(
-                records.AttachmentIndex(
-                    offset=self._offset - len(record),
-                    length=len(record),
-                    log_time=found.log_time,
-                    create_time=found.create_time,
-                    data_size=len(found.data),
-                    name=found.name,
-                    media_type=found.media_type,
-                )
-            )
+            self._attachments.append(records.AttachmentIndex(name=found.name, media_type=found.media_type, **place))
 
     def finish(self) -> None:
         """Write the summary and close the file."""

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The order of signal messages in a bag: by log time, then topic, then index, whoever arrived first."""
+"""Order of the signal messages in a bag: by log time, then topic, then index, whatever the order of arrival."""
 
 from collections import Counter
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
-from lathe_rc.bag.writing.rows import Dense, Plan, Sheet
+from lathe_rc.bag.writing.rows import Dense, Plan, RowBuffer
 from lathe_rc.bag.writing.writer import Output
 from lathe_rc.cell.block import Block
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import START_NS, Samples, Signals
 
-_SHEET = 2**20  # bytes of a sheet's rows, or one row
+_BUFFER = 2**20  # size of a buffer, unless one row takes more [B]
 
 
 class _Single(NamedTuple):
@@ -24,7 +24,7 @@ class _Single(NamedTuple):
 
 
 class Merger:
-    """Collects the messages of all signal topics and writes them in the order of a bag.
+    """Merge of all signal topics in the order of a bag.
 
     A row of blocks leaves when every dense topic has brought its block and every source the sparse messages up to its
     end, which the block counts: then nothing with an earlier time can still come. Later ones do not count: a source
@@ -63,10 +63,10 @@ class Merger:
         self._final: int | None = None  # the last row
         self._finals = 0  # topics that have brought it
         self._plan = Plan(self._topics, run_id, step_ns, samples)
-        self._sheet_rows = max(_SHEET // self._plan.rows.size, 1)  # rows
-        self._sheets: dict[int, Sheet] = {}  # by number
-        self._free: list[Sheet] = []
-        self._tail: Sheet | None = None  # the last row, if it is shorter
+        self._buffer_rows = max(_BUFFER // self._plan.rows.size, 1)  # rows
+        self._buffers: dict[int, RowBuffer] = {}  # by number
+        self._free: list[RowBuffer] = []
+        self._tail: RowBuffer | None = None  # the last row, if it is shorter
         self._sparse = sparse
         self._repeats: Counter[tuple[str, int, bytes]] = Counter()
         self._sequence = dict.fromkeys(sparse, 0)
@@ -95,8 +95,8 @@ class Merger:
         if block.run_id != self._run_id:
             raise LatheError(f"{topic}: block of run {block.run_id!r} from {block.source}; expected {self._run_id!r}")
         row = self._check(place, block.first_index, block.samples, last=block.last)
-        sheet, within = self._find(row, block.samples)
-        sheet.put(place, within, block, data)
+        buffer, within = self._find(row, block.samples)
+        buffer.put(place, within, block, data)
         source = self._topics[place].source
         if block.companions > self._written[source] and source not in self._lost:
             self._needs.append((row, source, block.companions))
@@ -119,20 +119,21 @@ class Merger:
         while done < samples:
             length = min(self._length, samples - done)
             row = self._check(place, first + done, length, last=last and done + length == samples)
-            sheet, within = self._find(row, length)
-            count = min((samples - done) // length, len(sheet.bytes) - within)
+            buffer, within = self._find(row, length)
+            count = min((samples - done) // length, len(buffer.bytes) - within)
             stop = done + count * length
             if last and stop == samples and count > 1:
                 self._end(place, row + count - 1)
             part = {name: array[done:stop] for name, array in signals.items()}
             numbers = companions[done // self._length :][:count]
-            sheet.put_many(place, within, part, numbers, last=last and stop == samples)
+            buffer.put_many(place, within, part, numbers, last=last and stop == samples)
             self._brought(place, row + count)
             done = stop
         return not self._late
 
     def add_sparse(self, topic: str, log_ns: int, data: bytes) -> None:
         """Take a sparse message."""
+        # A restarted node publishes its newest messages once more; those that wait here are taken once.
         if self._repeats[topic, log_ns, data]:
             self._repeats[topic, log_ns, data] -= 1
             return
@@ -179,29 +180,32 @@ class Merger:
         self._finals += 1
 
     def _brought(self, place: int, end: int) -> bool:
+        # Only a topic that had nothing for the next row changes whether that row is complete; so callers need not look
+        # at all topics for each block.
         if self._ends[place] == self.rows:
             self._late -= 1
         self._ends[place] = end
         return not self._late
 
-    def _find(self, row: int, samples: int) -> tuple[Sheet, int]:
-        """The sheet of a row, and its place there."""
+    def _find(self, row: int, samples: int) -> tuple[RowBuffer, int]:
+        """Return the buffer of a row, and the place of the row in it."""
         if samples != self._length:
             if self._tail is None:
-                self._tail = Sheet(Plan(self._topics, self._run_id, self._step_ns, samples), 1)
+                self._tail = RowBuffer(Plan(self._topics, self._run_id, self._step_ns, samples), 1)
                 self._tail.begin(row * self._length)
             return self._tail, 0
-        number, within = divmod(row, self._sheet_rows)
-        sheet = self._sheets.get(number)
-        if sheet is None:
-            sheet = self._sheets[number] = self._free.pop() if self._free else Sheet(self._plan, self._sheet_rows)
-            sheet.begin(number * self._sheet_rows * self._length)
-        return sheet, within
+        number, within = divmod(row, self._buffer_rows)
+        buffer = self._buffers.get(number)
+        if buffer is None:
+            buffer = self._free.pop() if self._free else RowBuffer(self._plan, self._buffer_rows)
+            self._buffers[number] = buffer
+            buffer.begin(number * self._buffer_rows * self._length)
+        return buffer, within
 
     # ---- what goes out ------------------------------------------------------------------------------
 
-    def _at(self, row: int) -> tuple[Sheet, int]:
-        """The sheet of a row that has come, and its place there."""
+    def _at(self, row: int) -> tuple[RowBuffer, int]:
+        """Like `_find`, for a row that has come."""
         return self._find(row, self._length if row != self._final or self._tail is None else self._tail.plan.samples)
 
     def release(self) -> None:
@@ -221,8 +225,9 @@ class Merger:
         self._late = sum(end == ready for end in self._ends)
 
     def _together(self, ready: int) -> int:
-        """Where the rows end that can be written at once: they are on one sheet, and no sparse message is between."""
-        end = min(ready, (self.rows // self._sheet_rows + 1) * self._sheet_rows)
+        """Return the end of the rows that one write takes: rows of one buffer without a sparse message between them."""
+        end = min(ready, (self.rows // self._buffer_rows + 1) * self._buffer_rows)
+        # The short last row has a buffer of its own, for its bytes are laid out otherwise.
         if self._tail is not None and self.rows != self._final and end > (self._final or 0):
             end -= 1
         if self._waiting:
@@ -230,29 +235,30 @@ class Merger:
             end = min(end, (earliest - START_NS) // self._step_ns // self._length)
         return max(end, self.rows + 1)
 
-    def _write(self, sheet: Sheet, within: int, end: int) -> None:
-        """Write rows up to ``end``, all of one sheet, and ahead of them the sparse messages of the first."""
+    def _write(self, buffer: RowBuffer, within: int, end: int) -> None:
+        """Write rows up to ``end``, all of one buffer, and ahead of them the sparse messages of the first."""
         first = self.rows
-        first_ns = START_NS + (first * self._length + sheet.plan.samples - 1) * self._step_ns
+        first_ns = START_NS + (first * self._length + buffer.plan.samples - 1) * self._step_ns
         due = sorted(single for single in self._waiting if single.log_ns <= first_ns) if self._waiting else []
         if due:
             self._waiting = [single for single in self._waiting if single.log_ns > first_ns]
             self._written.update(self._sparse[single.topic] for single in due)
         if due and due[-1].log_ns == first_ns:
             # Among messages of one time the topic decides: this row has to be taken apart.
-            due += [_Single(first_ns, each.topic, 0, sheet.message(k, within)) for k, each in enumerate(self._topics)]
+            due += [_Single(first_ns, each.topic, 0, buffer.message(k, within)) for k, each in enumerate(self._topics)]
             first += 1
         for single in sorted(due):
             self._writer.write(single.topic, single.log_ns, single.data)
         if first < end:
             skip = first - self.rows
-            data = sheet.bytes[within + skip : within + end - self.rows].reshape(-1).data
-            self._writer.write_rows(sheet.plan.rows, first_ns + skip * sheet.plan.rows.period_ns, data)
-        self.rows, self.samples = end, (end - 1) * self._length + sheet.plan.samples
+            data = buffer.bytes[within + skip : within + end - self.rows].reshape(-1).data
+            self._writer.write_rows(buffer.plan.rows, first_ns + skip * buffer.plan.rows.period_ns, data)
+        self.rows, self.samples = end, (end - 1) * self._length + buffer.plan.samples
         self.log_ns = START_NS + (self.samples - 1) * self._step_ns
         self.complete = self._final is not None and end > self._final
-        if end % self._sheet_rows == 0 and sheet is not self._tail:
-            self._free.append(self._sheets.pop(end // self._sheet_rows - 1))
+        # A used buffer has its template and step already; a new one costs a copy of the template for each row.
+        if end % self._buffer_rows == 0 and buffer is not self._tail:
+            self._free.append(self._buffers.pop(end // self._buffer_rows - 1))
 
     def write_rest(self) -> None:
         """Write everything that is left, sorted: what an interrupted run has of its last blocks.
@@ -263,8 +269,8 @@ class Merger:
         left, self._waiting = self._waiting, []
         for place, end in enumerate(self._ends):
             for row in range(self.rows, end):
-                sheet, within = self._at(row)
-                stamp = START_NS + (row * self._length + sheet.plan.samples - 1) * self._step_ns
-                left.append(_Single(stamp, self._topics[place].topic, 0, sheet.message(place, within)))
+                buffer, within = self._at(row)
+                stamp = START_NS + (row * self._length + buffer.plan.samples - 1) * self._step_ns
+                left.append(_Single(stamp, self._topics[place].topic, 0, buffer.message(place, within)))
         for single in sorted(left):
             self._writer.write(single.topic, single.log_ns, single.data)

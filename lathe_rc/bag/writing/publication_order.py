@@ -144,7 +144,7 @@ class PublicationOrder:
     def _give(self, held: _Held) -> Iterator[Recorded]:
         if held.source_ns < self._given_ns:
             self.late += 1
-            if not held.topic:
+            if not held.topic:  # time on /clock has gone on already
                 return
         self._given_ns = max(self._given_ns, held.source_ns)
         if not self._sim_time:

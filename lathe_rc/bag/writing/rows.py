@@ -75,8 +75,8 @@ class Plan:
         self.rows = RowPlan(len(template), samples * step_ns)
 
 
-class Sheet:
-    """Some rows in memory.
+class RowBuffer:
+    """Consecutive rows in memory.
 
     Args:
         plan: where everything stands.
@@ -111,6 +111,7 @@ class Sheet:
     def _whole(self, layout: Layout, place: int) -> Samples | None:
         """All samples of a message as one array, shape (rows, fields, samples), if they are of one type."""
         places = [start for dtype, start in layout.fields.values() if dtype == np.float64]
+        # Between the arrays of a message stand their lengths: a view with strides skips them.
         gaps = set(np.diff(places).tolist()) or {0}
         if len(places) != len(layout.fields) or len(gaps) > 1:
             return None

@@ -164,7 +164,8 @@ class Snapshots:
         Raises:
             LatheError: the disk does not take it, or too much is kept.
         """
-        whole = memoryview(bytes(data))  # the caller uses its memory again
+        # One copy for all rows: the caller uses its memory again, and the rows are kept for some seconds.
+        whole = memoryview(bytes(data))
         for row, start in enumerate(range(0, len(data), plan.size)):
             self._take(_Item(first_ns + row * plan.period_ns, plan, whole[start : start + plan.size]))
 
@@ -186,6 +187,7 @@ class Snapshots:
         if self._open is None:
             self._kept.append(item)
         else:
+            # Some items for each that comes: the seconds before a trigger at once would delay the cell.
             self._waiting.append(item)
             self._catch_up(_CATCH_UP)
             if self._newest_ns > self._stamp(self._open[0].last) + self._margin_ns:
